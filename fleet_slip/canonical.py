@@ -9,9 +9,8 @@ _ASCII = json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False
 
 
 def canonical_json(content: Any) -> str:
-    """Return content as JSON: keys sorted, no spaces, characters as they are.
-
-    Raises `ValueError` for numbers that JSON does not have.
+    """Return JSON with sorted keys, no spaces and no escapes. Raises `ValueError` for NaN,
+    infinity.
     """
     return _TEXT.encode(content)
 

@@ -136,10 +136,7 @@ def load_config(file: Traversable, model: type[ConfigT]) -> ConfigT:
 
 
 def parse_document(content: Mapping[str, Any], model: type[ModelT], name: str, kind: str) -> ModelT:
-    """Return the content of a document whose checksum is right. Raises `StorageError` otherwise.
-
-    Then another version of the program has written it.
-    """
+    """Return a document with a valid checksum. Raises `StorageError`: another program wrote it."""
     try:
         return model.model_validate(content)
     except ValidationError as error:

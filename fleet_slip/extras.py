@@ -8,10 +8,7 @@ from fleet_slip.errors import ExtraError
 
 @contextmanager
 def needed(extra: str, purpose: str) -> Iterator[None]:
-    """Import what an extra of `pyproject.toml` brings.
-
-    Raises `ExtraError`, which says how to install it and what it is for, if a package is missing.
-    """
+    """Import what an extra brings; raises `ExtraError` that says how to install it and what for."""
     try:
         yield
     except ModuleNotFoundError as error:

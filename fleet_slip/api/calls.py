@@ -43,9 +43,9 @@ ShowStep = Callable[[str, int, int], None]
 """Like `ShowProgress`, with the name of the step first."""
 
 Workers = int | str | Executor | None
-"""Where the tasks of a call run; the result is the same. A number of threads of this process (None
-is one for each core), the address of a Dask scheduler such as `tcp://10.0.0.1:8786`, or an
-executor."""
+"""Where tasks run, with the same result: threads of this process (None: one a core), the address of
+a Dask scheduler such as `tcp://10.0.0.1:8786`, or an executor.
+"""
 
 S = TypeVar("S", bound=Rooted)
 P = ParamSpec("P")

@@ -24,11 +24,9 @@ if TYPE_CHECKING:
 class FleetCohort(Rooted):
     """The drives that satisfy an SQL condition on the view `drives`; `Fleet.cohort` makes one.
 
-    Nothing but Gram rows is read, of the newest commits at the time of each call. Every call raises
-    `QuestionError` for a condition that is not valid SQL, an unknown feature set or input;
-    `DataError` if no drive satisfies the condition or the feature set has not been computed (see
-    `Fleet.gram`); and `RefusedError` if it asks for drives of evaluation scenarios, which others
-    leave out.
+    Each call reads the Gram rows of the newest commits, and raises `QuestionError` for an invalid
+    condition, feature set or input, `DataError` without drives or Gram rows (see `Fleet.gram`), and
+    `RefusedError` for drives of evaluation scenarios.
     """
 
     def __init__(self, warehouse: Warehouse, condition: str) -> None:
@@ -44,9 +42,8 @@ class FleetCohort(Rooted):
     def select(self, request: SelectionRequest) -> "RequestedSelection":
         """Compare models by cross-validation and choose one; `Fleet.publish` takes the answer.
 
-        The options are keywords, those of `fleet_slip.selection.request.SelectionRequest`. Raises
-        `UsageError` for options that do not go together or a list that is not valid, and
-        `DataError` if no model can be fitted.
+        Raises `UsageError` for options that do not go together or an invalid list, and `DataError`
+        if no model can be fitted.
         """
         from fleet_slip.selection.answer_request import answer_request
 
@@ -66,17 +63,16 @@ class FleetCohort(Rooted):
         """Fit a model's signals to the cohort and examine the fit.
 
         Args:
-            model: a published model, by default the only one that there is.
+            model: a published model, by default the only one.
             signals: instead of a model, inputs separated by commas, or `catalogue` for all.
             features: the feature set that `signals` are of.
             against: condition of another cohort: does it have the same coefficients?
-            serial: Durbin-Watson and AR(1) generalised least squares, from lagged Gram rows, which
-                `fleet.gram("lags")` makes.
-            sensor_noise: noise that the logs already have, as standard deviations in SI units by
-                signal: shows the coefficients without it (errors in variables).
+            serial: Durbin-Watson and AR(1) least squares, from what `fleet.gram("lags")` makes.
+            sensor_noise: standard deviations of the noise in the logs, in SI units by signal: shows
+                the coefficients without it (errors in variables).
             cluster: what is independent evidence, as in `select`.
 
-        Raises `UsageError` if both a model and signals are named, and what `Fleet.model` raises.
+        Raises `UsageError` for both a model and signals, and what `Fleet.model` raises.
         """
         from fleet_slip.catalogue.features import features as known
         from fleet_slip.selection.diagnostics import diagnose
@@ -103,15 +99,12 @@ class FleetCohort(Rooted):
         signals: str | None = None,
         features: str | None = None,
     ) -> "WhatIf":
-        """Predict a model's error with worse sensors, in closed form; nothing is simulated.
+        """Predict a model's error with worse sensors, in closed form, and the best model for these.
 
-        `noise` is the standard deviation of white noise and `bias` a constant, in SI units by
-        signal, which come on top of what the logs have. `model`, `signals` and `features` are those
-        of `diagnose`. Shown too: the best model for such sensors.
-
-        Raises `UsageError` if nothing is added or both a model and signals are named,
-        `QuestionError` for a signal that enters the model through a feature, and what `Fleet.model`
-        raises.
+        `noise` (standard deviation of white noise) and `bias`, in SI units by signal, come on top
+        of what the logs have; the rest is as in `diagnose`. Raises `UsageError` if nothing is added
+        or both a model and signals are named, `QuestionError` for a signal inside a feature, and
+        what `Fleet.model` raises.
         """
         from fleet_slip.catalogue.signals import catalogue
         from fleet_slip.models.counts_model import counts_model
@@ -146,13 +139,10 @@ class FleetCohort(Rooted):
     ) -> "RegimeComparison":
         """Return a model's error by speed and lateral acceleration, and whether to split it there.
 
-        One model for all rows is cross-validated against one for each regime. `signals` are inputs
-        separated by commas, by default those of a published `model`, or all; `over` the regimes to
-        divide by, by default all of the feature set `features`, whose Gram rows
-        `fleet.gram("regimes")` makes; `worth` the smallest gain for which a split is
-        advised, as in `select`.
-
-        Raises `DataError` for a feature set without such regimes.
+        One model for all rows is cross-validated against one a regime. `signals` are inputs
+        separated by commas, by default those of `model`, or all; `over` the regimes, by default all
+        of `features` (`fleet.gram("regimes")` makes them); `worth` as in `select`. Raises
+        `DataError` for a feature set without such regimes.
         """
         from fleet_slip.selection.regimes import compare_regimes
         from fleet_slip.selection.request import parse_worth
@@ -178,8 +168,7 @@ class FleetCohort(Rooted):
         """Compare least squares with ridge, lasso, James-Stein and Pace regression.
 
         Penalties are chosen by cross-validation inside each training fold. `signals` are inputs of
-        the feature set `features` separated by commas, by default all; with `naive` rows are
-        independent evidence, else what `cluster` says, as in `select`.
+        the feature set separated by commas, by default all; `naive` and `cluster` as in `select`.
         """
         from fleet_slip.selection.shrinkage import compare_shrinkage
 

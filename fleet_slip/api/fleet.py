@@ -29,9 +29,8 @@ if TYPE_CHECKING:
 class Fleet(LogsAndGrams, HealthAndUpkeep):
     """All that can be asked of a data root, and done to it; `fleet_slip.open` makes one.
 
-    A fleet holds no connection and no file open, and threads may share it. What changes the
-    warehouse leaves a record in the view `runs`, as commands do. Beside what is listed, every call
-    raises `StorageError` where the data root cannot be read or written.
+    A fleet holds no connection or file open, and threads may share it. Changes leave a record in
+    the view `runs`. Every call raises `StorageError` where the root cannot be read or written.
     """
 
     def sql(
@@ -39,24 +38,20 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
     ) -> "duckdb.DuckDBPyRelation":
         """Return the answer to an SQL query on the views as a DuckDB relation.
 
-        The views are those of `fleet_slip.connect`, of the newest commits at the time of the call.
-        A relation is computed when it is asked for rows: `.df()`, `.pl()`, `.to_arrow_table()`,
-        `.fetchall()`; it and all that is made of it keep their connection open. It can read the
-        warehouse and nothing else, and write nothing. The drives of evaluation scenarios are there
-        with `scenarios`, or if the query names the column `source`.
-
-        Raises `QuestionError` for a query that is not valid or would write, and `StorageError`
-        without a data root.
+        It is computed when asked for rows: `.df()`, `.pl()`, `.to_arrow_table()`, `.fetchall()`;
+        what is made of it keeps the connection open. Evaluation scenarios are there with
+        `scenarios`, or if the query names the column `source`. Raises `QuestionError` for a query
+        that is not valid or would write, and `StorageError` without a data root.
         """
         return self.session(query, threads=threads, scenarios=scenarios).sql(query)
 
     def session(
         self, query: str | None = None, *, threads: int | None = None, scenarios: bool = False
     ) -> "Session":
-        """Open the views of this moment for many queries, all of which see the same commits.
+        """Open the views of this moment for many queries, which all see the same commits.
 
-        With a `query`, only the views that it names are opened, which is faster. For `scenarios`
-        see `sql`. Raises `StorageError` without a data root.
+        With a `query`, only those that it names, which is faster. For `scenarios` see `sql`. Raises
+        `StorageError` without a data root.
         """
         from fleet_slip.api.session import Session, query_of_many
         from fleet_slip.views import connect
@@ -79,11 +74,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         return Session(connect_unlocked(self.root, query, scenarios=scenarios), any_statement)
 
     def cohort(self, condition: str = TRAINING_DRIVES) -> FleetCohort:
-        """Return the drives that satisfy an SQL condition on the view `drives`.
-
-        Such as `adhesion < 0.8`. By default all but those of evaluation scenarios. Nothing is read
-        before it is asked something.
-        """
+        """Return the drives of an SQL condition, by default all but those of evaluation scenarios."""
         return FleetCohort(self.warehouse, condition)
 
     @record_call

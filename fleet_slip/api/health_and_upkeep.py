@@ -36,10 +36,7 @@ if TYPE_CHECKING:
 
 
 class HealthAndUpkeep(JudgedModels):
-    """Health, quality and drift; checking, compacting and forgetting.
-
-    Nothing here raises `AlarmError` or `DamageError`: the answers say what calls for attention.
-    """
+    """Health, quality and drift; checking, compacting, forgetting. Answers tell alarms, damage."""
 
     def status(self, max_age_hours: float | None = None) -> "WarehouseStatus":
         """Return the warehouse's health: freshness, backlog, last runs, disk, champions.
@@ -53,8 +50,8 @@ class HealthAndUpkeep(JudgedModels):
     def examine(self, cluster: str | None = None) -> "Fitness":
         """Tell whether this machine, the data root and a cluster are fit for the work.
 
-        `cluster` is the address of a Dask scheduler. A probe of a few bytes is written to the root
-        and deleted again. What is not fit is among the `problems`; nothing is raised.
+        `cluster` is the address of a Dask scheduler. A few bytes are written to the root and
+        deleted.
         """
         from fleet_slip.monitoring.fitness import examine
 
@@ -67,19 +64,18 @@ class HealthAndUpkeep(JudgedModels):
     def quality(self, cohort: str = TRAINING_DRIVES) -> "QualityReport":
         """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors by drive.
 
-        `cohort` is an SQL condition on the view `drives`: which drives to compare with each other.
-        Reads Gram rows only. The `findings` are the drives that are not in order. Raises what
-        `FleetCohort` raises.
+        The drives of `cohort` are compared with each other, by Gram rows alone; `findings` are
+        those not in order. Raises what `FleetCohort` raises.
         """
         from fleet_slip.monitoring.quality import examine_drives
 
         return examine_drives(self.warehouse, cohort)
 
     def leave_out_faulty(self, cohort: str = TRAINING_DRIVES) -> "Examined":
-        """Examine the drives of a cohort; return the condition of those that are in order.
+        """Return the condition of a cohort's drives that `quality` finds in order; it raises the
+        same.
 
-        As `quality` does, for measured drives and those without a log, and once: what was found is
-        kept as long as the data are what they were. Raises what `quality` raises.
+        Simulated drives with logs are passed over; what was found is kept while the data stay.
         """
         from fleet_slip.monitoring.examined import leave_out_faulty
 
@@ -88,11 +84,9 @@ class HealthAndUpkeep(JudgedModels):
     def calibrate(self, cohort: str = ALL_DRIVES) -> "Calibration":
         """Return how the sensors of every car are off, and what else its drives tell of it.
 
-        Offsets of gyroscope, accelerometer and steering, each with its uncertainty, from all drives
-        of a car, with a label or without. `cohort` is an SQL condition on the view `drives`. Reads
-        the Gram rows of the feature set `calibration` only. Raises `DataError` if they have not
-        been computed or no drive satisfies the condition, and `QuestionError` for one that is no
-        condition; `CohortError` where a minimum cohort is asked for.
+        Offsets of gyroscope, accelerometer and steering with uncertainties, label or not, from the
+        Gram rows of `calibration`. Raises `DataError` without these or without drives,
+        `QuestionError` for an invalid condition, and `CohortError` where a minimum cohort holds.
         """
         from fleet_slip.grams.calibration.calibration import calibrate
         from fleet_slip.warehouse.condition import parse_cohort
@@ -110,10 +104,9 @@ class HealthAndUpkeep(JudgedModels):
     ) -> "Chart":
         """Chart a model's error on each day since it was trained, with control limits, in degrees.
 
-        `cohort` is an SQL condition on the view `drives`, by default that of its training. `since`
-        is the first new day, by default the one after the days that it was trained on. Reads Gram
-        rows only. The `alarms` are the new days beyond the limits. Raises `DataError` if there are
-        too few training days, and what `Fleet.model` raises.
+        `cohort` is by default that of its training, `since` the day after its data. `alarms` are
+        the new days beyond the limits. Raises `DataError` for too few training days, and as
+        `Fleet.model`.
         """
         from fleet_slip.monitoring.monitor import monitor
 
@@ -124,8 +117,8 @@ class HealthAndUpkeep(JudgedModels):
     ) -> "Verification":
         """Verify every byte against its checksum, and everything against everything else.
 
-        `full` computes the Gram rows of all log files again. Progress is in bytes. The `damage` of
-        the answer is what is wrong. Raises `StorageError` without a data root, and `ClusterError`.
+        `full` computes all Gram rows again. Progress is in bytes. `damage` is what is wrong. Raises
+        `StorageError` without a data root, and `ClusterError`.
         """
         from fleet_slip.maintenance.verify import verify
 
@@ -139,10 +132,9 @@ class HealthAndUpkeep(JudgedModels):
 
     @record_call
     def repair(self, found: "Verification", campaigns: Sequence[str] = ()) -> list[str]:
-        """Rebuild what `verify` found damaged: Gram rows from logs, simulated logs from campaigns.
+        """Rebuild what `verify` found damaged; return the paths, below the root. Then verify again.
 
-        `campaigns` names campaign files besides those that ship. Returns the paths that were
-        rebuilt, below the data root; verify again to see what is left.
+        Gram rows come from logs, simulated logs from `campaigns`, files or shipped ones.
         """
         from fleet_slip.maintenance.repair import repair
 
@@ -154,8 +146,8 @@ class HealthAndUpkeep(JudgedModels):
     ) -> "CompactionReport":
         """Turn the small log files of each day into large ones, of `target_rows` or fewer.
 
-        Readers and jobs are not disturbed. Progress is in days. Raises `StorageError`, and
-        `ConflictError` if other processes keep changing the same files.
+        Progress is in days. Raises `StorageError`, and `ConflictError` if others keep changing
+        files.
         """
         from fleet_slip.maintenance.compaction import TARGET_ROWS, compact
 
@@ -167,10 +159,9 @@ class HealthAndUpkeep(JudgedModels):
 
     @record_call
     def vacuum(self, retention_hours: float | None = None) -> "VacuumReport":
-        """Remove replaced files and leftovers of killed jobs when they are old enough.
+        """Remove replaced files and leftovers of killed jobs that are older than `retention_hours`.
 
-        What a version of the last `retention_hours` refers to is kept, by default of a week. Raises
-        `StorageError`.
+        By default a week. Raises `StorageError`.
         """
         from fleet_slip.maintenance.vacuum import RETENTION_HOURS, vacuum
 
@@ -200,13 +191,11 @@ class HealthAndUpkeep(JudgedModels):
     ) -> "ForgetReport":
         """Forget a vehicle, a drive, or drives of a name or file; mark their models.
 
-        They go in logs, Gram rows and quarantine. No job brings them back, nor one that is under
-        way: their rows are left out, until `allow`. Others that come under the same name or file
-        land. With `now` the old files are deleted at once, not when vacuum is due; while anything
-        is `pending` in the report, repeat it. Progress is in files, or in drives.
-
-        Raises `UsageError` unless one subject is given, `QuestionError` if there never was such a
-        drive, `StorageError` and `ConflictError`.
+        They leave logs, Gram rows and quarantine, and no job brings them back until `allow`. Others
+        under the same name or file land. `now` deletes old files at once; while anything is
+        `pending`, repeat it. Progress is in files, or in drives. Raises `UsageError` unless one
+        subject is given, `QuestionError` if there never was such a drive, `StorageError` and
+        `ConflictError`.
         """
         from fleet_slip.maintenance.forget import forget, forget_called
 
@@ -233,12 +222,12 @@ class HealthAndUpkeep(JudgedModels):
         drive: str | None = None,
         source_file: str | None = None,
     ) -> bool:
-        """Let a forgotten vehicle, drive or file come back: land its new rows again from now on.
+        """Let new rows of a forgotten vehicle, drive or file land again; return whether that is
+        new.
 
-        What was forgotten stays forgotten, but a file that is given to `ingest` again lands once it
-        is allowed by its name, or its drives by theirs. Returns whether that is new. Raises
-        `UsageError` unless one subject is given, `QuestionError` if it was never forgotten, and
-        `RefusedError` while it is being forgotten.
+        What was forgotten stays so, until `ingest` is given the allowed file, or its drives, again.
+        Raises `UsageError` unless one subject is given, `QuestionError` if it was never forgotten,
+        and `RefusedError` while it is being forgotten.
         """
         from fleet_slip.warehouse.audit import ALLOWED, Audit
 
@@ -281,10 +270,10 @@ class HealthAndUpkeep(JudgedModels):
     def retain(
         self, config: str | None = None, *, progress: ShowProgress | None = None
     ) -> "RetentionReport":
-        """Forget drives that are older than a retention says, then vacuum.
+        """Forget drives that are older than a retention file says, by default the shipped; then
+        vacuum.
 
-        `config` is the path of a retention file, by default the one that ships. Progress is in
-        files. Raises `RefusedError` if no drive would be left, and what `forget` raises.
+        Progress is in files. Raises `RefusedError` if no drive would be left, and as `forget`.
         """
         from fleet_slip.maintenance.retention import load_retention, retain
 

@@ -26,10 +26,9 @@ class JudgedModels(PublishedModels):
     def score(self, model: str | ModelVersion | None = None, cohort: str | None = None) -> "Score":
         """Evaluate a model on the rows of a cohort; angles are in degrees.
 
-        `cohort` is an SQL condition on the view `drives`, by default all drives that the model was
-        not trained on, or all if there are no others. Raises `DataError` if no row of the
-        cohort has the model's signals, `QuestionError` for a condition that is not valid, and what
-        `model` raises.
+        By default on all drives that it was not trained on, or all if there are no others. Raises
+        `DataError` if no row has the model's signals, `QuestionError` for an invalid condition, and
+        what `model` raises.
         """
         from fleet_slip.models.score import score
         from fleet_slip.models.seen_drives import find_seen
@@ -56,13 +55,11 @@ class JudgedModels(PublishedModels):
     ) -> "Document":
         """Evaluate models on the paper's test drives and on others; simulate those missing.
 
-        The models of Table I are fitted on the cohort of each and evaluated beside it. `scenarios`
-        are names of those that ship or paths of TOML files, by default all that ship. `rivals`
-        trains networks, trees and neuro-fuzzy rules as well, with scikit-learn. Progress is in
-        simulated rows. Returns the document that is kept below `evaluations/`.
-
-        Raises `ConfigError` for a scenario that is not valid, `DataError`, `RefusedError` for a
-        scenario that was changed since its drive was simulated, and what `model` raises.
+        Models of Table I are fitted on the cohort of each and evaluated beside it. `scenarios` are
+        names or paths, by default all that ship. `rivals` trains networks, trees and neuro-fuzzy
+        rules too, with scikit-learn. Progress is in simulated rows. Returns the document kept below
+        `evaluations/`. Raises `ConfigError` for an invalid scenario, `RefusedError` for one that
+        changed since it was simulated, `DataError`, and what `model` raises.
         """
         from fleet_slip.comparison.evaluation.evaluate import evaluate, keep
         from fleet_slip.comparison.evaluation.scenario_runs import simulate_scenarios
@@ -89,11 +86,9 @@ class JudgedModels(PublishedModels):
     ) -> "tuple[BlindRow, ...]":
         """Judge models, and all that `evaluate` trains beside them, on drives of the first.
 
-        Roads, cars, weather and noise are drawn from the hash of its version, so that nobody has
-        seen them before it was published (`configs/blind.toml`). No drive is written. Returns
-        figures over all drives, by class of road, by weather and by drive.
-
-        Raises what `evaluate` raises.
+        Roads, cars, weather and noise are drawn from its version's hash, unknown before it was
+        published (`configs/blind.toml`). Nothing is written. Returns figures over all drives, by
+        class of road, by weather and by drive. Raises as `evaluate`.
         """
         from fleet_slip.comparison.evaluation.blind import judge_blindly
         from fleet_slip.comparison.evaluation.evaluate import train_competitors
@@ -108,9 +103,9 @@ class JudgedModels(PublishedModels):
     ) -> "Written":
         """Write one page that lays our figures beside the paper's, from the latest evaluation.
 
-        `output` is a folder, by default `report` in the data root. Raises `DataError` if the model
-        has not been evaluated, or not on today's data, `CohortError` where a minimum cohort is
-        asked for, and what `model` raises.
+        `output` is a folder, by default `report` in the root. Raises `DataError` without an
+        evaluation on today's data, `CohortError` where a minimum cohort holds, and what `model`
+        raises.
         """
         from fleet_slip.files.local_folder import LocalFolder
         from fleet_slip.warehouse.minimum_cohort import require_single_cars
@@ -136,12 +131,10 @@ class JudgedModels(PublishedModels):
     ) -> Path:
         """Write a drive as a page that plays, or as a film: .html, .mp4 or .gif; return the file.
 
-        `what` is the name of a scenario that ships, the path of one, or a drive of the logs. The
-        test drive of a scenario is simulated if it is not there. Of the drive the part from
-        `from_s` until `until_s` is shown, in seconds.
-
-        Raises `UsageError` for another suffix or an empty part, `QuestionError` if there is no such
-        drive, `ExtraError` without the extra `watch`, and what `model` raises.
+        `what` is a scenario's name or path, simulated if missing, or a drive of the logs, shown
+        from `from_s` until `until_s`. Raises `UsageError` for another suffix or an empty part,
+        `QuestionError` for an unknown drive, `ExtraError` without the extra `watch`, and what
+        `model` raises.
         """
         with needed("watch", "a page or a film of a drive"):
             from fleet_slip.comparison.watch.drive_frames import (

@@ -47,11 +47,10 @@ class LogsAndGrams(Rooted):
     ) -> "SimulationReport":
         """Simulate what is missing of a campaign and write it to the logs.
 
-        `campaign` is the name of one that ships, the path of a TOML file, or a `Campaign`. Of its
-        days the first `days` are simulated, up to the day `through`. Progress is in rows.
-
-        Raises `ConfigError` for a campaign that is not valid, `UsageError` if it has no such days,
-        `RefusedError` for one that was changed since its drives were written, and `ClusterError`.
+        `campaign` is a name, the path of a TOML file, or a `Campaign`; of its days the first
+        `days`, up to `through`. Progress is in rows. Raises `ConfigError` for an invalid campaign,
+        `UsageError` if it has no such days, `RefusedError` for one changed since it was written,
+        and `ClusterError`.
         """
         from fleet_slip.simulation.campaign import load_campaign
         from fleet_slip.simulation.job import simulate_campaign
@@ -79,13 +78,10 @@ class LogsAndGrams(Rooted):
     ) -> "list[ReceiveReport]":
         """Take in messages of cars that send Gram rows, no logs; return a report of each file.
 
-        A file is messages one behind the other. Of a folder all files are taken, at any depth.
-        A file lands once, and so does a message. What is damaged, impossible or contradicts what is
-        there goes to the view `quarantine` with a reason. `each` is called with a report once its
-        file has landed. Progress is in files.
-
-        Raises `InputError` for a file that cannot be read, when all others are in; `StorageError`;
-        and `ConflictError` if other processes keep changing the tables.
+        Files hold messages one behind the other; folders are searched. Files and messages land
+        once; what is damaged, impossible or contradictory goes to the view `quarantine`. `each`
+        gets a report when its file has landed. Progress is in files. Raises `InputError` for an
+        unreadable file, when all others are in, `StorageError` and `ConflictError`.
         """
         from fleet_slip.grams.received.receiving import find_messages, receive_files
 
@@ -115,24 +111,19 @@ class LogsAndGrams(Rooted):
     ) -> "list[IngestReport]":
         """Bring measured logs in through a mapping of columns, units and axes.
 
-        `mapping` is the name of one that ships, the path of a TOML file, or a `Mapping`. Rows that
-        cannot be used go to the view `quarantine` with a reason. Of a folder all logs are taken, at
-        any depth, and of a pattern what matches, but for those that have landed before and have
-        not changed; with `as_one` they are parts of one log, whose drives go on from file to file.
-        Files on an object store are given as URLs, and copied to the temporary folder to be read.
-        Returns a report of each file that was read, in their order; `each` is called with it once
-        the file is committed. Progress is in files for folders and patterns, else in rows, where a
-        format tells about how many there are. Without a cluster, threads read the small files of
-        folders, and large ones come one after the other, each read by all cores.
+        `mapping` is a name, the path of a TOML file, or a `Mapping`. Rows that cannot be used go to
+        the view `quarantine`. Of folders, at any depth, and patterns, the logs are taken that have
+        not landed unchanged; with `as_one` they are parts of one log. Objects are given as URLs.
+        Returns a report of each file read, in order; `each` gets it once the file is committed.
+        Progress is in files for folders and patterns, else in rows where a format tells them.
+        Without a cluster, threads read a folder's small files; large ones are read one by one, by
+        all cores.
 
-        A recording that is in the logs already, from another file or through another mapping, is
-        told by its bytes and by its samples. If `replace` is `all`, its drives give way to the new
-        ones, in one commit; if it is `corrected`, those of the same file do, whose mapping has the
-        same name and was changed since.
-
-        Raises `ConfigError` for a mapping that is not valid; `InputError`, when all others are in,
-        for files that cannot be used, of which nothing is written, or `RepeatedError` where all of
-        these are in already; `StorageError` and `ClusterError`.
+        A recording that is there already is told by its bytes and samples. With `replace="all"` its
+        drives give way to the new ones, in one commit; with `corrected` those of the same file and
+        an older state of the same mapping do. Raises `ConfigError` for an invalid mapping;
+        `InputError`, when all others are in, for files that cannot be used, or `RepeatedError`
+        where these are all in already; `StorageError` and `ClusterError`.
         """
         from fleet_slip.ingest.landing.ingest_job import ingest_files
         from fleet_slip.ingest.landing.known_files import KnownFiles
@@ -181,11 +172,9 @@ class LogsAndGrams(Rooted):
     def take_back(self, what: str) -> int:
         """Take out what was ingested from a file or through a mapping; return how many drives.
 
-        `what` is the name of a file, or of a mapping, or what the names of a file's drives begin
-        with, such as `logger-0123456789ab`. Their Gram rows and refused rows go with them. Other
-        than what is forgotten, they land again when they are given again.
-
-        Raises `QuestionError` if there is no such drive, `StorageError` and `ConflictError`.
+        `what` is the name of either, or what a file's drives begin with, such as
+        `logger-0123456789ab`. Gram rows and refused rows go too; all can land again. Raises
+        `QuestionError` if there is no such drive, `StorageError` and `ConflictError`.
         """
         from fleet_slip.maintenance.superseding import take_back
 
@@ -199,11 +188,10 @@ class LogsAndGrams(Rooted):
         *,
         as_one: bool = False,
     ) -> "list[Preview]":
-        """Read measured files as `ingest` does, and store nothing.
+        """Read measured files as `ingest` does, and store nothing; raises the same.
 
-        A preview tells rows, drives, what would be rejected, the range of each signal, and what
-        looks wrong in the longest drive: a sign, a unit, swapped wheels, a delay of the label.
-        Of a folder every log is read, or with `as_one` all as one. Raises like `ingest`.
+        Tells rows, drives, rejections, each signal's range, and what looks wrong in the longest
+        drive: a sign, a unit, swapped wheels, a delay of the label.
         """
         from fleet_slip.ingest.drafting.preview import preview_log
         from fleet_slip.ingest.logs.log_files import find_logs, find_whole_logs
@@ -225,14 +213,10 @@ class LogsAndGrams(Rooted):
     ) -> "GramReport":
         """Reduce new log files to Gram rows, and drop the rows of files that are gone.
 
-        `features` is a feature set of `configs/features.toml`; `signals` is the logged signals
-        themselves. A set that is asked for the first time costs one pass over the logs; from then
-        on only new files are read. With a `cohort`, an SQL condition on the view `drives`, only
-        files are read that have a drive of it, as the Gram rows of `signals` tell. Progress is in
-        rows.
-
-        Raises `QuestionError` for an unknown set, `StorageError`, `ConflictError` and
-        `ClusterError`.
+        `features` is a feature set of `configs/features.toml`; `signals` are the logged ones. A
+        set's first time costs a pass over the logs. With a `cohort`, only files with a drive of it
+        are read, as the Gram rows of `signals` tell. Progress is in rows. Raises `QuestionError`
+        for an unknown set, `StorageError`, `ConflictError` and `ClusterError`.
         """
         from fleet_slip.grams.cohorts.reader import cohort_files
         from fleet_slip.grams.rows.gram_job import update_grams
@@ -253,14 +237,13 @@ class LogsAndGrams(Rooted):
     def check(
         self, files: int = 4, *, begin: int = 0, progress: ShowProgress | None = None
     ) -> "CheckReport":
-        """Compute the Gram rows of some log files three ways and compare them, bit for bit.
+        """Compute the Gram rows of some log files three ways; compare the bits, stored rows
+        included.
 
-        By the SQL statement, by float64 matrix products in which every partial sum is an exact
-        integer, and by Python integers; and with the stored rows. The files are evenly chosen, and
-        those of the next number `begin` are the next ones. Progress is in files.
-
-        Raises `StorageError` naming the first drive whose Gram rows differ, and `DataError` if
-        there is nothing to check.
+        By SQL, by float64 products with exact partial sums, and by Python integers. Files are
+        evenly chosen; those of `begin` + 1 are the next ones. Progress is in files. Raises
+        `StorageError` naming the first drive that differs, and `DataError` if there is nothing to
+        check.
         """
         from fleet_slip.grams.rows.check_grams import check_grams
 
@@ -268,11 +251,9 @@ class LogsAndGrams(Rooted):
 
     @record_call
     def migrate(self, *, progress: ShowProgress | None = None) -> "MigrationReport":
-        """Bring the logs to the signal catalogue: add columns, convert counts to other scales.
+        """Bring the logs to the signal catalogue (`docs/schema.md`): add columns, convert scales.
 
-        See `docs/operations.md` before widening a scale. Progress is in rows.
-
-        Raises `RefusedError` if counts would not fit a new scale, and `ConflictError`.
+        Progress is in rows. Raises `RefusedError` if counts would not fit, and `ConflictError`.
         """
         from fleet_slip.maintenance.migration import migrate
 

@@ -57,8 +57,7 @@ Told = tuple[State, str]
 class Night:
     """One night of a model. `run` does the steps in their order, and goes on where it can.
 
-    Files that cannot be used do not hold up the others; a step that needs one that failed is left
-    out.
+    A step that needs one that failed is left out.
     """
 
     fleet: "Fleet"

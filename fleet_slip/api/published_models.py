@@ -23,16 +23,15 @@ if TYPE_CHECKING:
 
 
 class PublishedModels(Rooted):
-    """Published models. A reference is `NAME@VERSION`, `NAME@ALIAS`, or `NAME` for its champion.
-
-    Where one is asked for and None given, it is the only model that there is.
+    """Published models: `NAME@VERSION`, `NAME@ALIAS`, `NAME` for its champion, None for the only
+    one.
     """
 
     def models(self, name: str | None = None) -> "pa.Table":
         """Return all published versions, or those of one model, as the view `models` has them.
 
-        `trained_on_forgotten` tells whether drives were forgotten since. Raises `QuestionError` for
-        an unknown model and `StorageError` without a data root.
+        `trained_on_forgotten`: whether drives were forgotten since. Raises `QuestionError`,
+        `StorageError`.
         """
         from fleet_slip.maintenance.marked_models import marked_models
 
@@ -50,8 +49,8 @@ class PublishedModels(Rooted):
     def model(self, reference: str | None = None) -> ModelVersion:
         """Return the version that a reference names, by default the only model.
 
-        Raises `QuestionError` for an unknown one, `StorageError` for one that was changed after it
-        was published, and `RefusedError` for one without the signature that is asked for.
+        Raises `QuestionError` for an unknown one, `StorageError` for one that was changed, and
+        `RefusedError` for one without a required signature.
         """
         return self.registry().resolve(reference)
 
@@ -67,17 +66,15 @@ class PublishedModels(Rooted):
     ) -> "Publication":
         """Make a selection's winner the next version of a model, and its champion.
 
-        `choice` is what `FleetCohort.select` returned, or a cohort, on which the model is trained
-        again as it was before, a new one from the usual list; None for the cohort of before, too. A
-        winner that is worse than the champion on the same cohort and folds is
-        published only with `force`. A `candidate` waits for somebody to `promote` it, and so does
-        whatever is published while the champion is held by `rollback` or `pin`. `sign_key` is the
-        private key that signs the version.
+        `choice` is what `FleetCohort.select` returned; or a cohort, None for that of before, on
+        which the model is trained as it was before, or from the usual list. A winner that is worse
+        than the champion on the same cohort and folds needs `force`. A `candidate` waits for
+        `promote`, and so does any winner while the champion is held. `sign_key` is the private key
+        to sign with.
 
-        Raises `RefusedError` for a worse winner, one that a late or false course taught, or a first
-        one of measured drives that contradict any car;
-        `UsageError` for a name that no model may have, `ConfigError` for a key that cannot be used,
-        and what `FleetCohort.select` raises.
+        Raises `RefusedError` for a worse winner, a late or false course, or first measured drives
+        that contradict any car; `UsageError` for an invalid name, `ConfigError` for an unusable
+        key, and what `FleetCohort.select` raises.
         """
         from fleet_slip.models.first_look import require_sound_drives
         from fleet_slip.models.in_time import require_in_time
@@ -129,9 +126,8 @@ class PublishedModels(Rooted):
 
     @record_call
     def rollback(self, name: str, alias: str = CHAMPION) -> ModelVersion:
-        """Point an alias back at the version that it had before; return that version.
-
-        No publication moves it from there until `promote` or `unpin`.
+        """Point an alias back at the version before, until `promote` or `unpin`; return that
+        version.
 
         Raises `RefusedError` if it never had another, and what `model` raises.
         """
@@ -157,10 +153,10 @@ class PublishedModels(Rooted):
         return compare_versions(self.registry(), self.resolve(one), self.resolve(other))
 
     def sign(self, reference: str, key: Path) -> ModelVersion:
-        """Sign a version that was published without a signature; return it.
+        """Sign the version `NAME@VERSION`, which was published without a signature; return it.
 
-        `reference` is `NAME@VERSION`. Raises `UsageError` for another, `ConfigError` for a key
-        that cannot be used, and what `model` raises.
+        Raises `UsageError` for another reference, `ConfigError` for an unusable key, and as
+        `model`.
         """
         name, _, version = reference.partition("@")
         if not (version.isascii() and version.isdigit() and len(version) < 10):
@@ -173,12 +169,10 @@ class PublishedModels(Rooted):
     def import_model(self, file: Path, *, sign_key: Path | None = None) -> ModelVersion:
         """Bring a version in that another data root exported to JSON; return it.
 
-        It becomes the next version of the model of its name, to which nothing points until
-        `promote`, and says where it comes from. The latest version is returned if it is the same
-        estimator. `sign_key` is the private key that signs the version.
-
-        Raises `InputError` for a file that is no such export or was changed, `RefusedError` if a
-        signal means something else here, and `ConfigError` for a key that cannot be used.
+        It becomes its model's next version, with its origin and no alias; the latest is returned if
+        it is the same estimator. `sign_key` signs it. Raises `InputError` for no such export, or a
+        changed one, `RefusedError` if a signal means something else here, `ConfigError` for an
+        unusable key.
         """
         from fleet_slip.export.importing import import_version
 
@@ -189,11 +183,9 @@ class PublishedModels(Rooted):
     ) -> "Estimator":
         """Return a version that estimates a drive sample by sample, as a car does.
 
-        `car` is what the car knows of itself, by name: drive columns such as `mass_kg`, and what
-        its own drives tell of it, in SI units as the view `calibration` has them. What is not there
-        is not known.
-
-        Raises `InputError` for what the version does not use, and what `export` and `model` raise.
+        `car` is what the car knows of itself, by name: drive columns such as `mass_kg`, and numbers
+        of the view `calibration`, in SI units. Raises `InputError` for what the version does not
+        use, and what `export` and `model` raise.
         """
         from fleet_slip.export.estimator import Estimator
 
@@ -209,14 +201,11 @@ class PublishedModels(Rooted):
     ) -> list[Path]:
         """Write a version as a program for elsewhere into a folder; return the files.
 
-        `with_gram` adds to C what counts Gram rows in the car, whose messages `receive` takes.
-
-        Every export carries the version's checksum, the hash of the drives that made it, and
-        checks: inputs that are made up, and the angles. No tick of a drive of the logs is in it.
-
-        Raises `RefusedError` if no bound of the angle's error can be stated or counts mean
-        something else now, `UsageError` for an unknown target, `ConfigError` if what it needs is
-        not installed, and what `model` raises.
+        `with_gram` adds to C what counts Gram rows in the car, for `receive`. Exports carry the
+        version's checksum, the hash of its drives, and checks of made-up inputs; no tick of a log.
+        Raises `RefusedError` if the angle's error has no bound or counts mean something else now,
+        `UsageError` for an unknown target, `ConfigError` without what it needs, and what `model`
+        raises.
         """
         from fleet_slip.export.files import export_files
         from fleet_slip.files.local_folder import LocalFolder
@@ -228,13 +217,11 @@ class PublishedModels(Rooted):
         return [output / name for name in files]
 
     def log_to_mlflow(self, model: str | ModelVersion, uri: str) -> str:
-        """Log a version to an MLflow server and register it; return the number that it has there.
+        """Log a version to an MLflow server and register it, once; return its number there.
 
-        It is a pyfunc model with signature, input example, metrics and tags. One that is registered
-        already is not registered again.
-
-        Raises `ConfigError` without the library, `UsageError` for a URI with a password in it,
-        `StorageError` if the server does not take it, and what `export` and `model` raise.
+        It is a pyfunc model with signature, input example, metrics and tags. Raises `ConfigError`
+        without the library, `UsageError` for a password in the URI, `StorageError` if the server
+        does not take it, and what `export` and `model` raise.
         """
         from fleet_slip.export.files import log_version
 

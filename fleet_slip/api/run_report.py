@@ -16,11 +16,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunReport:
-    """The report of each step.
+    """The report of each step; `gram_features` is that of the list's feature set.
 
-    `gram_features` is of the feature set of the model list, if that is not the logged signals.
-    There is no selection where the champion was made from the same data, list and program, and no
-    publication where it was refused, with the reason.
+    There is no selection where the champion is up to date, and no publication after a `refusal`.
     """
 
     campaign: str
@@ -85,9 +83,8 @@ class Training:
     def publish_if_not_worse(
         self, fleet: "Fleet", selection: "RequestedSelection", *, replace_marked: bool
     ) -> "tuple[Publication | None, str]":
-        """Return the publication, or None and why it was refused.
-
-        With `replace_marked`, what was trained on forgotten drives is replaced even by a worse one.
+        """Return the publication, or None and why; `replace_marked`: also over one of forgotten
+        drives.
         """
         from fleet_slip.maintenance.marked_models import marked_models
 

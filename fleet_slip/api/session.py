@@ -20,23 +20,18 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Session:
-    """A connection with the views of one moment; `Fleet.session` opens one.
+    """A connection with the views of one moment, for one thread; `Fleet.session` opens one.
 
-    Close it, or use it in a `with` block. For one thread at a time. Every query raises
-    `QuestionError` if it is not valid or would write.
-
-    Attributes:
-        database: the connection.
-        allow: returns a query's text if it may be asked, and raises `QuestionError` otherwise.
+    Close it, or use it in a `with` block. Queries raise `QuestionError` if invalid or writing;
+    `allow` returns the text of one that may be asked.
     """
 
     database: duckdb.DuckDBPyConnection
     allow: Callable[[duckdb.DuckDBPyConnection, str], str] = one_query
 
     def sql(self, query: str) -> duckdb.DuckDBPyRelation:
-        """Return the answer to a query as a relation, computed when it is asked for rows.
-
-        It and all that is made of it keep the connection open.
+        """Return the answer as a relation, computed when asked for rows; it keeps the connection
+        open.
         """
         text = self.allow(self.database, query)
         add_calibration(self.database, query)
@@ -51,10 +46,10 @@ class Session:
         return self.compute(query, duckdb.DuckDBPyRelation.to_arrow_table)
 
     def compute(self, query: str, work: Callable[[duckdb.DuckDBPyRelation], Result]) -> Result:
-        """Do work with the answer to a query, and return what it returns.
+        """Do work with the answer to a query, and return its result. Ctrl-C ends it within a
+        second.
 
-        Ctrl-C ends it within a second, in the middle of the query. Raises `StorageError` if a file
-        that was read is not what its checksum says.
+        Raises `StorageError` if a file that was read is not what its checksum says.
         """
 
         def answer() -> Result:

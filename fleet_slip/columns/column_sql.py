@@ -70,10 +70,7 @@ def with_columns(
 
 
 def column_query(known: FeatureCatalogue, name: str) -> str:
-    """Return the query over the view `log_counts` that computes a feature or column over time.
-
-    Raises `QuestionError` for what is neither.
-    """
+    """Return the query of `log_counts` for a feature or windowed column. Raises `QuestionError`."""
     definition = known.definition(name)
     if definition is not None and definition.number is not None:
         raise QuestionError(

@@ -71,10 +71,7 @@ def fact_sql(one: CarFact) -> str:
 def sql_of(
     operation: str, operands: list[str], *plain: int, divides_by: int, table: Mapping[str, str]
 ) -> str:
-    """Return an operation in SQL, of its operands in SQL and its plain numbers.
-
-    `divides_by` is the least that the divisor can be.
-    """
+    """Return an operation on operands in SQL; `divides_by` is the least that the divisor can be."""
     frame = f"RANGE BETWEEN {plain[0] - 1} PRECEDING AND CURRENT ROW" if plain and plain[0] else ""
     text = table[operation].format(
         *operands,

@@ -31,9 +31,8 @@ class TakingOut:
     warehouse: Warehouse
 
     def without(self, name: TableName, snapshot: Snapshot, origins: Collection[Origin]) -> Change:
-        """Return what takes drives, or their refused rows, out of a table; files are written.
-
-        Raises `ConflictError` and `StorageError`.
+        """Return the change without drives, or their refused rows, of origins. Raises
+        `ConflictError`.
         """
         if name == "quarantine":
             return self._without_refused(snapshot, origins)

@@ -30,9 +30,8 @@ from fleet_slip.models.predictor import Predictor
 
 
 def predict(manifest: Manifest, frame: Any, predictor: Predictor | None = None) -> Any:
-    """Return the angle in rad for each row of a frame; see `ModelVersion.predict`.
-
-    `predictor` is that of the manifest, if it has been made before.
+    """Return the angle of each row in rad, as `ModelVersion.predict`; `predictor` spares making
+    one.
     """
     opened = open_frame(frame)
     columns = opened.numbers(manifest.columns, f"the model {manifest.name}")

@@ -85,10 +85,7 @@ class Predictor:
 
 @kernel
 def add_terms(columns: Any, coefficients: Any, scales: Any, estimate: Any) -> None:
-    """Add the terms of a dot product to the estimate of each row, from left to right.
-
-    Columns are counts, shape (columns, rows).
-    """
+    """Add a dot product's terms to the estimates, left to right; counts are (columns, rows)."""
     for number in range(len(columns)):
         column, coefficient, scale = columns[number], coefficients[number], scales[number]
         for row in range(len(estimate)):

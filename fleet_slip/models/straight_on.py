@@ -115,9 +115,8 @@ def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) 
 
 
 def _by_offsets(rows: FloatArray, offsets: FloatArray, means: FloatArray) -> LinearModel | None:
-    """Fit the intercepts of cars to the counts of their offsets; None if these go together.
-
-    In rad for a count, and exact.
+    """Fit the cars' intercepts, in rad, to their offsets in counts, exactly; None if these go
+    together.
     """
     if not set(COLUMNS) <= set(features().calibrated):
         return None

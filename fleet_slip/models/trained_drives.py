@@ -37,18 +37,14 @@ def keep_drives(versions: Folder, content: bytes) -> None:
 
 
 def read_trained_drives(versions: Folder, manifest: Manifest) -> Hashes | None:
-    """Return the salted hashes of a version's drives, sorted; None of one from before.
-
-    Raises what `read_drives_file` raises.
-    """
+    """Return a version's salted drive hashes, sorted, or None; raises as `read_drives_file`."""
     content = read_drives_file(versions, manifest)
     return None if content is None else np.frombuffer(content, dtype=">u8").astype(np.uint64)
 
 
 def read_drives_file(versions: Folder, manifest: Manifest) -> bytes | None:
-    """Return the content of the file of a version's drives; None if it is from before it was kept.
-
-    Raises `StorageError` if it is gone or damaged.
+    """Return a version's drives file; None if older than such files. Raises `StorageError` if
+    damaged.
     """
     expected = manifest.trained_on.drives_sha256
     if expected is None:

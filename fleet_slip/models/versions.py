@@ -180,10 +180,7 @@ class Registry:
         history.decide(move)
 
     def hold(self, name: str, alias: str, command: Literal["pin", "unpin"]) -> int:
-        """Pin an alias to the version that it points at, or unpin it; return that version.
-
-        Raises `QuestionError` if it points at none.
-        """
+        """Pin or unpin an alias; return its version. Raises `QuestionError` if there is none."""
         version = self.resolve(f"{name}@{alias}").version
         history = self.history(name)
 

@@ -57,10 +57,7 @@ GIVEN = "given"
 def answer_request(
     warehouse: Warehouse, request: SelectionRequest, condition: str = TRAINING_DRIVES
 ) -> RequestedSelection:
-    """Select on the drives that satisfy a condition.
-
-    Raises `UsageError` for options that do not go together.
-    """
+    """Select on a condition's drives. Raises `UsageError` for options that do not go together."""
     usual = not (request.models or request.model or request.label or request.chosen_by_inputs)
     find = _answer_usual if usual else _answer
     answer = replace(find(warehouse, request, condition), request=request, asked=condition)

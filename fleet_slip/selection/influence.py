@@ -28,10 +28,7 @@ def influential_cars(served: Served, moments: DriveMoments) -> dict[str, Influen
 
 
 def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Condition:
-    """Return a condition on drives that leaves out some cars.
-
-    It names them, or their hashes where a minimum cohort is asked for, since versions keep it.
-    """
+    """Return a condition without some cars, named, or hashed where a minimum cohort holds."""
     if not vehicles:
         return condition
     tell, names = "vehicle_id", sorted(vehicles)

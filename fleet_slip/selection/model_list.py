@@ -19,10 +19,7 @@ from fleet_slip.selection.request import Label
 
 
 class CandidateModel(Config):
-    """A named set of inputs: signals, or features of a feature set.
-
-    A family of windows or gates stands for its members.
-    """
+    """A named set of signals or features; a family of windows or gates stands for its members."""
 
     name: str = Field(min_length=1, max_length=60)
     signals: tuple[Identifier, ...] = Field(min_length=1)
@@ -128,20 +125,14 @@ WHOLE_SET = "catalogue"
 
 
 def inputs_of(cohort: Cohort | SummedCohort, order: str) -> tuple[str, ...]:
-    """Return an order of inputs from text, `catalogue` meaning all that the cohort has.
-
-    Raises what `require_inputs` raises.
-    """
+    """Return the order of inputs in a text, `catalogue` being all; raises as `require_inputs`."""
     if order == WHOLE_SET:
         return cohort.inputs
     return require_inputs(order.split(","), cohort.feature_set)
 
 
 def require_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
-    """Return the names of inputs of a feature set.
-
-    Raises `QuestionError` for an unknown input, and `UsageError` for one that stands twice.
-    """
+    """Return the inputs. Raises `QuestionError` for an unknown, `UsageError` for a repeated one."""
     known = features().feature_set(feature_set).inputs
     order = tuple(name.strip() for name in names)
     if unknown := [name for name in order if name not in known]:

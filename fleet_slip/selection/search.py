@@ -97,10 +97,7 @@ class SearchResult:
 
 
 def require_criterion(name: str) -> str:
-    """Return the criterion that a name means, `cv` being cross-validation.
-
-    Raises `QuestionError` for an unknown one.
-    """
+    """Return a criterion by its name, `cv` for cross-validation. Raises `QuestionError`."""
     if name == "cv":
         return CROSS_VALIDATION
     if name not in (*CRITERIA, CROSS_VALIDATION):
@@ -228,9 +225,8 @@ def search_models(
     *,
     intercept: bool = True,
 ) -> SearchedModels:
-    """Search among the inputs on the drives that have them all.
-
-    Raises `DataError` if no drive has them all, or if no column tells anything.
+    """Search among the inputs on the drives with them all. Raises `DataError` where nothing is
+    told.
     """
     label = catalogue().label
     folds = cohort.folds(folding.by, folding.count).serving(inputs, label)
@@ -284,10 +280,7 @@ def _fits(gram: Gram, inputs: Sequence[str], label: str, search: Search) -> list
 def choose_by(
     search: Search | None, models: Sequence[CrossValidation], asked: Worth | None = None
 ) -> Winner:
-    """Return the winner of cross-validated models by the rule of a search.
-
-    The rule `best` gives way to a worth that was asked for.
-    """
+    """Return the winner by the rule of a search; a worth that was asked for precedes `best`."""
     if search is None or search.rule != "best" or asked is not None:
         return choose(models, asked or DEFAULT_WORTH)
     best = max(models, key=lambda model: model.sums.signed_r_squared)

@@ -192,10 +192,7 @@ class FleetPlan(Plan):
         of_drive: np.random.Generator,
         days: int = 0,
     ) -> CarOnRoad:
-        """Draw a car from one generator and its drive from another, in a fixed order.
-
-        `days` have passed since the first one, and have worn the tyres.
-        """
+        """Draw a car, its tyres `days` worn, from one generator, and its drive from another."""
         vehicle = self.vehicles[of_car.integers(len(self.vehicles))]
         mass_kg = vehicle.body.sprung_mass_kg * self.load.draw(of_car)
         stiffness, radius = self.tyre_stiffness.draw(of_car), self.tyre_radius.draw(of_car)

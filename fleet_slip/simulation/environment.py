@@ -190,9 +190,8 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Draw a trial; `options` may fix `speed_mps`, `steering_rad`, `adhesion`.
-
-        The side of the first turn is drawn too, unless the steering is fixed.
+        """Draw a trial, unless `options` fix `speed_mps`, `steering_rad` (with its side),
+        `adhesion`.
         """
         super().reset(seed=seed)
         speed, steering, adhesion = (self.np_random.uniform(*one) for one in self._ranges)

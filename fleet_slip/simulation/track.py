@@ -114,10 +114,7 @@ class Track(Config):
         return float(self._knots_m[-1])
 
     def curvature(self, station_m: ArrayLike) -> FloatArray:
-        """Return the curvature in 1/m at stations in m.
-
-        Stations outside the track wrap around a closed one and stay at the ends of an open one.
-        """
+        """Return the curvature in 1/m at stations in m; a closed track wraps, an open one ends."""
         station = np.asarray(station_m, dtype=np.float64)
         if self.closed:
             station = np.mod(station, self.length_m)
@@ -193,9 +190,8 @@ class SpeedProfile:
     speed_mps: FloatArray
 
     def time_s(self, laps: float) -> float:
-        """Return the time from the start over so many laps, or over a part of one, in s.
-
-        Between the stations the acceleration is constant.
+        """Return the time from the start over laps or a part, at constant acceleration between
+        stations.
         """
         station, speed = self.station_m, self.speed_mps
         if self.track.closed:

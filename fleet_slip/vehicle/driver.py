@@ -58,10 +58,7 @@ class Handling(NamedTuple):
 
 
 def handling(vehicle: VehicleParameters, compliance_rad_per_n: float = 0.0) -> Handling:
-    """Return the linear handling of a car on a dry road.
-
-    `compliance_rad_per_n`: how the front wheels give way under the lateral force of their axle.
-    """
+    """Return the linear handling on a dry road; `compliance_rad_per_n` is of the front wheels."""
     c = constants(vehicle, adhesion=1.0)
     front = c.static_front / cornering_stiffness(c.static_front, c.stiffness_front, c)
     rear = c.static_rear / cornering_stiffness(c.static_rear, c.stiffness_rear, c)

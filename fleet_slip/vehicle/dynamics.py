@@ -110,9 +110,8 @@ def rates_of(
 
 
 def build_derivative(extensions: Extensions) -> Callable[[State, Controls, Constants], Derivative]:
-    """Compile the equations of motion with some of the extensions.
-
-    The compiled function is pure: (state, controls, constants) to rates.
+    """Compile the equations of motion with some extensions: pure (state, controls, constants) to
+    rates.
     """
     directions = ackermann if extensions.steering else parallel
     loads = transferred_loads if extensions.load_transfer else static_loads

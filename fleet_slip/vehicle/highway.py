@@ -229,10 +229,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         return np.array([*place, rates.vx, rates.vy, rates.yaw_rate])[:, np.newaxis]
 
     def step(self, dt: float) -> None:
-        """Move on by a time in s, in steps of at most `STEP_S`.
-
-        Without extensions the step is highway-env's own, of fourth order.
-        """
+        """Move on by `dt` s in steps of at most `STEP_S`; without extensions, as highway-env."""
         if self.extensions == NO_EXTENSIONS:
             super().step(dt)
             rolling = self.speed * self.constants.inverse_radius

@@ -74,10 +74,7 @@ class _Wheel(NamedTuple):
 
 @equation
 def wheel_tangent(tangent: float, far: float, toe: float) -> tuple[float, float]:
-    """Return the vector (along, across) of a front wheel that is turned by its toe.
-
-    `tangent` over `far` is the tangent of its angle without toe.
-    """
+    """Return (along, across) of a front wheel with its toe; `tangent / far` is that without."""
     return far - toe * tangent, tangent + toe * far
 
 
@@ -153,10 +150,7 @@ def _wheels(
 def imperfect_derivative(
     x: State, u: Controls, give: Give, around: Around, c: Constants, t: Traits
 ) -> tuple[Derivative, GiveRates]:
-    """Return the rates of a car with imperfections.
-
-    Weight along the road moves the car and no accelerometer; wind moves both.
-    """
+    """Return the rates of a car with imperfections; accelerometers feel wind, not weight."""
     load = transferred_loads(x, c)
     force, give_rates = _wheels(x, give, around, load, c, t)
     still = driven_body(x, u, force, c)

@@ -167,10 +167,7 @@ class VehicleParameters(Config):
     def with_tyres(
         self, *, stiffness_factor: float = 1.0, rolling_radius_factor: float = 1.0
     ) -> Self:
-        """Return the car on other tyres: softer or stiffer, smaller or larger.
-
-        Raises `ConfigError` if the tyres cannot be simulated.
-        """
+        """Return the car on other tyres. Raises `ConfigError` if these cannot be simulated."""
         changes = {
             "peak_stiffness_n": self.tyre.peak_stiffness_n * stiffness_factor,
             "rolling_radius_m": self.tyre.rolling_radius_m * rolling_radius_factor,

@@ -149,9 +149,8 @@ class BlockProgram:
         return len(self.code.kinds)
 
     def regions(self, rows: int) -> NDArray[np.int64]:
-        """Return where each region begins, how far apart its parts are, and the memory's size.
-
-        Shape (regions + 1, 2): for drives of up to so many rows.
+        """Return each region's (begin, distance of parts) for so many rows, and last the memory's
+        size.
         """
         code = self.code
         shapes = {

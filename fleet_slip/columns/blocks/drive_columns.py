@@ -192,10 +192,7 @@ def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
 
 
 class DriveColumns:
-    """The columns of one drive.
-
-    `clipped`, shape (rows,), is how many columns of each row `compute` has clipped.
-    """
+    """The columns of one drive; `clipped`, (rows,), counts those that `compute` clipped."""
 
     def __init__(self, plan: ColumnPlan, drive: DriveCounts) -> None:
         """Take a drive. Raises `DataError` for one that cannot be looked back on."""

@@ -112,9 +112,8 @@ def values_ago(memory: Any, places: Any, first: int, size: int, ticks: int) -> N
 
 @inner_loop
 def find_begins(memory: Any, of_ticks: int, rows: int, ticks: int, begins: int) -> None:
-    """Write the first row of the last `ticks` ticks of each row; 0 ticks are all since the start.
-
-    Ticks rise.
+    """Write each row's first row within the last `ticks` of rising ticks; 0 for all since the
+    start.
     """
     at = 0
     for t in range(rows):

@@ -28,10 +28,7 @@ def about_mean(table: GramTable) -> GramTable:
 
 
 def swept(table: GramTable) -> GramTable:
-    """Return the table without `BESIDE`, nor what goes with the angle turned, nor what is constant.
-
-    In a drive, that is. `TURNED` is one of the signals.
-    """
+    """Return the table without `BESIDE`, the turned `TURNED`, and what is constant in a drive."""
     signals = tuple(name for name in table.signals if name not in BESIDE)
     kept = [table.signals.index(name) for name in signals]
     z, n, sums = table.signals.index(TURNED), table.n.astype(object), table.sums.astype(object)

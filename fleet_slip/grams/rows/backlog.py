@@ -25,10 +25,7 @@ class Backlog:
 
 
 def find_backlog(logs: Snapshot, grams: Snapshot, identity: str = PLAIN) -> Backlog:
-    """Compare the active log files with the files that Gram rows name.
-
-    `identity` is that of a feature set, as its Gram rows carry it.
-    """
+    """Compare active log files with those that Gram rows of a feature set's `identity` name."""
     done, named = named_files(grams, identity)
     active = {file.path for file in logs.files}
     return Backlog(

@@ -137,10 +137,7 @@ def grams_of(rows: pa.Table) -> DriveGrams:
 
 
 def differing_drives(one: DriveGrams, two: DriveGrams) -> list[str]:
-    """Return the drives whose Grams differ, sorted.
-
-    The order of the signals does not count: it is that of the catalogue when a row was made.
-    """
+    """Return the drives whose Grams differ, sorted, whatever the order of signals then and now."""
     one, two = _in_one_order(one), _in_one_order(two)
     return sorted({key[0] for key in one.keys() | two.keys() if one.get(key) != two.get(key)})
 

@@ -23,10 +23,7 @@ GRAIN_S = float(SAMPLE_TIME_S) / LATE_PARTS
 
 
 def course_delays(grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
-    """Return the delay of each car's course in parts of a tick, as its Gram rows tell it.
-
-    `active` are the log files that count.
-    """
+    """Return each car's course delay in parts of a tick, of Gram rows of the `active` log files."""
     return {car: in_parts(one) for car, one in receiver_delays(_of_delay(grams, active)).items()}
 
 

@@ -1,7 +1,4 @@
-"""What divides the rows of a drive into several Gram rows, in SQL and for arrays.
-
-Bands of a signal or feature, blocks of time, or folds of single rows.
-"""
+"""What divides a drive into several Gram rows, in SQL and for arrays: bands, blocks, row folds."""
 
 import math
 from collections.abc import Mapping

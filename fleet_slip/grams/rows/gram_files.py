@@ -88,9 +88,8 @@ def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
 
 
 def _files_to_merge(grams: Snapshot) -> set[str]:
-    """Return the smallest files, enough for one file of the usual size, where too many are small.
-
-    Each night merges a few, so that none has to merge all.
+    """Return the smallest files, enough for one usual file, where too many are small: few each
+    night.
     """
     small = sorted((_fullness(file), file.path) for file in grams.files if _fullness(file) < 1)
     if len(small) <= SMALL_FILES_MAX:

@@ -163,10 +163,7 @@ def _about_means(table: GramTable) -> FloatArray:
 
 
 def with_pooled(delays: dict[str, ReceiverDelay]) -> dict[str, ReceiverDelay]:
-    """Return the delays with the uncertainty of cars of few drives, as drives of others differ.
-
-    None if all cars together have too few.
-    """
+    """Add the spread of other cars' drives to cars with few; None if all have too few."""
     known = [one for one in delays.values() if one.uncertainty is not None]
     free = sum(one.drives - 1 for one in known)
     scatters = ((one, (one.uncertainty or 0.0) ** 2 - LASTING_S**2) for one in known)
@@ -185,10 +182,7 @@ def with_pooled(delays: dict[str, ReceiverDelay]) -> dict[str, ReceiverDelay]:
 def _best_split(
     products: dict[tuple[str, str], FloatArray],
 ) -> tuple[list[tuple[str, str]], ReceiverDelay, ReceiverDelay] | None:
-    """Return a car's drives, and what those before and after one of them tell.
-
-    Where these differ most for their numbers; None for a car of too few drives.
-    """
+    """Return the two parts of a car's drives that differ most for their numbers, None for few."""
     values = np.array(list(products.values()))
     so_far, count, most = np.cumsum(values, axis=0), 0, 0.0
     for some in range(FEWEST_DRIVES, len(values) - FEWEST_DRIVES + 1):

@@ -139,10 +139,7 @@ class Rollup:
 
 
 def read_rollup(table: Table, path: str) -> Rollup | None:
-    """Return the rollup of a file of Gram rows; None if it has none, or one that is not known.
-
-    Raises `StorageError` if it is damaged.
-    """
+    """Return a Gram file's rollup; None if unknown or missing. Raises `StorageError` if damaged."""
     content = table.read_leading_part(path, CELLS)
     if content is None:
         return None
@@ -178,9 +175,8 @@ def _tells_its_trips(rows: pa.Table) -> bool:
 
 
 def _cells_of(rows: pa.Table, columns: Collection[str]) -> tuple[list[str], IntArray, IntArray]:
-    """Return the columns to roll up by, the cell of each row, and the first row of each cell.
-
-    No columns if even those that must be have too many values.
+    """Return the columns to roll up by, each row's cell and each cell's first row; none for too
+    many.
     """
     names = {*ALWAYS, *columns}.intersection(rows.column_names)
     codes = {name: _codes(rows[name]) for name in names}
@@ -210,10 +206,7 @@ def _codes(column: pa.ChunkedArray) -> IntArray:
 
 
 def _sums(grams: GramTable, starts: IntArray) -> dict[str, pa.Array] | None:
-    """Return n, sums and products of groups of Gram rows, of which some places are the first.
-
-    None if one may have more than 64 bits.
-    """
+    """Return n, sums and products by group; None where one may have more than 64 bits."""
     largest = int(np.diff([*starts, len(grams)]).max())
     parts = {"n": grams.n[:, None], "sums": grams.sums, "products": grams.products}
     if any(_may_overflow(part, starts, largest) for part in parts.values()):

@@ -47,10 +47,7 @@ class LoggedDrives:
         return [file for file in files if pc.any(pc.is_in(_drives(file, grams), names)).as_py()]
 
     def _sent(self, file: TableFile, grams: Snapshot) -> Iterator[str]:
-        """Yield the received drives of a file that are these under another name.
-
-        The same content is of the same day.
-        """
+        """Yield a file's received drives of the same days that are these under another name."""
         first, last = file.days or (date.min, date.max)
         if any(first <= day <= last for day in self.days):
             rows = grams.table.read(file.path)
@@ -76,10 +73,7 @@ def has_received(grams: Snapshot) -> bool:
 
 
 def content_keys(rows: pa.Table) -> Iterator[bytes]:
-    """Yield a key for each Gram row of the logged signals; equal keys mean the same drive.
-
-    Rows of other feature sets have keys that none of these has.
-    """
+    """Yield a key for each Gram row: equal keys mean one drive; other feature sets match none."""
     rows = rows.combine_chunks()
     names = ("feature_set", "vehicle_id", "day", "signals", "n")
     told = [rows[name].cast(pa.string()).to_pylist() for name in names]

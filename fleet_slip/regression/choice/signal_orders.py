@@ -115,10 +115,7 @@ RANKINGS: dict[str, Ranking] = {
 
 
 def rank(name: str, gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Order the inputs by a ranking.
-
-    Raises `QuestionError` for an unknown one, `DataError` for dependent inputs.
-    """
+    """Order the inputs. Raises `QuestionError` for an unknown ranking, `DataError` if dependent."""
     if name not in RANKINGS:
         raise QuestionError(f"unknown ranking {name!r}. Known rankings: {', '.join(RANKINGS)}.")
     return RANKINGS[name](gram, inputs, label)

@@ -147,10 +147,7 @@ def _to_counts(drives: DriveMoments, at: Sequence[int]) -> FloatArray:
 
 
 def clustered_fit(fitted: Fit, drives: DriveMoments) -> ClusteredFit:
-    """Return a fit by its clusters; the coefficients that are compared are those in counts.
-
-    Raises `DataError` for too few rows to tell the noise.
-    """
+    """Return a fit by clusters, compared in counts. Raises `DataError` for too few rows."""
     at, first = _columns(fitted, drives), int(not fitted.has_intercept)
     each = drives.clusters
     numbers = np.arange(len(each)) if each.cluster is None else each.cluster

@@ -28,9 +28,7 @@ class Distortion:
     def __init__(
         self, flaws: Imperfections, of_car: np.random.Generator, of_drive: np.random.Generator
     ) -> None:
-        """Begin a drive. The pulses' places come from the car's generator, all else from the
-        drive's.
-        """
+        """Draw the pulses' places from the car's generator, all else from the drive's."""
         sensors = flaws.sensors
         self._flaws = flaws
         self._generator = of_drive

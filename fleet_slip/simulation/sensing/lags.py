@@ -48,10 +48,7 @@ class LowPass:
 
 @kernel
 def _delayed(values: FloatArray, before: FloatArray, part: float) -> FloatArray:
-    """Return values that are late by `len(before) - 1 + part` samples.
-
-    `before` holds the last values of the block before, and then of this one.
-    """
+    """Return values `len(before) - 1 + part` samples late; `before` is the last block's end."""
     first, ticks = len(before), len(values)
     late = np.empty(ticks)
     for i in range(min(first, ticks)):
@@ -108,9 +105,8 @@ class Wander:
 def _wander(
     drawn: FloatArray, ends: FloatArray, phase: int, step: tuple[float, float], values: FloatArray
 ) -> int:
-    """Fill in values, and return the samples since the last knot.
-
-    `ends` holds the processes at the knots before and after, shape (2, processes).
+    """Fill in values from processes at the knots `ends`, (2, processes); return samples since the
+    last.
     """
     decay, kick = step
     knot = 0

@@ -180,9 +180,8 @@ def noisy_counts(
     bias_and_std: tuple[float, float],
     signal: Signal,
 ) -> tuple[NDArray[np.int16], int]:
-    """Return `(physical + bias + std * noise) / scale` as counts, and how many were clipped.
-
-    Halves round to even. NaN is clipped as well, to the lower end.
+    """Return `(physical + bias + std * noise) / scale`, halves to even, and how many (NaN too)
+    clipped.
     """
     counts = np.empty(len(physical), dtype=np.int16)
     valid = (float(signal.min_count), float(signal.max_count))
