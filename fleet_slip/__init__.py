@@ -48,9 +48,8 @@ _HOMES = {
 def open(root: "Folder | Path | str | None" = None) -> "Fleet":  # noqa: A001 - as in gzip
     """Return the fleet whose warehouse is at `root`; nothing is read or written yet.
 
-    `root` is the path of a folder, the URL of a place on an object store (`s3://BUCKET/PATH`,
-    `gs://`, `az://`), or None for `$FLEET_SLIP_ROOT`, else `./data`. Credentials come from the
-    environment. Raises `StorageError` for a path or URL that cannot be a data root.
+    It is a folder, a URL (`s3://BUCKET/PATH`, `gs://`, `az://`), or None for `$FLEET_SLIP_ROOT`,
+    else `./data`. Credentials come from the environment. Raises `StorageError` for no such root.
     """
     from fleet_slip.api.fleet import Fleet  # noqa: PLC0415 - pyarrow and Delta
     from fleet_slip.files.data_root import data_root  # noqa: PLC0415

@@ -11,9 +11,6 @@ ObjectArray = NDArray[np.object_]
 
 
 def is_finite(values: FloatArray) -> bool:
-    """Whether neither a NaN nor an infinity is among values, which makes their sum so.
-
-    The sum of finite values so large that it is infinite is taken for one.
-    """
+    """Whether neither NaN nor infinity is among values, nor their sum, by which it is told."""
     with np.errstate(over="ignore", invalid="ignore"):
         return bool(np.isfinite(values.sum()))

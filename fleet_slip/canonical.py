@@ -16,10 +16,7 @@ def canonical_json(content: Any) -> str:
 
 
 def canonical_ascii(content: Any) -> str:
-    """Return content as `canonical_json` does, with characters beyond ASCII as escapes.
-
-    Campaigns and mappings have been known by the checksum of this text from the start.
-    """
+    """Return `canonical_json` with escapes beyond ASCII, for checksums of older documents."""
     return _ASCII.encode(content)
 
 

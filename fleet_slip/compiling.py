@@ -34,28 +34,22 @@ def _refusing(function: Callable[..., Any]) -> Callable[..., Any]:
 equation = _compiler(error_model="numpy", forceinline=True)
 """Compiles a pure function that is inlined where it is called, so that loops over lanes vectorise.
 
-Without `fastmath` the compiler neither reorders nor fuses operations, and of floating point only
-additions, multiplications, divisions, square roots, comparisons and selections are used, which
-IEEE 754 rounds in one way. Division by zero gives an infinity, not an exception that would put a
-branch in the loop.
+Without `fastmath` nothing is reordered or fused, and IEEE 754 rounds what is used in one way:
+additions, multiplications, divisions, roots, comparisons. Divisions by zero do not branch.
 """
 
 inner_loop = _compiler(nogil=True, error_model="numpy")
 """Compiles a loop that compiled code calls, to the same bits as an equation."""
 
 exact_loop = _compiler(nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-"""Compiles a loop over integers whose every product and sum is below 2^53 in size.
-
-They are exact in any order, so that the compiler may change the order, and fuse operations.
-"""
+"""Compiles a loop over integers below 2^53, products and sums too: exact in any order."""
 
 
 def kernel(function: Function) -> Function:
     """Compile a function that is called from Python, without the GIL.
 
-    The compiled code is kept on disk: in $NUMBA_CACHE_DIR, beside the source, or in the user's
-    cache folder. Where none of these can be written, every process compiles anew, and a remark says
-    so. It is never kept in a data root: to load it is to execute it, and others may write there.
+    The code is kept in $NUMBA_CACHE_DIR, beside the source or in the user's cache, else compiled
+    anew with a remark; never in a data root, where others may write what would be executed.
     """
     compiled = inner_loop(function)
     if numba:

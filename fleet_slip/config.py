@@ -89,9 +89,8 @@ def read_named_file(
 ) -> bytes:
     """Return the content of a file that a person, a variable or another config names.
 
-    It must be a regular file, since a device has no end and a pipe may never begin. No error here
-    or in what parses it may quote a line before it is known to be such a file: a name such as
-    `/etc/shadow` must not show its content. Raises the `error` that is given.
+    It must be regular: devices do not end, and pipes may never begin. No error may quote a line of
+    what may be `/etc/shadow`. Raises the `error` that is given.
     """
     try:
         if not isinstance(file, Path):  # of an installation that is an archive

@@ -26,10 +26,7 @@ _SECRET = re.compile(
 
 
 def hide_passwords(text: str, *, whole: bool = False) -> str:
-    """Return text without what identifies a user in URLs: before the last @, and in the query.
-
-    With `whole`, a URL goes on to the end of the text, whatever is in it.
-    """
+    """Return text without users and queries of URLs; with `whole`, a URL goes on to the end."""
     if "://" not in text:
         return text
     url = _WHOLE_URL if whole else _URL
@@ -43,10 +40,9 @@ def _without_user(found: re.Match[str]) -> str:
 
 
 def printable(text: str) -> str:
-    """Return text on one line, as it can be shown on a terminal or in a log.
+    """Return text on one line, for a terminal or a log: the unprintable as escapes like `\x1b`.
 
-    A name from outside may hold line breaks, which forge lines, or escape sequences, which
-    terminals obey: whatever is not printable is written as an escape, such as `\\x1b`.
+    A name from outside may hold line breaks, which forge lines, or escape sequences.
     """
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text

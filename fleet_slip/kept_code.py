@@ -1,8 +1,7 @@
 """Keeps compiled code from one process to the next, and checks it when it is read.
 
-What numba 0.68 lets others set is where code is kept and which stamp it has
-(`NUMBA_CACHE_LOCATOR_CLASSES`, for all packages of a process), not how files are written and read.
-So its classes are extended here, which are not of its public interface.
+numba 0.68 lets others say where code is kept and its stamp (`NUMBA_CACHE_LOCATOR_CLASSES`), not how
+files are read and written; so its classes, which are not public, are extended here.
 """
 
 import contextlib
@@ -78,10 +77,9 @@ class _KeptCode(FunctionCache):
 
 @functools.cache
 def _sources_stamp(file: str) -> str:
-    """Return a checksum of a source file, of all that it imports, and of how it is compiled.
+    """Return a checksum of a source file, of what it imports, and of how it is compiled.
 
-    Compiled code has the functions and constants of other files in it; numba looks at its own file
-    alone, and would go on with what is no longer written in the others.
+    numba looks at the file alone, but compiled code has functions of others in it.
     """
     digest = hashlib.sha256()
     for source in sorted({*_sources_of(Path(file)), Path(__file__), COMPILING}):
@@ -112,11 +110,7 @@ _USELESS = (_DamagedCodeError, ImportError, AttributeError, RuntimeError)
 
 
 class _CheckedFiles(IndexDataCacheFile):
-    """Files that begin with the checksum of the rest.
-
-    Without one, code with a flipped bit is executed, and computes something else or ends the
-    process; and what unpickling it raises can be anything.
-    """
+    """Files that begin with the checksum of the rest, lest a flipped bit be executed."""
 
     def _save_index(self, overloads: Any) -> None:
         stamped = dumps((self._source_stamp, overloads))  # type: ignore[no-untyped-call]

@@ -40,10 +40,8 @@ def data_needed() -> int:
 
 
 def require_limits() -> None:
-    """Raise `StorageError` under limits of the shell that the libraries do not survive.
-
-    Without address space the Delta library aborts the process or its threads wait for each other
-    for ever; without files it panics. So they are told beforehand.
+    """Raise `StorageError` under the shell's limits of address space or files that libraries crash
+    on.
     """
     needed = LIBRARIES_BYTES + THREAD_BYTES * len(os.sched_getaffinity(0))
     allowed, _ = resource.getrlimit(resource.RLIMIT_AS)

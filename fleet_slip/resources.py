@@ -38,10 +38,7 @@ def read_sql(name: ShippedFolder, file: str) -> str:
 
 
 def own_configs() -> Path | None:
-    """Return the folder of configs that is laid over the shipped ones, if there is one.
-
-    Raises `ConfigError` if it is not a folder that can be read, or has a file that is no config.
-    """
+    """Return the folder of configs laid over those shipped. Raises `ConfigError` if unusable."""
     chosen = os.environ.get(CONFIG_VARIABLE)
     if not chosen:
         return None
@@ -67,11 +64,7 @@ def _require_kind(name: str, file: Path) -> None:
 
 
 def config_file(name: str) -> Traversable:
-    """Return a config file such as `monitor.toml`: one's own, else the shipped one.
-
-    One's own counts as soon as something has its name: a link that leads nowhere is an error of
-    whoever reads it, and never the shipped file.
-    """
+    """Return a config file such as `monitor.toml`: one's own, even a broken link, or ours."""
     own = own_configs()
     return own / name if own and os.path.lexists(own / name) else folder("configs") / name
 
@@ -101,10 +94,7 @@ def config_names(kind: str) -> list[str]:
 
 
 def find_config(kind: str, name_or_path: str) -> Traversable:
-    """Return a config file: a path if it looks like one, else the config of that name.
-
-    Raises `ConfigError` if there is neither, naming those that there are.
-    """
+    """Return a config file by path or name. Raises `ConfigError`, naming those that there are."""
     if name_or_path.endswith(".toml") or "/" in name_or_path:
         path = Path(name_or_path)
         if _is_file(path):

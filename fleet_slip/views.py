@@ -44,15 +44,11 @@ def connect(
     """Return a DuckDB connection with the views of the warehouse at `root`, a path or a URL.
 
     `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `calibration`, `quarantine`, `runs`
-    and `dictionary`, which documents every column. The connection sees one snapshot; connect again
-    to see later commits. With a `query`, only the views that it names are there: opening the logs
-    takes longer the more files there are, and so does reading every model version. Computing
-    `calibration` takes longest: without a `query` it is not there before `add_calibration`.
+    and `dictionary`, which documents every column, all of one snapshot. With a `query`, only those
+    that it names, which is faster; without, `calibration` waits for `add_calibration`. Drives that
+    models are tested on are there with `scenarios`, or if the query names the column `source`.
 
-    The views show the fleet. Drives that models are tested on are there too with `scenarios`, or
-    with a `query` that asks for them: that names the column `source`.
-
-    It can open the files of the snapshot and no others, and its settings cannot be changed. DuckDB
+    It opens the files of the snapshot and no others, and its settings cannot be changed. DuckDB
     knows no right to read without the right to write: ask SQL of others through `Fleet.sql`.
     """
     database, paths = _open_views(data_root(root), query, threads, scenarios=scenarios)

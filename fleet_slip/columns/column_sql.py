@@ -1,8 +1,4 @@
-"""The SQL of columns of counts: features of a row, and columns over time.
-
-Subqueries wrap a table expression with counts, so that anyone can run them over the view
-`log_counts`. DuckDB's SQL for each step stands in `fleet_slip.columns.sql_operations`.
-"""
+"""The SQL of columns of counts, of a row and over time, as subqueries of `log_counts`."""
 
 from collections.abc import Mapping, Sequence
 
@@ -30,9 +26,8 @@ def with_columns(
 ) -> str:
     """Return a subquery: the rows of a table expression with features and columns over time.
 
-    `features` are columns of one row; those that columns over time look back on come to them. The
-    column `clipped` counts what was out of range in a row. Without columns, the rows stay.
-    Raises `QuestionError` or `DataError` for a feature that is defined in two ways.
+    `clipped` counts what was out of range in a row. Raises `QuestionError` or `DataError` for a
+    feature that is defined in two ways.
     """
     if not features and not over_time:
         return rows

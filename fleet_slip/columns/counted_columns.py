@@ -1,7 +1,6 @@
 """Columns lowered for the warehouse, which counts how often a value is clipped.
 
-Steps are those of `fleet_slip.columns.lowering`, but that a value is clipped last, once it is known
-to be there: what is missing is not counted. (Exported programs clip first, which is the same.)
+Clipping comes last, lest what is missing be counted; exported programs clip first: the same.
 """
 
 from collections import Counter
@@ -27,12 +26,10 @@ class CountedColumns:
     """Steps, and how often what they clip counts.
 
     Attributes:
-        lowered: the steps.
-        steps: the same by their numbers.
-        ranges: the range of each.
+        steps: those of `lowered` by their numbers, with the range of each in `ranges`.
         places: the step of each column of one row, and of each column over time, by name.
-        times: the steps that clip: once for each feature of a row, and once for each column over
-            time that it is in; what is gated, and what opens gates, once for all of them.
+        times: how often a step's clipping counts: once for each feature or column over time that
+            it is in; for gates and what they gate, once in all.
     """
 
     lowered: Lowering
@@ -80,10 +77,7 @@ def parts_of(one: Definition) -> Iterator[Definition]:
 def rows_of(
     rows: Mapping[str, Definition], over_time: Mapping[str, Definition]
 ) -> dict[str, Definition]:
-    """Return columns of one row with those that columns over time look back on.
-
-    Raises `QuestionError` or `DataError` if two of them define the same feature differently.
-    """
+    """Return columns of one row, looked back on ones too. Raises `QuestionError`, `DataError`."""
     found = dict(rows)
     features_behind(over_time)
     for one in (part for window in over_time.values() for part in parts_of(window)):

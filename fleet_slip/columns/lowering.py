@@ -1,7 +1,6 @@
 """Lowers signals, features, windows, factors, gates and own numbers to steps: the one place.
 
-What a column is stands in `fleet_slip.catalogue.definitions`; what a step computes in
-`fleet_slip.columns.operations`. Equal steps stand once.
+Columns are `fleet_slip.catalogue.definitions`, steps `fleet_slip.columns.operations`, once each.
 """
 
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
@@ -68,12 +67,7 @@ class CarCount:
 
 @dataclass
 class Lowering:
-    """Steps, in an order in which they can be computed, and what they number.
-
-    Attributes:
-        signals: the place of each signal.
-        steps, facts, numbers: what there is, by its place.
-    """
+    """Steps in an order in which they can be computed; signals, facts and numbers by place."""
 
     signals: Mapping[str, int]
     steps: dict[Step, int] = field(default_factory=dict)
@@ -224,10 +218,7 @@ def given_ranges(
 
 
 def most_values(one: Definition) -> int:
-    """Return how many values a window adds up at most: a running mean stays after so many.
-
-    So many that twice the sum times the numerator, and the divisor, fit into 64 bits.
-    """
+    """Return how many values a window adds up at most, so that 2 sum numerator has 64 bits."""
     if one.over != "running_mean":
         return one.ticks
     limit = limit_of(one.of_bits) if one.sql else COUNT_MAX

@@ -1,11 +1,8 @@
 """The operations that every column is made of: docs/export.md says what each computes.
 
-A step is an operation and what it works on: first the numbers of earlier steps, then plain numbers.
-Its value is a whole number of at most 63 bits, or missing. It is missing where what it works on is;
-where that is all, its `missing` is "operands".
-
-Whoever computes steps has a table with a line for each operation, and asks here for the rest: the
-range that a step can have, where it can be missing by itself, and how far it looks back.
+A step is an operation, the numbers of earlier steps, then plain numbers. Its value is a whole
+number of at most 63 bits, or missing where an operand is ("operands" if that is all). Targets have
+a table with a line an operation, and take ranges, missing and look-back from here.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,19 +17,15 @@ Range = tuple[int, int]
 
 Missing = Literal["never", "given", "operands", "divisor", "less", "both"]
 """Where a step is missing: never; where what is given or remembered is; where an operand is; also
-where the divisor is not positive, or the first operand less than the second; where both are."""
+for a divisor not above zero, or a first operand below the second; where both are.
+"""
 
 
 @dataclass(frozen=True)
 class Operation:
-    """What is known of an operation, whoever computes it.
+    """An operation: its range, from those of its `steps` operands, then its plain numbers.
 
-    Attributes:
-        range_of: the range of its value, given the ranges of the steps that it works on, then its
-            plain numbers.
-        steps: how many earlier steps it works on.
-        missing: where it is missing.
-        over_time: whether it looks back on the step that it works on.
+    `over_time`: it looks back on its step.
     """
 
     range_of: Callable[..., Range]
@@ -111,11 +104,7 @@ def operands_of(step: Step) -> tuple[int, ...]:
 
 
 def ranges_of(steps: Sequence[Step], given: Mapping[str, Sequence[Range]]) -> list[Range]:
-    """Return the range of each step; `given` has those of signals, facts and numbers.
-
-    Zero is within the range of what is given, so that the ranges also hold of whoever computes on
-    with zero where a value is missing.
-    """
+    """Return the range of each step, zero included in what is `given`, as for missing values."""
     found: list[Range] = []
     for step in steps:
         name, plain = operation_of(step), plain_of(step)

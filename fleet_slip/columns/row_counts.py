@@ -13,10 +13,7 @@ from fleet_slip.columns.operations import OPERATIONS, operands_of, operation_of,
 def row_counts(
     one: Definition, counts: Mapping[str, IntArray], present: BoolArray
 ) -> tuple[IntArray, BoolArray]:
-    """Return the counts of a feature, and where it has a value, (rows,) each.
-
-    `counts` are int64 and have the signals in it; `present` is where none of them is missing.
-    """
+    """Return a feature's counts and where it has one, (rows,), from int64 counts and presence."""
     lowered = Lowering({name: place for place, name in enumerate(one.signals)})
     last = lowered.row(one)
     there = present.copy()

@@ -19,8 +19,7 @@ from fleet_slip.columns.operations import (
 )
 
 QUOTIENT = "CAST(ROUND(({0} - {0} % {1}) / {1}) AS BIGINT)"
-"""{0} / {1}, truncated. Where `/` of whole numbers is a division in floating point, it is exact
-too: what is divided is a multiple of the divisor, and the quotient far below 2^53."""
+"""{0} / {1}, truncated; exact in floating point too: a small multiple of the divisor."""
 
 _NEAREST = QUOTIENT.format("(2 * ABS({0}) + {1})", "(2 * {1})")
 

@@ -1,9 +1,8 @@
 """An executor whose tasks run on the workers of a Dask cluster.
 
-Whoever submits sees a `concurrent.futures.Executor` and nothing of Dask. What Dask does: it runs a
-task again where its worker died. What is added here: every task is checked where it runs (see
-`fleet_slip.compute.cluster_worker`); tasks are sent again after the scheduler was restarted; and
-nobody waits for ever for a scheduler or for workers that do not come back.
+Dask runs a task again where its worker died. Added here: tasks are checked where they run
+(`fleet_slip.compute.cluster_worker`), sent again after the scheduler restarted, and nobody waits
+for ever.
 """
 
 import asyncio
@@ -66,9 +65,8 @@ Connected = TypeVar("Connected")
 def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
     """Connect to the Dask scheduler at an address, such as `tcp://10.0.0.1:8786`.
 
-    `root` is the data root that the workers must see too. Raises `ClusterError` if there is no
-    scheduler within 10 s, or less where Dask's own settings say so, and `RefusedError` if the
-    cluster has other versions.
+    Workers must see `root` too. Raises `ClusterError` without a scheduler in 10 s (or Dask's own
+    limit), and `RefusedError` for other versions.
     """
     _route_logs()
     try:
@@ -107,11 +105,7 @@ class _Client(Client):
 
 
 def _connected(connect: Callable[[], Connected]) -> Connected:
-    """Connect, again if Dask takes what the scheduler says for a fault.
-
-    It asserts that the first message comes alone. One to all clients, as of a task that another
-    command has just given up, may arrive together with it.
-    """
+    """Connect, again if Dask takes two first messages that came together for a fault."""
     for _ in range(CONNECT_ATTEMPTS - 1):
         with contextlib.suppress(AssertionError):
             return connect()
@@ -168,9 +162,8 @@ class _Task:
 class ClusterExecutor(Executor):
     """Runs tasks on a Dask cluster. A future raises `LostTaskError` if its workers died.
 
-    If the connection to the scheduler is lost, Dask's client forgets all tasks and connects again;
-    a thread that watches sends them again. A task may so be done twice, which its idempotence
-    allows. If no scheduler comes back, or no worker, all futures raise `ClusterError`.
+    After a lost connection a thread sends all tasks again, which are idempotent. If no scheduler or
+    worker comes back, all futures raise `ClusterError`.
     """
 
     def __init__(self, client: Client, address: str, marker: Marker) -> None:

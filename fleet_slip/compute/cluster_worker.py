@@ -1,8 +1,7 @@
 """What a worker of a cluster does with a task: it makes sure of its ground, then works.
 
-A task carries the versions of the command that sent it and the name of a file that the command has
-just made in the data root. Its function and argument come pickled, and are unpickled only by a
-worker of the same versions. It must see that file before it reads or writes others.
+It must have the sender's versions, before it unpickles, and see the file that the command just made
+in the data root.
 """
 
 import os
@@ -65,10 +64,9 @@ def pickled(marker: Marker, function: Callable[[Any], Any], item: Any) -> bytes:
 
 
 def work(expected: Mapping[str, str], task: bytes) -> Any:
-    """Do a task and return its result. Its expected errors are raised with the worker's name.
+    """Do a task and return its result; expected errors get the worker's name.
 
-    Raises `RefusedError` on a worker of other versions than expected, and `StorageError` on one
-    that does not see the marker.
+    Raises `RefusedError` for other versions, `StorageError` where the marker is not seen.
     """
     here = f"worker {socket.gethostname()}:{os.getpid()}"
     require_same(here, expected, environment())

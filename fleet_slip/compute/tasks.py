@@ -1,7 +1,6 @@
 """Calls functions on many items: on threads, in order or as they are done, or in an executor.
 
-An executor that is not of this machine may have two things that a plain one has not: `in_flight`,
-how many tasks it can take, and futures that raise `LostTaskError`.
+One of other machines may tell `in_flight`, the tasks it takes, and raise `LostTaskError`.
 """
 
 from collections import deque
@@ -60,11 +59,9 @@ def run_tasks(
 ) -> Iterator[tuple[Item, Result]]:
     """Call a function on items, and yield each with its result when it is done, in any order.
 
-    Without an executor that is here and now, one after the other.
-
-    A task whose worker died is set aside. It may be innocent: a worker does several tasks at once,
-    and all are suspected. When the others are done, each is tried alone; then `ClusterError` names
-    those that failed again. Any other error ends the whole at once.
+    Without an executor: here and now. Tasks whose worker died are tried again alone at the end,
+    since any of a worker's tasks is suspect; `ClusterError` names those that failed again. Any
+    other error ends the whole at once.
     """
     if executor is None:
         for item in items:
@@ -114,10 +111,9 @@ def _completed(
 
 
 def read_ahead(items: Iterator[Item], ahead: int = AHEAD) -> Generator[Item, None, None]:
-    """Yield items, in their order, while a thread takes the next; errors come in their place.
+    """Yield items in order while a thread takes the next; errors come in their place.
 
-    No two are taken at once. Closing it waits for the item that is being taken. A single item,
-    as most small files have, needs no thread.
+    Closing it waits for the one being taken. A single item needs no thread.
     """
     first = _take(items)
     try:

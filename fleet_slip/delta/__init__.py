@@ -1,12 +1,8 @@
 """The tables of a data root: Delta tables of Parquet files that we encode ourselves.
 
-A file is written as a whole, durably; only then is it committed to the table's Delta log. So a
-reader sees whole files of whole commits, or nothing.
-
-A file's name ends in the checksums of its bytes (`fleet_slip.files.checksums`). The name is the one
-thing about a file that the Delta log, its checkpoints, Gram rows and a listing of the folder all
-keep, so that damage can be told years later; the same rows are always the same file; and a file
-that is made again from its source takes its place without a commit.
+Files are written whole, durably, then committed. Names end in checksums of the bytes
+(`fleet_slip.files.checksums`), which Delta log, checkpoints, Gram rows and listings keep: damage is
+told years later, equal rows are equal files, and one made again needs no commit.
 """
 
 from fleet_slip.delta.change import Change, TableFile, Unit, absent_columns, rows_in

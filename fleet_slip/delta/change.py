@@ -126,8 +126,7 @@ def _table_files(actions: pa.Table) -> Iterator[TableFile]:
 class Unit:
     """A piece of work that lands exactly once: its name, and a number that its content determines.
 
-    Recorded as a Delta transaction identifier in the commit that lands it. Two processes that land
-    the same unit at once conflict, and one of them is told.
+    A Delta transaction identifier: of two processes that land it at once, one is in conflict.
     """
 
     name: str

@@ -1,10 +1,8 @@
 """Checksums of a table's checkpoints, kept beside its Delta log.
 
-Every hundred commits the Delta library sums the log up in a checkpoint, and after 30 days it
-removes the commits before that. Then the checkpoint alone tells which files and units of work there
-are, and nothing in it is guarded. So whoever commits looks whether a checkpoint has come since, and
-keeps the SHA-256 of its bytes as a document in `_checkpoints` below the table. Of documents about
-the same checkpoint the last counts.
+Every hundred commits Delta sums its log up; 30 days later the checkpoint alone tells files and
+units, and nothing guards it. So committers keep a new one's SHA-256 as a document in
+`_checkpoints`, of which the last counts.
 """
 
 import contextlib
@@ -28,10 +26,9 @@ COMMIT_FILE = re.compile(r"\d{20}\.json")
 
 
 def keep_checksum_of_new(table: Folder, before: int | None) -> None:
-    """Keep the checksums of the checkpoints of a table if one has come since version `before`.
+    """Keep the checksums of checkpoints if one has come since version `before`, older ones too.
 
-    Also those of earlier ones that a killed job has left without. The commit has landed: what
-    cannot be kept now is kept with the next checkpoint.
+    What cannot be kept now is kept with the next checkpoint.
     """
     latest = None
     with contextlib.suppress(StorageError, ValueError, KeyError, TypeError, RecursionError):

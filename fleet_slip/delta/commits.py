@@ -1,9 +1,7 @@
 """The commits of a table's Delta log, each with a checksum of what it does to the table.
 
-Delta's log has no checksums. Each commit's note therefore states the SHA-256 of the note and of
-the actions that stand beside it, in a form that does not depend on how they were written as JSON.
-It lands with the commit or not at all, needs no order among writers, and other programs that read
-the table ignore it. `fleet_slip.delta.log_check` compares.
+Each note states the SHA-256 of itself and of the actions beside it, however their JSON is written.
+It lands with the commit, in any order; `fleet_slip.delta.log_check` compares.
 """
 
 import hashlib

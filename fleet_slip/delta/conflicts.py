@@ -41,8 +41,7 @@ def on_newest(
 ) -> Result:
     """Look at tables, and again if what is found may be of files that a newer version removed.
 
-    A job that compacts or forgets takes files away that a reader has just been told of: damage, or
-    a `StorageError`, is told only if the tables rested meanwhile, or never rest.
+    Damage, or a `StorageError`, is told only if the tables rested meanwhile, or never rest.
     """
     for _ in range(LOOKS):
         before = _versions(tables)

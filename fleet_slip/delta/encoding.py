@@ -1,12 +1,9 @@
 """Rows as the bytes of a Parquet file, its checksum, and what stands before the rows.
 
-A file may begin with parts of its own, such as a rollup, each with a checksum:
-
     PAR1 | FSPF, layout, number of parts; length and XXH3 of each; XXH3 of all this | parts | rows …
 
-Parquet finds its rows from the end of a file, so that every reader passes over what stands here, as
-over a Bloom filter. It is one file with its rows: it is committed, found, checked and deleted with
-them. The first bytes of a file tell it, without the others.
+Parts, such as a rollup, land and go with the rows. Parquet readers start from the end, and pass
+over them.
 """
 
 import json
@@ -77,10 +74,8 @@ class Encoding:
     def encode(
         self, rows: pa.Table, omitted: Sequence[str] = (), leading: Sequence[bytes] = ()
     ) -> Encoded:
-        """Return the content of a file with these rows, without some of their columns.
-
-        A dictionary is stored as far as the rows have its values. `leading` parts stand before the
-        rows.
+        """Return a file of these rows, `leading` parts first, less columns; dictionaries are used
+        up.
         """
         kept = rows.drop_columns([name for name in omitted if name in rows.schema.names])
         # A dictionary that is shared with rows of another file, or of a drive that was forgotten,
@@ -134,10 +129,9 @@ def pack_leading_parts(parts: Sequence[bytes]) -> bytes:
 
 
 def read_leading_part(folder: Folder, path: str, wanted: int) -> bytes | None:
-    """Return one of the parts, from 0, before the rows of a file; None for a file without any.
+    """Return a part before a file's rows, from 0; None without, or of an unknown layout.
 
-    Of a layout that is not known there are none. Raises `StorageError` if the part is not what
-    was written.
+    Raises `StorageError` if it is not what was written.
     """
     content = folder.read(path, FIRST_BYTES)
     places = _places(content, f"{folder}/{path}")

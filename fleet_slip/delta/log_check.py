@@ -1,9 +1,7 @@
-"""Checks the Delta log of a table against the checksums that it states and that are kept of it.
+"""Checks a table's Delta log against the checksums that it states and that are kept of it.
 
-A flipped bit there removes a file or brings one back, or says that a signal is in every row: each
-makes wrong sums of sound files. So whenever a table is opened, the newest checkpoint is compared
-with the checksum kept of it, and every commit after it with its own. `verify` looks at all commits,
-and at what they add up to: at the name of a unit of work, too, or a commit behind a checkpoint.
+A flipped bit loses a file, or brings one back. So on opening, the newest checkpoint and the commits
+after it are compared; `verify` looks at all commits, and at what they add up to.
 """
 
 import functools
@@ -32,8 +30,7 @@ REMEMBERED_COMMITS = 2**14
 def require_sound_log(table: Folder, version: int) -> None:
     """Raise `StorageError` if what a version of a table is told from was damaged.
 
-    A file is read once by a process, as long as it stays the same. The log of an object store is
-    looked at by `verify` alone: another look would be at another answer.
+    Each file is read once by a process; of an object store, `verify` alone looks.
     """
     if not table.is_local:
         return

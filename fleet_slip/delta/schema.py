@@ -1,9 +1,7 @@
 """Which signals and scales a stored table has, beside those of the catalogue.
 
-A count means nothing without its scale, so the table's schema in the Delta log records the scale of
-each signal. All files of a table share it: the scale changes in the one commit that also exchanges
-the files (`fleet_slip.maintenance.migration`), and Delta refuses writers who began before that
-commit.
+A count means nothing without its scale, so the schema in the Delta log records each. It changes in
+the commit that exchanges the files (`fleet_slip.maintenance.migration`).
 """
 
 from collections.abc import Collection, Mapping
@@ -29,10 +27,9 @@ class Evolution:
     """How a stored table and the catalogue differ.
 
     Attributes:
-        added: columns of the catalogue that the table does not have yet.
-        retired: columns of the table that the catalogue no longer has.
+        added, retired: columns of the catalogue alone, and of the table alone.
         rescaled: old and new scale of the signals whose counts mean something else.
-        unrecorded: signals whose scale the table does not record; it is taken to be the same.
+        unrecorded: signals whose scale the table does not record, and which is taken to be ours.
         migrating: a migration was begun and has not ended.
     """
 

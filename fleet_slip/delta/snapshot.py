@@ -117,10 +117,7 @@ class Snapshot:
             return read_landed_units(self.table.folder, self.version)
 
     def moment(self, version: int) -> str | None:
-        """Return the digest of the commit that made a version of this table's past, or present.
-
-        Where it is what it was, so is all that had landed until then. None if there is none such.
-        """
+        """Return the digest of a version's commit, which also stands for all before it, or None."""
         if self.version is None or version > self.version:
             return None
         try:
@@ -140,8 +137,7 @@ class Snapshot:
     def commit(self, change: Change) -> None:
         """Apply a change in one atomic commit on top of this snapshot.
 
-        Raises `ConflictError` if another process landed one of the same units meanwhile, or removed
-        a file; and `StorageError` if the log cannot be written.
+        Raises `ConflictError` if one of its units landed or a file went, and `StorageError`.
         """
         table, actions = self.table, change.actions()
         note = checked_note(change.note, actions, {u.name: u.version for u in change.units})

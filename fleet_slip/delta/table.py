@@ -48,9 +48,8 @@ class Table:
         return pa.schema([field for field in self.schema if field.name not in self.optional])
 
     def snapshot(self, version: int | None = None) -> Snapshot:
-        """Return the table as it is now; a table that nobody has written yet is empty.
-
-        Raises `StorageError` for an earlier version that is no longer known, and a damaged log.
+        """Return the table as it is, or was at a version; empty if unwritten. Raises
+        `StorageError`.
         """
         delta = self.open_delta(version)
         if delta is not None:
@@ -117,12 +116,11 @@ class Table:
         return self.put(name, self.encode(rows, leading), day)
 
     def put(self, name: str, encoded: Encoded, day: date | None = None) -> AddAction:
-        """Write a file's content to the file NAME-CHECKSUMS.parquet, durably.
+        """Write a file's content to the file NAME-CHECKSUMS.parquet, durably; return its add
+        action.
 
-        Returns the action that adds it to the table; it is not part of the table before that is
-        committed. Where there is a file of that name, of an interrupted run or of another process,
-        the new one gets a longer name. So a file that is not committed is its writer's alone: who
-        deletes it can take it from nobody else.
+        It is in the table once committed. Where that name is taken, the new file gets a longer one:
+        what is not committed is its writer's alone, to delete.
         """
         path = encoded.path(name, day)
         while not self.folder.create(path, encoded.content):
@@ -130,10 +128,9 @@ class Table:
         return addition(path, encoded, day)
 
     def discard(self, actions: Iterable[AddAction]) -> None:
-        """Delete files that this process wrote and a commit has not added, as its conflict told.
+        """Delete files that this process wrote and its conflict left uncommitted.
 
-        The log is asked first: where the answer to a commit was lost on the way, the attempt is
-        made again and is in conflict with itself.
+        The log is asked first: a commit whose answer was lost conflicts with itself.
         """
         landed = {file.path for file in Snapshot(self, self.open_delta()).files}
         for action in actions:
@@ -166,9 +163,8 @@ class Table:
     def fence(self) -> None:
         """Make a conflict of every commit that began before now and has not landed.
 
-        It changes a property of the table: Delta refuses a commit that began before a change of
-        metadata. So who commits after this has looked at the table, and at whatever it looks at
-        after that, since now. Raises `ConflictError` if others keep changing the table.
+        Delta refuses commits that began before a change of metadata, here of a property. Raises
+        `ConflictError` if others keep changing the table.
         """
         note = CommitProperties(custom_metadata={NOTE: checked_note({"job": "fence"}, [], {})})
 

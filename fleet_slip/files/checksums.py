@@ -2,9 +2,8 @@
 
     NAME-x0123456789abcdef-0123456789abcdef0123456789abcdef.parquet
 
-The last is of its SHA-256, which `verify` computes and which tells damage years later; the one with
-an x before it is its XXH3, which is an order of magnitude faster, so that every job can look at
-every byte that it uses. Names of earlier versions have the last only, or none.
+The last is of its SHA-256, which `verify` computes; that with an x of its XXH3, so fast that every
+job looks at every byte. Earlier names have the last only, or none.
 """
 
 import functools

@@ -28,9 +28,8 @@ _OBJECT_URL = re.compile(
 def data_root(root: Folder | Path | str | None = None) -> Folder:
     """Return the data root: the argument, else $FLEET_SLIP_ROOT, else ./data.
 
-    A text with `://` in it is a URL: `s3://BUCKET/PATH`, `gs://`, `az://CONTAINER/PATH`, or
-    `file:///PATH`. Raises `StorageError` for a path with characters that Delta or DuckDB take for
-    something else, for a folder inside a table, and for a URL that is none of these.
+    With `://` it is a URL: `s3://BUCKET/PATH`, `gs://`, `az://CONTAINER/PATH`, `file:///PATH`.
+    Raises `StorageError` for another, for what Delta or DuckDB misread, and inside a table.
     """
     if root is not None and not isinstance(root, Path | str):
         return root

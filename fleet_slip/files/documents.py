@@ -1,8 +1,7 @@
 """Numbered, immutable JSON documents in a folder: 1.json, 2.json, ... with a checksum each.
 
-A document is created under the next free number as a whole, which fails if another process took
-that number first. So numbers are consecutive, no document is ever half there, none is replaced, and
-what is decided by the newest document can be added right after it or not at all.
+Creating one takes the next free number, or fails as another process took it: numbers are
+consecutive, none is half there, and what follows from the newest comes right after it.
 """
 
 import json
@@ -86,10 +85,11 @@ class DocumentFolder:
         return self.after_newest(lambda newest: self.create(newest + 1, content))
 
     def after_newest(self, attempt: Callable[[int], T | None]) -> T:
-        """Return what an attempt to add the next document comes to.
+        """Return what an attempt to add the next document, given the newest's number or 0, comes
+        to.
 
-        The attempt gets the number of the newest document, 0 without one. It is made again while it
-        comes to None: another process was faster. Raises `ConflictError` after very many of them.
+        It is made again while it is None: another was faster. Raises `ConflictError` after very
+        many.
         """
         for _ in range(ATTEMPTS):
             outcome = attempt(max(self.numbers(), default=0))

@@ -1,9 +1,7 @@
 """A folder of files below a data root: the few operations that the rest of the program needs.
 
-Data files, documents and signatures are written once and are immutable, so that a folder needs
-neither locks nor directories: whole files appear, are read, are listed and are deleted. Nothing
-else knows what a data root is made of. `fleet_slip.files.local_folder` is a folder of a file
-system, `fleet_slip.files.object_folder` one of an object store.
+Files are written whole, once: no locks, no directories. `fleet_slip.files.local_folder` is one of a
+file system, `fleet_slip.files.object_folder` one of an object store.
 """
 
 import time
@@ -25,13 +23,7 @@ Content: TypeAlias = "bytes | pa.Buffer"
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file, in the state in which a listing found it.
-
-    Attributes:
-        folder: the folder that was listed.
-        path: the file's path below that folder.
-        identity: changes when another file takes the place of this one.
-    """
+    """A file as a listing of `folder` found it; another in its place has another `identity`."""
 
     folder: "Folder"
     path: str
@@ -57,9 +49,8 @@ class StoredFile:
 class Folder(Protocol):
     """A folder below a data root; it need not exist. As text it is its path.
 
-    A folder is a value: comparing, hashing and pickling it touch nothing. All methods raise
-    `StorageError` for what cannot be read or written. `path` is always that of a file below the
-    folder, with slashes.
+    It is a value, and touches nothing by itself. All methods raise `StorageError`. `path` is a
+    file's below the folder, with slashes.
     """
 
     @property
@@ -101,9 +92,8 @@ class Folder(Protocol):
         """Return the content of files, None for one that is gone."""
 
     def check(self, path: str) -> None:
-        """Raise `StorageError` if a data file is not what its name says and `open` would not tell.
-
-        Answers of an object store may differ, so that there the one that is used is looked at.
+        """Raise `StorageError` if a data file is not what its name says; object stores say when
+        read.
         """
 
     def open(self, path: str) -> "pa.NativeFile":
@@ -139,7 +129,4 @@ class Folder(Protocol):
     def lend(
         self, database: "duckdb.DuckDBPyConnection", wanted: Callable[[str], bool]
     ) -> list[str]:
-        """Enable a connection to read the files whose paths are wanted; return their URIs, sorted.
-
-        For files that may be many and small, and may be replaced by others at any moment.
-        """
+        """Let a connection read small files that others may replace; return their URIs, sorted."""

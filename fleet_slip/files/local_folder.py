@@ -1,8 +1,6 @@
-"""Folders of a file system.
+"""Folders of a file system, where no reader sees half a file and files survive a power cut.
 
-A file is written under a temporary name, flushed to disk and renamed; a new number is taken by a
-hard link, which fails if another process took it first. So no reader ever sees half a file, and
-what was written survives a power cut.
+Files are flushed under a temporary name, then renamed; numbers are taken by hard links.
 """
 
 import contextlib
@@ -119,8 +117,7 @@ class LocalFolder:
     def remove(self, file: StoredFile) -> bool:
         """Delete the very file that a listing found; False if it is gone or was replaced.
 
-        A repair may write a file of the same name at this moment. So the file is looked at before
-        it is moved aside, and again after it; if it is not the one that was found it is put back.
+        It is compared before and after it is moved aside, and put back if a repair replaced it.
         """
         path = self.path / file.path
         if self._judge(path) != file:
@@ -160,8 +157,7 @@ class LocalFolder:
     def exclusive(self, name: str, waiting: Callable[[], None]) -> Iterator[None]:
         """Hold a lock among the processes of this machine; a killed process releases it.
 
-        Calls `waiting` once if another process holds it. Where the file system is read-only there
-        is nothing to protect, and no lock is taken.
+        Calls `waiting` once if another has it. A read-only file system needs none.
         """
         lock = self.path / name
         with contextlib.ExitStack() as stack:

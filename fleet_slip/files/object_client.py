@@ -1,10 +1,8 @@
 """The client for a bucket of an object store: its credentials, time limits and retries.
 
-With AWS_ACCESS_KEY_ID in the environment no file is read. Otherwise both libraries that talk to
-the store follow Amazon's own chain: ~/.aws/credentials and ~/.aws/config (AWS_PROFILE,
-AWS_SHARED_CREDENTIALS_FILE, AWS_CONFIG_FILE), with what a profile may refer to (a role, a process,
-a single sign-on), then the roles of containers and machines. For obstore botocore does it, for
-Delta logs delta-rs does. Each gets temporary credentials anew before they expire.
+With AWS_ACCESS_KEY_ID set no file is read. Else botocore (for obstore) and delta-rs follow Amazon's
+chain: ~/.aws/credentials and ~/.aws/config (AWS_PROFILE, AWS_SHARED_CREDENTIALS_FILE,
+AWS_CONFIG_FILE) with roles, processes and single sign-on, then roles of machines, renewed in time.
 """
 
 import functools

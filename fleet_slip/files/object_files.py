@@ -1,11 +1,7 @@
 """Objects as files that can be read anywhere in them: for DuckDB and for pyarrow.
 
-Objects of a data root that are read in this way never change, so that a size is asked for once.
-One whose name tells its checksum is fetched as a whole and compared, and what is read is read from
-those very bytes: another answer of the store might be another.
-
-A request has a time limit, whatever it asks for. So a large object is fetched in parts that come
-well within it: one that does not come is asked for again, smaller, and what has come is kept.
+They never change. One whose name tells its checksum is fetched whole, compared and read from those
+bytes. Large ones come in parts within a request's time limit, retried smaller.
 """
 
 import io
@@ -39,10 +35,9 @@ KEPT_BYTES = 2**27
 
 
 def fetch_parts(store: "ObjectStore", key: str, where: str) -> Iterator[tuple[Any, bytes]]:
-    """Yield the parts of an object in their order, each with what the store says of the object.
+    """Yield an object's parts in order, each with what the store says of it.
 
-    `where` names it in errors. Raises `StorageError`, also if not even `LEAST_BYTES` come within
-    the time limit of a request.
+    `where` names it in errors. Raises `StorageError`, as when not even `LEAST_BYTES` come in time.
     """
     position, length = 0, FIRST_BYTES
     with object_errors(where):
@@ -76,10 +71,9 @@ def _in_time(answer: Any, *, may_fail: bool = True) -> bytes | None:
 
 
 class ObjectReader(io.RawIOBase):
-    """An object as a file. It is read in as many requests as there are calls.
+    """An object as a file, a request a call.
 
-    The reader of obstore returns less than was asked for at the ends of its buffer, and reads the
-    buffer anew after every seek; DuckDB takes the first for a damaged file.
+    obstore's reader returns less at the ends of its buffer, which DuckDB takes for damage.
     """
 
     def __init__(self, store: "ObjectStore", key: str, where: str, size: int | None = None) -> None:

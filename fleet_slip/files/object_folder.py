@@ -1,8 +1,7 @@
 """Folders of an object store: S3 and what speaks like it, Google Cloud Storage, Azure.
 
-A put of an object is whole or nothing, and `If-None-Match: *` makes it fail where there is one of
-that name; so temporary names, renames, flushes and links are not needed. Nothing is ever changed
-in place, so that several machines can write.
+Puts are whole or nothing, and fail under `If-None-Match: *` where there is one: no temporary names
+or links, and several machines can write.
 """
 
 import contextlib
@@ -36,12 +35,7 @@ LISTINGS = 20
 
 @dataclass(frozen=True)
 class ObjectFolder:
-    """A folder of an object store; see `fleet_slip.files.folder.Folder`.
-
-    Attributes:
-        bucket: `s3://BUCKET`, `gs://BUCKET` or `az://CONTAINER`.
-        prefix: what the names of the folder's objects begin with, without a slash at the end.
-    """
+    """A folder `s3://BUCKET`, `gs://`, `az://` + `prefix`; see `fleet_slip.files.folder.Folder`."""
 
     bucket: str
     prefix: str
@@ -129,8 +123,7 @@ class ObjectFolder:
     def remove(self, file: StoredFile) -> bool:
         """Delete the very file that a listing found; False if it is gone or was replaced.
 
-        It is looked at first. What is written between looking and deleting would be deleted, so
-        that no name of a data file is used twice (`Table.put`).
+        What is written between look and deletion would go: no name is used twice (`Table.put`).
         """
         with object_errors(str(file)):
             try:
@@ -163,8 +156,7 @@ class ObjectFolder:
     def lend(self, database: duckdb.DuckDBPyConnection, wanted: Callable[[str], bool]) -> list[str]:
         """Read the files whose paths are wanted into memory, as one; return its URI.
 
-        DuckDB would ask for them one after the other. Raises `StorageError` if they are replaced as
-        fast as they are listed.
+        DuckDB would ask one by one. Raises `StorageError` if they are replaced as fast as listed.
         """
         for _ in range(LISTINGS):
             paths = [file.path for file in self.files() if wanted(file.path)]

@@ -119,9 +119,7 @@ def is_pattern(text: str) -> bool:
 def copy_object(file: StoredFile, copy: Path) -> None:
     """Copy an object as a listing found it to a file, whose folder is made.
 
-    What arrives is compared with the store's checksum, if its tag is one. Raises `InputError` if
-    the object is gone, or another has taken its place since, or it does not arrive as it is
-    stored; and `StorageError`.
+    Raises `InputError` if it is gone, replaced, or not as its tag's checksum; and `StorageError`.
     """
     arrived = set[str]()
     with storage_errors(copy):

@@ -1,7 +1,6 @@
 """Turns what fails below a data root into `StorageError`, with the next thing to do.
 
-Libraries for object stores tell only in text what went wrong, with the server's whole answer in it;
-that has names of keys and is never shown.
+Of the libraries' text, which has the server's whole answer and names of keys, none is shown.
 """
 
 import contextlib

@@ -1,7 +1,6 @@
 """Turns small log files of a day into large ones.
 
-The Gram rows of the new files are computed from them, a tenth of the time that writing them took,
-and land before they do; those of the old files are dropped by the reconciliation of the Gram job.
+Gram rows of new files are computed, and land before them; reconciliation drops the old.
 """
 
 from collections.abc import Iterable

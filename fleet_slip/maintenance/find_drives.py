@@ -39,9 +39,8 @@ class OldFiles:
 def remove_old_files(warehouse: Warehouse, subject: Forgettable, *, replaced: bool) -> OldFiles:
     """Delete the files with the drives that no version refers to; `replaced` ones if asked to.
 
-    What was never committed is deleted at once: since the fence no commit can land a row of a
-    forgotten car or drive, so that whoever wrote the file will be told. Drives before a day are not
-    barred; there a file younger than an hour is left to its writer.
+    Uncommitted ones go at once: since the fence none can land. Drives before a day are not barred:
+    there a file younger than an hour is left to its writer.
     """
     deleted = kept = 0
     pending: list[str] = []
@@ -143,8 +142,7 @@ def quarantined_of(
 ) -> pa.ChunkedArray:
     """Return which rows of the quarantine are of a subject, or of drives that are known to be.
 
-    A row that was refused before its drive was cut at a gap in time names the drive as a whole.
-    Rows that an earlier version of this program refused do not name the vehicle.
+    Rows refused before a cut at a gap name the whole drive; older rows name no vehicle.
     """
     if subject.kind == "drive":
         drives = {*drives, subject.value}
@@ -162,14 +160,7 @@ def quarantined_of(
 
 @dataclass(frozen=True)
 class Located:
-    """Which drives of a subject are in which log files, as Gram rows tell.
-
-    A log file never changes, and the Gram rows of the catalogue's signals have all of its drives.
-
-    Attributes:
-        known: paths of the log files that have such Gram rows, the subject's drives or not.
-        drives: the subject's drives in each log file that has some, by path.
-    """
+    """A subject's `drives` by log file, and all `known` log files that have such Gram rows."""
 
     known: frozenset[str]
     drives: Mapping[str, frozenset[str]]

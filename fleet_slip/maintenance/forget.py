@@ -1,14 +1,10 @@
 """Forgets drives: one car's, a single one, or all before a day.
 
-Their rows leave `quarantine`, `logs` and `grams`, in this order, so that an interrupted job finds
-by what is left what it still has to do. The log files concerned are written again without them,
-in one commit; the Gram rows follow by reconciliation. `fleet_slip/warehouse/audit.py` is the
-record of it.
-
-Jobs under way neither undo nor outlive it. The record is written first, then quarantine and logs
-are fenced: a commit that has not seen the record is a conflict. Once the logs are without the
-drives the Gram rows are fenced: a commit of Gram rows that has not seen the logs without them is
-a conflict. What such jobs have written is never committed, and deleted by them or here.
+Rows leave `quarantine`, `logs` (files are written again, in one commit) and `grams` (reconciled) in
+this order, so that what is left tells an interrupted job what to do. The record
+(`fleet_slip/warehouse/audit.py`) is written first, then quarantine and logs are fenced: commits
+that have not seen it conflict. Then Gram rows are fenced, against those that have not seen the new
+logs. What such jobs have written is deleted by them or here.
 """
 
 from collections.abc import Collection, Iterator
@@ -75,9 +71,9 @@ def forget(
 ) -> ForgetReport:
     """Forget drives; with `now`, delete the replaced files at once instead of by `vacuum`.
 
-    `source_file` is the file by whose name they are forgotten, and may come back.
-    It can be repeated after any interruption. `progress` counts files to rewrite. Raises
-    `QuestionError` if there never was such a drive, `StorageError`, or `ConflictError`.
+    `source_file` is the file by whose name they go. It can be repeated after interruptions.
+    `progress` counts files. Raises `QuestionError` for no such drive, `StorageError`,
+    `ConflictError`.
     """
     audit = Audit(warehouse.root)
     located = locate(warehouse.grams.snapshot(), subject)
@@ -212,11 +208,9 @@ def forget_called(
     now: bool = False,
     progress: Progress = no_progress,
 ) -> ForgetReport:
-    """Forget every drive that is called like that, one after another.
+    """Forget every drive that is called like that, one after another; later ones land.
 
-    Drives that come later under the same name are others, and land. Repeated after an interruption
-    it goes on: what is left of a drive still tells its name. Raises `QuestionError` if no drive is
-    called like that, and what `forget` raises.
+    Raises `QuestionError` if there is none, and as `forget`.
     """
     drives = sorted(_drives_called(warehouse, calling, value, old=now))
     if not drives:

@@ -1,9 +1,8 @@
 """Which model versions were trained on drives that were forgotten.
 
-Who forgets judges the versions that there are. A version that was published meanwhile was judged by
-nobody. Made of Gram rows from before they were without the drives, it counts as trained on them
-until the erasure is done; then it does if one of its own drives (`models/trained_drives.py`) has no
-Gram rows any more. A version from before those were kept counts as trained on them for ever.
+Who forgets judges the versions there are. One published meanwhile, of older Gram rows, counts as
+trained on them until the erasure is done; then if one of its own drives
+(`models/trained_drives.py`), or an unknown one, has no Gram rows any more.
 """
 
 from collections.abc import Collection, Mapping
@@ -95,9 +94,8 @@ def _may_have_seen(
 def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
     """Return the model versions that were trained on one of the drives.
 
-    Each keeps which drives those were. Of one from before that was kept, the question of its cohort
-    is asked again, of the Gram rows that it could see. Where it cannot be told, because they are
-    gone or the version is damaged, it counts as trained on them.
+    Each keeps which; for older ones the cohort is asked again of the Gram rows it could see. Those
+    of which it cannot be told count as trained on them.
     """
     registry = Registry(warehouse.root / "models")
     versions: dict[str, TrainedOn] = {}

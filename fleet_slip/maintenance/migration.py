@@ -1,18 +1,12 @@
 """Brings the table `logs` to the signal catalogue: new columns, other scales.
 
-The quarantine and the Gram rows get the columns that came later. Files of earlier versions that
-have names of other files in their dictionaries are written anew without them.
+Quarantine and Gram rows get later columns, too, and dictionaries lose names of other files. A new
+column touches no file: null where it lacks. For another scale every count is rewritten:
 
-New columns need no file to be touched: where a file lacks a column, its values are null. Another
-scale needs every count of the signal rewritten, and no reader may ever mix the two:
-
-1. The new scale is announced in the table's schema. From then on no writer can commit, since Delta
-   refuses commits that began before a change of schema, and later ones are refused here. Readers
-   with the old catalogue go on reading the old files.
+1. The table's schema announces it: Delta refuses commits begun before, and we later ones;
+   readers with the old catalogue go on reading the old files.
 2. The files are rewritten, with counts rounded to the nearest (halves to even) count.
-3. One commit exchanges all files and the schema's scales.
-
-A migration that was killed is run again; until step 3 nothing of the old data is gone.
+3. One commit exchanges all files and the schema's scales. Until then nothing old is gone.
 """
 
 import contextlib
@@ -64,11 +58,10 @@ class MigrationReport:
 
 
 def migrate(warehouse: Warehouse, progress: Progress = no_progress) -> MigrationReport:
-    """Make the logs agree with the catalogue. Running it again does nothing.
+    """Make the logs agree with the catalogue; `progress` counts rows. Again, it does nothing.
 
-    `progress` counts rows. Raises `RefusedError` if counts would not fit int16 in a new scale: then
-    nothing is changed but the announcement, which a migration back to the old catalogue takes away.
-    Raises `ConflictError` if another process changed the table at the same moment.
+    Raises `RefusedError` if counts would not fit int16: then only the announcement is there, until
+    a migration back; and `ConflictError`.
     """
     warehouse.require()
     for other in (warehouse.quarantine, warehouse.grams):  # columns that came later

@@ -1,8 +1,7 @@
 """Rebuilds what can be rebuilt: Gram rows from the logs, simulated logs from their campaign.
 
-Nothing is deleted that was not rebuilt. A file whose bytes are there under another name is put
-back; a log file is simulated again under the name that the Delta log knows; since the name has the
-file's checksum, it is the same file or it is refused.
+Nothing is deleted that was not. Bytes under another name are put back; simulated files have the
+checksum in the name that the Delta log knows, or are refused.
 """
 
 import contextlib

@@ -45,10 +45,9 @@ def retain(
     today: date,
     progress: Progress = no_progress,
 ) -> RetentionReport:
-    """Forget the drives that are older than retention says, then vacuum.
+    """Forget the drives that are older than retention says, then vacuum; `progress` counts files.
 
-    `progress` counts files to rewrite. Raises `RefusedError` if not one drive would be left, as
-    with a clock that is wrong.
+    Raises `RefusedError` if not one drive would be left, as with a clock that is wrong.
     """
     warehouse.require()
     try:

@@ -1,8 +1,7 @@
 """Writes rows again, to compact the logs or to forget drives.
 
-A file of the logs holds whole drives in the order of their names, each in the order of its ticks,
-and a dictionary holds only values that occur. So the bytes of a file follow from its drives alone:
-what was compacted or rewritten can be simulated again and is the same file.
+Log files hold whole drives by name and tick, and dictionaries of what occurs: their bytes follow
+from the drives, and can be simulated again.
 """
 
 import dataclasses
@@ -45,11 +44,10 @@ def rewrite(
     data_change: bool,
     progress: Progress = no_progress,
 ) -> list[AddAction]:
-    """Exchange log files, and with them their Gram rows, in one commit on top of a snapshot.
+    """Exchange log files and their Gram rows in one commit on a snapshot; return what was added.
 
-    Returns what was added; nothing for files without a drive that is kept. `progress` counts
-    rewritings. After a conflict the new files are deleted; raises `ConflictError` then, and
-    `StorageError`.
+    Files without kept drives go. `progress` counts rewritings. Raises `ConflictError`, after
+    deleting the new files, and `StorageError`.
     """
     new = write_again(warehouse, logs, rewritings, data_change=data_change, progress=progress)
     replaced = [file for one in rewritings for file in one.files]
@@ -68,10 +66,7 @@ def write_again(
     data_change: bool = True,
     progress: Progress = no_progress,
 ) -> list[AddAction]:
-    """Write log files, and land their Gram rows ahead; nothing of the logs is committed.
-
-    Returns what is to be added. Raises `ConflictError` and `StorageError`.
-    """
+    """Write log files, land their Gram rows ahead; return what to add. Raises as `rewrite`."""
     new: list[AddAction] = []
     replaced = [file for one in rewritings for file in one.files]
     try:
@@ -89,9 +84,8 @@ def write_again(
 
 
 def rewriting_units(logs: Snapshot, replaced: Sequence[TableFile]) -> list[Unit]:
-    """Return what tells two commits of each other that rewrite files of a day.
-
-    The Delta library takes files that were removed without a change of data for still there.
+    """Return units by which commits that rewrite a day's files conflict, which Delta would let
+    pass.
     """
     days = sorted({str(file.day) for file in replaced})
     return [Unit(f"rewrite/{day}", (logs.version or 0) + 1) for day in days]

@@ -1,7 +1,6 @@
 """Takes drives out of the logs that give way to others, or that somebody takes back.
 
-Unlike what is forgotten they may come again: nothing bars them, and their files' units are
-withdrawn. Gram rows count while their log file is active, so that they go with it.
+They may come again: their files' units are withdrawn. Their Gram rows go with the files.
 """
 
 from collections.abc import Collection
@@ -81,8 +80,7 @@ def drives_in(warehouse: Warehouse, logs: Snapshot) -> dict[str, set[str]]:
 def take_back(warehouse: Warehouse, what: str) -> int:
     """Take out what was ingested from a file, or through a mapping; return how many drives.
 
-    `what` is the name of a file or of a mapping, or what the names of a file's drives begin with.
-    They land again when they are given again. Raises `QuestionError` if there is none.
+    `what` names either, or begins the names of a file's drives. Raises `QuestionError` for none.
     """
     drives = _drives_called(warehouse, what)
     if not drives:

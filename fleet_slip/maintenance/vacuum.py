@@ -1,8 +1,7 @@
 """Removes files that nothing refers to any more: replaced ones, and leftovers of killed jobs.
 
-A file stays while a version of the last `retention_hours` refers to it, so that a query that began
-then goes on undisturbed; and while it is younger than that, because a job may be about to commit
-it. A clock that was set back keeps files longer. Files of a table without a Delta log all stay.
+A file stays while a version of the last `retention_hours` refers to it, for queries, and while it
+is younger, for jobs about to commit; and where a table has no Delta log.
 """
 
 import re

@@ -1,9 +1,8 @@
 """Compares everything below a data root with everything else that tells what it must be.
 
-Every byte of every data file with the checksum in its name; files, sizes and counts with the Delta
-log; drives with the rule that they are whole; Gram rows with the logs by a path of their own;
-documents with their checksums; model versions with the tables that they were made of; names of cars
-and drives with the record of what was forgotten.
+Data files with the checksums in their names and the Delta log; drives with the rule that they are
+whole; Gram rows with the logs by another path; documents with checksums; model versions with their
+tables; names with the record of what was forgotten.
 """
 
 from collections.abc import Mapping, Sequence
@@ -101,9 +100,8 @@ def verify(
 ) -> Verification:
     """Verify a data root; `full` computes the Gram rows of all log files again.
 
-    Files are read by the workers of an executor, if there is one, else by threads. `progress`
-    counts bytes. Where damage is found while other jobs change the tables, it is looked for again:
-    they take files away.
+    Workers of an executor, or threads, read; `progress` counts bytes. What jobs meanwhile take away
+    is looked for again.
     """
     warehouse.require()
     look = partial(_verify, warehouse, full, progress, executor)

@@ -44,12 +44,8 @@ TASK_FILES = 64
 class Damage:
     """One thing that is not as it must be, or that is worth knowing.
 
-    Attributes:
-        kind: where it is. "damage" of a `file`, a `drive`, a `gram` row, a `document`, a `model`,
-            the `log` of a table, or a `name` that was forgotten; or only a remark: "unreferenced",
-            "backlog", or "unchecked".
-        path: the file below the root, or the drive or model version.
-        problem: what is wrong.
+    `kind` is where damage is, or a remark: "unreferenced", "backlog" or "unchecked". `path` is a
+    file below the root, a drive or a model version.
     """
 
     kind: DamageKind

@@ -64,9 +64,8 @@ def verify_grams(
     full: bool,
     executor: Executor | None,
 ) -> None:
-    """Look for Gram rows that stand twice, are not those of their rows, are missing or left over.
-
-    Gram rows of `SAMPLE` log files are computed again; with `full`, those of all.
+    """Look for Gram rows that are doubled, wrong (of `SAMPLE` files; `full`: all), missing, left
+    over.
     """
     _verify_unique(warehouse, sound.grams, report)
     _verify_each(warehouse, sound.grams, report)

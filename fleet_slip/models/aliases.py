@@ -1,7 +1,7 @@
 """Where the aliases of a model point, and every move that brought them there.
 
-A move is decided by the moves before it, and added only while it comes right after these: of two
-processes that decide at once, one looks again.
+A move follows the moves before it directly: of two processes that decide at once, one decides
+again.
 """
 
 import re

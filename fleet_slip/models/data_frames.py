@@ -18,13 +18,7 @@ NAMES_SHOWN = 20
 
 @dataclass(frozen=True)
 class Frame:
-    """A data frame of some library.
-
-    Attributes:
-        names: its columns.
-        column: returns a column as an Arrow array, by name.
-        wrap: returns an array of the library, with a name, from float64 values of Arrow.
-    """
+    """A data frame of some library: columns as Arrow arrays by name, and how to wrap an answer."""
 
     names: Sequence[str]
     column: Callable[[str], Any]
@@ -33,8 +27,7 @@ class Frame:
     def numbers(self, names: Sequence[str], wanted_by: str) -> dict[str, FloatArray]:
         """Return columns as arrays of shape (rows,), NaN where null.
 
-        Raises `InputError` if a column is missing or there twice, is not of numbers, or has
-        infinite ones.
+        Raises `InputError` for columns that are missing, repeated, infinite or not of numbers.
         """
         missing = [name for name in names if name not in self.names]
         if missing:
@@ -74,11 +67,7 @@ def _is_number(kind: pa.DataType) -> bool:
 
 
 def open_frame(frame: Any) -> Frame:
-    """Return a frame of Polars, pandas or Arrow, or a mapping of one-dimensional arrays.
-
-    Of Arrow is whatever has its stream interface, a relation of DuckDB among them. Raises
-    `InputError` for anything else.
-    """
+    """Return a frame of Polars, pandas, Arrow (any stream) or a mapping. Raises `InputError`."""
     if _is_of("polars", "DataFrame", frame):
         return Frame(frame.columns, lambda name: frame[name].to_arrow(), _polars)
     if _is_of("pandas", "DataFrame", frame):

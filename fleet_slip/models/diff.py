@@ -34,13 +34,7 @@ class Term:
 
 @dataclass(frozen=True)
 class Difference:
-    """Two versions beside each other.
-
-    Attributes:
-        drives: which drives they share; None between models, or where a version does not keep it.
-        facts: data, reason and figures that differ, by what they are called in the manifest.
-        terms: the intercept and every signal of either.
-    """
+    """Two versions: facts and terms of either, and shared drives, None where these are not kept."""
 
     one: ModelVersion
     other: ModelVersion

@@ -20,10 +20,9 @@ NAMED = 5
 
 
 def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float]:
-    """Return how late courses still are in the Gram rows of the cars that taught a model, in s.
+    """Return how late courses still are, in s, in the Gram rows of the cars that taught a model.
 
-    Raises `RefusedError` unless it is known of all of them how late they were, and their Gram rows
-    are corrected by it; `DataError` if the Gram rows that tell it are missing.
+    Raises `RefusedError` unless all are known and corrected for, `DataError` without Gram rows.
     """
     condition = parse_cohort(manifest.trained_on.cohort)
     with open_grams(warehouse, DELAY, condition) as opened:

@@ -1,7 +1,6 @@
 """What a model version says of itself: its terms, figures, data and why it was chosen, checked.
 
-A manifest is a function of data, configuration and program alone. It may come from anywhere, so
-that every text and number in it is bounded, and the one text that becomes SQL is arithmetic.
+It may come from anywhere: texts and numbers are bounded, and what becomes SQL is arithmetic.
 """
 
 import math
@@ -89,10 +88,9 @@ def _require_rounded(value: float, exact: Fraction) -> None:
 class ModelTerm(Config):
     """One signal of a model: `label = intercept + sum(coefficient * signal)`, in SI units.
 
-    `sql` is empty for a logged signal. For a feature it computes the count from the counts of
-    signals; the count is clipped to +-32767, and times `scale` it is the physical value. A column
-    over time has a `definition` instead, and so has a feature of more than 16 bits; then
-    `signal_scales` are those of the signals in it when it was published.
+    A feature's `sql` gives its count, clipped to +-32767, from counts of signals; `scale` times it
+    is the physical value. Columns over time, and features of more than 16 bits, have a `definition`
+    and the `signal_scales` at publication instead.
     """
 
     signal: Identifier
@@ -175,9 +173,8 @@ class CrossValidated(Config):
 class TrainedOn(Config):
     """The data that made a model.
 
-    `vehicles` and `drives_sha256`, which names the file of exactly these drives
-    (`fleet_slip.models.trained_drives`), are None in versions from before they were kept.
-    `drives_without_log` are those whose cars sent Gram rows, None for none.
+    `vehicles` and `drives_sha256` (`fleet_slip.models.trained_drives`) are None in older versions;
+    `drives_without_log` are those of cars that sent Gram rows.
     """
 
     cohort: str
@@ -201,11 +198,10 @@ Seconds = Annotated[FiniteFloat, Field(gt=0)]
 
 
 class LearnedFrom(Config):
-    """What stood for a label: changes of the course over so many seconds.
+    """What stood for a label: changes of the course over `change_s`.
 
-    The intercept is that of `cars`, where they go straight, with its uncertainty and the standard
-    deviation between them; the uncertainty is None where drives do not tell it. Beside drives with
-    the label a change of the course has a `weight`, where a row of these has 1.
+    The intercept is that of `cars` going straight, with its uncertainty, None if untold, and the
+    spread between them. A change has a `weight` beside rows with the label, which have 1.
     """
 
     label: Literal["course", "course+sideslip"]
@@ -220,11 +216,7 @@ Asked = bool | int | Annotated[str, Field(max_length=100_000)]
 
 
 class SelectedBy(Config):
-    """Why this model: the list it came from, its name there, and the rule that chose it.
-
-    `asked` are the options of the selection by name where there were others than a list
-    (`fleet_slip.models.recipe`).
-    """
+    """The list, the name and the rule that chose a model; `asked` are other options by name."""
 
     model_list: str
     model: str
@@ -241,11 +233,7 @@ class ImportedFrom(Config):
 
 
 class Manifest(Config):
-    """One model version, complete.
-
-    A version that was imported was made of the tables of another data root: what it says of their
-    versions tells nothing of the tables here.
-    """
+    """One model version; `trained_on` of an imported one is about another data root's tables."""
 
     format: Literal[1] = 1
     name: Identifier

@@ -1,11 +1,8 @@
 """A published model on a data frame: side-slip angles from columns in SI units.
 
-The angle is `intercept + sum(coefficient * signal)`, added up from left to right as `score` does in
-SQL, so that both give the same bits. What is beyond its valid range is missing, and so is the angle
-then. A feature is a function of counts: the signals that it is
-made of are rounded to counts as the sensors round them, and its arithmetic is that which stands in
-the manifest. A model with columns over time looks back within a drive: by `drive_id` and `tick` or
-`time_s` of the frame; a frame without them is one drive with a row for each tick.
+Terms are added from left to right, to the bits of `score` in SQL. Features are arithmetic of
+rounded counts, as the manifest has it; what is out of its valid range is missing. Models with
+columns over time look back within a drive.
 """
 
 from fractions import Fraction
@@ -52,11 +49,7 @@ def predict(manifest: Manifest, frame: Any, predictor: Predictor | None = None) 
 def _over_time(
     manifest: Manifest, frame: Frame, columns: dict[str, FloatArray], predictor: Predictor
 ) -> FloatArray:
-    """Return the angles of a model that looks back: of each drive by itself, in the order of time.
-
-    Raises `DataError` if time does not rise within a drive, and `InputError` for a fact that the
-    frame lacks.
-    """
+    """Return the angles of a model that looks back, drive by drive in the order of time."""
     signals = catalogue()
     counts = {
         name: round_to_counts(columns[signals[name].column], signals[name])
@@ -100,10 +93,7 @@ def _rows_of_each_drive(frame: Frame, rows: int) -> list[slice] | list[IntArray]
 
 
 def _numbers(manifest: Manifest, frame: Frame) -> dict[str, tuple[FloatArray, Fraction]]:
-    """Return what a car's drives tell of it, in SI units by row, NaN where they do not, and grains.
-
-    Raises `InputError` if the frame lacks a column of the number's name.
-    """
+    """Return what a car's drives tell of it, in SI units by row with NaN, and grains."""
     used = {one.number.name: one.number for one in manifest.definitions.values() if one.number}
     if missing := [name for name in used if name not in frame.names]:
         raise InputError(

@@ -21,13 +21,8 @@ KEPT_ROWS = 2**16
 
 @dataclass(frozen=True)
 class Predictor:
-    """A published model on counts: the columns that it needs, and what a count of each adds.
-
-    Attributes:
-        plan: the columns, as the Gram rows had them that it was made of.
-        intercept: rad.
-        coefficients: rad per physical value of each column.
-        scales: physical value of a count of each column.
+    """A published model on counts: its column plan, its intercept in rad, rad per physical value
+    and physical value per count of each column.
     """
 
     plan: ColumnPlan
@@ -38,10 +33,10 @@ class Predictor:
 
     @classmethod
     def of(cls, manifest: Manifest) -> "Predictor":
-        """Return what a manifest publishes; its features are those that it defines itself.
+        """Return what a manifest publishes, by features of its own.
 
-        Raises `DataError` for definitions that contradict each other, and `RefusedError` if
-        counts mean something else now.
+        Raises `DataError` if these contradict each other, `RefusedError` if counts mean otherwise
+        now.
         """
         manifest.require_same_counts()
         coefficients = tuple(term.coefficient for term in manifest.terms)
@@ -68,9 +63,8 @@ class Predictor:
     def __call__(self, drive: DriveCounts, workspace: Workspace | None = None) -> FloatArray:
         """Return the estimate at each row in rad, shape (rows,); NaN where a column is missing.
 
-        Added up from left to right, as `score --sql` does, to the same bits on every machine; block
-        by block, so that the columns of a block are still in the processor's cache.
-        Raises `DataError` for a drive that cannot be looked back on.
+        Added up left to right and block by block, to the bits of `score --sql`. Raises `DataError`
+        for a drive that cannot be looked back on.
         """
         workspace = workspace or Workspace(self.plan)
         workspace.load(drive)

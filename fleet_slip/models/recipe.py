@@ -44,9 +44,8 @@ def asked_of(selection: RequestedSelection) -> dict[str, Any] | None:
 def recipe_for(
     registry: Registry, name: str, request: SelectionRequest, cohort: str | None = None
 ) -> Recipe:
-    """Return how to train a model again: as its champion, or newest version, but for what is asked.
-
-    Raises `QuestionError` if nothing tells how the version was chosen, and none is asked for.
+    """Return how to train a model as before, but for what is asked. Raises `QuestionError` if
+    untold.
     """
     before = _newest(registry, name)
     asked = _asked(request)

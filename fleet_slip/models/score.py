@@ -67,9 +67,8 @@ class Score:
 def score_statement(manifest: Manifest, condition: str | Condition) -> str:
     """Return `jobs/score.sql` for a model: its dot product over the logs in SI units.
 
-    Features are computed as the manifest defines them, whatever they are called today. Raises
-    `QuestionError` if the condition is not one expression on the columns of the view `log`, and for
-    a model that uses what a car's drives tell, which is no statement on rows.
+    Raises `QuestionError` for a condition that is not one expression on the view `log`, and for a
+    model with numbers that a car's drives tell.
     """
     if numbers := numbers_of(manifest):
         raise QuestionError(
@@ -96,10 +95,8 @@ def _scored_rows(manifest: Manifest, condition: Condition) -> dict[str, str]:
 
 
 def _step_rad(manifest: Manifest) -> float:
-    """Return the power of two in which angles are counted to be added up exactly.
-
-    No angle has more than 2^45 steps: so the squares of their differences have at most 92 bits, and
-    2^34 rows of them fit into HUGEINT.
+    """Return the power of two that angles are counted in: at most 2^45 steps, so that 2^34 squares
+    fit into HUGEINT.
     """
     largest = abs(manifest.intercept) + float(manifest.label.scale) * COUNT_MAX
     for term in manifest.terms:
@@ -136,11 +133,11 @@ def _si_rows(rows: str, computed: Sequence[str] = ()) -> str:
 
 
 def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) -> Score:
-    """Score a model on the rows of `log` that satisfy a condition.
+    """Score a model on the rows of `log` that satisfy a condition, columns over time drive by
+    drive.
 
-    Raises like `score_statement`, and `DataError` if no such row has the model's signals. A model
-    with columns over time is scored drive by drive, in the order of time. Where a minimum cohort is
-    asked for, whole drives are scored: `CohortError` for a condition on rows, or for too few cars.
+    Raises like `score_statement`, `DataError` if no row has the model's signals, and `CohortError`
+    where a minimum cohort holds, for a condition on rows or too few cars.
     """
     condition = cohort_of_rows(condition)
     manifest.require_same_counts()
@@ -158,10 +155,10 @@ def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) 
 
 
 def cohort_of_rows(condition: str | Condition) -> Condition:
-    """Return the condition of a cohort of rows: on the columns of the view `log`.
+    """Return the condition of a cohort of rows, on the view `log`. Raises `QuestionError`.
 
-    Raises `QuestionError` if it is none, and `CohortError` where a minimum cohort is asked for and
-    it parts the rows of a drive: then twenty cars with a row each would tell of another's row.
+    Where a minimum cohort holds, one that parts a drive's rows raises `CohortError`: twenty cars
+    with a row each would tell of another's row.
     """
     if isinstance(condition, Condition):
         return condition
@@ -234,10 +231,7 @@ def numbers_of(manifest: Manifest) -> tuple[str, ...]:
 
 
 def calibrated_cars(warehouse: Warehouse) -> CarCounts:
-    """Return the counts of the numbers of every car, by its drives so far; the log says of when.
-
-    Raises `DataError` if the Gram rows that tell them have not been computed.
-    """
+    """Return the counts of every car's numbers, by its drives so far. Raises `DataError`."""
     found = calibrate(warehouse)
     log_event("calibration", cars=len(found.cars), grams_version=found.grams_version)
     return found.counts()

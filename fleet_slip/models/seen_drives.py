@@ -17,13 +17,7 @@ from fleet_slip.warehouse.tables import Warehouse
 
 @dataclass(frozen=True)
 class SeenDrives:
-    """A cohort's drives, and among them those that made a version.
-
-    Attributes:
-        drives: how many there are.
-        trained: how many of them made it; None for a version from before they were kept.
-        others: the condition of those that did not.
-    """
+    """A cohort's drives, those that made a version (None: not kept), the condition of others."""
 
     drives: int
     trained: int | None

@@ -1,11 +1,9 @@
 """Optional signatures of model versions: Ed25519, over what a version is called and contains.
 
-    models/<name>/versions/1.json    the version
-    models/<name>/versions/1.sig     its signature, in base64
+    models/<name>/versions/1.sig     the signature of 1.json, in base64
 
-A checksum finds damage; whoever can write the data root can compute it anew. A signature can only
-be made with the private key, which need not be where versions are read. The number and the name of
-the version are signed too, so that a signed version cannot take the place of another.
+A checksum finds damage, but whoever writes the data root can compute it anew; a signature needs the
+private key. Number and name are signed too: no version can take another's place.
 """
 
 import base64
@@ -31,10 +29,7 @@ LONGEST_FILE_BYTES = 10_000
 
 
 def make_keys(private: Path) -> Path:
-    """Write a new private key, and its public key beside it with `.pub`; return the latter's path.
-
-    Raises `ConfigError` if one of them exists: a key is never replaced.
-    """
+    """Write a new private key and, beside it, its `.pub`; return that. Raises `ConfigError`."""
     public = private.with_name(private.name + ".pub")
     for path in (private, public):
         if os.path.lexists(path):
@@ -59,10 +54,7 @@ def sign_version(folder: Folder, number: int, name: str, sha256: str, key: Path)
 
 
 def require_signature(folder: Folder, number: int, name: str, sha256: str) -> None:
-    """Raise `RefusedError` if a public key is configured and did not sign this version.
-
-    The environment is read here, not by the callers, so that none of them can forget to ask.
-    """
+    """Raise `RefusedError` if $FLEET_SLIP_VERIFY_KEY is set and did not sign this version."""
     configured = os.environ.get(VERIFY_VARIABLE)
     if configured is None:
         return

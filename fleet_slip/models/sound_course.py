@@ -20,10 +20,7 @@ NAMED = 3
 def require_sound_course(
     warehouse: Warehouse, manifest: Manifest, delays_s: Mapping[str, float]
 ) -> None:
-    """Raise `RefusedError` unless the course of all cars that taught a model is that of a car.
-
-    `delays_s` are how late the courses of the cars are in their Gram rows.
-    """
+    """Raise `RefusedError` unless all courses, `delays_s` late in Gram rows, are those of a car."""
     condition = parse_cohort(manifest.trained_on.cohort)
     with GramReader(warehouse) as reader:
         cars = course_moments(reader, condition)

@@ -1,14 +1,10 @@
 """The intercept of a model that changes taught, which know none: cars that go straight do not slip.
 
-What a car's signals are when it goes straight without lateral force follows from the offsets of its
-gyroscope and accelerometer, which its drives tell without a label (`calibrate`): each signal is
-fitted as a plane in both over all rows of the car, and read at these offsets. From there the car is
-led into bends as hard as usual, left and right alike, each even and without end: the model's
-columns must add up to no side-slip angle on average, as an offset that is squared does not when
-going straight on alone.
-
-Cars differ in this, and mostly by their offsets: where there are several cars, these become columns
-of the model, whose coefficients no change can tell.
+A car's signals when it goes straight follow from the offsets of its gyroscope and accelerometer,
+which `calibrate` tells without a label: each signal is fitted as a plane in both over all rows of
+the car, and read there. From there the car is led into even bends as hard as usual, left and right
+alike: on average the model must give no angle, also where an offset is squared. Cars differ mostly
+by their offsets: of several cars, these become columns of the model.
 """
 
 import math
@@ -57,11 +53,9 @@ class StraightOn:
     """What cars that go straight say of an intercept.
 
     Attributes:
-        intercept: rad, the mean of the cars, each counting as often as it has rows; with slopes,
-            that of a car without offsets.
+        intercept: rad, the mean of cars by rows; with slopes, that of a car without offsets.
         slopes: rad for a count of the offset, by its column; none of few cars, or of like ones.
-        uncertainty: rad, of the mean, from the uncertainty of the cars' offsets; where that of one
-            is not known, from how cars differ, and None of one car.
+        uncertainty: rad, of the mean, from the offsets or from how cars differ; None of one.
         spread: rad, standard deviation between cars of what the slopes do not tell.
         cars: how many.
     """
@@ -74,11 +68,7 @@ class StraightOn:
 
 
 def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) -> StraightOn:
-    """Return the intercept of a model whose manifest has none.
-
-    Raises `DataError` if no car's drives tell the offsets of its sensors and the signals that the
-    model needs.
-    """
+    """Return the intercept of a model without one. Raises `DataError` if no car tells offsets."""
     numbers = calibrate(warehouse, condition).cars
     cohort = load_cohort(warehouse, condition, training=False)
     signals = tuple(dict.fromkeys(name for term in manifest.terms for name in term.inputs))

@@ -1,11 +1,9 @@
 """Exactly which drives a model version was trained on, for ever, without their names.
 
-    models/<name>/versions/drives-CHECKSUM.bin   a hash of 8 bytes for each drive, sorted
+    models/<name>/versions/drives-CHECKSUM.bin     8 bytes a drive, sorted
 
-What a condition chose is told by the data of that day, which may be gone tomorrow. So each version
-keeps a hash of every drive: that a drive was among them can be told by who knows its name, after
-the drive is forgotten, too. The hashes are salted with the model's name, so that they are the same
-for versions of a model and differ between models. A manifest names the file by its SHA-256.
+Tables may be gone tomorrow; from hashes, salted with the model's name, whoever knows a drive's name
+can tell that it was among them. A manifest names the file by its SHA-256.
 """
 
 from hashlib import sha256

@@ -12,11 +12,9 @@ from fleet_slip.warehouse.tables import Warehouse
 def is_up_to_date(
     manifest: Manifest, warehouse: Warehouse, cohort: str, models: str, worth: str | None
 ) -> bool:
-    """Return whether a selection from a model list has nothing to look at that is new.
+    """Return whether a selection from a model list would come to this manifest again.
 
-    A manifest is a function of data, configuration and program alone: from the same versions of
-    the tables, the same cohort, list, feature set and program comes the same manifest. Raises
-    `ConfigError` for a list that cannot be read.
+    It is a function of table versions, cohort, list and program. Raises `ConfigError` for the list.
     """
     model_list = load_model_list(models)
     trained, chosen = manifest.trained_on, manifest.selected_by

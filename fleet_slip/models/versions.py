@@ -1,9 +1,7 @@
 """Model versions: immutable, numbered, each explaining itself; and aliases with their history.
 
-    models/<name>/versions/1.json, 2.json, ...   what was published
-    models/<name>/history/1.json, 2.json, ...    every move of an alias, in order
-
-A manifest is a function of data, configuration and program alone; the time stands in the history.
+    models/<name>/versions/1.json, 2.json, ...     what was published
+    models/<name>/history/1.json, 2.json, ...      every move of an alias, with its time
 """
 
 import re
@@ -54,10 +52,8 @@ class Registry:
         return self._versions(name).numbers()
 
     def load(self, name: str, version: int) -> ModelVersion:
-        """Return one version.
-
-        Raises `StorageError` if it was changed after it was published, and `RefusedError` if it
-        lacks the signature that is asked for (`fleet_slip.models.signing`).
+        """Return a version. Raises `StorageError` if changed, `RefusedError` without a needed
+        signature.
         """
         loaded = self._read(name, version)
         require_signature(self._versions(name).folder, version, name, loaded.sha256)
@@ -98,10 +94,8 @@ class Registry:
         return names[0]
 
     def resolve(self, reference: str | None) -> ModelVersion:
-        """Return the version that `NAME`, `NAME@VERSION` or `NAME@ALIAS` names.
-
-        `NAME` alone is its champion, and None the only model. Raises `QuestionError` for an unknown
-        one.
+        """Return the version of `NAME`, `NAME@VERSION`, `NAME@ALIAS`, or None. Raises
+        `QuestionError`.
         """
         name, _, which = (reference or self.only()).partition("@")
         self.require(name)
@@ -131,11 +125,10 @@ class Registry:
         return AliasHistory(DocumentFolder(self.folder / name / "history"))
 
     def add(self, manifest: Manifest, drives: bytes | None = None) -> ModelVersion:
-        """Make a manifest the next version of its model, to which nothing points yet.
+        """Make a manifest the next version of its model, after the content of its `drives` file.
 
-        `drives` is the content of the file about its drives, which is written first. If the latest
-        version is the same estimator from the same rows, that one is used: another process added it
-        just now, or was interrupted.
+        If the latest is the same estimator from the same rows, it is used: another process added
+        it.
         """
         if self.signing_key is not None:
             require_signing_key(self.signing_key)  # before anything is written
@@ -154,9 +147,8 @@ class Registry:
         return self._read(name, version)
 
     def make_champion(self, version: ModelVersion, *, after: int, best: int | None = None) -> bool:
-        """Point the champion at a version; return False if an alias moved after the move given.
-
-        `best` is the best of the champions so far, by default this version.
+        """Point the champion at a version, `best` being the best so far; False if an alias moved
+        since.
         """
         history = self.history(version.manifest.name)
         there = history.pointed_at(CHAMPION) == version.version
@@ -165,8 +157,8 @@ class Registry:
     def promote(self, name: str, version: int, alias: str) -> None:
         """Point an alias at a version. Raises `QuestionError` for an unknown version.
 
-        Where it points there already nothing is added, so that a repeated command can be undone by
-        one `rollback`; unless that ends a hold, or the comparison with a better champion of before.
+        Where it points there already nothing is added, unless a hold or a better champion of before
+        ends: one `rollback` undoes a repeated command.
         """
         self.load(name, version)
         history = self.history(name)
@@ -192,9 +184,8 @@ class Registry:
         return history.decide(move)
 
     def rollback(self, name: str, alias: str) -> int:
-        """Point an alias back at the version it had before; return that version.
-
-        Raises `RefusedError` if it never had another, and what `load` raises if that is not sound.
+        """Point an alias back; return the version. Raises `RefusedError` without one, and as
+        `load`.
         """
         history = self.history(name)
 

@@ -1,12 +1,11 @@
 """Reading the history of runs, and keeping it short where every record is an object of its own.
 
-    runs/2026-11.jsonl                          in a folder: the records of a month
-    runs/2026-11.jsonl/TIME-RANDOM.jsonl        on an object store: a record
-    runs/2026-11.jsonl/CHECKSUM.jsonl           records of that month, gathered
+    runs/2026-11.jsonl                        the records of a month, in a folder
+    runs/2026-11.jsonl/TIME-RANDOM.jsonl      a record, on an object store
+    runs/2026-11.jsonl/CHECKSUM.jsonl         records of that month, gathered
 
-Gathering takes no lock. A record is deleted by who has written, durably, an object that has it; so
-whatever gatherers do at once, or are killed at, every record is there once or more, and the view
-`runs` counts a run by its name. A reader whose files are gathered meanwhile lists them again.
+Gathering takes no lock: a record is deleted by who has written an object that has it, so that each
+is there once or more; the view `runs` counts by name, and readers list again.
 """
 
 import hashlib
@@ -66,8 +65,7 @@ def runs_under_way(root: Folder) -> list[str]:
 def state_of(run: Mapping[str, Any]) -> str:
     """Return done, failed, interrupted, running, or killed: no outcome, and its process is gone.
 
-    Of another machine's process nothing is known: it is said to be running. The number of a process
-    that is gone may be another's by now, whose beginning differs.
+    Another machine's process counts as running; a reused number differs in its beginning.
     """
     if run["outcome"] is not None:
         return str(run["outcome"])

@@ -1,12 +1,10 @@
 """The history of runs: which commands changed a warehouse, when, and what came of it.
 
-    runs/2026-11.jsonl    one line when a command starts, one when it ends
+    runs/2026-11.jsonl     one line when a command starts, one when it ends
 
-A line is appended by a single write to the month's file and never changed, so that processes need
-no lock, and a run that was killed is known by its missing second line. Each has a checksum
-(`fleet_slip.runs.records`). A line that a full disk or a power cut tore is skipped by readers; it
-cannot damage its successor, since every record begins on a new line. Nothing here may fail or delay
-the command: what cannot be written is not written.
+A line is one write, with a checksum (`fleet_slip.runs.records`), never changed: no lock, and a
+killed run lacks its second line. Torn lines are skipped; each record begins a new line. What cannot
+be written is not: nothing here fails or delays the command.
 """
 
 import contextlib
@@ -177,10 +175,9 @@ def step(name: str) -> Iterator[MeasuredStep]:
 def publishable(arguments: Sequence[str]) -> list[str]:
     """Return command line arguments without what the history must not keep.
 
-    That is the value of an option whose name speaks of a key, token, secret or password, the user
-    part of a URL and the like in its query, and what may name a person's car, since the history
-    outlives what is forgotten: the values of --vehicle, --drive, --drive-name and --source-file,
-    conditions on such columns, and the names of data files.
+    That is keys, tokens, secrets and passwords, users and queries of URLs, and what may name a
+    person's car, since the history outlives it: --vehicle, --drive, --drive-name, --source-file,
+    conditions on such columns, names of data files.
     """
     kept: list[str] = []
     hide_next = False

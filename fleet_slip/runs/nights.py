@@ -1,9 +1,8 @@
 """The record of nights: where each began, and how it ended.
 
-    nights/1.json, 2.json, ...   numbered documents, two of a night: its beginning and its end
+    nights/1.json, 2.json, ...    two of a night: its beginning and its end
 
-A night that was killed and is given again starts from the beginning that is there, so that it tells
-the whole night and judges the model that was champion before it. Faulty drives stand here as
+A killed night that is given again starts from its beginning, and tells the whole. Faulty drives are
 hashes: the record outlives what is forgotten.
 """
 
@@ -23,12 +22,7 @@ HASH_CHARACTERS = 16
 
 @dataclass(frozen=True)
 class Beginning:
-    """What a data root had when a night began.
-
-    Attributes:
-        champion: the version that was champion, NAME@VERSION.
-        known: hashes of the drives whose sensors were not in order after the night before.
-    """
+    """What a root had when a night began: its champion, and hashes of drives `known` as faulty."""
 
     champion: str | None
     drives: int

@@ -2,15 +2,11 @@
 
     {"run_id":…,"documents":…,"sha256":"0123456789abcdef0123456789abcdef"}
 
-The checksum is of the line's bytes before it. So a line that was changed is told from one that a
-full disk or a power cut tore, which lacks its end and is skipped, and from one of an earlier
-version, which has no checksum. Lines are no chain: processes add them at once, without a lock.
+The checksum is of the bytes before it: a changed line differs from a torn one, which lacks its end,
+and an old one, which has none. Lines are no chain: processes add them without a lock.
 
-Every run keeps the number and the checksum of the newest document of each folder.
-Numbered documents tell a gap among them, but not that the last ones are gone: a version, a move of
-an alias, an entry of `forgotten/`. Whoever deletes one would have to rewrite the records of all
-runs since as well. Who can do that, and owns every copy of the history, leaves no trace:
-docs/security.md.
+Every run keeps number and checksum of the newest document of each folder, to tell that the last
+ones are gone; whoever deletes these and rewrites all records leaves no trace: docs/security.md.
 """
 
 import contextlib
@@ -59,11 +55,7 @@ _WITH_CHECKSUM = re.compile(rb'(.*),"sha256":"([0-9a-f]{%d})"\}' % _DIGITS)
 
 
 def process_began(number: int) -> str | None:
-    """Return the boot and the start of a process of this machine; None if it is not known.
-
-    The system gives the number of a process that is gone to another one. Neither the boot nor the
-    ticks since it depend on the clock.
-    """
+    """Return a process's boot and start, whatever the clock, since numbers are reused; or None."""
     try:
         boot = (PROC / "sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         status = (PROC / str(number) / "stat").read_bytes()

@@ -143,8 +143,7 @@ def weigh(
 ) -> RequestedSelection:
     """Select with the weight of the course that serves held-out drives with the label best.
 
-    Of weights whose error is not larger for sure, by Student's t over the folds, the largest: few
-    cars with a label say little about it, and the course is of all.
+    Of those not worse for sure, by Student's t over the folds, the largest: few cars have a label.
     """
     found = [
         _compare_listed(replace(cohort, weight=weight), request, model_list, folds)
@@ -253,10 +252,7 @@ def _compare_listed(
 
 
 def checksum_of_list(model_list: ModelList, worth: str | None) -> str | None:
-    """Return the `config_sha256` of a selection from a list as it stands.
-
-    None for a list that is nothing but a search, whose selection depends on the cohort's inputs.
-    """
+    """Return the `config_sha256` of a selection from a list, None for one that only searches."""
     return _checksum(model_list.sha256, worth, True) if model_list.model else None
 
 

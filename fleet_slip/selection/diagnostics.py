@@ -41,13 +41,7 @@ from fleet_slip.words import number_of
 
 @dataclass(frozen=True)
 class SerialDiagnosis:
-    """How much the residual of a row says of the next one.
-
-    Attributes:
-        correlation: of the least-squares residuals.
-        autoregressive: feasible generalised least squares, whose residuals are independent.
-        inference: standard errors of its slopes.
-    """
+    """How much a row's residual says of the next one's; slopes of feasible least squares."""
 
     correlation: SerialCorrelation
     autoregressive: AutoregressiveFit
@@ -56,14 +50,8 @@ class SerialDiagnosis:
 
 @dataclass(frozen=True)
 class CohortComparison:
-    """Whether another cohort has the same coefficients.
-
-    Attributes:
-        condition: the other cohort.
-        other: the coefficients there.
-        rows: Chow's test, which takes rows for independent.
-        drives: Wald's test, which takes drives or cars for independent; None with too few of
-            them for so many coefficients.
+    """Whether another cohort has the same coefficients, by Chow's test of rows and Wald's of
+    drives.
     """
 
     condition: str
@@ -74,22 +62,16 @@ class CohortComparison:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """One model on one cohort.
+    """One model on one cohort; coefficients are in SI units, and None is what was not asked for.
 
     Attributes:
         fitted: exact fit, in counts.
-        drives: number of drives that serve it.
-        cluster: what counts as independent in `robust` and `evidence`; rows where there is one
-            drive only, and nothing better.
-        naive, robust: coefficients in SI units, rows or clusters counting as independent.
+        cluster: what is independent in `robust` and `evidence`; rows of a single drive.
         inflation: variance inflation of each input.
         condition_number: of the inputs' correlation matrix.
         evidence: effective rows and design effect.
-        serial: from lagged Gram rows; None if they were not given.
-        comparison: with another cohort; None without one.
-        noise_free: the model, in SI units, for signals without the noise they were logged with.
-        influential: the cars that `robust` would leave out of a selection, by name; none where
-            cars are too few to tell what is usual.
+        noise_free: the model for signals without the noise they were logged with.
+        influential: the cars that `robust` would leave out of a selection, by name.
     """
 
     fitted: Fit
@@ -161,8 +143,8 @@ def diagnose(
 ) -> Diagnosis:
     """Fit the inputs to the drives of a cohort that have them all, and examine the fit.
 
-    `lagged` is the same cohort with lagged Gram rows; `sensor_noise` the standard deviation of
-    sensors in SI units. Raises `DataError` for dependent or absent signals.
+    `lagged` has lagged Gram rows; `sensor_noise` is in SI units. Raises `DataError` for dependent
+    or absent signals.
     """
     label, scales = catalogue().label, input_scales()
     served = cohort.serving(inputs)

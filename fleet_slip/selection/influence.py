@@ -16,10 +16,9 @@ HASH_CHARACTERS = 16
 
 
 def influential_cars(served: Served, moments: DriveMoments) -> dict[str, Influential]:
-    """Return the cars of unusual influence by name, the most unusual first.
+    """Return named cars of unusual influence, the most unusual first, by the moments of drives.
 
-    `moments` are those of the drives. Drives that name no car are never left out. Raises
-    `DataError` for fewer cars than tell what is usual.
+    Raises `DataError` for fewer cars than tell what is usual.
     """
     owners = np.array([name or "" for name in served.drives["vehicle_id"].to_pylist()])
     names, cars = np.unique(owners, return_inverse=True)

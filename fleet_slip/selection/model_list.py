@@ -46,13 +46,10 @@ DEFAULT_MOST = 24
 
 
 class Search(Config):
-    """How to choose among many inputs.
+    """How to choose among many inputs: at most so many columns, by `rule`.
 
-    Attributes:
-        method: forward, backward, exchange or lars.
-        most: largest number of columns that a model may have.
-        rule: `best` takes the best cross-validated correlation; `worth` the fewest columns whose
-            error is negligibly larger, see `fleet_slip.regression.choice.winner`.
+    `best` takes the best cross-validated correlation; `worth` the fewest columns whose error is
+    negligibly larger (`fleet_slip.regression.choice.winner`).
     """
 
     method: Literal["forward", "backward", "exchange", "lars"] = "forward"
@@ -63,9 +60,7 @@ class Search(Config):
 class ModelList(Config):
     """Candidates in their declared order, the feature set and the folds to compare them on.
 
-    `label` is what may stand for the label of a reference sensor, if it is not that alone. With a
-    `search`, the models that it finds among the inputs of the feature set are candidates
-    too, and its rule decides.
+    `label` may stand for a reference sensor. What a `search` finds joins, and its rule decides.
     """
 
     description: str = Field(min_length=1)
@@ -110,10 +105,7 @@ def load_model_list(name_or_path: str) -> ModelList:
 
 
 def nested_candidates(order: Sequence[str]) -> tuple[CandidateModel, ...]:
-    """Return the nested models of a predefined order (paper, section II.B): its first 1..k inputs.
-
-    The null model, without any input, predicts the mean and has no correlation to compare.
-    """
+    """Return the models of an order's first 1..k inputs (paper, section II.B)."""
     return tuple(
         CandidateModel(name=f"first {size}", signals=tuple(order[:size]))
         for size in range(1, len(order) + 1)

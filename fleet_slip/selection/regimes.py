@@ -28,10 +28,7 @@ ROWS_PER_COEFFICIENT = 100
 
 @dataclass(frozen=True)
 class RegimeFigures:
-    """Held-out figures of one regime's rows, by the model of all regimes and by its own.
-
-    `share` is the part of the cohort's rows; `own` says whether it had enough rows for one.
-    """
+    """Held-out figures of a regime's rows, a `share`, by the common model and any of its `own`."""
 
     name: str
     rows: int
@@ -45,17 +42,8 @@ class RegimeFigures:
 class RegimeComparison:
     """One model for all regimes against one for each, cross-validated on the same folds.
 
-    Attributes:
-        signals: the inputs.
-        drives: number of drives that have them.
-        folds: number of folds.
-        regimes: figures by regime.
-        pooled, split: figures over all rows.
-        gain: mean over the folds of what splitting adds to the correlation.
-        gain_standard_error: of the gain, over the same folds.
-        rmse_gain: what splitting takes away from the RMSE over all rows, rad.
-        rmse_gain_standard_error: of that, over the same folds.
-        worth: the smallest gain that is worth the coefficients of a split.
+    `gain` is the mean over folds of what splitting adds to the correlation; `rmse_gain` is what it
+    takes from the RMSE, in rad; standard errors are over the folds.
     """
 
     signals: tuple[str, ...]
@@ -111,10 +99,7 @@ class RegimeComparison:
 
 
 def regime_names(cohort: Cohort, over: Sequence[str]) -> list[str]:
-    """Return the regime of each Gram row, by some of the regimes that divide its feature set.
-
-    Raises `QuestionError` if the set does not divide by one of them.
-    """
+    """Return the regime of each Gram row, by some or all of its set's. Raises `QuestionError`."""
     divided = features().feature_set(cohort.feature_set).regimes
     unknown = [name for name in over if name not in divided]
     if unknown or not divided:
@@ -150,9 +135,8 @@ def compare_regimes(
 ) -> RegimeComparison:
     """Cross-validate one model for all regimes and one for each, on drives that have the inputs.
 
-    A split is advised if what it gains is worth it, and larger than one standard error of
-    the gain, paired over the same folds. Raises `QuestionError` for a feature set without regimes,
-    and `DataError` for absent signals or empty folds.
+    A split is advised if its gain is worth it and above a standard error, paired over folds. Raises
+    `QuestionError` without regimes, `DataError` for absent signals or empty folds.
     """
     if folding.by in (ROW_FOLDS, PARTS):
         raise QuestionError("rows are divided by regime already: fold by drive, or by vehicle.")
@@ -212,10 +196,7 @@ def compare_regimes(
 
 
 def _of_enough_cars(cohort: Cohort, names: Sequence[str]) -> tuple[Cohort, list[str]]:
-    """Return a cohort without the regimes that too few cars were in to be told of, and the rest.
-
-    Their rows are in no figure: what all rows tell less the other regimes would tell of them.
-    """
+    """Return a cohort without the regimes of too few cars, lest differences tell of them."""
     cars: dict[str, set[str]] = {}
     for name, car in zip(names, cohort.drives["vehicle_id"].to_pylist(), strict=True):
         cars.setdefault(name, set()).add(car)

@@ -14,8 +14,7 @@ DEFAULT_MODELS = "estimator"
 """The model list that is compared unless another is named, by `run` and every night too."""
 
 LOGGED_MODELS = "table1"
-"""That of logged signals alone, which every data root has: where another feature set is named, or
-the columns of the default list have not been computed."""
+"""That of logged signals, for other feature sets or where the usual columns are not computed."""
 
 Label = Literal["course", "course+sideslip"]
 """What may stand for the label of a reference sensor, or beside it where few cars have one."""

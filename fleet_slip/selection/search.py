@@ -56,10 +56,8 @@ class SearchChoice:
         rule: ranking (or `ALL_SUBSETS`) and criterion.
         evidence: what the criterion looked at.
         nested: the ranked signals with the criterion's values; None for all subsets.
-        subsets: the best subsets of size 0, 1, ...; None for a ranking.
-        picks: the size that each criterion picks among the best subsets.
-        honest: figures of the whole choice, made again inside every training fold; None with
-            fewer than three folds, and for all subsets.
+        subsets: the best subsets of size 0, 1, ..., of which each criterion picks a size.
+        honest: figures of the choice, made again in every training fold; None of two folds.
     """
 
     rule: Rule
@@ -116,11 +114,10 @@ def select_inputs(
     cluster: ClusterUnit | None = None,
     intercept: bool = True,
 ) -> SearchResult:
-    """Choose some of the inputs, on the drives that have them all.
+    """Choose a nested model by the rule's ranking, or of the best subsets, on the drives that fit.
 
-    By the ranking of the rule one of the nested models; by `ALL_SUBSETS` one of the best subsets of
-    every size. Raises `DataError` if no drive has them all, if they are linearly dependent, or if
-    the criterion keeps none of them, and `QuestionError` for an unknown rule.
+    Raises `DataError` without drives, for dependent inputs or if none is kept, and `QuestionError`
+    for an unknown rule.
     """
     label = catalogue().label
     if folding.by == ROW_FOLDS:
@@ -166,11 +163,7 @@ def try_distances(
     cluster: ClusterUnit | None = None,
     intercept: bool = True,
 ) -> NestedDistances | str:
-    """Return the distances of the nested models of an order as given, or why there are none.
-
-    They are of the drives that have all its signals; folds other than of drives, dependent signals
-    and a single drive allow none.
-    """
+    """Return the distances of the nested models of an order as given, or why there are none."""
     try:
         ready = drive_folds(cohort, inputs, folding, cluster=cluster, intercept=intercept)
         return measure_distances(ready.training, inputs, catalogue().label)
@@ -200,13 +193,7 @@ def told_figures(model: CrossValidation) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class SearchedModels:
-    """The models of a search: one of each size, cross-validated with the search made again.
-
-    Attributes:
-        search: how it was searched.
-        inputs: those that there were to choose among.
-        models: of sizes 1, 2, ...
-    """
+    """The models of a search, of sizes 1, 2, ..., cross-validated with the search made again."""
 
     search: Search
     inputs: tuple[str, ...]
@@ -250,10 +237,7 @@ def search_models(
 
 
 def searching(found: SearchedModels, size: int, *, intercept: bool = True) -> Procedure:
-    """Return the procedure that searches again, in the rows that it is given, for so many columns.
-
-    It takes the largest set below where those rows allow no more.
-    """
+    """Return what searches again in given rows for so many columns, or the most that they allow."""
 
     def procedure(gram: Gram) -> LinearModel:
         seen, label = gram if intercept else gram.about_origin(), catalogue().label

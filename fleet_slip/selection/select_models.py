@@ -43,16 +43,11 @@ class Selection(Generic[AnyCohort]):
 
     Attributes:
         cohort: the Gram rows, or their sums.
-        folds: how they were divided.
-        models: the candidates that the cohort can serve, cross-validated.
-        winner: the chosen one and why.
         skipped: candidates that the cohort cannot serve, with the reason.
         choice: how an order or a subset was chosen; None for a list of models.
-        searched: the models of a search, which are among `models`; None without one.
-        uncertainty: how sure the winner's figures are, if that was asked for.
-        distances: how far the nested models of an order are from the full and from the true one, or
-            why that cannot be told; None unless an order was asked for.
-        intercept: whether the models have one; without it they go through the origin.
+        searched: the models of a search, which are among `models`.
+        distances: of an order's nested models from the full and the true one, or why not told.
+        intercept: whether models have one; without it they go through the origin.
     """
 
     cohort: AnyCohort
@@ -148,10 +143,8 @@ def select(
 ) -> Selection[AnyCohort]:
     """Cross-validate each candidate, and what a search finds among inputs; choose the winner.
 
-    `worth` overrides the rule of the search. Without an intercept all models go through the
-    origin. A candidate that needs signals which no drive of the cohort has, or whose signals are
-    linearly dependent, is skipped with the reason. Raises `DataError` if none is left, or no drive
-    has the label.
+    `worth` overrides the search's rule. Candidates with absent or dependent signals are skipped,
+    with the reason. Raises `DataError` if none is left, or no drive has the label.
     """
     divided = cohort.folds(folds.by, folds.count)
     label = catalogue().label
@@ -200,8 +193,7 @@ class RequestedSelection(Selection[Any]):
     """A selection that can be published: it tells what it was made from.
 
     Attributes:
-        model_list: what was compared, such as `table1`.
-        config_sha256: checksum of all that says what to compare.
+        model_list, config_sha256: what was compared, such as `table1`, and its checksum.
         left_out: the cars that `robust` left out, and what influence they had.
         without_label: what changes of the course tell of the winner, if they taught it alone.
         label_noise_deg: of the label, which every error has in it; None where it is not known.

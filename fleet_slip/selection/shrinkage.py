@@ -55,9 +55,8 @@ def compare_shrinkage(
 ) -> tuple[Shrunk, ...]:
     """Cross-validate every method on the drives that have all the inputs.
 
-    Ridge and lasso choose their penalty by cross-validation inside each training fold. Pace
-    weighs effects by the noise; drives or cars count as independent, so its noise is larger by
-    the design effect, unless `naive`. Raises `QuestionError` for fewer than three folds, and
+    Ridge and lasso choose penalties inside each training fold. Pace's noise is larger by the design
+    effect of drives or cars, unless `naive`. Raises `QuestionError` for fewer than three folds, and
     `DataError` for dependent signals.
     """
     label = catalogue().label

@@ -24,11 +24,7 @@ SEED = 1
 class Uncertainty:
     """What resampling says of a model's cross-validated correlation.
 
-    Attributes:
-        interval: percentile interval by cluster bootstrap.
-        drawn: what is drawn for it: drives, or cars with all their drives.
-        repeats: number of deals of drives into folds; with `EACH` there is no other.
-        repeated_mean, repeated_spread: mean and standard deviation of the correlation over them.
+    A percentile interval, drawing drives or cars; mean and spread over `repeats` deals of folds.
     """
 
     interval: Interval | None
@@ -48,9 +44,7 @@ def estimate_uncertainty(
     cluster: ClusterUnit | None = None,
     intercept: bool = True,
 ) -> Uncertainty:
-    """Draw the drives with replacement `bootstrap` times, deal the folds anew `repeat` times.
-
-    Of several cars, whole cars are drawn, see `clustered_moments`.
+    """Draw drives, or cars of several, `bootstrap` times; deal the folds anew `repeat` times.
 
     Raises `QuestionError` for folds of rows, `DataError` for too few drives.
     """

@@ -15,14 +15,7 @@ from fleet_slip.regression.shrinkage.ridge import fit_noise_matched
 
 @dataclass(frozen=True)
 class WhatIf:
-    """Figures of a model on a cohort, as it is and with bias and noise added to its signals.
-
-    Attributes:
-        drives: number of drives that serve the model.
-        before, after: figures of the model.
-        refitted: the model, in SI units, that is best under the added noise.
-        refitted_after: its figures with the bias and the noise.
-    """
+    """Figures of a model before and after bias and noise come, and of the best model after it."""
 
     drives: int
     before: Figures
@@ -51,9 +44,8 @@ def what_if(
 ) -> WhatIf:
     """Return the figures to expect once bias and white noise come on top of what is logged.
 
-    `model` is one of counts; `bias` and `noise` (standard deviations) are in SI units. Raises
-    `QuestionError` for a signal that the model does not use, or uses inside a feature: there the
-    effect is not linear.
+    `model` is of counts; `bias` and `noise` (standard deviations) are in SI units. Raises
+    `QuestionError` for a signal that the model lacks, or has in a feature: that is not linear.
     """
     for name in {*bias, *noise}:
         _require_linear(name, model)

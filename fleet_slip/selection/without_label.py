@@ -1,10 +1,9 @@
 """How good a model is that changes of the course taught, where no sensor tells the angle.
 
-The error of changes has the noise of two fixes in it, which the changes of a car that goes straight
-on show. There it is fast, and a course has the less noise the faster a car is, so that what is left
-is more than the error of the angle over the time of a change; if its errors then and now have
-nothing in common, each has half the square. What no change tells stands beside it, as what it
-would cost: a course that is late, an antenna that is elsewhere.
+The error of changes has the noise of two fixes in it, which changes of cars that go straight on
+show. These are fast, and fast cars have less of it: what is left is more than the angle's error
+over the change, and each of two independent errors has half the square. What no change tells stands
+beside as its cost: a late course, an antenna elsewhere.
 """
 
 import math
@@ -29,24 +28,22 @@ LATE_S, AWAY_M = 0.01, 0.1
 """A course that is so late and an antenna that is so far from where it was said to be."""
 FEWEST_STRAIGHT = 100
 ONE_WAY = 0.7
-"""Share of one side above which left and right bends cannot be told apart: 1 on a skid pad, 0.2 on
-a circuit of bends to both sides, which turns once in a lap."""
+"""Share of one side beyond which bends cannot be told apart: 1 on a skid pad, 0.2 on a circuit."""
 
 
 @dataclass(frozen=True)
 class WithoutLabel:
-    """What changes of the course tell of a model's error, all in degrees.
+    """What changes of the course tell of a model's error, in degrees; None is untold.
 
     Attributes:
         change_s: over how long.
         error: cross-validated, of changes of the course.
-        noise: of the course, from changes where cars go straight on; None if too few do.
-        noise_uncertainty: standard error of it, over drives.
+        noise, noise_uncertainty: of the course, where cars go straight on; over drives.
         angle_at_most: bound of the angle's error over so long: what is left of `error`.
-        late: what a course would cost that is late by `LATE_S`; None without the yaw rate.
-        away: what an antenna would that is `AWAY_M` from its place; None without `curvature`.
-        to_the_left: mean of the angles turned over their root mean square: 1 where cars turn to the
-            left alone and as hard at any time, −1 to the right.
+        late: what a course would cost that is late by `LATE_S`.
+        away: what an antenna would that is `AWAY_M` from its place.
+        to_the_left: mean of the angles turned over their root mean square: 1 where cars turn to
+            the left alone and as hard at any time, −1 to the right.
     """
 
     change_s: tuple[float, ...]

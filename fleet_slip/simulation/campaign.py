@@ -1,7 +1,6 @@
 """Campaigns: which cars drive where, how fast and how often, read from `configs/campaigns/*.toml`.
 
-A campaign is a function of its file alone. A drive depends on the campaign's seed and on its own
-name, never on the number of days, on other drives or on the order in which they are simulated.
+A drive depends on the campaign's seed and its own name, never on days, other drives or order.
 """
 
 import math
@@ -122,10 +121,9 @@ _BATCH = TypeAdapter(Batch)
 
 
 class Campaign(Config):
-    """A plan of drives over days. A day's drives stay the same when days are added.
+    """A plan of drives over days, which stay the same when days are added.
 
-    With a `base` it says only in what it differs from that campaign. Its cars, roads and noise are
-    drawn as those of the base are, so that what it leaves as it was has the same values.
+    With a `base` it says only in what it differs; the rest is drawn as the base's.
     """
 
     name: Identifier

@@ -89,9 +89,8 @@ class Plan(Config):
 class GridPlan(Plan):
     """Every combination of the lists once, then again from the beginning.
 
-    The order strides through the combinations by about 1/φ of their number (φ the golden
-    ratio), so that any run of drives, such as one day's, is spread evenly over all of them.
-    Speeds are planned for μ = 1 whatever the road is: the driver does not see it.
+    The stride is 1/φ of their number, φ the golden ratio: any run of drives spreads evenly. Speeds
+    are planned for μ = 1: the driver does not see the road.
     """
 
     kind: Literal["grid"]
@@ -160,8 +159,8 @@ class SensorBiases(Config):
 class FleetPlan(Plan):
     """Many different cars that take turns, each on roads and at speeds drawn for every drive.
 
-    Model, load, tyres and sensor biases are a car's own and stay. The driver sees the road: he uses
-    a share of the friction that it offers, `friction_use`, planned lateral acceleration over μ g.
+    Model, load, tyres and biases are a car's own. The driver plans lateral acceleration over μ g by
+    `friction_use`.
     """
 
     kind: Literal["fleet"]

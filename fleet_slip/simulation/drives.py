@@ -80,12 +80,10 @@ def lane_drive(spec: DriveSpec) -> LaneDrive:
 
 
 def simulate_batch(batch: Batch) -> pa.Table:
-    """Simulate and measure the drives of a batch.
+    """Simulate and measure the drives of a batch, a function of the batch alone.
 
-    Returns a table in the order of `SignalCatalogue.log_schema`, without the extras that no car
-    of the batch logs, with strings as dictionaries,
-    sorted by drive, then tick. It depends on the batch alone: any number of threads may simulate
-    any batches in any order.
+    Columns are in the order of `SignalCatalogue.log_schema`, without unlogged extras, strings as
+    dictionaries; rows by drive, then tick.
     """
     logs: list[DriveLog] = []
     for first in range(0, len(batch.drives), DRIVES_AT_ONCE):
@@ -94,10 +92,7 @@ def simulate_batch(batch: Batch) -> pa.Table:
 
 
 def simulate_logs(specs: Sequence[DriveSpec]) -> list[DriveLog]:
-    """Simulate drives together, each measured with its own sensors and random generator.
-
-    A block of a drive is measured as soon as it is there: of true signals nothing is kept.
-    """
+    """Simulate drives together, each measured block by block by its own sensors and generator."""
     recorders = [Recorder(s.sensors, s.generator(), s.distortion()) for s in specs]
     receivers = [
         ReceiverLog(s.receiver, s.satellite_generator()) if s.receiver else None for s in specs

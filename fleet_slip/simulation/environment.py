@@ -1,10 +1,8 @@
 """`gymnasium.make("fleet_slip/SideSlip-v0")`: what a stability controller sees, and may do.
 
-A car is steered through a sine with dwell (FMVSS 126: a sine of 0.7 Hz that rests for 0.5 s at its
-second peak). A controller brakes single wheels. It sees the signals that a fleet logs, as their
-sensors report them: noisy, biased, in counts. The side-slip angle is in `info`, not among them.
-
-Importing this module makes the environment known to gymnasium.
+A car is steered through a sine with dwell (FMVSS 126: 0.7 Hz, 0.5 s at the second peak); a
+controller brakes single wheels by the signals that a fleet logs: noisy, biased, in counts.
+Importing this module registers the environment.
 """
 
 import math
@@ -141,13 +139,11 @@ class Trial:
 class SideSlipEnv(gymnasium.Env[Observation, Observation]):
     """A sine with dwell; actions brake wheels.
 
-    Observation: the inputs of the signal catalogue in SI units, float32 of shape (10,), in the
-    order of `signals`. Action: how hard to brake the wheels fl, fr, rl, rr, float32 of shape (4,)
-    from 0 to 1, for the next 10 ms. Reward: minus the square of the side-slip angle in units of 5
-    degrees, and a little for braking. An episode is terminated when the car has spun or stopped.
-
-    `info` has what no series sensor measures: `sideslip_rad`, `vx_mps`, `vy_mps`, and the
-    `adhesion`, `time_s` and noiseless `yaw_rate_rad_s`.
+    Observation: `signals` in SI units, float32 (10,). Action: brakes fl, fr, rl, rr from 0 to 1,
+    float32 (4,), for 10 ms. Reward: minus the squared side-slip angle in units of 5 degrees, and a
+    little for braking. An episode ends when the car has spun or stopped. `info` has what no series
+    sensor measures: `sideslip_rad`, `vx_mps`, `vy_mps`, `adhesion`, `time_s` and the true
+    `yaw_rate_rad_s`.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
@@ -160,11 +156,10 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
         adhesion: tuple[float, float] = (0.4, 1.0),
         sensors: bool = True,
     ) -> None:
-        """Choose the car and the ranges that trials are drawn from.
+        """Choose the car and the ranges that trials are drawn from: m/s, rad at the steering wheel.
 
-        `speed_mps` in m/s, `steering_rad` the amplitude at the steering wheel in rad. Without
-        `sensors` the signals are true. Raises `ConfigError` for an unknown car and `UsageError`
-        for an invalid range.
+        Without `sensors` the signals are true. Raises `ConfigError` for an unknown car and
+        `UsageError` for an invalid range.
         """
         for name, (least, most) in {
             "speed_mps": speed_mps,

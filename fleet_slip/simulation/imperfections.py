@@ -1,6 +1,5 @@
-"""What cars, sensors and roads have beyond the textbook's. Sources: `docs/imperfections.md`.
-
-Every figure is zero by default, and all of them zero is what was simulated before there were any.
+"""What cars, sensors and roads have beyond the textbook's; zero is without. Sources:
+`docs/imperfections.md`.
 """
 
 from typing import Annotated, TypeVar
@@ -20,10 +19,7 @@ ConfigT = TypeVar("ConfigT", bound=Config)
 
 
 class SensorImperfections(Config):
-    """Where sensors sit, how fast they follow, and what they err by beside bias and white noise.
-
-    A bandwidth is that of a low-pass of first order; 0 is without limit.
-    """
+    """Where sensors sit, how fast they follow (bandwidths; 0 is no limit), and further errors."""
 
     inertial_x_m: FiniteFloat = Field(default=0.0, ge=-5, le=5)
     """Of the inertial unit before the centre of gravity."""
@@ -118,8 +114,8 @@ less on 325 mm, and shorter blocks, which give way less (the scenario `tyres_wor
 class ImperfectionRanges(Config):
     """From what each car's imperfections, and each drive's road, are drawn.
 
-    Keys are fields of `CarImperfections`, `SensorImperfections` and `RoadImperfections`; those not
-    named stay zero. Cars and sensors stay as they are drawn; the road is drawn for every drive.
+    Keys are fields of `CarImperfections`, `SensorImperfections` and `RoadImperfections`; others are
+    zero. Cars and sensors keep theirs, the road is drawn anew.
     """
 
     load_position_m: Range | None = None

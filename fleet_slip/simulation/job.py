@@ -1,8 +1,4 @@
-"""Writes what is missing of a campaign into the warehouse.
-
-Each batch of drives is one file and one unit of work that lands exactly once: a repeated or
-interrupted job goes on with the batches that have not landed.
-"""
+"""Writes what is missing of a campaign: each batch of drives is a file that lands exactly once."""
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -97,9 +93,8 @@ def simulate_campaign(
 ) -> SimulationReport:
     """Simulate what has not landed of the given days of a campaign, and land each batch.
 
-    A day is planned when its turn comes: a plan of years takes no time before the first row and no
-    memory. A day that is complete is recorded as such and never planned again, so that a night
-    takes as long after years as after a week. Raises like `simulate_batches`.
+    A day is planned in its turn; a complete one is recorded and never planned again, so that nights
+    stay short for years. Raises like `simulate_batches`.
     """
     snapshot = warehouse.logs.snapshot()
     every = tuple(days)
@@ -144,9 +139,8 @@ def simulate_batches(
 ) -> SimulationReport:
     """Simulate the batches that have not landed, and land each.
 
-    Raises `RefusedError` if a batch's place was taken by a different version of it, `StorageError`
-    if the warehouse cannot be written, and `ClusterError` at the end for batches that the workers
-    of a cluster died of.
+    Raises `RefusedError` if a different version of a batch is there, `StorageError`, and at the end
+    `ClusterError` for batches that workers died of.
     """
     snapshot = warehouse.logs.snapshot()
     for batch in batches:

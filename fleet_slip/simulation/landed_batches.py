@@ -1,7 +1,6 @@
-"""What a campaign lands in the logs, and whether it did: a batch of drives, and a complete day.
+"""What a campaign lands in the logs, and whether it did: batches of drives, and complete days.
 
-Each is a unit of work of the logs' table. Its version is made of what defines it, so that a changed
-campaign is noticed.
+Units of work, their version made of what defines them: a changed campaign is noticed.
 """
 
 from collections.abc import Iterable, Iterator

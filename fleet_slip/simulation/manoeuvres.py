@@ -1,8 +1,6 @@
 """Manoeuvres: what a driver does besides following the track, as changes of the road before him.
 
-He follows a line at a speed. A step and a slalom are curvature that the line has besides the
-track's own; braking is a dip of the speed to hold. So a script of manoeuvres is a road, and the
-driver's law, the physics and their compiled kernel know nothing of it.
+Steps and slaloms are added curvature, braking a dip of the speed: no law or kernel knows them.
 """
 
 import math
@@ -29,15 +27,11 @@ DEEPEST_DIP = 0.45
 class Manoeuvre:
     """One manoeuvre on each lap.
 
-    A step turns to one side and back, each for half the time; a slalom swings around the line in
-    sines; braking slows down and speeds up again, each in half the time.
-
     Attributes:
-        kind: step, slalom or braking.
+        kind: a step to one side and back, a slalom in sines, or braking and speeding up again.
         station_m: where it begins.
         duration_s: how long it takes at the planned speed.
-        strength_mps2: planned lateral acceleration, positive to the left first; of braking its
-            size is how hard it brakes.
+        strength_mps2: planned lateral acceleration, first to the left, or deceleration.
         period_s: of a slalom, how long one swing to each side takes together.
     """
 

@@ -1,8 +1,7 @@
 """Roads drawn by class, and the lines that drivers take along them.
 
-A road is a row of straights and bends; a bend is an arc between two clothoids, as roads are laid
-out (Germany's RAL 2012, RAA 2008 and RASt 06: a clothoid's parameter is a third of the radius to
-the radius). Only sums and products make a road: it has the same bits on every machine.
+Straights and bends, arcs between clothoids, as laid out in Germany (RAL 2012, RAA 2008, RASt 06:
+parameters from a third of the radius to it); from sums and products, for the same bits.
 """
 
 import math
@@ -41,16 +40,14 @@ CLASSES = {
     "motorway": RoadClass((400.0, 3000.0), (5.0, 40.0), (200.0, 900.0), 6000.0, 45.0),
     "switchback": RoadClass((8.0, 25.0), (100.0, 190.0), (40.0, 200.0), 1500.0, 18.0),
 }
-"""From RAL 2012 (country: classes 3 and 4), RAA 2008 (motorway: from the sharpest allowed) and
-RASt 06 (city: turns at crossings); hill roads and switchbacks are older than any rule."""
+"""From RAL 2012, RAA 2008 and RASt 06; hill roads and switchbacks are older than any rule."""
 
 _NAME = re.compile(rf"({'|'.join(CLASSES)})_(\d{{1,9}})")
 
 
 def load_track(name_or_path: str) -> Track:
-    """Read a track by the name of a shipped one or by path, or draw a road.
-
-    A road has a name such as `country_17`: a class of `CLASSES` and a seed. Raises `ConfigError`.
+    """Read a track by name or path, or draw a road `CLASS_SEED` such as `country_17`. Raises
+    `ConfigError`.
     """
     drawn = _NAME.fullmatch(name_or_path)
     if drawn:
@@ -104,9 +101,8 @@ def driven_line(
 ) -> Track:
     """Return the line that a driver takes along a road.
 
-    He rounds off bends: the curvature is the mean of the road's from `cut_m` behind to `cut_m`
-    ahead. And he wanders: offsets of standard deviation `wander_m` at points `wander_every_m` apart
-    are the coefficients of a cubic spline, whose second derivative is curvature of the line too.
+    He cuts bends: curvature is the road's mean from `cut_m` behind to `cut_m` ahead. He wanders:
+    cubic splines through offsets of deviation `wander_m`, `wander_every_m` apart.
     """
     points = max(2, round(road.length_m / LINE_STEP_M)) + 1
     station_m = np.linspace(0.0, road.length_m, points)

@@ -1,7 +1,6 @@
 """Scenarios: test drives that models are evaluated on, read from `configs/scenarios/*.toml`.
 
-A scenario says only in what it differs from its base. Its drive is simulated once and kept in the
-logs under a source of its own, so that it can never be part of a training cohort.
+Each says in what it differs from its base; its drive has a source of its own, and trains none.
 """
 
 import json
@@ -42,11 +41,7 @@ class PacePoint(Config):
 
 
 class Failure(Config):
-    """Sensors that fail for a while. The stored log stays as it was; the failure is applied to
-    what is read of it.
-
-    `stuck`: the signals keep the count that they had at `from_s`. `missing`: they are null.
-    """
+    """Sensors that fail for a while: `stuck` at the count of `from_s`, or `missing`, when read."""
 
     kind: Literal["stuck", "missing"]
     signals: tuple[Identifier, ...] = Field(min_length=1)
@@ -190,9 +185,8 @@ class Scenario(Config):
 
 
 def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str, Any]:
-    """Fill in what a scenario takes over from its base, and whose drive it is.
-
-    `derived` names the scenarios that are made from this one. Raises `ValueError`.
+    """Fill in what a scenario, and those `derived` from it, take from its base. Raises
+    `ValueError`.
     """
     name, base = content.get("name"), content.get("base")
     if "drive" in content:

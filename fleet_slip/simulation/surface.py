@@ -1,7 +1,6 @@
-"""The surface of a drive's road, drawn at random along its track.
+"""The surface of a drive's road: slopes of the track, adhesion and wind of the drive.
 
-Slopes and adhesion are drawn at knots and linear in between; on a closed track they are periodic.
-Slopes belong to the track, adhesion and wind to the drive.
+Drawn at knots and linear in between, periodic on a closed track.
 """
 
 import math
@@ -72,10 +71,7 @@ def _along(track: Track, station_m: FloatArray, generator: np.random.Generator) 
 
 @kernel
 def _across(curvature: FloatArray, spacing_m: float, wind_x: float, wind_y: float) -> FloatArray:
-    """Return the part of a wind across the track, whose heading is the integral of its curvature.
-
-    The heading is a unit vector, turned from point to point without sine or cosine.
-    """
+    """Return a wind's part across the track; its heading is a unit vector turned by points."""
     across = np.empty(len(curvature))
     cosine, sine = 1.0, 0.0
     for i in range(len(curvature)):

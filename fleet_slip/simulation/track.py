@@ -1,9 +1,7 @@
 """Tracks as sequences of curvature segments (`configs/tracks/*.toml`), and how fast a car follows.
 
-The speed over station is the usual forward-backward pass of lap-time simulation (Kapania, Subosits
-and Gerdes, 2016, "A sequential two-step algorithm for fast generation of vehicle racing
-trajectories"), within the friction circle. Each step is taken implicitly, so that the limits hold
-exactly at every point of the grid and a higher limit never makes any point slower.
+Speeds come of a forward-backward pass (Kapania, Subosits and Gerdes, 2016) within the friction
+circle; implicit steps hold the limits exactly, and a higher limit slows no point.
 """
 
 from dataclasses import dataclass
@@ -50,10 +48,7 @@ class Segment(Config):
 
 @dataclass(frozen=True)
 class CentreLine:
-    """Points on a track's centre line, from a start at the origin that heads along x.
-
-    All arrays have the same shape. `heading_rad` is continuous, not wrapped to one turn.
-    """
+    """Points from a start at the origin along x; `heading_rad` is continuous, not wrapped."""
 
     station_m: FloatArray
     x_m: FloatArray
@@ -121,21 +116,17 @@ class Track(Config):
         return np.interp(station, self._knots_m, self._curvature_at_knots_1pm)
 
     def grid(self, spacing_m: float) -> tuple[FloatArray, float]:
-        """Return evenly spaced stations in m and their spacing, as near `spacing_m` as fits.
+        """Return evenly spaced stations in m from 0, and their spacing, as near `spacing_m` as
+        fits.
 
-        The stations begin at 0. On an open track they end at its end; on a closed one they end
-        one spacing before the start comes again.
+        On an open track they reach its end; on a closed one the next would be the start.
         """
         intervals = max(1, round(self.length_m / spacing_m))
         stations = np.linspace(0.0, self.length_m, intervals + 1)
         return (stations[:-1] if self.closed else stations), self.length_m / intervals
 
     def centre_line(self, spacing_m: float) -> CentreLine:
-        """Integrate the curvature to points about `spacing_m` apart, both ends included.
-
-        The heading is the exact integral; the position is integrated by Gauss-Legendre
-        quadrature within each segment, to rounding.
-        """
+        """Integrate the curvature to points about `spacing_m` apart, ends included, to rounding."""
         intervals = max(1, round(self.length_m / spacing_m))
         station = np.linspace(0.0, self.length_m, intervals + 1)
         steps = np.arange(0.0, self.length_m, INTEGRATION_STEP_M)
@@ -206,12 +197,8 @@ class SpeedProfile:
 def speed_profile(track: Track, limits: SpeedLimits, spacing_m: float) -> SpeedProfile:
     """Return the fastest speed over station within the limits.
 
-    With v the speed, a the acceleration along the track and κ the curvature, everywhere
-
-        v <= top speed   and   (κ v² / lateral)² + (a / a_max)² <= 1,
-
-    where a_max is the limit of acceleration or of braking, after the sign of a. The ends of an
-    open track are entered and left at any speed.
+    With v the speed, a the acceleration along the track and κ the curvature, v <= top speed and (κ
+    v² / lateral)² + (a / a_max)² <= 1, a_max by the sign of a. Open ends take any speed.
     """
     station_m, step_m = track.grid(spacing_m)
     load = np.abs(track.curvature(station_m)) / limits.lateral_mps2
@@ -226,9 +213,8 @@ def speed_profile(track: Track, limits: SpeedLimits, spacing_m: float) -> SpeedP
 def _pass(cap: FloatArray, load: FloatArray, gain: float, periodic: bool) -> FloatArray:
     """Limit how fast the squared speed w rises from point to point.
 
-    The next w is the larger root of ((w - w_before) / gain)² + (load w)² = 1, at most its cap,
-    where gain = 2 Δs a_max. On a closed track the pass begins at the slowest point, which no
-    other limits.
+    The next w is the larger root of ((w - w_before) / gain)² + (load w)² = 1, gain = 2 Δs a_max, at
+    most its cap. A closed track begins at its slowest point.
     """
     count = len(cap)
     first = np.argmin(cap) if periodic else 0

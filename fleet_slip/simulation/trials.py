@@ -61,9 +61,8 @@ class Manoeuvres(Config):
 class TrialPlan(Plan):
     """One car on every road, at every speed and load, and now and then one of other cars.
 
-    The first vehicle is the tested one. Its load, tyres, road, noise and speeds are mostly the
-    usual ones; speeds are planned for a lateral acceleration up to a share of the friction that the
-    road offers. Beyond one the driver expects more than there is.
+    The first vehicle is tested, mostly as usual; planned lateral acceleration goes up to a share of
+    the road's friction, beyond one too.
     """
 
     kind: Literal["trials"]

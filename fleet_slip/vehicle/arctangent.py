@@ -1,7 +1,6 @@
 """Arctangent from additions, multiplications and one division: the same bits everywhere.
 
-The mathematical libraries of two machines, or numpy on two processors, differ in the last bit of an
-arctangent. The error here is below 1e-12 rad, eight orders of magnitude under one count.
+Libraries differ in the last bit. The error is below 1e-12 rad, far under one count.
 """
 
 import math

@@ -1,7 +1,4 @@
-"""What a real car has beyond the textbook's: play, compliance, unequal wheels, tyres that lag.
-
-Every figure is zero by default, which is the car of `dynamics`. Sources: `docs/imperfections.md`.
-"""
+"""What a real car has beyond the textbook's; zero is without. Sources: `docs/imperfections.md`."""
 
 import math
 from typing import Annotated, NamedTuple

@@ -1,10 +1,8 @@
 """The driver: follows a line by preview and feedback, and a speed profile by feed-forward.
 
-Steering is a demand for curvature, as in pure pursuit (Coulter 1992), with the road's own curvature
-ahead fed forward, and turned into a steering wheel angle by the handling curve of the car on a dry
-road (Kapania and Gerdes 2015, "Design of a feedback-feedforward steering controller for accurate
-path tracking and stability at the limits of handling"). He knows his car and believes in a dry
-road: on a slippery one he is wrong.
+Steering is a demand for curvature, as in pure pursuit (Coulter 1992), with the road's own fed
+forward, turned into an angle by the car's handling on a dry road (Kapania and Gerdes 2015, "Design
+of a feedback-feedforward steering controller ..."): on a slippery one he is wrong.
 """
 
 import math
@@ -82,8 +80,7 @@ def clip(value: float, limit: float) -> float:
 def slip_growth(ax: float, ay: float, h: Handling) -> float:
     """Return how much more a brush tyre slips than a linear one, at an acceleration.
 
-    With f the share of the friction in use, a brush tyre needs the slip 3 (1 − ∛(1 − f)) / f times
-    the linear one's; 3 / (3 − f) has the same slope and no root.
+    With the share f of friction in use, 3 (1 − ∛(1 − f)) / f; 3 / (3 − f) has its slope, no root.
     """
     use = min(math.sqrt(ax * ax + ay * ay) * h.inverse_grip, LARGEST_GRIP_USE)
     return 3.0 / (3.0 - use)
@@ -91,10 +88,7 @@ def slip_growth(ax: float, ay: float, h: Handling) -> float:
 
 @equation
 def wanted_steering(x: State, pose: Pose, path: Path, h: Handling) -> float:
-    """Return the steering wheel angle that leads back to the line and along it.
-
-    The heading that belongs to the line is that of a car whose rear axle slips as it must.
-    """
+    """Return the steering wheel angle back to the line, headed as a slipping rear axle asks."""
     v2 = x.vx * x.vx
     ay = path.curvature * v2
     steady_slip = h.rear * path.curvature - h.rear_slip * ay * slip_growth(x.traction, ay, h)

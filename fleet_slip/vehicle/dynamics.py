@@ -1,7 +1,6 @@
-"""Equations of motion of a car with four wheels.
+"""Equations of motion of a car with four wheels, for highway-env's class and the lane kernel.
 
-`derivative` is the only place where they stand; the highway-env class and the lane kernel both call
-it. Symbols, sources and limits: `docs/vehicle.md`.
+Symbols, sources and limits: `docs/vehicle.md`.
 """
 
 from collections.abc import Callable
@@ -34,8 +33,7 @@ class Extensions(NamedTuple):
     steering: bool = True
     """Ackermann geometry and the lag of the steering; else parallel wheels without lag."""
     drivetrain: bool = True
-    """Wheels spin under drive and brake torque, against drag and rolling resistance; else the
-    demanded acceleration happens and the wheels roll freely."""
+    """Wheels spin under torque, drag and rolling resistance; else they roll freely, as demanded."""
 
 
 NO_EXTENSIONS = Extensions(False, False, False, False)

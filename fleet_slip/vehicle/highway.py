@@ -1,8 +1,7 @@
 """The car as a highway-env vehicle, for any of its roads and environments.
 
-highway-env draws y downwards and counts headings from x towards y. In its plane the equations hold
-as they stand, with "left" as the direction of growing y: a positive steering angle turns the
-heading up in number and the car to the right of the picture.
+y is drawn downwards and headings count from x to y: "left" is the direction of growing y, and a
+positive steering angle turns to the right of the picture.
 """
 
 import math
@@ -102,13 +101,9 @@ def _constants(parameters: VehicleParameters, adhesion: float) -> Constants:
 class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
     """A car with four wheels on highway-env's roads.
 
-    It takes highway-env's actions: `steering`, the angle of the road wheels in rad, and
-    `acceleration`, the tractive force per mass in m/s². What becomes of them is up to actuators,
-    engine, brakes, tyres and the road. `speed` is the longitudinal velocity, as in
-    `BicycleVehicle`; `velocity` includes the lateral one.
-
-    highway-env makes vehicles by their class. A class for another car sets `PARAMETERS`,
-    `ADHESION` or `EXTENSIONS`.
+    Of highway-env's actions `steering` is the road wheels' angle in rad, `acceleration` the
+    tractive force per mass in m/s². `speed` is longitudinal, as in `BicycleVehicle`; `velocity` has
+    both parts. A class for another car sets `PARAMETERS`, `ADHESION` or `EXTENSIONS`.
     """
 
     PARAMETERS: VehicleParameters = load_vehicle("d_class_sedan")
@@ -133,10 +128,8 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         adhesion: float | None = None,
         extensions: Extensions | None = None,
     ) -> None:
-        """Put the car on a road, or on none, rolling straight ahead.
-
-        `position` is in m, `heading` in rad, `speed` in m/s, as for every vehicle of highway-env.
-        What is not given is the class's.
+        """Put the car on a road, or none, at m, rad and m/s, straight ahead; else as its class has
+        it.
         """
         self.parameters = self.PARAMETERS if parameters is None else parameters
         self.adhesion = self.ADHESION if adhesion is None else adhesion

@@ -1,8 +1,7 @@
 """Equations of motion of a car with imperfections, on a road that is not flat, even and calm.
 
-They are those of `dynamics` with more in them: what steers the wheels gives way, wheels differ and
-point elsewhere, tyres lag, and weight and wind act along the road. Sources:
-`docs/imperfections.md`.
+As `dynamics`, but steering gives way, wheels differ, tyres lag, weight and wind act along the road.
+Sources: `docs/imperfections.md`.
 """
 
 from typing import NamedTuple
@@ -99,8 +98,7 @@ def _imperfect_wheel(
 ) -> _Wheel:
     """Return the force of a wheel whose tyre follows the lateral velocity after a way.
 
-    Single contact point transient model (Pacejka 2012, section 7.2): the relaxation length L times
-    the rate of what the tyre has followed is the rolling speed times what it has not.
+    Pacejka 2012, section 7.2: L times the followed velocity's rate is rolling speed times the rest.
     """
     cosine, sine = to
     along = cosine * vx + sine * vy
@@ -175,10 +173,7 @@ def advance_give(
     step: float,
     extrapolation: float,
 ) -> Give:
-    """Return what follows the car after a step, at the end of which the column stands at an angle.
-
-    The rack rests while the column moves within the play, and is taken along at its end.
-    """
+    """Return what follows the car after a step; the rack rests within the play, else goes along."""
     return Give(
         min(max(give.rack, column - t.half_lash), column + t.half_lash),
         give.rack_force + step * extrapolate(d.rack_force, before.rack_force, extrapolation),

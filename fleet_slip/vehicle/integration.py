@@ -1,12 +1,8 @@
 """One step in time, of second order, with one evaluation of the equations; and the car's pose.
 
-The car is stepped explicitly (Adams-Bashforth; the actuators by their Taylor series), its wheels
-linearly implicitly (SBDF2; Ascher, Ruuth and Wetton 1995, "Implicit-explicit methods for
-time-dependent partial differential equations"): the tyre holds a wheel's spin so stiffly that an
-explicit step would have to be far shorter.
-
-The pose is in curvilinear coordinates (Serret-Frenet): no nearest point has to be searched, and
-with the heading as a unit vector no angle has to be taken.
+The car is stepped explicitly (Adams-Bashforth; actuators by their Taylor series), its stiff wheels
+linearly implicitly (SBDF2; Ascher, Ruuth and Wetton 1995). The pose is curvilinear (Serret-Frenet),
+its heading a unit vector: no search, no angle.
 """
 
 from typing import NamedTuple
@@ -53,11 +49,7 @@ def extrapolate(now: float, before: float, extrapolation: float) -> float:
 
 @equation
 def followed(rate: float, inverse_lag: float, step: float) -> float:
-    """Return how far a first-order lag moves in a step under a constant demand.
-
-    The demand jumps from sample to sample, so that no slope can be extrapolated from the previous
-    step; but the rate's own rate is known: −rate / lag.
-    """
+    """Return how far a first-order lag moves in a step under a constant demand, by −rate / lag."""
     return step * rate * (1.0 - 0.5 * step * inverse_lag)
 
 
@@ -65,14 +57,10 @@ def followed(rate: float, inverse_lag: float, step: float) -> float:
 def turned(
     wheel: WheelRate, rate_before: float, change_before: float, step: float, extrapolation: float
 ) -> float:
-    """Return the change of a wheel's speed in a step.
+    """Return the change of a wheel's speed in a step, stable however stiff the tyre.
 
-    With K = −∂f/∂ω, or something larger, the part −K ω of the rate f is taken at the end of the
-    step and the rest is extrapolated:
-
-        (3/2 + h K) Δω = Δω_before / 2 + h (2 f − f_before + K Δω_before)
-
-    However stiff the tyre, the wheel follows the car without lag.
+    With K at least −∂f/∂ω, −K ω is taken at the step's end and the rest of the rate extrapolated:
+    (3/2 + h K) Δω = Δω_before / 2 + h (2 f − f_before + K Δω_before)
     """
     twice = 2.0 * extrapolation
     rate = wheel.rate + twice * (wheel.rate - rate_before + wheel.stiffness * change_before)

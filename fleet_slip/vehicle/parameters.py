@@ -143,11 +143,9 @@ class VehicleParameters(Config):
     def with_sprung_mass(self, mass_kg: float, load_position_m: float | None = None) -> Self:
         """Return the car loaded to another sprung mass.
 
-        Without a position the load sits as the sprung mass did, so that the yaw inertia of the
-        sprung mass grows in proportion and the centre of gravity stays. Else the load is a point at
-        a position before the centre of gravity of the car without it, and both move. Wheel loads,
-        and with them cornering stiffness and friction, follow from the mass. Raises `ConfigError`
-        if the car cannot be.
+        Without a position the load sits as the sprung mass did, whose yaw inertia grows in
+        proportion; else it is a point before the empty car's centre of gravity. Raises
+        `ConfigError` if the car cannot be.
         """
         body = self.body
         changes = {"sprung_mass_kg": mass_kg}

@@ -1,9 +1,8 @@
 """Forces of a tyre: the brush model with combined slip, load and sliding speed.
 
-Sources: H. B. Pacejka, "Tire and Vehicle Dynamics", 3rd ed. (2012), section 3.3 (brush model with
-combined slip), equations 4.E25 (cornering stiffness over load) and 4.E7 (friction that falls with
-sliding speed); J. Svendenius, "Tire Modeling and Friction Estimation" (Lund, 2007), for splitting
-the contact patch into its sticking and its sliding part. `docs/vehicle.md` derives the form used.
+H. B. Pacejka, "Tire and Vehicle Dynamics" (2012), section 3.3, equations 4.E25 (cornering stiffness
+over load) and 4.E7 (friction over sliding speed); J. Svendenius, "Tire Modeling and Friction
+Estimation" (Lund, 2007), for sticking and sliding parts. Derived in `docs/vehicle.md`.
 """
 
 import math
@@ -13,10 +12,9 @@ from fleet_slip.compiling import equation
 from fleet_slip.vehicle.parameters import Constants
 
 CREEP_SPEED_MPS = 2.5
-"""Rolling speed below which slip is measured against this speed.
+"""Rolling speed below which slip is measured against this speed, so that a car comes to rest.
 
-So a car comes to rest, and the integration is stable: it needs C h / (m v) < 1/4 with C the
-longitudinal slip stiffness of all wheels, which a tyre within `STIFFEST_TYRE` keeps.
+Stable where C h / (m v) < 1/4, C the slip stiffness of all wheels within `STIFFEST_TYRE`.
 """
 
 SMALLEST_SLIDING_MPS = 1e-9
@@ -55,16 +53,13 @@ def brush_force(
 ) -> TyreForce:
     """Return the force of a brush tyre where the road has `grip` times the drive's adhesion.
 
-    `along` and `across` are the velocity of the wheel's centre in the wheel's frame and `rolling`
-    is spin times radius, all in m/s; `load` > 0 is in N and `peak` the largest cornering stiffness.
-
-    The bristles stick at the front of the contact patch, over a part λ of its length, and slide
-    behind. With the slip stiffnesses Cx, Cy and the theoretical slip σ = v_s / |rolling|
+    `along` and `across` are the wheel centre's velocity in its frame, `rolling` is spin times
+    radius, in m/s; `load` > 0 in N; `peak` the largest cornering stiffness. Bristles stick over a
+    part λ of the patch. With slip stiffnesses Cx, Cy, slip σ = v_s / |rolling| and μ(v_s) = μ0 / (1
+    + |v_s| / V),
 
         λ = max(0, 1 − |(Cx σx, Cy σy)| / (3 μ0 Fz))
-        F = λ² (Cx σx, Cy σy) + (1 − λ)² (1 + 2 λ) μ(v_s) Fz v_s / |v_s|
-
-    where v_s points against the sliding and μ(v_s) = μ0 / (1 + |v_s| / V).
+        F = λ² (Cx σx, Cy σy) + (1 − λ)² (1 + 2 λ) μ(v_s) Fz v_s / |v_s|, v_s against the sliding.
     """
     slide_x = rolling - along
     slide_y = -across

@@ -104,11 +104,9 @@ def direction_of(along: float, across: float) -> Direction:
 
 @equation
 def ackermann(x: State, _u: Controls, c: Constants) -> tuple[Direction, Direction]:
-    """Return where the left and the right front wheel point (exact Ackermann geometry).
+    """Return where the left and right front wheel point: tangents t / (1 ∓ t w / (2 L)).
 
-    The rack moves the mean wheel so that its tangent t is the steering wheel's angle over the
-    ratio; both wheels then stand square to one centre on the line of the rear axle: their tangents
-    are t / (1 ∓ t w / (2 L)).
+    t is the tangent of the steering wheel's angle over the ratio; both stand square to one centre.
     """
     tangent = c.steer_per_wheel * x.steering_wheel
     nearer = c.ackermann * tangent
@@ -229,9 +227,8 @@ def spin_rate(
 ) -> WheelRate:
     """Return the rate of a wheel under drive and brake forces at its rim, I dω/dt = Σ torques.
 
-    Brake and rolling resistance oppose the spin; below `STICTION_RAD_S` they fade in proportion to
-    it. Anti-lock and traction control take the torque off a wheel as its slip grows from
-    `slip_control` to three times that.
+    Brake and rolling resistance fade below `STICTION_RAD_S`. Slip control takes torque off as slip
+    grows from `slip_control` to three times that.
     """
     left = min(max(1.5 - abs(force.slip) * c.inverse_slip_band, 0.0), 1.0)
     fading = c.inverse_slip_band * force.slip_per_speed if 0.0 < left < 1.0 else 0.0

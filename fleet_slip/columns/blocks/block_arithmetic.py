@@ -1,7 +1,6 @@
 """Compiled loops of integer arithmetic on the rows of a block.
 
-A missing value is NaN, which every operation passes on. Integers of 2^53 and more are int64, which
-has no NaN: what they are made of says which rows have a value.
+Missing is NaN, which operations pass on; from 2^53 on int64, with validity from the operands.
 """
 
 from typing import Any
@@ -52,10 +51,9 @@ def compute(  # noqa: PLR0912 - one loop for each operation
     limit: float,
     times: float,
 ) -> None:
-    """Do an operation that writes binary64.
+    """Do an operation that writes binary64; `places` are where out, a and b begin.
 
-    `places` are where what is written and read begins: out, a and b. What is clipped counts so
-    many `times` in the first rows of the memory.
+    What is clipped counts so many `times` in the first rows of the memory.
     """
     at, of_a, of_b = places
     out, a = memory[at : at + size], memory[of_a : of_a + size]
@@ -142,7 +140,7 @@ def compute_integers(operation: int, memory: Any, places: Any, size: int, number
 def nearest(value: float, numerator: float, divisor: float) -> Any:
     """Return value * numerator / divisor to the nearest integer, halves away from zero.
 
-    All are integers, the divisor positive, and 2 |value| numerator + divisor below 2^53.
+    Integers; the divisor is positive, and 2 |value| numerator + divisor below 2^53.
     """
     size = np.floor((2.0 * abs(value) * numerator + divisor) / (2.0 * divisor))
     return -size if value < 0.0 else size

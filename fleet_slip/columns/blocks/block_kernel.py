@@ -32,16 +32,12 @@ def run(
 ) -> Any:
     """Compute blocks from the row `first` on.
 
-    With `exact_rows`, the sums and products of complete blocks are added to the integers `totals`,
-    by way of `products`, in which no more rows than that come together; see `product_sums` for
-    their shapes. It stops at a block that lacks a value. Without, it stops after one block.
-
-    `steps` and `ratios` are a program, `memory` what it works on, and `flags` what is known of sums
-    and kinds of windows. `ticks` is where the ticks of the drive's
-    `rows` begin, `place` where the columns do, so many with a stride.
-
-    Returns the first row that is not done, whether the block there lacks a value, how many rows
-    were added, and how often a column of theirs was clipped.
+    With `exact_rows`, sums and products of complete blocks go to the integers `totals` by way of
+    `products`, at most so many rows at once (shapes: `product_sums`), until a block lacks a value;
+    without, it stops after one block. `steps` and `ratios` are a program, `memory` its registers,
+    `flags` what is known of sums and windows; `ticks` begin there, columns at `place`, `stride`
+    apart. Returns the first row not done, whether the block lacks a value, rows added, and values
+    clipped.
     """
     added, clipped, waiting = 0, 0.0, 0
     lacks = False

@@ -1,7 +1,6 @@
-"""The operations of a program over blocks of rows, and how a program writes them.
+"""The operations of a program over blocks of rows: whole numbers, and one of four ratios or limits.
 
-A step is a row of whole numbers, and one of four ratios or limits. `kernel` runs them, and
-`program` writes them; `block_arithmetic` and `lookback` say what each does.
+`kernel` runs them, `program` writes them; `block_arithmetic` and `lookback` define them.
 """
 
 from enum import IntEnum
@@ -39,11 +38,10 @@ second plus the third times n."""
 
 
 class Region(IntEnum):
-    """Parts of the memory of a program.
+    """Parts of a program's memory.
 
-    The first counts how many columns of each row of the block were clipped; `TOLD` is what is known
-    of the car. Signals, sums, counts, values, begins and ticks are of all rows of a drive; see
-    `lookback`.
+    The first counts columns clipped by row; `TOLD` is what is known of the car; signals, sums,
+    counts, values, begins and ticks are of all rows (`lookback`).
     """
 
     CLIPPED = 0

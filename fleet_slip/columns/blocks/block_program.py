@@ -45,7 +45,6 @@ class Code:
     """Operations in order, equal ones once, and what they number.
 
     Attributes:
-        operations: they are numbered from 0.
         signals, told: what the program reads of a drive and its car, with their numbers.
         summed, kept: what is summed up, and what is kept, over a drive.
         kinds: windows of different lengths in ticks.
@@ -70,10 +69,7 @@ class Code:
         return len(self.operations) - 1
 
     def assemble(self, results: Sequence[Value], also: Sequence[Value] = ()) -> "BlockProgram":
-        """Return the program that leaves some results in the first registers, in their order.
-
-        Those of `also` come after them and what pads them to whole tiles.
-        """
+        """Return the program with results in the first registers, then `also`, padded to tiles."""
         columns: list[int] = []
         for one in results:
             if isinstance(one, int) and one not in columns:
@@ -109,13 +105,9 @@ def padded(columns: int) -> int:
 
 @dataclass(frozen=True)
 class BlockProgram:
-    """Operations with places for what they read and write.
+    """Operations with `places`, (steps, 5, 2): region and number of what each writes and reads.
 
-    Attributes:
-        code: the operations.
-        places: the region and the number there of what each writes and reads, shape (steps, 5, 2).
-        columns: how many of the first registers are columns.
-        registers: how many there are.
+    The first `columns` of the `registers` are columns.
     """
 
     code: Code

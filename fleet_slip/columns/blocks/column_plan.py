@@ -15,13 +15,9 @@ from fleet_slip.columns.counted_columns import CountedColumns, parts_of, rows_of
 
 @dataclass(frozen=True)
 class ColumnPlan:
-    """What to compute of a drive.
+    """What to compute of a drive: columns by `names`, of `rows` (one row each) and `windows`.
 
-    Attributes:
-        names: the columns, in order.
-        rows: the columns of one row that are asked for, looked back on, or tell a row's part.
-        windows: the columns over time.
-        also: of `rows`, those that are computed beside the columns.
+    `rows` has what is looked back on and tells parts; `also` of them come beside the columns.
     """
 
     names: tuple[str, ...]
@@ -37,10 +33,9 @@ class ColumnPlan:
         windows: Mapping[str, Definition],
         also: Sequence[str] = (),
     ) -> "ColumnPlan":
-        """Plan columns by name: of `features`, of `windows`, or else logged signals.
+        """Plan columns by name: of `features`, of `windows`, or logged; `also` are beside them.
 
-        `also` are columns of one row that are computed beside them. Raises `DataError` if two of
-        them define the same feature differently.
+        Raises `DataError` for a feature that is defined in two ways.
         """
         rows = {
             name: features.get(name, plain_column(name))
@@ -89,10 +84,7 @@ class ColumnPlan:
 
     @cached_property
     def program(self) -> BlockProgram:
-        """The program that computes the columns; equal plans have the same.
-
-        Raises `QuestionError` for a feature that divides by a number that is not positive.
-        """
+        """The program that computes the columns, one for equal plans. Raises `QuestionError`."""
         return _program(
             self.names, tuple(self.rows.items()), tuple(self.windows.items()), self.also
         )

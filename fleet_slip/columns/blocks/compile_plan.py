@@ -1,7 +1,6 @@
 """Writes the program over blocks of rows that computes columns, from their steps.
 
-An operation is a loop of its own, but where one loop does several for speed: `_FUSED` says which.
-Values are binary64; where an operation on the counts of a row may need more than 53 bits, int64.
+Each operation is a loop, but for `_FUSED` ones; values are binary64, or int64 beyond 53 bits.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -48,10 +47,7 @@ Found = Mapping[str, int]
 def compile_plan(
     counted: CountedColumns, names: Sequence[str], also: Sequence[str] = ()
 ) -> BlockProgram:
-    """Return the program of columns; `also` are those of one row that it leaves beside them.
-
-    Raises `QuestionError` for arithmetic that divides by a number that is not positive.
-    """
+    """Return the program of columns, with `also`. Raises `QuestionError` for a bad divisor."""
     writer = _Writer(counted)
     for place in sorted({*counted.places.values(), *counted.times}):
         writer.value(place)
@@ -73,11 +69,7 @@ class _Writer:
         self._whole = cache(self._needs_integers)
 
     def _value(self, number: int, guard: int | None = None) -> Value:
-        """Return a step in binary64, NaN where it is missing.
-
-        `guard` is a step that is above zero wherever the value is used. Raises `QuestionError` for
-        a constant divisor that is not positive.
-        """
+        """Return a step in binary64, NaN where missing; `guard` is positive wherever it is used."""
         step = self._steps[number]
         name, plain = operation_of(step), plain_of(step)
         if (constant := self._constant(number)) is not None:

@@ -1,7 +1,7 @@
 """From the counts of one drive to the integer columns of a feature set, sample by sample.
 
-This is the one path to the columns of models with windows: Gram rows, scores, evaluations and
-predictions all come through it. It computes what the SQL of `fleet_slip.columns.column_sql` says.
+Gram rows, scores, evaluations and predictions with windows come through it, and it computes what
+the SQL of `fleet_slip.columns.column_sql` says.
 """
 
 from collections.abc import Mapping
@@ -30,8 +30,7 @@ class DriveCounts:
 
     Attributes:
         ticks: rising, shape (rows,).
-        counts: of each signal, shape (rows,); any number where it is missing.
-        present: where a signal is not missing, shape (rows,); a signal that never is has none.
+        counts, present: by signal, shape (rows,); a signal that never is missing has no `present`.
         facts: what the car knows of itself, by drive column.
         numbers: counts of what the car's drives before told of it; those that are known.
     """
@@ -57,13 +56,9 @@ class DriveCounts:
 
 
 class Workspace:
-    """The memory that the columns of a plan are computed in, for one drive after the other.
+    """The memory of a plan's columns, for one drive after the other and one thread.
 
-    Not for several threads at once.
-
-    Attributes:
-        rows: of the drive that was loaded last.
-        rows_at_most: of the drives for which memory was taken so far.
+    `rows` are of the drive loaded last, `rows_at_most` those that memory was taken for.
     """
 
     def __init__(self, plan: ColumnPlan) -> None:
@@ -99,10 +94,8 @@ class Workspace:
         self._flags[GAPS] = not drive.whole
 
     def block(self, first: int) -> tuple[FloatArray, FloatArray]:
-        """Return the columns of the block that was computed last, and what was clipped of each row.
-
-        Columns have shape (columns, rows of the block), NaN where missing; the next block
-        overwrites them.
+        """Return the last block's columns, (columns, rows) with NaN, until the next, and its
+        clipping.
         """
         place, stride = self._regions[Region.REGISTER]
         rows, columns = min(BLOCK_ROWS, self.rows - first), len(self.plan.names)
@@ -122,9 +115,8 @@ class Workspace:
         self._run(first, 0, self._products.astype(np.int64))
 
     def add_blocks(self, first: int, exact_rows: int, totals: NDArray[np.int64]) -> "Added":
-        """Compute blocks from a row on and add the complete ones to `totals`; see `kernel.run`.
-
-        It stops at a block that lacks a value, which `block` returns.
+        """Add blocks from a row on to `totals` (`kernel.run`), until one lacks a value: see
+        `block`.
         """
         return self._run(first, exact_rows, totals)
 
@@ -157,14 +149,7 @@ class Workspace:
 
 
 class Added(NamedTuple):
-    """What became of blocks.
-
-    Attributes:
-        following: the first row that is not added.
-        lacks: whether the block that begins there lacks a value.
-        rows: how many were added.
-        clipped: how often a column of theirs was clipped.
-    """
+    """The first row not added, whether its block lacks a value, rows added, values clipped."""
 
     following: int
     lacks: bool

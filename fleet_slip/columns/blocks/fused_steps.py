@@ -3,8 +3,7 @@
 from typing import Any
 
 Pattern = Any
-"""A step: its operation and patterns of what it works on. A name stands for any step, and for the
-same one again; a name after # for the value of a constant, a number for that constant."""
+"""A step: its operation and operands; names stand for steps, #names for constants, numbers too."""
 
 ROUNDED = ("//", ("+", ("*", 2, "c"), ("*", ("sign", "c"), "d")), ("*", 2, "d"))
 """A quotient to the nearest, as the SQL of a feature says it."""

@@ -1,8 +1,7 @@
 """Compiled loops of windows over the rows of a block: running sums, quotients, values of before.
 
-Sums, counts, values, begins and ticks are of all rows of a drive; sums and counts are those of the
-rows before each, so that they have one more. Sums are integers below 2^53 in binary64, which are
-added exactly.
+Sums, counts, values, begins and ticks are of all rows of a drive; sums and counts are of the rows
+before, one more. Sums are integers below 2^53, exact in binary64.
 """
 
 from typing import Any
@@ -18,10 +17,7 @@ from fleet_slip.compiling import inner_loop
 def add_up(
     memory: Any, values: int, sums: int, counts: int, first: int, size: int, gaps: Any
 ) -> Any:
-    """Write running sums of a block's values; return whether the drive has had gaps up to here.
-
-    A drive with gaps, which are missing ticks or values, gets counts of its values, too.
-    """
+    """Write running sums of a block; return whether there have been gaps, which counts are for."""
     a, out = memory[values : values + size], memory[sums + first : sums + first + size + 1]
     count = memory[counts : counts + first + size + 1]
     total = out[0] if first else 0.0
@@ -58,9 +54,8 @@ def divide_sums(
 ) -> None:
     """Write the rounded quotients of a window, clipped; count it `times` in the first rows.
 
-    `places` are where what is written, the sums, the counts, the begins and the values begin.
-    0 ticks are all rows since the start. A row without a value of its own gets NaN. See
-    `operations` for the ratio.
+    `places`: out, sums, counts, begins, values. 0 ticks are all rows since the start. A row without
+    a value gets NaN. For the ratio see `operations`.
     """
     at, of_sums, of_counts, of_begins, of_values = places
     out, clipped = memory[at : at + size], memory[0:size]
@@ -98,10 +93,9 @@ def divide_sums(
 
 @inner_loop
 def values_ago(memory: Any, places: Any, first: int, size: int, ticks: int) -> None:
-    """Write the values of so many ticks before; NaN where that tick was not logged.
+    """Write the values of so many ticks before, NaN where not logged; windows as in `find_begins`.
 
-    `places` are where what is written, the values, the ticks and the begins begin. A row's window
-    begins at the first row that is not earlier than that.
+    `places`: out, values, ticks, begins.
     """
     at, of_values, of_ticks, of_begins = places
     for i in range(size):

@@ -1,7 +1,6 @@
 """Compiled sums of products of columns: exact, because all are integers below 2^53.
 
-Tiles of 4 by 4 columns keep their sixteen sums in the processor's registers while a block of rows
-goes by.
+Tiles of 4 by 4 columns keep sixteen sums in registers while a block goes by.
 """
 
 from typing import Any
@@ -14,10 +13,10 @@ from fleet_slip.compiling import exact_loop, inner_loop
 
 @inner_loop
 def add_sums(memory: Any, place: int, stride: int, rows: int, columns: int, products: Any) -> Any:
-    """Add the sum of each column to the last row of `products`; return whether a value is missing.
+    """Add each column's sum to the last row of `products`; tell, and add nothing, if one is
+    missing.
 
-    If one is, nothing is added. Columns lie `stride` apart from `place` on; shape of `products`:
-    (columns + 1, columns), padded to whole tiles.
+    Columns lie `stride` apart from `place`; `products` is (columns + 1, columns), in whole tiles.
     """
     missing = 0.0
     for i in range(columns):

@@ -1,7 +1,7 @@
 """The cells of rollups that are in a cohort: they serve instead of the Gram rows of their files.
 
-The rollup of a file serves where its columns tell the condition and the folds of all its rows. The
-sums are then those of the rows, to the bit. The rows of other files are read, beside it.
+A rollup serves where its columns tell condition and folds of all rows, to the bit of the rows'
+sums; other files' rows are read.
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -35,12 +35,7 @@ READS_AT_ONCE = 16
 
 @dataclass(frozen=True)
 class Cells:
-    """The cells of a cohort.
-
-    Attributes:
-        table: a cell a row; its `rollup` is a place among those that serve.
-        rollups: those that serve, also the ones of which no cell is in the cohort.
-    """
+    """A cohort's cells, a row each; `rollup` is a place among those serving, with cells or not."""
 
     table: pa.Table
     rollups: Sequence[Rollup] = ()

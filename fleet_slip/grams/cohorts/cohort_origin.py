@@ -16,13 +16,11 @@ class CohortOrigin:
 
     Attributes:
         condition: which drives, by the columns of the view `drives`.
-        logs_version, grams_version: versions of the Delta tables that were read.
-        feature_set: which Gram rows these are.
+        logs_version, grams_version, feature_set: what was read.
         left_out: drives of the condition that have no such Gram rows: their cars sent no log.
         revoked: how many drives of a car are left out, since a revoked key signed them.
         outweighing: which are, since their cars would outweigh the others with them.
-        untold: sets of signals whose Gram rows are left out, since fewer cars have them than the
-            minimum cohort asks for.
+        untold: sets of signals left out, of fewer cars than the minimum cohort.
     """
 
     condition: Condition

@@ -32,8 +32,7 @@ class DailySums:
     Attributes:
         left_out: drives of the condition that have no such Gram rows: their cars sent no log.
         revoked: how many drives of a car are left out, since a revoked key signed them.
-        untold: days that are left out, since fewer cars drove with the signals than the minimum
-            cohort asks for.
+        untold: days left out, of fewer cars with the signals than the minimum cohort.
     """
 
     days: tuple[date, ...]

@@ -18,12 +18,9 @@ Drive = tuple[str, date, str]
 
 @dataclass(frozen=True)
 class DriveSums:
-    """Sums of some columns over the rows that have them all, one drive after another.
+    """Sums of some columns over the rows that have them all, by drive, sorted by car.
 
-    Attributes:
-        drives: sorted; of each the car first.
-        table: the sums of each.
-        cars: where the drives of each car begin and end.
+    `cars` tells where the drives of each begin and end.
     """
 
     drives: tuple[Drive, ...]

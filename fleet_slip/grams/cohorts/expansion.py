@@ -1,8 +1,7 @@
 """Calibrated columns of Gram rows, computed exactly from the rows and the numbers of each car.
 
-A column that is another times a number which is the same in all rows of a drive has sums that are
-that number times the other's, and products that are the product of both numbers times theirs. So
-no log row is read for it, and the numbers may be those of tonight.
+Times a number of the drive, a column has that many times the sums, and products of both numbers: no
+log is read, and the numbers may be tonight's.
 """
 
 from collections.abc import Iterator, Mapping
@@ -35,12 +34,9 @@ CarCounts = Mapping[str, Mapping[str, int]]
 
 @dataclass(frozen=True)
 class Expansion:
-    """Adds the calibrated columns of a feature set to its Gram rows.
+    """Adds a feature set's calibrated columns: each a column times one of the cars' numbers.
 
-    Attributes:
-        columns: the column that each is made of, and its number.
-        cars: the counts of the cars' numbers.
-        sweep: whether rows are of changes, which are swept of the gyroscope's bias and scale.
+    `sweep`: rows are of changes, swept of the gyroscope's bias and scale.
     """
 
     columns: Mapping[str, tuple[str, Number]]
@@ -50,9 +46,10 @@ class Expansion:
     def tables(
         self, batch: pa.RecordBatch | pa.Table
     ) -> Iterator[tuple[str, GramTable, BoolArray]]:
-        """Yield the signals of Gram rows, their table with calibrated columns, and which they are.
+        """Yield signals of Gram rows, their table with calibrated columns, and which rows these
+        are.
 
-        Rows of a car without a number do not have the columns that need it.
+        Rows of a car without a number lack the columns that need it.
         """
         for names, rows, here in by_signals(batch):
             if self.sweep:
@@ -99,8 +96,7 @@ def expand(
 ) -> GramTable:
     """Return a table with more columns: each is a factor of the drive times a column.
 
-    `bases` number the columns from 1; 0 is the constant 1. `factors` have the shape (drives, new).
-    Exact: where products need more than 64 bits, the numbers are Python's.
+    `bases` number the columns from 1, 0 being the constant; `factors` is (drives, new). Exact.
     """
     k, new = len(table.signals), len(names)
     source = np.concatenate([table.n[:, None], table.sums, table.products], axis=1)
@@ -132,10 +128,7 @@ def expand(
 
 
 def expansion_of(opened: OpenedGrams, feature_set: str) -> Expansion:
-    """Return what adds the calibrated columns of a feature set, with the numbers as of now.
-
-    A number is told by all drives of a car that there are, whatever the cohort: it needs no label.
-    """
+    """Return what adds a set's calibrated columns, by the numbers of all of a car's drives now."""
     known = features()
     one = known.feature_set(feature_set)
     names, sweep = one.calibrated, bool(one.change_ticks)

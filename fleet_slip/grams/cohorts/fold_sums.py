@@ -1,7 +1,6 @@
 """The sums of a cohort over its folds, from rollups, and from Gram rows read batch by batch.
 
-Comparing given models needs no single drive, only the Gram of each fold. So any number of Gram
-rows is added up in the memory of one batch; and of a file whose rollup serves, no row is read.
+Comparing given models needs the Gram of each fold alone: any number of rows fits in memory.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -44,8 +43,7 @@ class SummedCohort(CohortOrigin):
     """What a selection from given models needs of a cohort.
 
     Attributes:
-        folding: how the cohort was divided.
-        sums: the Gram of each fold.
+        folding, sums: how the cohort was divided, and the Gram of each fold.
         rows, drive_count: number of rows of the logs, and of drives, behind the cohort.
         members: which drives and cars the Gram rows are of.
         source: where they were read, and can be read again over other folds.
@@ -77,10 +75,9 @@ def sum_cohort(
     condition: str | Condition = TRAINING_DRIVES,
     feature_set: str = PLAIN,
 ) -> SummedCohort:
-    """Add up the Gram rows of the drives that satisfy a condition, over each fold.
+    """Add up the Gram rows of a condition's drives over each fold.
 
-    Raises like `fleet_slip.grams.cohorts.gram_cohort.load_cohort`, and `DataError`
-    if there are not two folds.
+    Raises as `fleet_slip.grams.cohorts.gram_cohort.load_cohort`, and `DataError` for one fold.
     """
     condition = parse_cohort(condition)
     require_divided(feature_set, folding.by, folding.count)
@@ -117,7 +114,6 @@ class _Folds:
     """The folds that there may be.
 
     Attributes:
-        names: what they are called.
         of_rows: tells the fold of each Gram row, from its metadata and its drive's hash.
         of_cells: tells the fold of each cell of rollups.
         key: what was dealt into the buckets of the cells that folds are made of.

@@ -24,9 +24,7 @@ FOLD_KEYS: dict[str, str] = {
     "part": "part",
     "row": "part",
 }
-"""What a fold may be made of, and the column that tells.
-
-Drives of one trip share a fold: they are pieces of one drive, of the same road, load and tyres."""
+"""What a fold may be made of, and its column. Drives of a trip are pieces, and share a fold."""
 
 BANDS: FoldKey = "speed"
 """Whole bands of speed: neighbouring drives share a fold, so that no model sees their speed."""
@@ -99,10 +97,9 @@ def _require_row_folds(feature_set: str, count: FoldCount) -> None:
 
 
 def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssignment:
-    """Assign Gram rows to folds by the values of a fold key.
+    """Assign Gram rows to folds by a key's values, unnamed where a minimum cohort hides drives.
 
-    Folds are not called after drives and cars where a minimum cohort is asked for. Raises
-    `DataError` if there are not two folds, or too many.
+    Raises `DataError` if there are not two folds, or too many.
     """
     of_their_own = len({*values}) <= (MOST_FOLDS if count == EACH else count)
     if by in ("drive", "vehicle") and of_their_own and not tells_single_cars():

@@ -39,12 +39,7 @@ from fleet_slip.words import number_of
 
 @dataclass(frozen=True)
 class Served:
-    """The drives of a cohort that have all of some signals, one Gram row each.
-
-    Attributes:
-        table: their Gram rows, restricted to the signals.
-        drives: metadata of each, in the same order.
-    """
+    """The drives of a cohort with all of some signals: a Gram row and metadata each, in order."""
 
     table: GramTable
     drives: pa.Table
@@ -52,14 +47,9 @@ class Served:
 
 @dataclass(frozen=True, kw_only=True)
 class Cohort(CohortOrigin):
-    """Gram rows, grouped by the signals that they have.
+    """Gram rows in a `GramTable` for each set of signals, and metadata of each row in their order.
 
-    A drive has several Gram rows if it has a signal in some of its rows only, or if the feature set
-    divides its rows.
-
-    Attributes:
-        tables: one `GramTable` for each set of signals.
-        drives: metadata of each Gram row, in the order of the tables.
+    A drive has several rows if a signal is in some of its rows only, or if its set has parts.
     """
 
     tables: tuple[GramTable, ...]
@@ -105,10 +95,9 @@ class Cohort(CohortOrigin):
     def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
         """Divide the cohort into folds, of whole drives unless by `row`.
 
-        By `drive` or another key of `FOLD_KEYS`: one fold for each value, or hashed into `count`
-        folds if there are more values than that; by `speed`, cut into `count` bands. With `EACH`,
-        every drive or value is a fold. By `part` or `row`: the parts or the folds of single rows
-        that the feature set made. Raises `QuestionError` if it made none.
+        By a key of `FOLD_KEYS`: a fold for each value, or hashed into `count` if there are more
+        (`EACH`: never); by `speed` in bands; by `part` or `row` as the feature set has them. Raises
+        `QuestionError` if it has none.
         """
         require_divided(self.feature_set, by, count)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
@@ -149,13 +138,10 @@ def load_cohort(
 ) -> Cohort:
     """Read the Gram rows of the drives that satisfy a condition.
 
-    For `training` what outweighs the others is not among them, nor, where a minimum cohort is asked
-    for, are the rows of sets of signals that few cars have: raises `CohortError` if none is left.
-    Who asks for all rows counts the cars.
-
-    Raises `QuestionError` if the condition is not one SQL expression on the columns of `drives`,
-    `DataError` if no drive satisfies it or the feature set has not been computed for all logs, and
-    `RefusedError` if it asks for a drive of an evaluation scenario, which others leave out.
+    For `training`, what outweighs others is left out and, where a minimum cohort holds, sets of
+    signals of few cars: raises `CohortError` if none is left. Who asks for all counts the cars.
+    Raises `QuestionError` for an invalid condition, `DataError` if no drive satisfies it or the set
+    was not computed for all logs, `RefusedError` for drives of evaluation scenarios.
     """
     condition = parse_cohort(condition)
     with open_grams(warehouse, feature_set, condition, training=training) as opened:

@@ -18,13 +18,7 @@ AT_ONCE = 2**21
 
 @dataclass(frozen=True)
 class Hashed:
-    """Drives or cars, whose hashes are read when they are asked for.
-
-    Attributes:
-        parts: what return the hashes.
-        once: how many there are, if each is there once.
-        least: so many there are at least.
-    """
+    """Drives or cars whose hashes `parts` return when asked: `once` if each is there once."""
 
     parts: tuple[Callable[[], Hashes], ...]
     once: int | None = None
@@ -43,13 +37,7 @@ class Hashed:
 
 @dataclass(frozen=True)
 class Members:
-    """The drives and cars of Gram rows, by the signals that these have.
-
-    Attributes:
-        drives: the drive of each Gram row, by the row's signals, separated by commas.
-        vehicles: the cars, by the same.
-        received: the drives whose cars sent Gram rows and no log, by the same.
-    """
+    """The drives of each Gram row, and their cars, by its signals, and the `received` drives."""
 
     drives: Mapping[str, Hashed]
     vehicles: Mapping[str, Hashed]
@@ -87,10 +75,9 @@ class Members:
         return _count(self.vehicles, _kinds_with(self.vehicles, signals))
 
     def told(self) -> frozenset[str]:
-        """Return the sets of signals that enough cars have for figures of them to be told.
+        """Return the sets of signals of enough cars (`fleet_slip.warehouse.minimum_cohort`).
 
-        See `fleet_slip.warehouse.minimum_cohort`. Each is counted alone: models of other inputs are
-        of other sets, and their difference would tell of a set that few cars have.
+        Each is counted alone: differences of models would tell of a set that few cars have.
         """
         least = minimum_vehicles() or 0
         return frozenset(

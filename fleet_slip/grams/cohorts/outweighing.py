@@ -1,13 +1,10 @@
 """Which drives training leaves out, so that no car outweighs the others.
 
-A car that sends Gram rows says itself how many rows they are of. So that none decides alone what is
-true, each counts with `MOST_CARS` times the rows of the mean car at most, these bounded likewise:
-with its logs, then with its shortest drives, whole ones, so that all sums stay exact. The mean and
-not the median: where most cars have sent little yet, the others are no liars.
-
-Rollups tell no single car, only the rows of `BUCKETS` groups of cars. While no group has more than
-`MOST_GROUPS` times the rows of the median group, no car weighs more than about a sixtieth of the
-cohort, and all count. So the answer is the same with rollups and without.
+A car that sends Gram rows says itself how many they are of. So each counts with at most `MOST_CARS`
+times the rows of the mean car, bounded likewise: with logs first, then its shortest drives, whole,
+so that sums stay exact. The mean, since where most cars have sent little yet the others are no
+liars. Rollups tell rows of `BUCKETS` groups of cars: while none has more than `MOST_GROUPS` times
+the median's, no car outweighs a sixtieth or so, and all count, with rollups or without.
 """
 
 from collections.abc import Sequence
@@ -37,13 +34,7 @@ LEAST_CARS = 10
 
 @dataclass(frozen=True)
 class Outweighing:
-    """The drives of one car that are left out: its longest.
-
-    Attributes:
-        vehicle_id: the car.
-        rows, drive_id: the first Gram row that is left out, in the order of rows and drive.
-        drives: how many drives have such Gram rows.
-    """
+    """The longest drives of one car, left out: the first (by rows, then name), and how many."""
 
     vehicle_id: str
     rows: int
@@ -82,8 +73,7 @@ def find_outweighing(opened: "OpenedGrams", condition: Condition) -> tuple[Outwe
 def most_rows(rows: IntArray) -> int:
     """Return the largest c that is not above `MOST_CARS` times the mean of min(rows, c).
 
-    With the h largest at c and the others below it, that is c = m sum / (cars - m h). If it holds
-    for any c, as where many cars have most rows, it is the largest of `rows`.
+    With h rows above it, c = m sum / (cars - m h); if any c holds, the largest of `rows`.
     """
     ordered: list[int] = sorted(rows.tolist())
     below, cars = sum(ordered), len(ordered)

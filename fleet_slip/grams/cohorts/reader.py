@@ -62,10 +62,7 @@ class OpenedGrams:
         return read_sql("jobs", name).format(**values)
 
     def revoked(self, condition: Condition) -> dict[str, int]:
-        """Return how many drives of each car a cohort lacks, since a key of it was revoked.
-
-        All together under `UNNAMED`, where a minimum cohort is asked for.
-        """
+        """Return a cohort's drives by car (or `UNNAMED`) that are left out for a revoked key."""
         some = [key.condition for key in _revoked_keys()]
         if not some:
             return {}
@@ -127,10 +124,9 @@ class OpenedGrams:
 
 
 class GramReader:
-    """The Gram rows of a warehouse, for one cohort after another.
+    """The newest Gram rows of a warehouse, for one cohort after another of one thread.
 
-    Each is read from the newest version. What was opened for the one before is used again if nobody
-    has committed since: then a cohort costs its query and no more. Not for several threads at once.
+    What was opened is used again until somebody commits: a cohort then costs its query alone.
     """
 
     def __init__(self, warehouse: Warehouse) -> None:
@@ -160,10 +156,8 @@ class GramReader:
     ) -> OpenedGrams:
         """Return the Gram rows of a feature set; they are valid until the next call.
 
-        For a cohort's sums over folds, cells stand in for the rows of files that have rollups. For
-        `training` what outweighs the others is left out (`fleet_slip.grams.cohorts.outweighing`).
-        Raises `DataError` if there are no Gram rows, or if those of the feature set are not
-        complete for a cohort.
+        For sums over folds, cells stand in for rows. For `training`, what outweighs others is left
+        out. Raises `DataError` for missing Gram rows, or a set incomplete for a cohort.
         """
         grams, logs = gram_snapshots(self._warehouse, self._grams, self._logs)
         if grams is not self._grams or logs is not self._logs:

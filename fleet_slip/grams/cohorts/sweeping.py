@@ -1,14 +1,9 @@
 """Takes from the Gram row of changes what a gyroscope's bias and scale do to it, drive by drive.
 
-The label of changes has the gyroscope's bias times the time in it, and its scale error times the
-angle turned. Both are of a drive and not of the model, so that they are fitted away within each
-drive: of the matrix of products, with z = (1, turned),
-
-    P_ab − P_az P_zz⁻¹ P_zb,
-
-in whole numbers: what is taken off is a sum of two quotients of exact numbers in binary64, rounded
-to the nearest, the same on any machine. What is left has sums of zero, and adds up over drives as
-the products of any Gram row do.
+The label has the bias times the time, and the scale error times the angle turned, both of a drive:
+they are fitted away by z = (1, turned), P_ab − P_az P_zz⁻¹ P_zb, in whole numbers, each a sum of
+two quotients of exact numbers in binary64, rounded: the same bits everywhere. Sums are then zero,
+and products add up over drives.
 """
 
 import numpy as np

@@ -1,9 +1,8 @@
 """A cohort that few reference sensors teach, and the course of all others: one weighted sum.
 
-Of a drive with the label, its rows count about their mean in the drive: what the angle changes by
-from there, as changes of the course have no constant either. The constant follows from cars that go
-straight on (`fleet_slip.models.straight_on`). Only drives with the label are tested on; the course
-of cars (or drives) without one is always trained on, with a weight.
+Rows with the label count about their drive's mean, since changes have no constant either: it
+follows from cars that go straight on (`fleet_slip.models.straight_on`). Only these drives are
+tested on; the course of others is always trained on, with a weight.
 """
 
 from collections.abc import Collection
@@ -26,12 +25,7 @@ from fleet_slip.warehouse.tables import Warehouse
 
 @dataclass(frozen=True, kw_only=True)
 class TaughtCohort(Cohort):
-    """The drives with the label, and what others teach beside them.
-
-    Attributes:
-        others: the changes of drives without the label.
-        weight: of a change of the course, where a row with the label has 1.
-    """
+    """The drives with the label, and the changes of others, whose rows have a `weight` beside 1."""
 
     others: Cohort
     weight: Fraction
@@ -67,9 +61,8 @@ def load_taught(
 ) -> TaughtCohort:
     """Read the Gram rows of the drives that satisfy a condition, of both kinds; the weight is 1.
 
-    `feature_set` is of the changes of another. A car, or what else folds are made of, that has a
-    label teaches by it alone. Raises `DataError` if no drive has a label, or all have, and like
-    `load_cohort`.
+    What folds are made of teaches by its label alone if it has one. Raises `DataError` if no drive
+    has one, or all have, and as `load_cohort`.
     """
     base = features().feature_set(feature_set).of
     if base is None:

@@ -18,13 +18,7 @@ from fleet_slip.regression.validation.folds import CohortFolds, Folds
 
 @dataclass(frozen=True)
 class DriveFolds:
-    """The drives that have all of some inputs, and the fold of each.
-
-    Attributes:
-        served: the drives.
-        fold: fold of each drive, shape (drives,).
-        training: what the regression modules work on.
-    """
+    """The drives that have all of some inputs, the fold of each, and what is computed from."""
 
     served: Served
     fold: IntArray
@@ -47,9 +41,8 @@ def clustered_moments(
 ) -> DriveMoments:
     """Return the moments of each drive, and which of them are one piece of evidence.
 
-    By default the coarser there is: cars where there are several, else drives. Clusters are
-    numbered by their place among `cars`, by default those of these drives, so that two cohorts can
-    share them. For fits without an intercept the moments are about zero.
+    By default cars where there are several, else drives; numbered by place among `cars`, so that
+    two cohorts can share them. Without an intercept moments are about zero.
     """
     table = served.table if intercept else served.table.about_origin()
     owners = served.drives["vehicle_id"].to_pylist()
@@ -74,9 +67,7 @@ def drive_folds(
     cluster: ClusterUnit | None = None,
     intercept: bool = True,
 ) -> DriveFolds:
-    """Divide the drives that have all the inputs into folds.
-
-    `naive` takes rows for independent; otherwise drives or cars are, see `clustered_moments`.
+    """Divide the drives with all the inputs into folds; `naive` takes rows for independent.
 
     Raises `DataError` if no drive has them all, and `QuestionError` for folds of rows.
     """

@@ -57,12 +57,10 @@ def compute_grams(
     executor: Executor | None = None,
     late: Late = None,
 ) -> Iterator[pa.Table]:
-    """Yield the Gram rows of some log files after the other, in the schema of `grams`.
+    """Yield the Gram rows of log files, one file after the other, in the schema of `grams`.
 
-    `late` is by how many parts of a tick the course of each car is.
-
-    In this process, on all of its cores unless `threads` says how many; or, with an executor of
-    other processes, as tasks of some files and one thread each.
+    `late` is the delay of each car's course in parts of a tick. The work is done here, on all cores
+    or `threads`, or by an executor as tasks of some files and one thread each.
     """
     if features().feature_set(feature_set).windows:
         from fleet_slip.grams.rows.wide import wide_grams  # noqa: PLC0415 - the compiler takes a while

@@ -52,10 +52,7 @@ def _has_log(file: str) -> bool:
 
 
 def _about_to_land(logs: Snapshot, paths: Collection[str]) -> set[str]:
-    """Return the log files that a job has just written and not yet committed.
-
-    Their Gram rows land first, so that readers see a file and its Gram rows at the same moment.
-    """
+    """Return the log files that a job has written and not committed: their Gram rows land first."""
     if not paths:
         return set()
     written = {

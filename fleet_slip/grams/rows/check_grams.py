@@ -50,11 +50,9 @@ def check_grams(
     progress: Progress = no_progress,
     begin: int = 0,
 ) -> CheckReport:
-    """Check the Gram rows of evenly chosen log files.
+    """Check the Gram rows of evenly chosen log files, the next ones for the next number `begin`.
 
-    `begin` numbers the sample: that of the next number is of the next files, until all had their
-    turn. Raises `StorageError` naming the first drive whose Grams differ, and `DataError` if there
-    is nothing to check.
+    Raises `StorageError` naming the first drive that differs, and `DataError` for nothing to check.
     """
     look = partial(_check, warehouse, count, progress, begin)
     return on_newest((warehouse.logs, warehouse.grams), look)
@@ -104,10 +102,7 @@ def _computed_wide_sets(warehouse: Warehouse) -> tuple[str, ...]:
 
 
 def _check_wide(warehouse: Warehouse, file: TableFile, feature_set: str) -> int:
-    """Compare the kernel with the SQL that defines it, and with what is stored; count drives.
-
-    A file that the set was not computed for has nothing to compare.
-    """
+    """Compare the kernel with its SQL and with what is stored, where it is; count drives."""
     identity = features().identity(feature_set)
     grams = [gram_file.path for gram_file in warehouse.grams.snapshot().files]
     kept = stored_grams(warehouse, [file], grams, identity).get(file.path)

@@ -1,8 +1,7 @@
 """By how much the course of each car is late, and which Gram rows were computed otherwise.
 
-The delay that Gram rows of changes are corrected by is a pure function of those of the set `delay`:
-of the same drives, in whatever order they came, follow the same Gram rows, and what a forgotten
-drive told is gone. It is a whole number of parts of a tick, so that a drive more seldom moves it.
+The delay is a whole number of parts of a tick, a pure function of the Gram rows of the set `delay`:
+the same drives in any order give the same rows, and forgotten ones leave nothing.
 """
 
 from collections.abc import Iterator, Mapping

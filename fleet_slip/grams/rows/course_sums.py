@@ -1,7 +1,6 @@
 """Sums of the changes from fix to fix of one drive, as `catalogue/course_change.py` says it in SQL.
 
-Only rows with a fix are kept, one in ten or fewer, so that the products cost less than those of all
-rows and a drive of any length fits into memory.
+Only rows with a fix are kept, at most one in ten: they fit into memory.
 """
 
 from dataclasses import dataclass
@@ -21,12 +20,10 @@ class Fixes:
 
     Attributes:
         ticks, yaw_rate: of all rows, shape (rows,); NaN where the rate is missing.
-        at: the rows with a fix, shape (fixes,).
-        course: the counts of each.
+        at, course: the rows with a fix and their courses in counts, shape (fixes,).
         gain: what the label gains per count of r, see `split_late`.
-        counts: the columns of those rows, shape (columns, fixes).
-        clipped: how many columns of each were clipped, shape (fixes,).
-        first_clipped: the same of the first row.
+        counts, clipped: the columns of those rows, (columns, fixes), and how many were clipped.
+        first_clipped: how many columns of the first row were clipped.
     """
 
     ticks: IntArray
@@ -43,10 +40,7 @@ class Fixes:
 class Changes:
     """The changes of a drive's columns between fixes that are so many ticks apart.
 
-    Attributes:
-        rows: each row that has a change, after that of tick 0, shape (changes,).
-        columns: shape (columns + 4, changes), NaN where missing; `BESIDE` and the label come last.
-        clipped: how many columns of each row were clipped, shape (changes,).
+    `rows` are those with a change; `columns` end in `BESIDE` and the label, NaN where missing.
     """
 
     rows: IntArray
@@ -55,10 +49,7 @@ class Changes:
 
 
 def find_fixes(workspace: Workspace, drive: DriveCounts, late: int = 0) -> Fixes:
-    """Return the fixes of the drive, which is loaded; its course is late by `late`.
-
-    The last two columns of the workspace's plan are the course and the yaw rate.
-    """
+    """Return the fixes of the loaded drive, its course and yaw rate last, `late` by so much."""
     ticks = drive.ticks.astype(np.int64)
     whole, gain = split_late(late)
     at, course = _fixes(drive, ticks, whole)

@@ -25,13 +25,8 @@ BLOCK_FORMAT = "block %04d"
 
 @dataclass(frozen=True)
 class Bands:
-    """The bands of a regime, as counts: a row's band is how many of the bounds it has reached.
-
-    Attributes:
-        of: the signal or feature.
-        absolute: whether its sign is ignored.
-        bounds: the least count of each band but the first.
-        names: of the bands.
+    """The bands of a signal or feature, or its absolute value: the least count of all but the
+    first.
     """
 
     of: str
@@ -54,13 +49,10 @@ class Bands:
 
 @dataclass(frozen=True)
 class Parts:
-    """How the rows of a drive are divided: by at most one of the four.
+    """How the rows of a drive are divided: by at most one of bands, blocks, folds and times.
 
-    Attributes:
-        bands: of each regime; a part is a combination of them, the last running fastest.
-        block_ticks: length of a block of time.
-        row_folds: number of folds that rows are dealt into.
-        times: over which columns change, if those are several; each has all rows.
+    Combined bands run with the last fastest. `times` are what columns change over, if several; each
+    has all rows.
     """
 
     bands: tuple[Bands, ...] = ()
@@ -119,10 +111,7 @@ class Parts:
         return f"coalesce([{names}][{number} + 1], '{UNKNOWN_PART}')"
 
     def numbers(self, ticks: NDArray[Any], counts: Mapping[str, FloatArray]) -> IntArray:
-        """Return the part of each row, shape (rows,); `UNKNOWN` where it is not known.
-
-        Given the columns that the bands are of. Folds of single rows are for SQL alone.
-        """
+        """Return each row's part, (rows,), or `UNKNOWN`; `columns` are what the bands are of."""
         if self.row_folds:
             raise ValueError("rows are dealt into folds by SQL alone")
         if self.block_ticks:
@@ -144,8 +133,7 @@ class Parts:
 def _row_fold_sql(count: int) -> str:
     """Number the folds by a hash of drive and tick that is the same everywhere and for ever.
 
-    MD5 of the drive's id begins a sequence; two rounds of multiplication and exclusive or (the
-    32-bit integer hash of Thomas Mueller) scatter the ticks. All below 2^63.
+    MD5 of the id, then two rounds of the 32-bit hash of Thomas Mueller, all below 2^63.
     """
     value = "((md5_number_lower(drive_id) % 4294967296)::BIGINT + tick) % 4294967296"
     for _ in range(2):

@@ -25,10 +25,7 @@ class LoggedDrive:
 
 
 def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iterator[LoggedDrive]:
-    """Yield the drives of a log file with what a plan needs of them, each in the order of time.
-
-    A drive without a row of tick 0 has no metadata, and is left out as it is by SQL.
-    """
+    """Yield a log file's drives in the order of time; as in SQL, none without a row of tick 0."""
     drive_columns = tuple(warehouse.catalogue.drive)
     present = warehouse.logs.read_metadata(file.path).schema.to_arrow_schema().names
     wanted = [name for name in (*drive_columns, "tick", *plan.signals) if name in present]
@@ -52,10 +49,9 @@ def counts_of(
     facts: Mapping[str, Any] | None = None,
     numbers: Mapping[str, int] | None = None,
 ) -> DriveCounts:
-    """Return the rows of a drive, in the order of time, as what a plan is computed from.
+    """Return a drive's rows, in the order of time, as what a plan is computed from.
 
-    A signal that the rows have not is missing everywhere. Facts are those of the first row, if
-    they are not given. `numbers` are what the car's drives told of it.
+    Facts are by default the first row's; `numbers` are what the car's drives told of it.
     """
     counts, present = {}, {}
     for name in plan.signals:

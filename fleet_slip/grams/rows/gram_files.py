@@ -13,8 +13,7 @@ from fleet_slip.grams.rows.rollup import make_rollup
 from fleet_slip.warehouse.tables import Warehouse
 
 FILE_ROWS = 100_000
-"""Gram rows of a file, some 700 bytes each; a file with fewer is small. Rewriting takes the memory
-of a few files, however many Gram rows there are."""
+"""Gram rows of a file, some 700 bytes each; with fewer it is small, and may be merged."""
 
 FILE_BYTES = 2**28
 """Most bytes of the Gram rows of a file; a row of 200 columns has 160,000."""
@@ -46,10 +45,7 @@ def _together(parts: Sequence[pa.Table]) -> pa.Table:
 
 
 def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
-    """Write one file for each feature set, so that reading one set reads no other.
-
-    Rows that cars sent have files of their own: these cannot be computed again.
-    """
+    """Write a file for each feature set, and others for received rows, not to be computed again."""
     came = pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
     actions = []
     for prefix, some in ((RECEIVED_NAME, came), ("", pc.invert(came))):

@@ -1,8 +1,7 @@
 """Makes the table `grams` agree with the active files of `logs`.
 
-Log files without Gram rows of a feature set are aggregated; Gram rows of any set
-whose file is no longer active are dropped; both in one commit. That one rule covers new days,
-interrupted runs, repeated runs, deletions and compaction.
+One commit adds Gram rows of new log files and drops those of inactive ones: one rule for new days,
+interrupted and repeated runs, deletions and compaction.
 """
 
 from collections.abc import Collection, Iterable, Iterator
@@ -56,13 +55,9 @@ def update_grams(
 ) -> GramReport:
     """Bring the Gram rows of a feature set up to date. Running it again does nothing.
 
-    An executor runs the queries elsewhere; see `compute_grams`. With `among`, only log files of
-    these paths are read. Raises `QuestionError` for an unknown
-    set, `StorageError`, `ConflictError` if other processes keep changing the table, or
-    `ClusterError`.
-
-    A set in which delays of receivers are corrected has those of `delay` brought up to date first,
-    and is computed again for drives of cars whose delay they tell anew.
+    For an executor see `compute_grams`; `among` limits the log files read. Sets corrected for
+    receivers' delays bring `delay` up to date first, and are computed again where these moved.
+    Raises `QuestionError` for an unknown set, `StorageError`, `ConflictError` and `ClusterError`.
     """
     if features().feature_set(feature_set).in_time and DELAY in features().sets:
         update_grams(warehouse, progress, DELAY, executor, among)
@@ -72,9 +67,8 @@ def update_grams(
 def reconcile(
     warehouse: Warehouse, progress: Progress = no_progress, *, unreadable: Collection[str] = ()
 ) -> list[GramReport]:
-    """Bring the Gram rows of every feature set up to date that was ever computed here.
+    """Bring every feature set up to date that was computed here, for the drives that it was.
 
-    A set that was computed for some drives only is brought up to date for the files of these.
     `unreadable` log files are left for later.
     """
     grams = warehouse.grams.snapshot()

@@ -1,7 +1,6 @@
 """Lands the Gram rows of log files before the files themselves, where others are written again.
 
-A Gram row counts while its log file is active. So the one commit that exchanges log files
-exchanges their Gram rows with them: no reader sees the one without the other.
+They count while their log file is active: one commit exchanges both.
 """
 
 import json
@@ -26,8 +25,7 @@ def land_ahead(
 ) -> None:
     """Land the Gram rows of new log files, of the feature sets that replaced ones have.
 
-    Raises `ConflictError` if another process has removed one of the replaced files, or changes the
-    Gram rows at the same moment.
+    Raises `ConflictError` if a replaced file is gone, or the Gram rows change at that moment.
     """
     files = [_as_file(action) for action in new]
     for name in (PLAIN, *features().sets):

@@ -1,12 +1,10 @@
 """How late the satellite receiver of each car is, from Gram rows: its speed against acceleration.
 
 A receiver's speed is as late as its course. The change of speed over 0.4 s is the integral of the
-longitudinal acceleration, whatever wheels do, and so are the changes of both over 0.4 s more, in
-which an offset of the accelerometer is no more. The lag of the integral with the smallest sum of
-squares, by a parabola through its neighbours, is the delay. An integral that is k ticks late is
-that of the last 40 + k ticks less that of the last k, so that Gram rows have what all lags need.
-What the lag would be without each drive in turn tells how much drives differ (jackknife); to that
-comes what is the same in all.
+longitudinal acceleration; changes of both over 0.4 s more are free of its offset. The lag of the
+integral with the smallest sum of squares, by a parabola, is the delay. The integral k ticks late is
+that of 40 + k ticks less that of k, which Gram rows have. Its uncertainty is a jackknife over
+drives, and what all have in common.
 """
 
 import math
@@ -40,12 +38,8 @@ FEWEST_DRIVES = 3
 
 @dataclass(frozen=True)
 class ReceiverDelay:
-    """The delay of one car's receiver behind its accelerometer.
-
-    Attributes:
-        value: s.
-        uncertainty: standard error, s; None if all cars have few drives.
-        drives, rows: what tells it.
+    """The delay of a car's receiver behind its accelerometer and standard error, s; None of few
+    drives.
     """
 
     value: float
@@ -56,13 +50,7 @@ class ReceiverDelay:
 
 @dataclass(frozen=True)
 class ChangedDelay:
-    """A car's receiver that is later, or less late, than it was.
-
-    Attributes:
-        before, after: s.
-        since: the day of the first drive after the change.
-        drives: all drives of the car that tell it.
-    """
+    """A car's receiver that is later, or less late, than it was, in s, from the day `since` on."""
 
     before: float
     after: float
@@ -102,8 +90,7 @@ def receiver_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, Receiv
 def changed_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, ChangedDelay]:
     """Return the cars whose receivers are later from some drive on than they were before.
 
-    Of every place between two drives the one is looked at where what is told before and after
-    differs by most standard errors; these are of how much drives of a usual car differ.
+    Looked at is the place where both sides differ by most standard errors, as usual drives do.
     """
     halves = {
         car: split
@@ -150,7 +137,7 @@ def _by_car(
 def _about_means(table: GramTable) -> FloatArray:
     """Return the products of speed and late integrals about their means in each drive.
 
-    Shape (drives, 2 + STEPS, 2 + STEPS): an offset of the accelerometer is not in them.
+    Shape (drives, 2 + STEPS, 2 + STEPS), free of the accelerometer's offset.
     """
     weights, k = _weights(), len(table.signals)
     full = np.zeros((len(table), k, k))

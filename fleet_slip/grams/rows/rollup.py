@@ -1,12 +1,11 @@
 """Rollups: the Gram rows of a file added up by what cohorts and folds ask for, in the file itself.
 
-    cells      a table: n, sums and products of the rows that share some columns and a fold bucket
-    vehicles   the hashes of each cell's cars, each once, 8 bytes each
-    drives     the hashes of each cell's drives
+    cells        a table: n, sums and products of the rows that share some columns and a bucket
+    vehicles     the hashes of each cell's cars, each once, 8 bytes each
+    drives       the hashes of each cell's drives
 
-These are the parts of what stands before the rows (`fleet_slip.delta.encoding`). So a rollup lands,
-moves and goes with its rows, and cannot be of others. A file has none where it would save little,
-where a sum has more than 64 bits, and where it takes other files to tell the trips of its drives.
+They stand before the rows (`fleet_slip.delta.encoding`) and go with them. A file has none where it
+saves little, a sum has more than 64 bits, or other files tell its trips.
 """
 
 import json
@@ -31,8 +30,7 @@ Hashes = NDArray[np.uint64]
 """Hashes of drives or cars: what tells one from others, in 8 bytes."""
 
 BUCKETS = 60
-"""Drives and cars are dealt into so many buckets by their hashes: folds in any number that divides
-it are whole buckets."""
+"""Drives and cars are dealt into buckets by hashes: folds in a divisor of it are whole ones."""
 
 BUCKET_KEYS = {"drive": "drive_id", "vehicle": "vehicle_id"}
 """What is dealt into buckets, and by which column. Each cell is of one of both."""
@@ -50,10 +48,7 @@ LAYOUT = "1"
 
 
 def make_rollup(rows: pa.Table, columns: Collection[str] | None = None) -> list[bytes]:
-    """Return the parts of the rollup of the Gram rows of one file; none, if it is to have none.
-
-    `columns` are those that it may be by, by default all that a condition may ask for.
-    """
+    """Return the parts of a file's rollup, by `columns` or all that conditions name, or none."""
     rows = rows.filter(pc.not_equal(rows["signals"].cast(pa.string()), "")).combine_chunks()
     if len(rows) < ROWS_PER_CELL or not _tells_its_trips(rows):
         return []
@@ -100,8 +95,7 @@ class Rollup:
 
     Attributes:
         table, path: where the file is.
-        cells: the cells, with where the hashes of each begin (`first_car`, `first_drive`): those of
-            cells by drive.
+        cells: the cells, and the first of the hashes of each, or those of cells by drive.
         feature_set: identity of the set that its rows are of.
         files: the log files, or files of messages, that its rows are of.
     """
@@ -166,10 +160,7 @@ def is_rollup_of(rollup: Rollup, rows: pa.Table) -> bool:
 
 
 def _tells_its_trips(rows: pa.Table) -> bool:
-    """Whether each drive is a trip of its own, and a Gram row of a whole one.
-
-    Drives of a file that names their trips, or dates them, may be pieces of one drive with others.
-    """
+    """Whether each drive is a whole trip, and not a piece of one that goes on in another file."""
     absent = (rows[name].null_count == len(rows) for name in ("part", "trip_id", "started_at"))
     return all(absent) and not any(rows[name].null_count for name in BUCKET_KEYS.values())
 
@@ -219,11 +210,7 @@ def _sums(grams: GramTable, starts: IntArray) -> dict[str, pa.Array] | None:
 
 
 def _may_overflow(values: IntArray, begin: IntArray, largest: int) -> bool:
-    """Whether the sum of a group of rows may have more than 64 bits.
-
-    By the largest number, else by the groups' sums in binary64: these are right to far less than
-    the half of the range that is left over.
-    """
+    """Whether a group's sum may need more than 64 bits, by the largest number or a float sum."""
     most = max(int(values.max()), -int(values.min()))
     if most * largest < 2**63:
         return False

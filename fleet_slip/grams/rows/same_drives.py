@@ -1,8 +1,7 @@
 """Which received Gram rows are of drives whose logs are here: the logs count, the rows go.
 
-A drive is the same if it has the same name; or the same car, day and signals, and exactly the same
-n, sums and products: what a car counts is, bit for bit, what its log comes to. The rows of the
-logged signals tell; those of other sets that the car sent of the same drive go with them.
+Same is a drive of the same name; or of the same car, day and signals, with exactly the same n, sums
+and products of logged signals, as its log gives. Rows of other sets go with them.
 """
 
 import hashlib

@@ -32,9 +32,8 @@ def gram_statement(
 ) -> str:
     """Return the statement that computes the Gram rows of a feature set.
 
-    `whole` states that no file has a column of the set in only some of its rows; `absent` are the
-    columns that no file has, since they came to the catalogue later. Raises
-    `QuestionError` for an unknown set.
+    `whole`: no file has a column in only some rows; `absent` are later columns, which none has.
+    Raises `QuestionError` for an unknown set.
     """
     known = features()
     one = known.feature_set(feature_set)
@@ -112,8 +111,7 @@ def _joined(number: int) -> str:
 
 
 def _group(*, whole: bool, divided: bool) -> list[str]:
-    """Return the columns to group by. DuckDB hashes a dictionary's entries, not its rows, if the
-    dictionary's column is the only one; so a constant is left out."""
+    """Return the columns to group by, no constant, lest DuckDB hash a dictionary row by row."""
     return ["drive_id", *([] if whole else ["absent"]), *(["part"] if divided else [])]
 
 

@@ -1,8 +1,7 @@
 """Gram rows of feature sets with windows, from the columns of log files: what SQL says, faster.
 
-Each drive is gone through once in the order of time. Blocks of its columns are integers below 2^19
-in binary64; every product and every sum of so many rows is an integer below 2^53, so that it is
-exact in whatever order it is added. Sums of blocks are 64-bit integers.
+Drives are gone through once, in time. Columns are integers below 2^19 in binary64, whose products
+and block sums stay below 2^53: exact in any order. Sums of blocks have 64 bits.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,11 +37,10 @@ def wide_grams(
     feature_set: str,
     late: Mapping[str, int] | None = None,
 ) -> pa.Table:
-    """Return the Gram rows of log files for a feature set, as `jobs/gram.sql` would.
+    """Return the Gram rows of log files for a feature set, as `jobs/gram.sql` would, sorted.
 
-    `late` is by how much the course of cars is, in parts of a tick. Sorted by file and drive.
-    Raises `DataError` for a drive that cannot be looked back on, and `StorageError` for one whose
-    sums need more than 64 bits.
+    `late` is the course's delay of cars, in parts of a tick. Raises `DataError` for a drive that
+    cannot be looked back on, `StorageError` for sums of more than 64 bits.
     """
     one = features().feature_set(feature_set)
     workspace = Workspace(ColumnPlan.of_set(features(), feature_set))
@@ -144,11 +142,7 @@ def _last_if_unknown(kind: Kind) -> tuple[int, bool, int]:
 
 
 def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[Kind, PartSums]:
-    """Return the sums of a drive's rows, by which columns they lack and by part.
-
-    Raises `DataError` for a drive that cannot be looked back on, and `StorageError` if sums of
-    products could need more than 64 bits.
-    """
+    """Return the sums of a drive's rows, by columns missing and part; raises as `wide_grams`."""
     plan, total = workspace.plan, len(counts.ticks)
     largest = max(plan.limits)
     exact_rows = (_EXACT - 1) // largest**2
@@ -175,10 +169,7 @@ def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[
 def change_sums(
     workspace: Workspace, counts: DriveCounts, times: Sequence[int], late: int = 0
 ) -> dict[Kind, PartSums]:
-    """Return the sums of the changes of a drive's columns, by which they lack and over which time.
-
-    The course is `late` parts of a tick. Raises like `drive_sums`.
-    """
+    """Return the sums of a drive's changes, by columns missing and time; the course is `late`."""
     largest = 2 * max(workspace.plan.limits)
     exact_rows = (_EXACT - 1) // largest**2
     if len(counts.ticks) * largest**2 >= _INT64:

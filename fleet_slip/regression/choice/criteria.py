@@ -1,8 +1,8 @@
 """Selection criteria: each is a value per model, and the smallest wins.
 
-All are written in the excess x = (RSS - RSS_full) / sigma^2 of a model with j of k signals, so that
-the same formulas serve nested models and subsets, naive and effective numbers of rows n. Constants
-that all models share are left out. With nu = n - k - 1, RSS / RSS_full = 1 + x / nu.
+All are written in the excess x = (RSS - RSS_full) / sigma^2 of a model with j of k signals, for
+nested models and subsets and any effective number of rows n, less constants that models share. With
+nu = n - k - 1, RSS / RSS_full = 1 + x / nu.
 """
 
 import math
@@ -37,8 +37,7 @@ class Problem:
 def expected_squares(k: int) -> tuple[float, ...]:
     """Return E[Z_(l:k)^2] for l = 1..k, the expected order statistics of k squared normals.
 
-    Integral of z^2 k! / ((l-1)! (k-l)!) (1-F)^(l-1) F^(k-l) dF with F = 2 Phi(z) - 1, by the
-    trapezoidal rule, which converges geometrically for this integrand.
+    Integral of z^2 k! / ((l-1)! (k-l)!) (1-F)^(l-1) F^(k-l) dF, F = 2 Phi(z) - 1, by trapezia.
     """
     z = np.linspace(0.0, 12.0, 6001)
     inside = normal_cdf(z) - normal_cdf(-z)

@@ -1,7 +1,6 @@
-"""Least-angle regression, lasso and elastic-net paths from the correlations alone.
+"""Least-angle regression, lasso and elastic-net paths from correlations alone.
 
-Efron, Hastie, Johnstone and Tibshirani (2004), Annals of Statistics 32:407. Signals and label are
-standardised to unit length, so that the whole path is a function of the Gram.
+Efron, Hastie, Johnstone and Tibshirani (2004), Annals of Statistics 32:407.
 """
 
 from collections.abc import Sequence
@@ -23,11 +22,9 @@ _TIE = 1e-12
 
 @dataclass(frozen=True)
 class LarsPath:
-    """Piecewise linear path of standardised coefficients.
+    """Piecewise linear path of standardised coefficients; `order` is that of first entry.
 
     Attributes:
-        signals: k inputs in declared order.
-        order: inputs in order of (first) entry.
         penalties: largest absolute correlation with the residual at each breakpoint, falling.
         coefficients: at each breakpoint, shape (breakpoints, k).
     """
@@ -46,10 +43,9 @@ class LarsPath:
 
 
 def lars_path(gram: Gram, inputs: Sequence[str], label: str) -> LarsPath:
-    """Return the path of least-angle regression.
+    """Return the path of least-angle regression; ties enter in the declared order.
 
-    Ties to within rounding enter in the declared order. Raises `DataError` for a constant signal
-    or dependent ones.
+    Raises `DataError` for constant or dependent signals.
     """
     return lars_path_of_moments(*_correlations(gram, inputs, label), inputs)
 
@@ -57,9 +53,8 @@ def lars_path(gram: Gram, inputs: Sequence[str], label: str) -> LarsPath:
 def lasso_path(gram: Gram, inputs: Sequence[str], label: str, *, ridge: float = 0.0) -> LarsPath:
     """Return the path of all minimisers of the lasso, |y - Xb|^2 / 2 + penalty |b|_1.
 
-    `ridge` adds ridge |b|^2 / 2 (the elastic net of Zou and Hastie 2005, without their rescaling).
-    Ties to within rounding enter in the declared order. Raises `DataError` for a constant signal
-    or dependent ones.
+    `ridge` adds ridge |b|^2 / 2 (elastic net, Zou and Hastie 2005, not rescaled). Ties enter in the
+    declared order. Raises `DataError` for constant or dependent signals.
     """
     matrix, target = _correlations(gram, inputs, label)
     return lasso_path_of_moments(matrix + ridge * np.eye(len(inputs)), target, inputs)
@@ -111,10 +106,7 @@ def fit_lasso(
 
 
 class _Walk:
-    """State of the path: all active signals keep the same absolute residual correlation.
-
-    The lasso `drops` every signal whose coefficient reaches zero; least angles never do.
-    """
+    """The path's state: active signals share the correlation size; the lasso `drops` zeros."""
 
     def __init__(self, matrix: FloatArray, target: FloatArray, *, drops: bool) -> None:
         self.matrix, self.target, self.drops = matrix, target, drops

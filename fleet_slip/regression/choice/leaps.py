@@ -7,11 +7,10 @@ from fleet_slip.compiling import kernel
 
 
 def best_by_leaps(matrix: FloatArray, count: int) -> list[list[int]]:
-    """Return bit masks of the `count` best subsets of each size 0..k, best first.
+    """Return bit masks of the `count` best subsets of each size 0..k, best first; k is at most 62.
 
-    The moment matrix has the label last, and k is at most 62. A branch keeps some signals for good
-    and may drop the others one by one; no model in it has a smaller residual sum of squares than
-    its largest one, and it is left as soon as that exceeds what every size in reach already has.
+    The label is last. A branch keeps some signals for good and may drop the others one by one; it
+    is left once its largest model's residuals exceed what every size in reach already has.
     """
     k = len(matrix) - 1
     best = np.full((k + 1, count), np.inf)

@@ -1,7 +1,6 @@
 """Ranking and criterion together: which of the k+1 nested models, and how well that choice does.
 
-A choice made on the data flatters the figures of its winner. The honest figures come from making
-the whole choice again inside every training fold: ranking, evidence, criterion and fit.
+A choice flatters its winner, so that it is made again inside every training fold.
 """
 
 from collections.abc import Sequence
@@ -33,10 +32,9 @@ from fleet_slip.regression.validation.folds import Folds
 def nested_fits(
     gram: Gram, order: Sequence[str], label: str, *, intercept: bool = True
 ) -> list[Fit]:
-    """Return the exact fits of the first 0, 1, ..., k signals of an order.
+    """Return the exact fits of the first 0..k signals of an order, from one Bareiss pass.
 
-    One Bareiss pass yields every residual sum of squares (bordered over principal minors) and
-    every leading triangular system. Raises `DataError` for dependent signals.
+    Raises `DataError` for dependent signals.
     """
     part = gram.restrict([*order, label])
     triangle = eliminate(moments(part, intercept=intercept))
@@ -65,15 +63,11 @@ class Rule:
 
 @dataclass(frozen=True)
 class NestedChoice:
-    """A choice among the nested models of an order.
+    """A choice of the first `size` signals of an order, their exact fit in counts, and its
+    evidence.
 
-    Attributes:
-        order: the ranked signals.
-        size: how many of them are chosen.
-        fit: exact fit of the chosen ones, in counts.
-        evidence: what the criterion looked at.
-        values: of the criterion for 0..k signals, smaller is better; for cross-validation the
-            negative correlations.
+    `values` of the criterion are for 0..k signals, smaller being better; of cross-validation they
+    are the negative correlations.
     """
 
     order: tuple[str, ...]
@@ -112,13 +106,10 @@ class NestedDistances:
 
 @dataclass(frozen=True)
 class TrainingFolds:
-    """The rows to choose on.
+    """The rows to choose on: their folds, and per-drive moments of them (None: rows independent).
 
-    Attributes:
-        folds: their folds; the criteria use the total, cross-validation the folds.
-        drives: per-drive moments of the same rows; None takes rows for independent.
-        scales: physical value of one count of each signal.
-        intercept: whether models have one; without it the moments of the drives are about zero.
+    `scales` is the physical value of a count of each signal. Without `intercept` moments are about
+    zero.
     """
 
     folds: Folds
@@ -152,8 +143,7 @@ def select_nested(
 ) -> NestedChoice:
     """Rank the inputs, and choose one of the nested models.
 
-    Raises `DataError` for dependent signals or a label without noise, and `QuestionError` for an
-    unknown rule.
+    Raises `DataError` for dependent signals or a label without noise, `QuestionError` for the rule.
     """
     order = rank(rule.ranking, training.total, inputs, label)
     fits = training.nested_fits(order, label)
@@ -193,10 +183,7 @@ def cross_validate_selection(
     label: str,
     rule: Rule,
 ) -> CrossValidation:
-    """Cross-validate the choice itself: nothing of a fold is seen in choosing for it.
-
-    `fold` says the fold of each of the drives. Raises `DataError` as `select_nested` does.
-    """
+    """Cross-validate the choice itself, `fold` saying each drive's fold. Raises `DataError`."""
     folds = training.folds
     tests = []
     for number, test in enumerate(folds.grams):

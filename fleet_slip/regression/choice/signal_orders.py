@@ -1,7 +1,6 @@
-"""Ranking algorithms: the predefined order on which nested models depend (Section II-B).
+"""Rankings: the predefined order on which nested models depend (Section II-B).
 
-All decide on exact integers and rationals, so that ties are ties; they go to the declared order.
-The exception is LARS, whose steps need square roots.
+All but LARS, which needs roots, decide exactly; ties go to the declared order.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,10 +43,7 @@ def forward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
 
 
 def backward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Remove, at each step, the signal whose loss costs least; the last one left comes first.
-
-    Of equals, the later in the declared order is removed. This is Wang's and WEKA's order.
-    """
+    """Remove the signal whose loss costs least, of equals the later: Wang's and WEKA's order."""
     k = len(inputs)
     matrix = _moments(gram, inputs, label)
     later_first = [*reversed(range(k)), k]
@@ -57,10 +53,7 @@ def backward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
 
 
 def pivoted_cholesky(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Take, at each step, the signal that the ones before it explain least; the label is ignored.
-
-    The order of a column-pivoted QR decomposition of standardised signals.
-    """
+    """Take the signal that those before it explain least, as a column-pivoted QR does."""
     matrix = _moments(gram, inputs, label)
     squares = [matrix[i][i] for i in range(len(inputs))]
 
@@ -71,11 +64,9 @@ def pivoted_cholesky(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str
 
 
 def replacement(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Order by sequential replacement (Miller 2002, section 3.3).
+    """Order by sequential replacement (Miller 2002, section 3.3): after each step exchange signals.
 
-    After each forward step, signals are exchanged while any exchange lowers the residual sum of
-    squares. The sets of successive sizes need not be nested: a signal ranks by the first size at
-    which it appears, several at once in the declared order.
+    Sets need not be nested: a signal ranks by the first size at which it appears.
     """
     order: list[str] = []
     for chosen in replacement_sets(gram, inputs, label):
@@ -131,8 +122,7 @@ def _moments(gram: Gram, inputs: Sequence[str], label: str) -> Matrix:
 def _full_model(matrix: Matrix) -> tuple[Matrix, int]:
     """Return the rows (adj N, d b) of the full model and its determinant d.
 
-    Pivoting on row i, divided by d, gives the same of the model without signal i (Jacobi's
-    identity on the minors of an adjugate).
+    Pivoting on row i, over d, gives those without signal i (Jacobi's identity).
     """
     inverse, determinant = adjugate([row[:-1] for row in matrix[:-1]])
     numerators = [
@@ -146,10 +136,7 @@ def _gain(row: list[int], i: int) -> Fraction:
 
 
 def _pivot(matrix: Matrix, score: Score, *, largest: bool, divisor: int = 1) -> list[int]:
-    """Eliminate one input after the other, each time that with the largest or smallest score.
-
-    Fraction-free, so all entries share one positive factor and scores can be compared as they are.
-    """
+    """Eliminate inputs by the best score, fraction-free: entries share one positive factor."""
     sign = -1 if largest else 1
     inputs = len(matrix[0]) - 1
     work = {i: matrix[i] for i in range(inputs)}

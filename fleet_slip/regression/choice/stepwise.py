@@ -1,14 +1,9 @@
 """Choosing among many inputs: forward, backward, exchange, or the order of least angles.
 
-The search works on the correlation matrix in extended precision (`numpy.longdouble`), since exact
-elimination of a hundred columns takes seconds. Its decisions are which sum of squares is smallest.
-Where the two smallest differ by less than rounding could have made, the step is decided again by
-exact elimination; so an order is that of exact arithmetic, and does not depend on the machine. (The
-order of least angles needs square roots and is floating point by nature.) What is fitted, validated
-and published from an order is exact in any case.
-
-A column that others explain but for 10^-9 of its variance is taken for dependent on them, and left
-out of the search.
+Steps are taken in extended precision (`numpy.longdouble`); where the two best sums of squares
+differ by less than rounding could make, exact elimination decides. So but for least angles, which
+needs roots, an order is that of exact arithmetic. A column that others explain but for 10^-9 of its
+variance counts as dependent, and is left out.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,10 +35,9 @@ METHODS: Final = ("forward", "backward", "exchange", "lars")
 def stepwise_order(
     gram: Gram, inputs: Sequence[str], label: str, method: str, most: int
 ) -> tuple[tuple[str, ...], ...]:
-    """Return the chosen inputs of sizes 1, 2, ... up to `most`, by one of `METHODS`.
+    """Return the chosen inputs of sizes 1, 2, ... up to `most`; all but exchange's are nested.
 
-    All but those of exchange are nested, in the order of entry. Raises `QuestionError` for an
-    unknown method, `DataError` for no rows.
+    Raises `QuestionError` for an unknown method, `DataError` for no rows.
     """
     if method not in METHODS:
         raise QuestionError(f"unknown search {method!r}. Known: {', '.join(METHODS)}.")
@@ -59,10 +53,7 @@ def stepwise_order(
 
 
 def sweep(matrix: LongArray, pivot: int) -> LongArray:
-    """Return a symmetric matrix swept on a pivot (Goodnight 1979); sweeping again undoes it.
-
-    Swept on a set of inputs, the rest holds what these leave of the products of the others.
-    """
+    """Return a matrix swept on a pivot (Goodnight 1979), which done again undoes it."""
     row = matrix[pivot] / matrix[pivot, pivot]
     swept = matrix - np.outer(matrix[:, pivot], row)
     swept[pivot] = row

@@ -1,11 +1,8 @@
 """The best models of every size among all 2^k subsets of the signals.
 
-Up to `DOUBLING_LIMIT` signals every subset is computed: starting from the moments, each signal
-doubles the list into copies without it (unchanged) and with it (Schur complement), until the 2^k
-remaining scalars are the residual sums of squares, indexed by bit mask. Beyond, leaps and bounds
-(Furnival and Wilson 1974) finds the same best models without visiting them all.
-
-The search is in float64 on correlations; the best are then fitted and ordered exactly.
+Up to `DOUBLING_LIMIT` signals, each doubles a list of moments into copies without it and with it
+(Schur complement) until 2^k residual sums of squares are left, by bit mask; beyond, leaps and
+bounds (Furnival and Wilson 1974). That is float64 on correlations; the best are ordered exactly.
 """
 
 from collections.abc import Sequence
@@ -61,10 +58,9 @@ class SizeResult:
 
 
 def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) -> list[SizeResult]:
-    """Return the `count` best models of each size 0..k, re-checked and ordered exactly.
+    """Return the `count` best models of each size 0..k, ordered exactly; ties as declared.
 
-    Ties go to the signals declared first. Raises `DataError` for dependent signals or a
-    constant label, and `QuestionError` for more than `MOST_INPUTS`.
+    Raises `DataError` for dependence or a constant label, `QuestionError` beyond `MOST_INPUTS`.
     """
     relations = dependence(gram, inputs)
     if relations:

@@ -1,22 +1,13 @@
 """Which model wins: the fewest signals whose shortfall from the best is negligible.
 
-Two things are asked of a gain in error before it justifies a richer model. It must be worth having,
-which a user says; with enough rows every gain is certain, and none need matter. What a model lacks
-is the root of the difference of the mean squared errors, sqrt(MSE - MSE of the best): the noise of
-the label adds the same to both and cancels, so that it is a figure of the models alone. Of nested
-models fitted to many rows it is the root mean square of how far their estimates lie apart. And the
-gain must be real: larger than its standard error. Models are compared on the same folds, so the
-error that counts is that of the difference, as in a paired test: the folds' difficulty is common to
-both and cancels. The one-standard-error rule of Breiman, Friedman, Olshen and Stone, Classification
-and Regression Trees (1984), section 3.4.3, takes the error of the best model's own figure instead,
-which may be ten times as large.
+A gain must be worth having, which a user says. What a model lacks is sqrt(MSE - MSE of the best),
+in which the label's noise cancels: of nested models, how far their estimates lie apart. And it must
+be real: larger than its standard error, paired over the same folds, whose difficulty cancels
+(Breiman, Friedman, Olshen and Stone 1984, section 3.4.3, take that of the best model's own figure).
 
-Models are also compared on the same rows without folds. Cars differ, and rows of a car are alike.
-So the rows are divided into groups of whole units that are independent: cars, or drives. With d the
-difference of the squared errors of a group and n its rows, the difference of the mean squared
-errors is the ratio sum d / sum n, whose standard error is that of a ratio of sums over groups of
-unequal size (Cochran, Sampling Techniques, 3rd edition, 1977, section 6.4). Both models share each
-group, so that what makes it difficult cancels.
+Without folds, the same rows are divided into groups of independent units, cars or drives. With d a
+group's difference of squared errors and n its rows, the difference of the mean squared errors is
+sum d / sum n, with the standard error of a ratio (Cochran, Sampling Techniques, 1977, section 6.4).
 """
 
 import math
@@ -57,14 +48,9 @@ DEFAULT_WORTH = Worth(math.radians(0.025))
 
 @dataclass(frozen=True)
 class Shortfall:
-    """How much larger a model's RMSE is than that of the best, over the same folds.
+    """How much larger a `model`'s RMSE (rad) is than the best's, over the same folds.
 
-    Attributes:
-        model: the model.
-        rmse: the difference of the pooled RMSEs, in rad; negative if the model's is smaller.
-        standard_error: of it, over the folds.
-        square: the difference of the mean squared errors, in rad^2.
-        worthless: whether a gain of so much is less than what is worth having.
+    `square` is the difference of mean squared errors, rad^2; `worthless` if not worth having.
     """
 
     model: CrossValidation
@@ -116,9 +102,8 @@ class Winner:
 def choose(models: Sequence[CrossValidation], worth: Worth = DEFAULT_WORTH) -> Winner:
     """Return the winner of cross-validated models, given in their declared order.
 
-    The best pooled correlation is the reference. Among the models whose RMSE is negligibly larger,
-    the fewest signals win; then the higher exact correlation; then the declared order. Raises
-    `QuestionError` for an empty list.
+    Among those negligibly worse than the best pooled correlation the fewest signals win, then the
+    higher exact correlation, then the declared order. Raises `QuestionError` for none.
     """
     if not models:
         raise QuestionError("no model to choose from: the list of models is empty.")
@@ -194,14 +179,10 @@ def compare_paired(model: CrossValidation, other: CrossValidation, worth: Worth)
 
 
 def compare_typical(model: CrossValidation, other: CrossValidation, worth: Worth) -> Shortfall:
-    """Return how much larger a model's RMSE is than another's in the median group.
+    """Return how much larger a model's RMSE is than another's in the median group, a vote each.
 
-    Each group has one vote, whatever its rows and its errors. So what is wrong in fewer than half
-    of the groups does not decide (median of means; Lugosi and Mendelson, Mean estimation and
-    regression under heavy-tailed distributions, 2019). The standard error is that of a median of
-    normal numbers, whose deviation is told by the median of the absolute ones.
-
-    Raises `ValueError` if they were not tested on the same rows.
+    After the median of means (Lugosi and Mendelson 2019); the standard error is that of a median of
+    normals, their deviation from the median absolute one. Raises `ValueError` for other rows.
     """
     _common_rows(model, other)
     differences = [one.rmse - two.rmse for one, two in zip(model.folds, other.folds, strict=True)]

@@ -1,8 +1,4 @@
-"""Eigenvalues of small symmetric matrices, the same bits on every machine.
-
-LAPACK's depend in their last digits on the processor. These come of additions, multiplications,
-divisions and square roots alone, in one order.
-"""
+"""Eigenvalues of small symmetric matrices, the same bits on every machine, unlike LAPACK's."""
 
 import math
 
@@ -19,9 +15,8 @@ _UNIT_ROUNDOFF = 2.0**-53
 def symmetric_eigenvalues(matrix: FloatArray) -> list[float]:
     """Return the eigenvalues of a symmetric matrix, shape (k, k), ascending.
 
-    Cyclic Jacobi rotations (Golub and Van Loan, Matrix Computations, section 8.5). An element off
-    the diagonal counts as zero if it is small beside those on the diagonal, so that also the small
-    eigenvalues of a positive definite matrix are accurate (Demmel and Veselic 1992).
+    Cyclic Jacobi rotations (Golub and Van Loan, section 8.5) with relative stopping, by which small
+    eigenvalues of positive definite matrices are accurate (Demmel and Veselic 1992).
     """
     a = np.array(matrix, dtype=np.float64)
     pairs = [(p, q) for q in range(len(a)) for p in range(q)]

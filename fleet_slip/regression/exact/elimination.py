@@ -1,7 +1,6 @@
 """Fraction-free elimination of integer matrices (Bareiss 1968, Math. Comp. 22:565).
 
-Every intermediate value is a minor of the matrix, so each division is exact and the numbers stay
-as small as exact arithmetic allows. Nothing is rounded, and a zero pivot is a fact.
+Every value is a minor, so each division is exact and numbers stay as small as can be.
 """
 
 from collections.abc import Sequence
@@ -11,15 +10,13 @@ from fractions import Fraction
 
 @dataclass(frozen=True)
 class Elimination:
-    """Fraction-free triangular form of a symmetric positive semidefinite integer matrix.
-
-    The last row and column of the matrix belong to the response; the first k to the inputs.
+    """Fraction-free triangular form of a semidefinite integer matrix: k inputs, then the response.
 
     Attributes:
         rows: row t after t steps, from its diagonal to the right: k rows.
         minors: leading principal minors of order 0..k (order 0 is 1).
         corners: bordered minors of the response after 0..k steps.
-        singular: the first input with a zero pivot, at which elimination stopped; else None.
+        singular: the first input with a zero pivot, at which elimination stopped.
     """
 
     rows: tuple[tuple[int, ...], ...]
@@ -96,10 +93,9 @@ def adjugate(matrix: Sequence[Sequence[int]]) -> tuple[list[list[int]], int]:
 
 
 def is_semidefinite(lower: Sequence[Sequence[int]]) -> bool:
-    """Whether a symmetric integer matrix is positive semidefinite.
+    """Whether a symmetric integer matrix, of rows of i + 1 values, is positive semidefinite.
 
-    Row i has its first i + 1 values. Each pivot must be positive, or zero with zeros below it; then
-    it is left out.
+    Each pivot must be positive, or zero with zeros below it; then it is left out.
     """
     work = [list(row) for row in lower]
     previous = 1

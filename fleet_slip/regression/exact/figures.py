@@ -13,13 +13,9 @@ from fleet_slip.regression.exact.least_squares import LinearModel
 
 @dataclass(frozen=True)
 class ErrorSums:
-    """Sums over rows of a prediction p and a label y; they add over folds.
+    """Sums over n rows of a prediction p, a label y and their products; they add over folds.
 
-    Attributes:
-        n: number of rows.
-        p, y: sums of predictions and of labels.
-        pp, py, yy: sums of their products.
-        null: sum of (y - m)^2, with m the mean label of the training rows.
+    `null` is the sum of (y - m)^2, with m the mean label of the training rows.
     """
 
     n: int
@@ -75,14 +71,11 @@ class ErrorSums:
 
 @dataclass(frozen=True)
 class Figures:
-    """How well a model predicts rows it was not fitted on.
+    """How well a model predicts rows it was not fitted on, in units of the label (rad).
 
     Attributes:
-        rows: number of rows predicted.
         correlation: of prediction and label (0 if one of them is constant), as in Table I.
-        rmse: root mean square error, in units of the label (rad).
-        error_mean, error_std: mean and standard deviation of prediction minus label (rad), as in
-            Table II.
+        error_mean, error_std: of prediction minus label, as in Table II.
         relative_rmse: RMSE over that of always predicting the mean of the training rows.
     """
 
@@ -121,9 +114,8 @@ class Figures:
 
 
 def error_sums(model: LinearModel, gram: Gram, training_mean: Fraction | None = None) -> ErrorSums:
-    """Return the sums for a model of counts over the rows of a Gram, exactly.
+    """Return a model's sums over the rows of a Gram, exactly: sum (p - y)^2 = v'Gv, v = (b, -1).
 
-    With v = (coefficients, -1), sum (p - y)^2 = v'Gv; nothing cancels, since nothing is rounded.
     Without a training mean, the rows' own mean is the reference of `null`.
     """
     part = gram.restrict([*model.signals, model.label])

@@ -1,8 +1,7 @@
 """Gram matrices of integer counts: the exact sufficient statistics of every linear model.
 
-A Gram holds the number of rows, the sum of every signal and the sum of every product of two
-signals. All are integers, so Grams add and subtract without rounding: training on all drives
-minus a fold is, bit for bit, training on the other drives.
+Sums and products are integers, so Grams add and subtract without rounding: training on all minus a
+fold is, bit for bit, training on the rest.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,14 +33,7 @@ def packed_position(i: int, j: int) -> int:
 
 @dataclass(frozen=True)
 class Gram:
-    """Row count, sums and sums of products of integer counts, exactly (Python integers).
-
-    Attributes:
-        signals: k names, which are the order of everything else.
-        n: number of rows.
-        sums: k sums of counts.
-        products: k(k+1)/2 sums of products, the lower triangle packed row by row.
-    """
+    """Number of rows, k sums and k(k+1)/2 products (lower triangle by rows) of integer counts."""
 
     signals: tuple[str, ...]
     n: int
@@ -69,9 +61,8 @@ class Gram:
     def from_counts(cls, signals: Sequence[str], counts: NDArray[Any]) -> "Gram":
         """Return the Gram of rows of integer counts, shape (n, k).
 
-        Counts up to 2^21 go through float64 matrix products of at most `BLOCK_ROWS` rows. Every
-        partial sum there is an integer below 2^53, so that the result is exact in any order of
-        summation. Larger counts (polynomials of decimal data) use Python integers.
+        Counts up to 2^21 take float64 products of at most `BLOCK_ROWS` rows, whose partial sums
+        stay below 2^53 and so are exact in any order; larger ones take Python integers.
         """
         if counts.ndim != 2 or counts.shape[1] != len(signals):
             raise ValueError(f"counts of shape {counts.shape} do not have {len(signals)} columns")
@@ -137,9 +128,9 @@ class Gram:
         return Gram(self.signals, self.n, (0,) * len(self.sums), self.products)
 
     def combine(self, combinations: Mapping[str, Mapping[str, int]]) -> "Gram":
-        """Return the Gram of integer linear combinations of the signals, T'GT.
+        """Return the Gram of integer combinations of signals, such as {"difference": {"a": 1, "b":
+        -1}}.
 
-        Each new signal maps old signals to integer weights: {"difference": {"a": 1, "b": -1}}.
         Raises `DataError` for a signal that the Gram lacks.
         """
         weights = [
@@ -172,10 +163,7 @@ class Gram:
         return _mirrored([self._packed_row(i) for i in range(len(self.signals))])
 
     def centred(self) -> list[list[int]]:
-        """Return the integer matrix n S, with S the product sums about the means.
-
-        n S_ab = n sum(a b) - sum(a) sum(b): no rounding, so a constant signal has exactly zero.
-        """
+        """Return n S_ab = n sum(a b) - sum(a) sum(b), with S the product sums about the means."""
         return _mirrored(
             [
                 [

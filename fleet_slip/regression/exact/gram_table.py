@@ -15,13 +15,8 @@ _MODULUS = 2**64
 
 @dataclass(frozen=True)
 class GramTable:
-    """Many Grams of the same signals, one a drive.
-
-    Attributes:
-        signals: k names.
-        n: rows of each drive, shape (drives,).
-        sums: sums of counts, shape (drives, k).
-        products: packed product sums, shape (drives, k(k+1)/2).
+    """Many Grams of the same signals, one a drive: n (drives,), sums (drives, k) and packed
+    products.
 
     Numbers are int64; sums and products that need more bits are integers of Python.
     """
@@ -79,8 +74,7 @@ class GramTable:
     def about(self, origin: Sequence[int]) -> "GramTable":
         """Return the table of the counts minus an integer origin, exactly.
 
-        sum((a - u)(b - v)) = sum(ab) - u sum(b) - v sum(a) + n u v. Intermediate values may wrap
-        around 64 bits; the result does not, since it is again a sum of products of counts.
+        sum((a - u)(b - v)) = sum(ab) - u sum(b) - v sum(a) + n u v; wrap-around on the way cancels.
         """
         u = np.array(origin, dtype=np.int64)
         i, j = np.tril_indices(len(self.signals))
@@ -104,10 +98,9 @@ class GramTable:
 
 
 def exact_sum(values: IntArray) -> list[int]:
-    """Return the sums of the columns of an int64 array, shape (rows < 2^26, columns), exactly.
+    """Return the sums of an int64 array's columns, shape (rows < 2^26, columns), exactly.
 
-    The int64 sum is right modulo 2^64; the float64 sum is right to far less than 2^63, and so
-    says how often it wrapped around. Integers of Python are added as they are.
+    The int64 sum is right modulo 2^64; the float64 sum tells how often it wrapped around.
     """
     wrapped = values.sum(axis=0).tolist()
     if values.dtype == object:

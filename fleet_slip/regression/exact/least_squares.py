@@ -58,14 +58,7 @@ class LinearModel:
 
 @dataclass(frozen=True)
 class Fit:
-    """Exact least-squares fit of a Gram, in counts.
-
-    Attributes:
-        gram: the rows it was fitted on, restricted to the inputs and the label.
-        model: coefficients per count; intercept in counts of the label.
-        rss: residual sum of squares, counts^2.
-        has_intercept: false for a model through the origin.
-    """
+    """Exact least-squares fit of a Gram of inputs and label, in counts; `rss` is in counts^2."""
 
     gram: Gram
     model: LinearModel
@@ -197,10 +190,7 @@ def correlation_matrix(gram: Gram) -> FloatArray:
 
 
 def condition_number(gram: Gram, inputs: Sequence[str]) -> float:
-    """Return the 2-norm condition number of the inputs' correlation matrix; 1 for no inputs.
-
-    Scaling to unit diagonal is within a factor k of the best scaling (van der Sluis 1969).
-    """
+    """Return the 2-norm condition number of correlations, within k of the best scaling's."""
     if not inputs:
         return 1.0
     eigenvalues = symmetric_eigenvalues(correlation_matrix(gram.restrict(inputs)))

@@ -1,8 +1,7 @@
 """Exact solution of large integer systems by p-adic lifting (Dixon 1982, Numer. Math. 40:137).
 
-Elimination multiplies numbers of thousands of digits k^3 times; lifting inverts the matrix once,
-modulo a prime, and finds the solution digit by digit with k^2 small products each. What it finds
-is proven by putting it back into the equations, so that it is the same fractions or none.
+It inverts once, modulo a prime, and finds the solution digit by digit with k^2 small products,
+where elimination multiplies huge numbers k^3 times. Solutions are proven by the equations.
 """
 
 import math
@@ -33,10 +32,7 @@ Integers = NDArray[np.int64]
 def solve_by_lifting(
     matrix: Sequence[Sequence[int]], right: Sequence[int]
 ) -> tuple[list[int], int] | None:
-    """Return x and d > 0 with `matrix @ x == d * right`, exactly, of a symmetric matrix.
-
-    None if the matrix is singular, or has more than `MOST_EQUATIONS` rows.
-    """
+    """Return x, d > 0 with `matrix @ x == d * right`, symmetric; None if singular or too large."""
     if not 0 < len(matrix) <= MOST_EQUATIONS:
         return None
     for prime in PRIMES:

@@ -82,9 +82,9 @@ def influence(
 ) -> Influence | None:
     """Return the influence of drives on a combination of the coefficients; None if singular.
 
-    `moments` are those of (1, signals) of each drive, shape (drives, k+1, k+1), about any origin;
-    `gradient` is with respect to the intercept there and the two slopes. With h = (X'X)^-1 a, a
-    drive moves a'b by h'(X_g'y_g - X_g'X_g b), and its share is h'X_g'X_g h.
+    `moments` are of (1, signals), shape (drives, k+1, k+1), about any origin; `gradient` is for the
+    intercept there and the slopes. With h = (X'X)^-1 a, a drive moves a'b by h'(X_g'y_g - X_g'X_g
+    b), and its share is h'X_g'X_g h.
     """
     turn = np.zeros((4, moments.shape[1]))
     turn[0, 0] = 1.0

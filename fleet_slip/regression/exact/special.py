@@ -1,7 +1,4 @@
-"""Distribution functions: normal, Student's t, F and chi-square with one degree of freedom.
-
-Own code, because NumPy has none of them and the package needs nothing else of SciPy.
-"""
+"""Distribution functions: normal, Student's t, F and chi-square, instead of all of SciPy."""
 
 import math
 

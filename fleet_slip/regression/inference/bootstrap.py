@@ -1,7 +1,6 @@
 """Repeated k-fold cross-validation and the cluster bootstrap over drives.
 
-Both work in float64 on centred and scaled per-drive moments: thousands of refits are a few matrix
-products. The exact figures are those of `crossval`; these say how far to trust them.
+Both work in float64 on centred and scaled moments: thousands of refits are matrix products.
 """
 
 import math
@@ -42,10 +41,9 @@ def held_out_products(
     fold: np.ndarray[tuple[int], np.dtype[np.int64]],
     models: Sequence[LinearModel],
 ) -> FloatArray:
-    """Return each cluster's moments of (1, error, label) under the models that did not see it.
+    """Return each cluster's moments of (1, error, label) under the fold's model that left it out.
 
-    `models` holds the model (of counts) for each fold. Shape (clusters, 6), packed lower triangle,
-    in spreads of the label.
+    Shape (clusters, 6), packed lower triangle, in spreads of the label.
     """
     result = np.empty((len(drives), 6))
     label = drives.size - 1

@@ -48,11 +48,9 @@ def chow_test(
 def wald_test(one: Fit, one_drives: DriveMoments, other: Fit, other_drives: DriveMoments) -> FTest:
     """Compare the coefficients of the same model fitted to two sets of drives.
 
-    Wald's statistic d'V^-1 d of their difference d, V being its covariance by clusters with the
-    correction for few of them, judged as Hotelling's T^2 with the degrees of freedom that their
-    leverages leave (`few_clusters`). Unlike `chow_test`, it does not take neighbouring rows for
-    independent. Clusters of the same number are the same car; drives are in one set only. Raises
-    `DataError` where clusters are too few.
+    Wald's statistic d'V^-1 d of their difference, V clustered and corrected for few of them, judged
+    as Hotelling's T^2 (`few_clusters`); neighbouring rows need not be independent. Clusters of the
+    same number are the same car. Raises `DataError` where clusters are too few.
     """
     unit, first = one_drives.unit, int(not one.has_intercept)
     size = one.size + 1 - first

@@ -1,7 +1,6 @@
 """Per-drive moments in float64 for what needs every drive: clusters and resampling.
 
-The moments are taken about the cohort's mean, rounded to a whole count, while they are still
-integers; so nothing is lost to cancellation before they are scaled to unit spread.
+They are about the cohort's mean, rounded to a count, while integers: nothing cancels.
 """
 
 from collections.abc import Sequence
@@ -59,13 +58,11 @@ class DriveMoments:
     """Moments of u = (1, (count - centre) / spread) of each drive; the label is last.
 
     Attributes:
-        signals: inputs, then the label: k names.
         centre: mean count of each signal over all drives, rounded to an integer.
         spread: standard deviation of each signal's counts; 1 for a constant.
         packed: lower triangle of the (k+1) x (k+1) moments of u, shape (drives, (k+1)(k+2)/2).
-        cluster: number of the piece of evidence that each drive belongs to, shape (drives,): drives
-            of a car share its biases and tyres. None: every drive is one of its own.
-        unit: what a piece of evidence is.
+        cluster: number of each drive's piece of evidence, shape (drives,); None: its own.
+        unit: what a piece of evidence is: drives of a car share its biases and tyres.
     """
 
     signals: tuple[str, ...]

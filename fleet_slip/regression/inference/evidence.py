@@ -1,9 +1,8 @@
 """How much each signal of an order contributes, and how much data says so.
 
-In the orthogonal basis of a nested order, signal j has the squared length A_j, in units of the
-noise. Every selection criterion is a price on A_j; those that depend on n need to know how many
-independent rows there are. Neighbouring rows at 100 Hz are not independent, so the evidence that
-decides is the one over drives.
+In the orthogonal basis of a nested order, signal j has the squared length A_j in units of the
+noise, and every criterion is a price on it. Neighbouring rows at 100 Hz are not independent, so the
+evidence that decides is over drives.
 """
 
 from collections.abc import Sequence
@@ -27,14 +26,12 @@ from fleet_slip.regression.inference.standard_errors import (
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the data says about the k+1 nested models of an order.
+    """What the data says about the k+1 nested models of an order; variances are in counts^2.
 
     Attributes:
         contributions: A_j of each signal of the order.
         rows: number of independent rows, at most the number of rows.
         design_effect: variance of an estimate over what independent rows would give.
-        variance: sigma^2 of the full model, counts^2.
-        full_rss: residual sum of squares of the full model, counts^2.
         kind: "rows" if rows count as independent, "drives" or "vehicles" if only those do.
     """
 
@@ -62,10 +59,10 @@ class Evidence:
     def clustered(cls, fits: Sequence[Fit], drives: DriveMoments) -> "Evidence":
         """Take drives, or cars, for independent: A_j is a squared cluster-robust t value.
 
-        With q_j the orthogonal direction of signal j and e the full model's residuals,
-        A_j = (q_j'y)^2 / (c sum_p (q_j'e)_p^2), p running over clusters. The ratio to the naive
-        A_j is the design effect of that direction (Kish 1965); rows divided by the mean design
-        effect are the effective rows, at least k + 2. Raises `DataError` as `naive` does.
+        With q_j the orthogonal direction of signal j and e the full model's residuals, A_j =
+        (q_j'y)^2 / (c sum_p (q_j'e)_p^2) over clusters p. Its ratio to the naive A_j is the
+        direction's design effect (Kish 1965); rows over the mean effect are effective, at least k +
+        2. Raises `DataError`.
         """
         full, variance = fits[-1], _variance(fits[-1])
         at = [0, *(drives.signals.index(name) + 1 for name in full.model.signals)]
@@ -114,10 +111,9 @@ class Evidence:
         return np.asarray((rss - self.full_rss) / (self.variance * self.design_effect))
 
     def distances(self) -> tuple[float, ...]:
-        """Return the unbiased estimates of the distance D of equation (2), j = 0..k.
+        """Return unbiased estimates of the distance D of equation (2), j = 0..k.
 
-        E D(M*, M_j) = j + sum_{i>j} A*_i and E A_i = A*_i + 1, so D_j = sum_{i>j} A_i + 2j - k
-        (Mallows 1973).
+        D_j = sum_{i>j} A_i + 2j - k (Mallows 1973), since E A_i = A*_i + 1.
         """
         size = np.arange(self.inputs + 1)
         return tuple((self.excess() + 2 * size - self.inputs).tolist())

@@ -1,18 +1,13 @@
 """A test of two sets of coefficients that holds its level with few clusters, from Gram rows alone.
 
-Residuals of a cluster are smaller than its noise, the more so the larger its leverage, so that a
-sandwich of them is too small; and it is far less certain than the number of clusters says where a
-few of them weigh most. CR2 of Bell and McCaffrey (Survey Methodology 28, 2002) mends the first: the
-residuals of a cluster are multiplied by (I - H_g)^(-1/2), H_g its block of the hat matrix. The
-second is mended by the degrees of freedom of Zhang's approximation to Hotelling's T^2 after
-Pustejovsky and Tipton (Journal of Business & Economic Statistics 36, 2018, section 3.2), of which
-Bell and McCaffrey's are the case of one coefficient. Both take the noise of rows for independent
-where they say how large a matrix is on average, and for nothing else.
+Residuals of a cluster shrink with its leverage, and a sandwich of few is uncertain. CR2 (Bell and
+McCaffrey, Survey Methodology 28, 2002) multiplies the residuals by (I - H_g)^(-1/2), H_g their
+block of the hat matrix; degrees of freedom are Zhang's for Hotelling's T^2 (Pustejovsky and Tipton,
+JBES 36, 2018, section 3.2). Both take rows for independent only for the mean of a matrix.
 
-No row is needed. In inputs x~ whose moments over all clusters are I, with N_g those of a cluster,
-X~' (I - X~ X~')^(-1/2) = (I - N_g)^(-1/2) X~': so the sums of inputs times residual are multiplied
-by S_g = (I - N_g)^(-1/2), and the covariances between clusters that the degrees of freedom take are
-S_g N_g S_g for one cluster, and -S_g N_g N_h S_h for two.
+No row is needed: in inputs x~ whose moments are I, with N_g those of a cluster, X~' (I - X~
+X~')^(-1/2) = (I - N_g)^(-1/2) X~'. So scores are multiplied by S_g = (I - N_g)^(-1/2); covariances
+are S_g N_g S_g within a cluster, and -S_g N_g N_h S_h between two.
 """
 
 from dataclasses import dataclass
@@ -34,8 +29,8 @@ class ClusteredFit:
         moments: of the inputs of each cluster, shape (clusters, q, q).
         scores: sums of inputs times residual, shape (clusters, q).
         cluster: a number of each, the same for the same cluster of another fit.
-        to_common: from coefficients in these coordinates to those that are compared, shape (q, q).
-        noise: standard deviation of the noise of rows, in units of the label here.
+        to_common: from these coordinates to the coefficients that are compared, shape (q, q).
+        noise: standard deviation of rows, in units of the label here.
     """
 
     moments: FloatArray
@@ -58,10 +53,9 @@ class _Adjusted:
 def hotelling(
     difference: FloatArray, fits: tuple[ClusteredFit, ClusteredFit]
 ) -> tuple[float, float]:
-    """Return F and the degrees of freedom of its denominator, those of its numerator being q.
+    """Return F and its denominator's degrees of freedom (the numerator's are q) for a difference.
 
-    The difference is that of the coefficients that are compared. A cluster may be in both fits.
-    Raises `DataError` where clusters are too few, or have too much leverage, to tell.
+    A cluster may be in both fits. Raises `DataError` for too few, or too much leverage.
     """
     size = len(difference)
     numbers = np.unique(np.concatenate([one.cluster for one in fits]))
@@ -112,9 +106,8 @@ def _adjust(one: ClusteredFit, at: IntArray, clusters: int) -> _Adjusted:
 def _variance(single: FloatArray, double: FloatArray) -> float:
     """Return the sum of the variances of all entries of the covariance, in units of its mean.
 
-    With P_gh = [g = h] D_g - K_g K_h' it is the sum of (tr P_gh)^2 + tr(P_gh P_gh) over all pairs
-    of clusters. That of the second term factors: with B_ac the sum over clusters of the products
-    of the rows a and c of K_g, it is the sum of |B_ac|^2 + <B_ac, B_ac'> over all a and c.
+    With P_gh = [g = h] D_g - K_g K_h', sum (tr P_gh)^2 + tr(P_gh P_gh) over pairs; the second
+    factors: sum |B_ac|^2 + <B_ac, B_ac'>, B_ac the products of rows a and c of K_g over clusters.
     """
     size = double.shape[1]
     pairs = 0.0

@@ -1,14 +1,9 @@
 """Cars whose influence on a model no honest car has, from Gram matrices alone.
 
-The influence of a car is the root mean square, over all rows, of how much the estimate changes when
-the car is taken out of the sums: Cook's distance (Technometrics 19, 1977) of a group of rows, but
-for its scale. It is leave-one-out itself, not an approximation, since a Gram can be subtracted.
-
-A car with ten times the drives has more influence by right. With M the moments of the inputs, M_c
-those of a car and H = M^-1 M_c its leverage, the mean square of the influence is a tr(H H) for
-coefficients that differ from car to car, and b tr(H) for what differs from drive to drive. How the
-two are mixed is not known, so a car may have the larger of what either alone would give it, beside
-the car of median leverage: influence is judged in these units.
+Influence is the root mean square, over all rows, of how the estimate changes without the car:
+Cook's distance (1977) of a group, exact leave-one-out. With M the moments of the inputs, M_c a
+car's and H = M^-1 M_c its leverage, its mean square is a tr(H H) if coefficients differ by car, and
+b tr(H) if by drive; a car may have the larger of both beside that of median leverage.
 """
 
 from dataclasses import dataclass
@@ -31,12 +26,8 @@ LEAST_CARS = 20
 
 @dataclass(frozen=True)
 class Influential:
-    """A car of unusual influence.
-
-    Attributes:
-        car: its number.
-        times: its influence, by what its leverage gives, as a multiple of the median car's.
-        rows: its part of all rows.
+    """A car, its influence over what its leverage gives and the median car's, and its share of
+    rows.
     """
 
     car: int
@@ -47,11 +38,9 @@ class Influential:
 def find_influential(moments: DriveMoments, cars: IntArray) -> list[Influential]:
     """Return the cars of unusual influence, the most unusual first.
 
-    `cars` numbers the car of each drive, from 0. One after the other, the car goes whose influence,
-    by what its leverage gives, lies above the cars' median by more than so many spreads that
-    `FALSE_ALARMS` would, in logarithms; the spread is 1.4826 times the median absolute deviation.
-    Raises `DataError` for
-    fewer than `LEAST_CARS` cars.
+    `cars` numbers each drive's car from 0. One by one the car goes whose log influence lies above
+    the median by more spreads (1.4826 median absolute deviations) than `FALSE_ALARMS` would. Raises
+    `DataError` for fewer than `LEAST_CARS` cars.
     """
     number = int(cars.max()) + 1
     if number < LEAST_CARS:

@@ -1,8 +1,6 @@
 """Serial correlation of the residuals, from a Gram of signals and their previous values.
 
-A lag Gram has each signal twice, now and one sample before, over all rows that have a predecessor
-in their drive. It holds S0 = sum u_t u_t', S1 = sum u_t u_{t-1}' and
-Sm = sum u_{t-1} u_{t-1}'.
+Over rows with a predecessor: S0 = sum u_t u_t', S1 = sum u_t u_{t-1}', Sm = sum u_{t-1} u_{t-1}'.
 """
 
 from collections.abc import Sequence
@@ -49,10 +47,9 @@ def serial_correlation(model: LinearModel, gram: Gram, lagged: LagGram) -> Seria
 
 
 def quasi_difference(lagged: LagGram, signals: Sequence[str], rho: Fraction) -> Gram:
-    """Return the Gram of q u_t - p u_{t-1} for rho = p / q, exactly.
+    """Return the Gram of q u_t - p u_{t-1} for rho = p / q, exactly, in counts worth 1/q.
 
-    Its counts are worth 1/q of the signals'; coefficients are unaffected, the intercept becomes
-    q - p times that of the levels.
+    Coefficients stay; the intercept becomes q - p times that of the levels.
     """
     p, q = rho.numerator, rho.denominator
     return lagged.gram.combine({name: {name: q, lagged.before(name): -p} for name in signals})

@@ -1,7 +1,6 @@
 """Standard errors, tests and collinearity of a fit.
 
-Rows at 100 Hz depend on each other, so the classical standard errors are far too small; the
-cluster-robust ones treat each drive as one piece of evidence.
+Rows at 100 Hz depend on each other: cluster-robust errors take each drive as one piece.
 """
 
 import math
@@ -37,13 +36,9 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Inference:
-    """Coefficients with their uncertainty.
+    """Coefficients, the intercept first if any, and the residual deviation in units of the label.
 
-    Attributes:
-        estimates: intercept first, if there is one.
-        residual_std: residual standard deviation in units of the label.
-        degrees_of_freedom: of the t distribution.
-        kind: "classical" (independent rows) or "cluster" (independent drives).
+    `kind` is "classical" (independent rows) or "cluster"; t has `degrees_of_freedom`.
     """
 
     estimates: tuple[Estimate, ...]
@@ -66,10 +61,7 @@ def _require_noise(fitted: Fit) -> None:
 
 
 def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
-    """Return the variances of the intercept (if any) and coefficients, in counts, exactly.
-
-    Var b = sigma^2 S^-1; Var b0 = sigma^2 (1/n + m'S^-1 m), m the mean inputs.
-    """
+    """Return Var b0 = sigma^2 (1/n + m'S^-1 m) and Var b = sigma^2 S^-1, in counts, exactly."""
     inputs, gram = fitted.model.signals, fitted.gram
     scale = gram.n if fitted.has_intercept else 1
     part = gram.restrict(inputs)
@@ -84,10 +76,9 @@ def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
 
 
 def infer_classically(fitted: Fit, scales: Scales, variance: Fraction | None = None) -> Inference:
-    """Return standard errors for independent rows, rounded once from exact rationals.
+    """Return standard errors for independent rows, rounded once; `variance` is in counts^2.
 
-    `variance` is that of the noise in counts^2 if it is from another model (the full one, for
-    nested models). Raises `DataError` if it is to be estimated and there are too few rows.
+    Raises `DataError` if it is to be estimated and there are too few rows.
     """
     sigma2 = noise_variance(fitted) if variance is None else variance
     units = _units(fitted, scales)
@@ -103,10 +94,9 @@ def infer_classically(fitted: Fit, scales: Scales, variance: Fraction | None = N
 def infer_by_clusters(fitted: Fit, drives: DriveMoments, scales: Scales) -> Inference:
     """Return cluster-robust standard errors, a cluster being a drive or a car.
 
-    After Cameron and Miller, A Practitioner's Guide to Cluster-Robust Inference (2015):
     V = c B (sum_p s_p s_p') B with B = (X'X)^-1, s_p the cluster's sum of x times residual, and
-    c = P/(P-1) (n-1)/(n-k-1), their correction CR1 for few clusters. The t distribution has P - 1
-    degrees of freedom. Raises `DataError` if there is only one cluster.
+    CR1's c = P/(P-1) (n-1)/(n-k-1); t has P - 1 degrees of freedom (Cameron and Miller 2015).
+    Raises `DataError` for one cluster.
     """
     covariance = cluster_covariance(fitted, drives)
     units = [float(unit) for unit in _units(fitted, scales)]
@@ -125,9 +115,9 @@ def cluster_covariance(fitted: Fit, drives: DriveMoments) -> FloatArray:
 
 
 def cluster_influences(fitted: Fit, drives: DriveMoments) -> FloatArray:
-    """Return how each cluster moves (intercept, coefficients), in counts, shape (k+1, clusters).
+    """Return how each cluster moves (intercept, coefficients) in counts, shape (k+1, clusters).
 
-    Their products sum up to the cluster-robust covariance. Raises `DataError` for one cluster.
+    The sum of squares is the robust covariance. Raises `DataError` for one cluster.
     """
     at = _columns(fitted, drives)
     scores = cluster_scores(fitted, drives)

@@ -1,8 +1,6 @@
 """What sensor bias and noise do to a model's error, in closed form (the paper's section III-A).
 
-No drive is simulated again: if sensor j reads too much by d_j plus independent noise of standard
-deviation s_j, the prediction changes by b'd + sum b_j v_j, so every sum of the error changes by
-terms that are known.
+With biases d_j and noise v_j, the prediction changes by b'd + sum b_j v_j: every sum follows.
 """
 
 from collections.abc import Mapping
@@ -24,10 +22,8 @@ def disturb(
 ) -> ErrorSums:
     """Return the error sums to expect once bias and white noise are added to the signals.
 
-    MSE' = MSE + 2 e (b'd) + (b'd)^2 + sum b_j^2 s_j^2, with e the mean error. `model` is one of
-    counts, as are the sums; `bias` and `noise` (standard deviations) are in physical units and
-    come on top of what the logged signals already have.
-    Raises `QuestionError` for a signal that the model does not use.
+    MSE' = MSE + 2 e (b'd) + (b'd)^2 + sum b_j^2 s_j^2, e the mean error. Model and sums are of
+    counts; `bias` and `noise` (deviations) physical. Raises `QuestionError` for an unused signal.
     """
     shift = sum(
         (model.coefficients[i] * value for i, value in _counts(model, scales, bias or {})),

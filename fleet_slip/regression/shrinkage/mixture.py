@@ -1,8 +1,7 @@
 """Mixing distributions of normal means and of noncentral chi-squares, by minimum distance.
 
-The distribution G of the true effects is a nonnegative measure on the data points that matches
-the empirical mass of intervals around them (Wang 2000, Wang and Witten 2002): least squares with
-w >= 0 and no constraint on the sum, so that a few far points are not absorbed by the many.
+G is a nonnegative measure on the data that matches the mass of intervals around them (Wang 2000,
+Wang and Witten 2002): w >= 0 without a constraint on the sum, lest the many absorb the few.
 """
 
 from collections.abc import Callable
@@ -86,10 +85,9 @@ class NormalKernel:
 
 @dataclass(frozen=True)
 class ChiSquareKernel:
-    """X ~ noncentral chi-square with one degree of freedom and noncentrality `point`.
+    """X ~ noncentral chi-square, one degree of freedom, noncentrality `point`.
 
-    `reach` is how far the intervals above the data go, on the scale of roots: as far as those below
-    them, or less as in WEKA, where a slip makes it 0.5.
+    `reach`: how far intervals go above the data, as roots; WEKA's slip makes it 0.5.
     """
 
     reach: float = 3.0

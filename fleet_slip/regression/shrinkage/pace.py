@@ -1,11 +1,8 @@
 """Pace regression: adaptive shrinkage of orthogonal responses (Wang 2000, Wang and Witten 2002).
 
-In the orthogonal basis of a nested order, shrinkage acts on one dimension at a time. The effects
-A_j of an order are samples from a mixture; the mixing distribution G, estimated from all of them,
-says how much each one is worth. Names follow Wang: pace1 truncates the nested sequence, pace3
-selects dimensions, pace5 shrinks, by a chi-square mixture that is known; pace2, pace4 and pace6 do
-the same by the one that is estimated from the very effects. eb shrinks by a normal mixture of
-signed effects.
+The effects A_j of an order are samples of a mixture, whose estimated distribution G says how much
+each is worth. pace1 truncates, pace3 selects, pace5 shrinks by a known chi-square mixture; pace2,
+pace4, pace6 by an estimated one; eb by a normal mixture of signed effects.
 """
 
 from collections.abc import Callable, Sequence
@@ -64,9 +61,8 @@ class OrthogonalResponses:
     def model(self, shrunk: FloatArray) -> LinearModel:
         """Return the model of counts whose responses are `shrunk`, shape (k+1,).
 
-        With R the triangular factor, R b = sigma a~. Each equation of the exact triangular system
-        is scaled by a~_j / a_j; so a~ = a gives least squares exactly, and zeros at the end give
-        a smaller nested model. Signals with a zero coefficient drop out.
+        R b = sigma a~; equations of the exact triangular system are scaled by a~_j / a_j, so that
+        a~ = a is least squares exactly. Signals with a zero coefficient drop out.
         """
         factors = [
             Fraction(float(new / old)) if old else Fraction(0)

@@ -1,9 +1,7 @@
-"""Least squares with an added diagonal: ridge, sensor noise, and errors in variables.
+"""Least squares with an added diagonal, S b + Lambda b = S_xy.
 
-S b + Lambda b = S_xy. A positive Lambda shrinks: it is ridge regression, and with n times the
-variance of noise that will be added to the signals it is the exact minimiser of the expected
-error under that noise (Bishop 1995). A negative one corrects for noise that the signals already
-have (errors in variables, Fuller 1987).
+A positive Lambda is ridge regression, or the exact minimiser under noise to come, n times its
+variance (Bishop 1995); a negative one corrects for noise that is there (Fuller 1987).
 """
 
 import math
@@ -58,11 +56,9 @@ def fit_noise_matched(
 def fit_errors_in_variables(
     gram: Gram, inputs: Sequence[str], label: str, noise: Mapping[str, float], scales: Scales
 ) -> LinearModel:
-    """Return the model of counts for signals without the noise that they were logged with.
+    """Return the model of counts for signals without `noise` (deviations, physical) in them.
 
-    `noise` is the standard deviation of the sensors, in physical units. Raises `DataError`
-    if there is less variance in the signals than that, and `QuestionError` for noise of a signal
-    that is not among the inputs.
+    Raises `DataError` if signals vary less, `QuestionError` for one that is no input.
     """
     variances = _variances(gram, inputs, noise, scales)
     return fit_penalised(gram, inputs, label, [-variance for variance in variances])

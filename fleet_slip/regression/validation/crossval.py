@@ -1,8 +1,4 @@
-"""Cross-validation from one Gram a fold: train on the total minus the fold, test on the fold.
-
-Predictive accuracy is measured as the paper does in Table I (k-fold cross-validation, Kohavi 1995):
-the sums of all folds are pooled before the correlation is taken.
-"""
+"""Cross-validation from one Gram a fold: train on the total minus it; pool all sums (Table I)."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -24,15 +20,10 @@ class CrossValidation:
     """A model's figures on rows that it was not fitted on, and its fit to all rows.
 
     Attributes:
-        name: what the model list calls it.
-        signals: its inputs.
         drives: number of drives it used: those that have all its signals.
-        pooled: figures over all folds' test rows together.
-        folds: figures of each fold's test rows.
-        fold_names: what the folds are called.
+        pooled, folds: figures over all folds' test rows together, and of each fold.
         condition_number: of the correlation matrix of the inputs, all rows.
-        model: fit to all rows, in physical units, exact.
-        counts: the same in counts.
+        model, counts: exact fit to all rows, in physical units and in counts.
         sums: exact pooled sums behind `pooled`, in counts.
     """
 

@@ -1,10 +1,7 @@
-"""Which fold a drive belongs to.
+"""Which fold a drive belongs to: the SHA-256 of its id modulo the number of folds.
 
-A drive's fold is a function of the drive alone: the SHA-256 hash of its id modulo the number of
-folds. Adding or removing drives therefore never moves another one, so that models of yesterday
-and today are compared on the same split. No rule that also equalises the folds can do this: it
-would have to know the other drives. The price is that fold sizes vary as they do by chance; with
-fewer than about five drives a fold, one may be empty, which is an error and not a silent change.
+It depends on the drive alone, so that models of different days share a split, which rules that even
+the folds out cannot. Sizes vary by chance; an empty fold is an error.
 """
 
 import hashlib
@@ -59,9 +56,8 @@ class FoldAssignment:
 def by_hash(keys: Sequence[str], count: int) -> FoldAssignment:
     """Deal drives into `count` folds by the hash of a key: the drive id, or a vehicle or track.
 
-    Drives with the same key share a fold. A fold that no drive falls into, as happens in small
-    cohorts, is left out: a drive's fold must not depend on which other drives there are. Raises
-    `DataError` if fewer than two folds are left, `QuestionError` if fewer are asked for.
+    Folds that no drive falls into are left out. Raises `DataError` if fewer than two are left,
+    `QuestionError` if fewer are asked for.
     """
     if count < 2:
         raise QuestionError(f"cross-validation needs at least two folds, not {count}.")
@@ -85,10 +81,9 @@ def by_value(values: Sequence[Any]) -> FoldAssignment:
 
 
 def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
-    """Cut the range of a number into `count` bands of about as many distinct values each.
+    """Cut a number's range into `count` bands of about as many distinct values: whole folds.
 
-    A fold is a whole band, so that a model is tested between or beyond the values that it was
-    fitted on. Unlike the other folds these move with the cohort. Raises `DataError` as `by_value`.
+    Unlike the other folds these move with the cohort. Raises `DataError` as `by_value`.
     """
     assignment = by_value(values)
     if len(assignment.names) <= count:
@@ -101,11 +96,7 @@ def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
 
 @dataclass(frozen=True)
 class Folds:
-    """One Gram a fold, all of the same signals, their names, and how many drives they are of.
-
-    Always trained on, and in no fold, are the rows `beside`, each of which has a `weight` where one
-    of a fold has 1.
-    """
+    """One Gram a fold, their names and numbers of drives; rows `beside` are always trained on."""
 
     grams: tuple[Gram, ...]
     names: tuple[str, ...]
@@ -137,13 +128,10 @@ class Folds:
 
 @dataclass(frozen=True)
 class CohortFolds:
-    """The folds of a cohort whose drives may have different signals.
+    """The folds of a cohort whose drives may have different signals: `tables` of Grams by set.
 
-    Attributes:
-        names: what the folds are called.
-        tables: for each signal set, one Gram a fold.
-        count_drives: tells how many drives have a Gram row in some of the tables, by their places.
-        beside, weight: see `Folds`; one Gram for each signal set.
+    `count_drives` tells how many drives have a row in some of the tables, by their places; for
+    `beside` and `weight` see `Folds`.
     """
 
     names: tuple[str, ...]
@@ -156,10 +144,7 @@ class CohortFolds:
     def of(
         cls, tables: Sequence[GramTable], assignment: FoldAssignment, drives: IntArray | None = None
     ) -> "CohortFolds":
-        """Add up the Gram rows of each fold. The assignment lists the rows table after table.
-
-        `drives` numbers the drive of each row; without it, every row is a drive of its own.
-        """
+        """Add up each fold's Gram rows; `drives` numbers their drives, by default one each."""
         sizes = [len(table) for table in tables]
         if sum(sizes) != len(assignment.fold):
             raise ValueError("the assignment is not of these drives")
@@ -179,10 +164,9 @@ class CohortFolds:
         return cls(assignment.names, grams, count_drives)
 
     def serving(self, inputs: Sequence[str], label: str, *, sparse: bool = False) -> Folds:
-        """Return the folds of the drives that have the label and all the inputs.
+        """Return the folds of drives that have the label and all the inputs; `sparse` skips others.
 
-        `sparse` leaves out folds without such a drive. Raises `DataError` if no drive has them all,
-        if a fold has no such row, or if there are not two folds that have.
+        Raises `DataError` if a fold, or all but one, has no such row.
         """
         signals = (*inputs, label)
         served = [i for i, grams in enumerate(self.tables) if set(signals) <= set(grams[0].signals)]

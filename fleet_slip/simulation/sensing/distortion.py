@@ -1,7 +1,4 @@
-"""What sensors make of the truth before bias and noise: place, tilt, delay, pulses, lasting errors.
-
-A drive comes in blocks; what a block leaves behind is kept for the next.
-"""
+"""What sensors make of the truth, block by block, before bias and noise: place, tilt, delay ..."""
 
 import math
 from collections.abc import Mapping
@@ -64,9 +61,8 @@ class Distortion:
     def _accelerations(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Return what the inertial unit feels at its place on a leaning body.
 
-        At (x, y) from the centre of gravity a body that turns has the specific force
-        ax − r² x − ṙ y, ay + ṙ x − r² y; tilted by roll φ and pitch θ it reads a part of the
-        weight's reaction g sin φ, g sin θ (Kidambi et al. 2014).
+        At (x, y): ax − r² x − ṙ y, ay + ṙ x − r² y, and for roll φ and pitch θ a part of the
+        weight's reaction, g sin φ, g sin θ (Kidambi et al. 2014).
         """
         sensors, car = self._flaws.sensors, self._flaws.car
         r, turning = truth["yaw_rate_rad_s"], truth["yaw_acceleration_rad_s2"]

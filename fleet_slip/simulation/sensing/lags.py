@@ -79,10 +79,7 @@ KNOT_TICKS = 10
 
 
 class Wander:
-    """Processes of mean 0 and standard deviation 1 that forget within a correlation time.
-
-    What they do depends on the generator alone, not on the blocks they come in.
-    """
+    """Processes of mean 0 and deviation 1 that forget within a correlation time, block or not."""
 
     def __init__(self, count: int, correlation_s: float, generator: np.random.Generator) -> None:
         """Begin at random. A correlation time is long beside the time between draws."""

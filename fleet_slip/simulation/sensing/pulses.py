@@ -10,10 +10,9 @@ from fleet_slip.vehicle.driver import SAMPLE_S
 
 
 class Pulses:
-    """A wheel speed sensor that times the pulses of an encoder.
+    """A wheel speed sensor that times the pulses of an encoder's teeth.
 
-    At every sample it reports the pulses since the last report over their time; where none came, no
-    more than that one comes right now. Pulses stand where the encoder's teeth are.
+    It reports pulses over the time since the last report; without one, at most one just now.
     """
 
     def __init__(self, places: FloatArray) -> None:
@@ -32,11 +31,7 @@ class Pulses:
 
 @kernel
 def _timed_pulses(speed: FloatArray, places: FloatArray, state: FloatArray) -> FloatArray:
-    """Fill in what the sensor reports.
-
-    `state` is the turned angle in pulses, the last pulse's number, the samples since it came, the
-    speed before, and the report.
-    """
+    """Fill in reports; `state`: turned pulses, last pulse, its age, speed before, report."""
     turned, last, since, before, report = state
     count = len(places)
     per_sample = count * SAMPLE_S / (2.0 * math.pi)

@@ -67,8 +67,7 @@ class Fixes:
 class ReceiverLog:
     """What the receiver of one car logs of one drive, recorded block by block.
 
-    The velocity is that of the centre of gravity, as it is after a mapping has moved it there from
-    the antenna; what the antenna's place was mistaken by is left in it.
+    The velocity is the centre of gravity's, as a mapping makes it, with the antenna's error left.
     """
 
     def __init__(self, receiver: Receiver, generator: np.random.Generator) -> None:
@@ -108,10 +107,7 @@ class ReceiverLog:
 
 @equation
 def _turn(heading: FloatArray, rate: float) -> None:
-    """Turn a unit vector (cosine, sine, rate before) by a tick's trapezoid of the yaw rate.
-
-    Of the half angle's tangent, so that it needs no sine and keeps its length.
-    """
+    """Turn a unit vector (cosine, sine, rate before) by a tick's trapezoid, by half tangents."""
     if not np.isnan(heading[2]):
         half = 0.25 * SAMPLE_S * (rate + heading[2])
         tangent = half + half * half * half / 3.0

@@ -27,8 +27,7 @@ EXACT = (0.0, 0.0)
 class Gps(Config):
     """Satellite navigation: velocity at its own rate, and stretches without a fix.
 
-    Outages begin at random with a mean time from the end of one to the beginning of the next,
-    and last for exponentially distributed times.
+    Outages, and the times between them, are exponentially distributed.
     """
 
     rate_hz: int = Field(gt=0)
@@ -81,8 +80,7 @@ class Sensors(Config):
 class Measurement:
     """One drive in counts: an int16 array per signal in catalogue order, one value a tick.
 
-    `gps_fix` is true where the GPS signals are valid. `saturated` counts the values that were
-    clipped to their signal's valid range.
+    `gps_fix`: where GPS is valid; `saturated`: values clipped to the signal's valid range.
     """
 
     counts: dict[str, NDArray[np.int16]]
@@ -93,9 +91,8 @@ class Measurement:
 class Recorder:
     """What the sensors of one car report of one drive, recorded block by block.
 
-    The draws come in a fixed order: for every block white noise signal by signal in catalogue
-    order, then the GPS outages, then the GPS noise. Signals without an entry in
-    `Sensors.bias_and_std` are exact. So the counts depend on where a drive is cut into blocks.
+    For every block white noise is drawn by signal, then GPS outages, then GPS noise: counts depend
+    on the cut. Signals without an entry in `Sensors.bias_and_std` are exact.
     """
 
     def __init__(
@@ -112,10 +109,8 @@ class Recorder:
         self._saturated = 0
 
     def record(self, truth: Mapping[str, FloatArray]) -> None:
-        """Measure the next block.
-
-        `truth` holds a float64 array of one length for the SI column of every signal but GPS; a
-        signal without one is not measured, as by a car that lacks the sensor.
+        """Measure the next block of float64 arrays by SI column, but GPS; missing ones are
+        unmeasured.
         """
         ticks = len(next(iter(truth.values())))
         if self._distortion is not None:

@@ -1,11 +1,7 @@
-"""The compiled loop over time and lanes.
+"""The compiled loop over time and lanes, each of which carries one drive after the other.
 
-Each lane carries one drive; a lane whose drive has ended takes the next one. At every sample the
-scalar part looks up the road and records; the driver's law and the physics are loops over all lanes
-that the compiler turns into vector instructions.
-
-When a lane's block of samples is full or its drive ends, the loop stops so that the caller takes
-the block; then it is called again.
+At every sample the scalar part looks up the road and records; driver and physics are loops over all
+lanes, vector instructions. When a block is full or its drive ends, the caller takes it.
 """
 
 import hashlib
@@ -172,10 +168,8 @@ def _finish(truth: Any, book: Any, ended: Any, cars: Any, imperfect: bool) -> No
 def build_kernel(sources: str, imperfect: bool = False) -> Callable[..., None]:
     """Return the kernel, not yet compiled: of cars as in the textbook, or with imperfections.
 
-    Its closure holds a digest of the `sources`, and so does the key under which numba keeps the
-    compiled code on disk: a change of any module compiles it again. What else the closure holds is
-    in the key too. A compiled function has another identity in each process, so that a kernel with
-    one in its closure would never be found again.
+    Its closure, and so numba's key on disk, has a digest of the `sources`: changes compile again. A
+    compiled function in it would have another identity in each process, and never be found.
     """
 
     def simulate(
@@ -189,12 +183,11 @@ def build_kernel(sources: str, imperfect: bool = False) -> Callable[..., None]:
         truth: Any,
         ended: Any,
     ) -> None:
-        """Drive on, from sample to sample, until a lane's block is complete.
+        """Drive on, from sample to sample, until a lane's block is complete; some lane has a drive.
 
-        `routes` are of dtype `ROUTE` and point into the tables `roads` and, for cars with
-        imperfections, `surfaces`; `cars` has `Constants`, `Handling` and `Traits` in rows; a sample
-        takes `steps` steps. `truth` is made by `empty_blocks`; `ended` gets the number of samples
-        and the tick of the loss of each drive. There must be a drive on some lane.
+        `routes` (`ROUTE`) point into `roads` and `surfaces`; `cars` has `Constants`, `Handling` and
+        `Traits` in rows; a sample takes `steps` steps; `truth` is of `empty_blocks`; `ended` gets
+        each drive's number of samples and tick of loss.
         """
         _ = sources
         complete = 0

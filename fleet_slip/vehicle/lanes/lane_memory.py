@@ -1,9 +1,7 @@
 """Lanes in memory: what each carries, how a drive enters and leaves it, and the blocks it records.
 
-Every quantity is a row of `LANES` numbers in one flat array. With all rows in one array at offsets
-known at compile time, the compiler needs no check that they overlap, and a loop over lanes that
-reads, computes and writes becomes vector instructions. A block of samples is still in the
-processor's cache when it is measured, and a drive of any length needs the same memory.
+Every quantity is a row of `LANES` numbers in one flat array, at offsets known when compiling: loops
+over lanes become vector instructions. Blocks are measured from the processor's cache.
 """
 
 import math
@@ -97,10 +95,7 @@ ROUTE = np.dtype(
 
 @equation
 def place(route: Any, station: float) -> tuple[int, float]:
-    """Return the entry at or before a station, and how far towards the next the station is.
-
-    A closed road's entries are continued beyond its length by what a driver sees ahead.
-    """
+    """Return the entry at or before a station, and how far the next is; closed roads go on."""
     entries = station * route.inverse_spacing
     entry = min(max(math.floor(entries), 0), route.last - route.first - 1)
     return route.first + entry, min(max(entries - entry, 0.0), 1.0)

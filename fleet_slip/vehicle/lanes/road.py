@@ -28,10 +28,9 @@ class Surface(NamedTuple):
 
 
 class Road(NamedTuple):
-    """The line to follow and the speed to hold, tabulated at equal steps of the station.
+    """The line to follow and the speed to hold, at equal steps of the station from 0.
 
-    The first entry stands at station 0. A closed road is periodic: `length_m` is a whole number of
-    spacings, and the entry after the last is the first again.
+    A closed road is a whole number of spacings long, and the entry after the last is the first.
     """
 
     spacing_m: float
@@ -53,11 +52,7 @@ def planned_time_s(road: Road, distance_m: float) -> float:
 
 
 def target_acceleration(road: Road) -> FloatArray:
-    """Return the acceleration d(v²/2)/ds of the target speed at the road's entries, in m/s².
-
-    Central differences; interpolated linearly it is continuous, so that a drive does not hinge on
-    which side of an entry a sample falls.
-    """
+    """Return d(v²/2)/ds of the target speed at the entries, m/s², by central differences."""
     energy = road.speed_mps**2 / 2
     if road.closed:
         return (np.roll(energy, -1) - np.roll(energy, 1)) / (2 * road.spacing_m)
