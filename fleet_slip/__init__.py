@@ -66,5 +66,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Name what `help` shows."""
     return [*globals(), *_HOMES]

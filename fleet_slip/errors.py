@@ -55,7 +55,6 @@ class FleetSlipError(Exception):
     exit_code = 1
 
     def __init__(self, message: str) -> None:
-        """Take a message; names in it may be hostile."""
         super().__init__(printable(hide_passwords(message)))
 
 

@@ -49,7 +49,6 @@ class _KeptCode(FunctionCache):
     """Compiled code on disk. A full disk or a damaged file costs the time to compile, no more."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        """Take the function. Raises `RuntimeError` if there is no folder."""
         super().__init__(function)  # type: ignore[no-untyped-call]
         self._cache_file = _CheckedFiles(  # type: ignore[no-untyped-call]
             self.cache_path,

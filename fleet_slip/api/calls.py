@@ -23,7 +23,6 @@ class Rooted:
     """The warehouse of a data root. Making one touches nothing."""
 
     def __init__(self, warehouse: Warehouse) -> None:
-        """Take the tables; `fleet_slip.open` makes them."""
         self.warehouse = warehouse
 
     @property
@@ -32,7 +31,6 @@ class Rooted:
         return self.warehouse.root
 
     def __repr__(self) -> str:
-        """Return the class and the data root."""
         return f"{type(self).__name__}({str(self.root)!r})"
 
 

@@ -30,12 +30,10 @@ class FleetCohort(Rooted):
     """
 
     def __init__(self, warehouse: Warehouse, condition: str) -> None:
-        """Take the tables and the condition."""
         super().__init__(warehouse)
         self.condition = condition
 
     def __repr__(self) -> str:
-        """Return the data root and the condition."""
         return f"{type(self).__name__}({str(self.root)!r}, {self.condition!r})"
 
     @takes(SelectionRequest)

@@ -63,7 +63,6 @@ class Session:
         self.database.close()
 
     def __enter__(self) -> Self:
-        """Return the session."""
         return self
 
     def __exit__(
@@ -72,7 +71,6 @@ class Session:
         error: BaseException | None,
         traceback: types.TracebackType | None,
     ) -> None:
-        """Close the connection, unless a query goes on that could not be stopped."""
         if not isinstance(error, QueryGoesOnError):
             self.close()
 

@@ -101,7 +101,6 @@ class SqlLayers:
         table: Mapping[str, str],
         given: Callable[[str, int], str],
     ) -> None:
-        """Take steps with their ranges, what operations are in SQL, and what is given is there."""
         self._steps, self._ranges, self._table, self._given = steps, ranges, table, given
         self.layers: defaultdict[int, list[str]] = defaultdict(list)
         self._uses = Counter(of for step in steps for of in operands_of(step))

@@ -92,7 +92,6 @@ class _Client(Client):
     """A client that leaves no thread behind where it cannot begin."""
 
     def __init__(self, address: str) -> None:
-        """Connect to the scheduler at an address."""
         Client.__init__(self, address, set_as_default=False, name="fleet-slip")
 
     def start(self, **options: Any) -> None:
@@ -167,7 +166,6 @@ class ClusterExecutor(Executor):
     """
 
     def __init__(self, client: Client, address: str, marker: Marker) -> None:
-        """Take a connected client, its address, and the file that workers must see."""
         self.workers = 0
         self._threads = 0
         self._client, self._address, self._marker = client, address, marker

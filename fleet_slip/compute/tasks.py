@@ -41,7 +41,6 @@ class LocalThreads(ThreadPoolExecutor):
     """Threads of this process."""
 
     def __init__(self, number: int) -> None:
-        """Take the number of threads."""
         super().__init__(number)
         self.in_flight = 2 * number
 

@@ -32,7 +32,6 @@ class StoredFile:
     identity: str
 
     def __str__(self) -> str:
-        """Return the full path."""
         return f"{self.folder}/{self.path}"
 
     @property

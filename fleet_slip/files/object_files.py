@@ -77,7 +77,6 @@ class ObjectReader(io.RawIOBase):
     """
 
     def __init__(self, store: "ObjectStore", key: str, where: str, size: int | None = None) -> None:
-        """Open an object; `where` names it in errors."""
         self._store, self._key, self._where, self._position = store, key, where, 0
         if size is None:
             with object_errors(where):
@@ -175,7 +174,6 @@ class ObjectFilesystem(_ReadOnlyFilesystem):
     """The objects of one bucket."""
 
     def __init__(self, bucket: str, store: "Callable[[], ObjectStore]") -> None:
-        """Serve a bucket, such as s3://BUCKET, of the store that is returned when asked for."""
         super().__init__()
         self.protocol, _, self._name = bucket.partition("://")
         self._store = store()
@@ -204,7 +202,6 @@ class LentFile(_ReadOnlyFilesystem):
     uri = "lent://file"
 
     def __init__(self, content: memoryview) -> None:
-        """Serve a content."""
         super().__init__()
         self._content = content
 

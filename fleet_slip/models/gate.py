@@ -119,7 +119,6 @@ class Comparison:
         return first.name if first.pooled.rmse < self.challenger.pooled.rmse else None
 
     def __str__(self) -> str:
-        """Return what was compared, with its figures."""
         challenger = self.challenger.pooled
         others = "; ".join(
             f"the coefficients of {one.name} have {one.pooled.rmse_deg:.4f} deg and "

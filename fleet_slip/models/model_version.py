@@ -40,7 +40,6 @@ class ModelVersion:
     sha256: str
 
     def __repr__(self) -> str:
-        """Return its name, how many signals it has, and how good it is."""
         figures = self.manifest.cross_validation
         return (
             f"<{type(self).__name__} {self.reference}: {len(self.manifest.terms)} signals, RMSE "

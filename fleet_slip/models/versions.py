@@ -1,7 +1,7 @@
 """Model versions: immutable, numbered, each explaining itself; and aliases with their history.
 
-    models/<name>/versions/1.json, 2.json, ...     what was published
-    models/<name>/history/1.json, 2.json, ...      every move of an alias, with its time
+models/<name>/versions/1.json, 2.json, ...     what was published
+models/<name>/history/1.json, 2.json, ...      every move of an alias, with its time
 """
 
 import re

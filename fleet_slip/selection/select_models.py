@@ -62,7 +62,6 @@ class Selection(Generic[AnyCohort]):
     intercept: bool = True
 
     def __repr__(self) -> str:
-        """Return the winner, among how many, and of which drives."""
         winner = self.winner.model
         return (
             f"<{type(self).__name__}: {winner.name}, {len(winner.signals)} signals, RMSE "

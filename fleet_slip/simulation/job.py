@@ -186,7 +186,6 @@ class _Backlog:
     """Batches that have not landed, planned day by day as they are asked for."""
 
     def __init__(self, snapshot: Snapshot, plan: Iterable[Sequence[Batch]], days: int) -> None:
-        """Take what has landed, the batches of each day, and how many days there are."""
         self._snapshot = snapshot
         self._plan = plan
         self._days = days
@@ -200,7 +199,6 @@ class _Backlog:
         return self._rows * self._days // max(self._days_planned, 1)
 
     def __iter__(self) -> Iterator[Batch]:
-        """Yield the batches in order."""
         for batches in self._plan:
             missing = [batch for batch in batches if not has_landed(self._snapshot, batch)]
             self.present += len(batches) - len(missing)

@@ -59,7 +59,6 @@ class _Writer:
     """Writes the operations of steps, those that are asked for and what they need."""
 
     def __init__(self, counted: CountedColumns) -> None:
-        """Take the steps."""
         self.code = Code(signals={name: n for n, name in enumerate(counted.lowered.signals)})
         self._told = [*counted.lowered.facts, *counted.lowered.numbers]
         self._counted, self._steps, self._ranges = counted, counted.steps, counted.ranges

@@ -101,7 +101,6 @@ class RollupReader:
     """Reads rollups, each once."""
 
     def __init__(self) -> None:
-        """Read nothing yet."""
         self._known: dict[str, Rollup | None] = {}
 
     def cells(

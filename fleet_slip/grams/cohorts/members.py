@@ -30,7 +30,6 @@ class Hashed:
         return cls((lambda: hashes,), len(hashes) if once else None)
 
     def __add__(self, other: "Hashed") -> "Hashed":
-        """Return both; each is there once if it was, and none is in both."""
         both = None if self.once is None or other.once is None else self.once + other.once
         return Hashed(self.parts + other.parts, both, max(self.least, other.least))
 
@@ -44,7 +43,6 @@ class Members:
     received: Mapping[str, Hashed] = field(default_factory=dict)
 
     def __add__(self, other: "Members") -> "Members":
-        """Return the drives and cars of both."""
         found = []
         for own, more in zip(vars(self).values(), vars(other).values(), strict=True):
             both = dict(own)

@@ -130,7 +130,6 @@ class GramReader:
     """
 
     def __init__(self, warehouse: Warehouse) -> None:
-        """Open nothing yet."""
         self._warehouse = warehouse
         self._logs: Snapshot | None = None
         self._grams: Snapshot | None = None
@@ -139,11 +138,9 @@ class GramReader:
         self._rollups = RollupReader()
 
     def __enter__(self) -> Self:
-        """Return the reader."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the connection."""
         self._close()
 
     def opened(

@@ -74,7 +74,6 @@ class Parts:
         return cls(tuple(bands), one.block_ticks, one.row_folds, times if len(times) > 1 else ())
 
     def __bool__(self) -> bool:
-        """Return whether rows are divided at all."""
         return bool(self.bands or self.block_ticks or self.row_folds or self.times)
 
     @property

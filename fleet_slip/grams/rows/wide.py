@@ -113,7 +113,6 @@ class PartSums:
     products: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Begin with nothing."""
         self.sums = np.zeros(self.size, dtype=np.int64)
         self.products = np.zeros((self.size, self.size), dtype=np.int64)
 

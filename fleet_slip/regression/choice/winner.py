@@ -36,7 +36,6 @@ class Worth:
         return share if self.relative else self.amount**2
 
     def __str__(self) -> str:
-        """Return it as it is asked for."""
         if self.relative:
             return f"{100 * self.amount:.3g} % of the best"
         return f"{math.degrees(self.amount):.4g} deg"
@@ -85,7 +84,6 @@ class Shortfall:
         }
 
     def __str__(self) -> str:
-        """Return the figure with its standard error, in degrees."""
         return f"{math.degrees(self.rmse):.4f} +- {math.degrees(self.standard_error):.2g} deg"
 
 

@@ -27,7 +27,6 @@ class ErrorSums:
     null: Fraction
 
     def __add__(self, other: "ErrorSums") -> "ErrorSums":
-        """Pool with the sums over other rows."""
         return ErrorSums(
             self.n + other.n,
             self.p + other.p,

@@ -41,7 +41,6 @@ class Gram:
     products: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        """Check the shapes. Raises `ValueError`."""
         k = len(self.signals)
         if len(set(self.signals)) != k:
             raise ValueError(f"a signal stands twice in {self.signals}")

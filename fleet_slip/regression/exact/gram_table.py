@@ -27,7 +27,6 @@ class GramTable:
     products: IntArray
 
     def __post_init__(self) -> None:
-        """Check shapes and types. Raises `ValueError`."""
         drives, k = len(self.n), len(self.signals)
         if self.sums.shape != (drives, k) or self.products.shape != (drives, packed_size(k)):
             raise ValueError(
@@ -39,7 +38,6 @@ class GramTable:
             raise ValueError("a GramTable holds int64, or integers of Python")
 
     def __len__(self) -> int:
-        """Return the number of drives."""
         return len(self.n)
 
     def row(self, index: int) -> Gram:

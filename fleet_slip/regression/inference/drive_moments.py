@@ -104,7 +104,6 @@ class DriveMoments:
         return cls(table.signals, centre, spread, packed, cluster, unit)
 
     def __len__(self) -> int:
-        """Return the number of drives."""
         return len(self.packed)
 
     @property

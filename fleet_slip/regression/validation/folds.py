@@ -38,7 +38,6 @@ class FoldAssignment:
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        """Check that no fold is empty and that there are two. Raises `DataError`."""
         used = set(self.fold.tolist())
         if len(self.names) < 2:
             raise DataError(

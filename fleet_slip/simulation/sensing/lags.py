@@ -13,7 +13,6 @@ class Delay:
     """A signal that comes late; between samples it is linear, before the first one constant."""
 
     def __init__(self, latency_s: float) -> None:
-        """Take the latency."""
         self._ticks = latency_s / SAMPLE_S
         self._before: FloatArray | None = None
 
@@ -82,7 +81,6 @@ class Wander:
     """Processes of mean 0 and deviation 1 that forget within a correlation time, block or not."""
 
     def __init__(self, count: int, correlation_s: float, generator: np.random.Generator) -> None:
-        """Begin at random. A correlation time is long beside the time between draws."""
         decay = 1.0 - KNOT_TICKS * SAMPLE_S / correlation_s
         self._step = (decay, math.sqrt(1.0 - decay * decay))
         self._generator = generator

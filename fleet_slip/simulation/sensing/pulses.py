@@ -16,7 +16,6 @@ class Pulses:
     """
 
     def __init__(self, places: FloatArray) -> None:
-        """Take how far each pulse of a turn stands from its place, over their distance."""
         self._places = places
         self._state = np.zeros(5)
         self._begun = False

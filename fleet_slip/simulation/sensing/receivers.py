@@ -71,7 +71,6 @@ class ReceiverLog:
     """
 
     def __init__(self, receiver: Receiver, generator: np.random.Generator) -> None:
-        """Begin a drive, in a direction of its own."""
         self._receiver, self._generator = receiver, generator
         direction = generator.standard_normal(2)
         self._heading = np.append(direction / np.sqrt((direction**2).sum()), np.nan)

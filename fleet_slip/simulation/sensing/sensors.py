@@ -98,7 +98,6 @@ class Recorder:
     def __init__(
         self, sensors: Sensors, generator: np.random.Generator, distortion: Distortion | None = None
     ) -> None:
-        """Begin a drive. Without a distortion the sensors see the truth."""
         self._distortion = distortion
         self._sensors = sensors
         self._generator = generator
@@ -211,7 +210,6 @@ class Outages:
     """When a drive has a GPS fix: once a period, and never in an outage."""
 
     def __init__(self, gps: Gps, generator: np.random.Generator) -> None:
-        """Begin a drive, with a fix."""
         self._gps = gps
         self._generator = generator
         self._begin_s = 0.0
