@@ -9,9 +9,7 @@ _ASCII = json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False
 
 
 def canonical_json(content: Any) -> str:
-    """Return JSON with sorted keys, no spaces and no escapes. Raises `ValueError` for NaN,
-    infinity.
-    """
+    """Return JSON with sorted keys, no spaces, no escapes. Raises `ValueError` for NaN."""
     return _TEXT.encode(content)
 
 

@@ -40,9 +40,7 @@ def data_needed() -> int:
 
 
 def require_limits() -> None:
-    """Raise `StorageError` under the shell's limits of address space or files that libraries crash
-    on.
-    """
+    """Raise `StorageError` under limits of the shell that libraries do not survive."""
     needed = LIBRARIES_BYTES + THREAD_BYTES * len(os.sched_getaffinity(0))
     allowed, _ = resource.getrlimit(resource.RLIMIT_AS)
     if allowed != resource.RLIM_INFINITY and allowed < needed:

@@ -74,7 +74,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         return Session(connect_unlocked(self.root, query, scenarios=scenarios), any_statement)
 
     def cohort(self, condition: str = TRAINING_DRIVES) -> FleetCohort:
-        """Return the drives of an SQL condition, by default all but those of evaluation scenarios."""
+        """Return the drives of an SQL condition, by default all but evaluation scenarios."""
         return FleetCohort(self.warehouse, condition)
 
     @record_call

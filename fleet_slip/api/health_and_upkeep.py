@@ -72,8 +72,7 @@ class HealthAndUpkeep(JudgedModels):
         return examine_drives(self.warehouse, cohort)
 
     def leave_out_faulty(self, cohort: str = TRAINING_DRIVES) -> "Examined":
-        """Return the condition of a cohort's drives that `quality` finds in order; it raises the
-        same.
+        """Return the condition of a cohort's drives that are in order; raises as `quality`.
 
         Simulated drives with logs are passed over; what was found is kept while the data stay.
         """
@@ -222,8 +221,7 @@ class HealthAndUpkeep(JudgedModels):
         drive: str | None = None,
         source_file: str | None = None,
     ) -> bool:
-        """Let new rows of a forgotten vehicle, drive or file land again; return whether that is
-        new.
+        """Let a forgotten vehicle, drive or file land again; return whether that is new.
 
         What was forgotten stays so, until `ingest` is given the allowed file, or its drives, again.
         Raises `UsageError` unless one subject is given, `QuestionError` if it was never forgotten,
@@ -270,10 +268,10 @@ class HealthAndUpkeep(JudgedModels):
     def retain(
         self, config: str | None = None, *, progress: ShowProgress | None = None
     ) -> "RetentionReport":
-        """Forget drives that are older than a retention file says, by default the shipped; then
-        vacuum.
+        """Forget drives that are older than a retention file says, then vacuum.
 
-        Progress is in files. Raises `RefusedError` if no drive would be left, and as `forget`.
+        `config` is its path, by default the one that ships. Progress is in files. Raises
+        `RefusedError` if no drive would be left, and as `forget`.
         """
         from fleet_slip.maintenance.retention import load_retention, retain
 

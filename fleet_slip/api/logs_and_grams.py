@@ -237,13 +237,12 @@ class LogsAndGrams(Rooted):
     def check(
         self, files: int = 4, *, begin: int = 0, progress: ShowProgress | None = None
     ) -> "CheckReport":
-        """Compute the Gram rows of some log files three ways; compare the bits, stored rows
-        included.
+        """Compute the Gram rows of some log files three ways; compare them bit for bit.
 
-        By SQL, by float64 products with exact partial sums, and by Python integers. Files are
-        evenly chosen; those of `begin` + 1 are the next ones. Progress is in files. Raises
-        `StorageError` naming the first drive that differs, and `DataError` if there is nothing to
-        check.
+        By SQL, by float64 products with exact partial sums, and by Python integers; and with the
+        stored rows. Files are evenly chosen; those of `begin` + 1 are the next ones. Progress is in
+        files. Raises `StorageError` naming the first drive that differs, and `DataError` if there
+        is nothing to check.
         """
         from fleet_slip.grams.rows.check_grams import check_grams
 

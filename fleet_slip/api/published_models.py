@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 
 
 class PublishedModels(Rooted):
-    """Published models: `NAME@VERSION`, `NAME@ALIAS`, `NAME` for its champion, None for the only
-    one.
+    """Published models. A reference is `NAME@VERSION`, `NAME@ALIAS`, or `NAME` for its champion.
+
+    None stands for the only model that there is.
     """
 
     def models(self, name: str | None = None) -> "pa.Table":
@@ -126,8 +127,7 @@ class PublishedModels(Rooted):
 
     @record_call
     def rollback(self, name: str, alias: str = CHAMPION) -> ModelVersion:
-        """Point an alias back at the version before, until `promote` or `unpin`; return that
-        version.
+        """Point an alias back at the version before; return it. It is held there as by `pin`.
 
         Raises `RefusedError` if it never had another, and what `model` raises.
         """

@@ -83,8 +83,9 @@ class Training:
     def publish_if_not_worse(
         self, fleet: "Fleet", selection: "RequestedSelection", *, replace_marked: bool
     ) -> "tuple[Publication | None, str]":
-        """Return the publication, or None and why; `replace_marked`: also over one of forgotten
-        drives.
+        """Return the publication, or None and why it was refused.
+
+        With `replace_marked`, what was trained on forgotten drives is replaced even by a worse one.
         """
         from fleet_slip.maintenance.marked_models import marked_models
 

@@ -30,9 +30,7 @@ class Session:
     allow: Callable[[duckdb.DuckDBPyConnection, str], str] = one_query
 
     def sql(self, query: str) -> duckdb.DuckDBPyRelation:
-        """Return the answer as a relation, computed when asked for rows; it keeps the connection
-        open.
-        """
+        """Return the answer as a relation; what is made of it keeps the connection open."""
         text = self.allow(self.database, query)
         add_calibration(self.database, query)
         with database_errors("the query"):
@@ -46,8 +44,7 @@ class Session:
         return self.compute(query, duckdb.DuckDBPyRelation.to_arrow_table)
 
     def compute(self, query: str, work: Callable[[duckdb.DuckDBPyRelation], Result]) -> Result:
-        """Do work with the answer to a query, and return its result. Ctrl-C ends it within a
-        second.
+        """Do work with the answer to a query; Ctrl-C ends it within a second.
 
         Raises `StorageError` if a file that was read is not what its checksum says.
         """

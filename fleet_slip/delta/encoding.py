@@ -74,9 +74,7 @@ class Encoding:
     def encode(
         self, rows: pa.Table, omitted: Sequence[str] = (), leading: Sequence[bytes] = ()
     ) -> Encoded:
-        """Return a file of these rows, `leading` parts first, less columns; dictionaries are used
-        up.
-        """
+        """Return a file of these rows, `leading` parts first, with dictionaries of what occurs."""
         kept = rows.drop_columns([name for name in omitted if name in rows.schema.names])
         # A dictionary that is shared with rows of another file, or of a drive that was forgotten,
         # would bring their names along: Parquet stores one as it is given.

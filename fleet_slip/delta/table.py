@@ -48,9 +48,7 @@ class Table:
         return pa.schema([field for field in self.schema if field.name not in self.optional])
 
     def snapshot(self, version: int | None = None) -> Snapshot:
-        """Return the table as it is, or was at a version; empty if unwritten. Raises
-        `StorageError`.
-        """
+        """Return the table as it is, or at a version; empty if unwritten. Raises `StorageError`."""
         delta = self.open_delta(version)
         if delta is not None:
             require_sound_log(self.folder, delta.version())
@@ -116,8 +114,7 @@ class Table:
         return self.put(name, self.encode(rows, leading), day)
 
     def put(self, name: str, encoded: Encoded, day: date | None = None) -> AddAction:
-        """Write a file's content to the file NAME-CHECKSUMS.parquet, durably; return its add
-        action.
+        """Write a content to the file NAME-CHECKSUMS.parquet, durably; return its add action.
 
         It is in the table once committed. Where that name is taken, the new file gets a longer one:
         what is not committed is its writer's alone, to delete.

@@ -85,8 +85,7 @@ class DocumentFolder:
         return self.after_newest(lambda newest: self.create(newest + 1, content))
 
     def after_newest(self, attempt: Callable[[int], T | None]) -> T:
-        """Return what an attempt to add the next document, given the newest's number or 0, comes
-        to.
+        """Return what an attempt to add the next document comes to, given the newest number or 0.
 
         It is made again while it is None: another was faster. Raises `ConflictError` after very
         many.

@@ -91,9 +91,7 @@ class Folder(Protocol):
         """Return the content of files, None for one that is gone."""
 
     def check(self, path: str) -> None:
-        """Raise `StorageError` if a data file is not what its name says; object stores say when
-        read.
-        """
+        """Raise `StorageError` for a changed data file, if `open` would not."""
 
     def open(self, path: str) -> "pa.NativeFile":
         """Open a file for reading anywhere in it."""

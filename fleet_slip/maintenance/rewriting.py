@@ -84,9 +84,7 @@ def write_again(
 
 
 def rewriting_units(logs: Snapshot, replaced: Sequence[TableFile]) -> list[Unit]:
-    """Return units by which commits that rewrite a day's files conflict, which Delta would let
-    pass.
-    """
+    """Return units that make commits conflict which rewrite the same day; Delta lets them pass."""
     days = sorted({str(file.day) for file in replaced})
     return [Unit(f"rewrite/{day}", (logs.version or 0) + 1) for day in days]
 

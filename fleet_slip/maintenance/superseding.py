@@ -30,9 +30,7 @@ class TakingOut:
     warehouse: Warehouse
 
     def without(self, name: TableName, snapshot: Snapshot, origins: Collection[Origin]) -> Change:
-        """Return the change without drives, or their refused rows, of origins. Raises
-        `ConflictError`.
-        """
+        """Return the change that takes the drives, or refused rows, of origins out."""
         if name == "quarantine":
             return self._without_refused(snapshot, origins)
         drives = drives_in(self.warehouse, snapshot)

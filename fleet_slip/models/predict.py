@@ -27,9 +27,7 @@ from fleet_slip.models.predictor import Predictor
 
 
 def predict(manifest: Manifest, frame: Any, predictor: Predictor | None = None) -> Any:
-    """Return the angle of each row in rad, as `ModelVersion.predict`; `predictor` spares making
-    one.
-    """
+    """Return the angle of each row in rad; see `ModelVersion.predict`."""
     opened = open_frame(frame)
     columns = opened.numbers(manifest.columns, f"the model {manifest.name}")
     for signal in catalogue().signals.values():

@@ -21,8 +21,9 @@ KEPT_ROWS = 2**16
 
 @dataclass(frozen=True)
 class Predictor:
-    """A published model on counts: its column plan, its intercept in rad, rad per physical value
-    and physical value per count of each column.
+    """A published model on counts: the columns that it needs, and what a count of each adds.
+
+    `coefficients` are in rad per physical value, which is `scales` times the count.
     """
 
     plan: ColumnPlan

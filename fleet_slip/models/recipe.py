@@ -44,9 +44,7 @@ def asked_of(selection: RequestedSelection) -> dict[str, Any] | None:
 def recipe_for(
     registry: Registry, name: str, request: SelectionRequest, cohort: str | None = None
 ) -> Recipe:
-    """Return how to train a model as before, but for what is asked. Raises `QuestionError` if
-    untold.
-    """
+    """Return how to train a model as before, but for what is asked. Raises `QuestionError`."""
     before = _newest(registry, name)
     asked = _asked(request)
     if before is None:

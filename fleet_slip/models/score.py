@@ -95,8 +95,9 @@ def _scored_rows(manifest: Manifest, condition: Condition) -> dict[str, str]:
 
 
 def _step_rad(manifest: Manifest) -> float:
-    """Return the power of two that angles are counted in: at most 2^45 steps, so that 2^34 squares
-    fit into HUGEINT.
+    """Return the power of two in which angles are counted to be added up exactly.
+
+    None has more than 2^45 steps, so that 2^34 squares of differences fit into HUGEINT.
     """
     largest = abs(manifest.intercept) + float(manifest.label.scale) * COUNT_MAX
     for term in manifest.terms:
@@ -133,8 +134,7 @@ def _si_rows(rows: str, computed: Sequence[str] = ()) -> str:
 
 
 def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) -> Score:
-    """Score a model on the rows of `log` that satisfy a condition, columns over time drive by
-    drive.
+    """Score a model on the rows of `log` that satisfy a condition.
 
     Raises like `score_statement`, `DataError` if no row has the model's signals, and `CohortError`
     where a minimum cohort holds, for a condition on rows or too few cars.

@@ -46,9 +46,7 @@ def require_signing_key(key: Path) -> None:
 
 
 def sign_version(folder: Folder, number: int, name: str, sha256: str, key: Path) -> None:
-    """Write the signature of a version beside it, durably. Raises `ConfigError` for an unusable
-    key.
-    """
+    """Write the signature of a version beside it, durably. Raises `ConfigError` for the key."""
     signature = _signed(key, _message(number, name, sha256))
     folder.put(f"{number}.sig", base64.b64encode(signature) + b"\n")
 

@@ -105,9 +105,7 @@ def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) 
 
 
 def _by_offsets(rows: FloatArray, offsets: FloatArray, means: FloatArray) -> LinearModel | None:
-    """Fit the cars' intercepts, in rad, to their offsets in counts, exactly; None if these go
-    together.
-    """
+    """Fit the cars' intercepts in rad to their offsets in counts; None if these go together."""
     if not set(COLUMNS) <= set(features().calibrated):
         return None
     grains = np.rint(means / float(GRAIN_RAD))

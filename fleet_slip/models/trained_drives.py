@@ -41,9 +41,7 @@ def read_trained_drives(versions: Folder, manifest: Manifest) -> Hashes | None:
 
 
 def read_drives_file(versions: Folder, manifest: Manifest) -> bytes | None:
-    """Return a version's drives file; None if older than such files. Raises `StorageError` if
-    damaged.
-    """
+    """Return the file of a version's drives, None if it has none. Raises `StorageError`."""
     expected = manifest.trained_on.drives_sha256
     if expected is None:
         return None

@@ -52,9 +52,7 @@ class Registry:
         return self._versions(name).numbers()
 
     def load(self, name: str, version: int) -> ModelVersion:
-        """Return a version. Raises `StorageError` if changed, `RefusedError` without a needed
-        signature.
-        """
+        """Return a version. Raises `StorageError` if changed, `RefusedError` if unsigned."""
         loaded = self._read(name, version)
         require_signature(self._versions(name).folder, version, name, loaded.sha256)
         return loaded
@@ -94,9 +92,7 @@ class Registry:
         return names[0]
 
     def resolve(self, reference: str | None) -> ModelVersion:
-        """Return the version of `NAME`, `NAME@VERSION`, `NAME@ALIAS`, or None. Raises
-        `QuestionError`.
-        """
+        """Return the version that a reference names, None the only model. Raises `QuestionError`."""
         name, _, which = (reference or self.only()).partition("@")
         self.require(name)
         which = which or CHAMPION
@@ -147,9 +143,7 @@ class Registry:
         return self._read(name, version)
 
     def make_champion(self, version: ModelVersion, *, after: int, best: int | None = None) -> bool:
-        """Point the champion at a version, `best` being the best so far; False if an alias moved
-        since.
-        """
+        """Point the champion at a version, and at the `best`; False if an alias moved since."""
         history = self.history(version.manifest.name)
         there = history.pointed_at(CHAMPION) == version.version
         return there or history.move(CHAMPION, version.version, "publish", after=after, best=best)
@@ -184,9 +178,7 @@ class Registry:
         return history.decide(move)
 
     def rollback(self, name: str, alias: str) -> int:
-        """Point an alias back; return the version. Raises `RefusedError` without one, and as
-        `load`.
-        """
+        """Point an alias back; return its version. Raises `RefusedError`, and as `load`."""
         history = self.history(name)
 
         def move(newest: int) -> int | None:

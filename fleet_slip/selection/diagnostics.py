@@ -50,9 +50,7 @@ class SerialDiagnosis:
 
 @dataclass(frozen=True)
 class CohortComparison:
-    """Whether another cohort has the same coefficients, by Chow's test of rows and Wald's of
-    drives.
-    """
+    """Whether another cohort has the same coefficients: Chow's test of rows, Wald's of drives."""
 
     condition: str
     other: Inference

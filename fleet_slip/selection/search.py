@@ -212,9 +212,7 @@ def search_models(
     *,
     intercept: bool = True,
 ) -> SearchedModels:
-    """Search among the inputs on the drives with them all. Raises `DataError` where nothing is
-    told.
-    """
+    """Search among the inputs on the drives that have them all. Raises `DataError`."""
     label = catalogue().label
     folds = cohort.folds(folding.by, folding.count).serving(inputs, label)
 

@@ -185,9 +185,7 @@ class Campaign(Config):
         return chosen
 
     def drives(self, day: date) -> tuple[DriveSpec, ...]:
-        """Return the drives of a day, by name. Raises `ConfigError` if the campaign has no such
-        day.
-        """
+        """Return the drives of a day, by name. Raises `ConfigError` for no such day."""
         days = self.days()
         if day not in days:
             raise ConfigError(

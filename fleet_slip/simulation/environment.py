@@ -185,9 +185,7 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Draw a trial, unless `options` fix `speed_mps`, `steering_rad` (with its side),
-        `adhesion`.
-        """
+        """Draw a trial; `options` may fix `speed_mps`, `steering_rad` and `adhesion`."""
         super().reset(seed=seed)
         speed, steering, adhesion = (self.np_random.uniform(*one) for one in self._ranges)
         side = 1.0 if self.np_random.random() < 0.5 else -1.0

@@ -1,6 +1,4 @@
-"""What cars, sensors and roads have beyond the textbook's; zero is without. Sources:
-`docs/imperfections.md`.
-"""
+"""What cars, sensors and roads have beyond the textbook's. Sources: `docs/imperfections.md`."""
 
 from typing import Annotated, TypeVar
 

@@ -29,8 +29,7 @@ from fleet_slip.warehouse.tables import Warehouse
 
 @dataclass
 class Seconds:
-    """Where the time went. Tasks run side by side, so that their seconds add up to more than
-    `elapsed`."""
+    """Where the time went; tasks run side by side and may add up to more than `elapsed`."""
 
     elapsed: float = 0.0
     simulate: float = 0.0

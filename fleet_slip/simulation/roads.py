@@ -46,9 +46,7 @@ _NAME = re.compile(rf"({'|'.join(CLASSES)})_(\d{{1,9}})")
 
 
 def load_track(name_or_path: str) -> Track:
-    """Read a track by name or path, or draw a road `CLASS_SEED` such as `country_17`. Raises
-    `ConfigError`.
-    """
+    """Read a track by name or path, or draw `country_17`: class, seed. Raises `ConfigError`."""
     drawn = _NAME.fullmatch(name_or_path)
     if drawn:
         return draw_road(drawn[1], int(drawn[2]))

@@ -185,9 +185,7 @@ class Scenario(Config):
 
 
 def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str, Any]:
-    """Fill in what a scenario, and those `derived` from it, take from its base. Raises
-    `ValueError`.
-    """
+    """Fill in what a scenario takes from its base. Raises `ValueError`."""
     name, base = content.get("name"), content.get("base")
     if "drive" in content:
         raise ValueError("drive follows from the base and cannot be given")

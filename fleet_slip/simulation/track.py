@@ -116,8 +116,7 @@ class Track(Config):
         return np.interp(station, self._knots_m, self._curvature_at_knots_1pm)
 
     def grid(self, spacing_m: float) -> tuple[FloatArray, float]:
-        """Return evenly spaced stations in m from 0, and their spacing, as near `spacing_m` as
-        fits.
+        """Return even stations in m from 0 and their spacing, as near `spacing_m` as fits.
 
         On an open track they reach its end; on a closed one the next would be the start.
         """
@@ -181,9 +180,7 @@ class SpeedProfile:
     speed_mps: FloatArray
 
     def time_s(self, laps: float) -> float:
-        """Return the time from the start over laps or a part, at constant acceleration between
-        stations.
-        """
+        """Return the time from the start over laps or parts, by constant accelerations."""
         station, speed = self.station_m, self.speed_mps
         if self.track.closed:
             station, speed = np.append(station, self.track.length_m), np.append(speed, speed[0])

@@ -108,9 +108,7 @@ def rates_of(
 
 
 def build_derivative(extensions: Extensions) -> Callable[[State, Controls, Constants], Derivative]:
-    """Compile the equations of motion with some extensions: pure (state, controls, constants) to
-    rates.
-    """
+    """Compile the equations of motion: a pure function of (state, controls, constants)."""
     directions = ackermann if extensions.steering else parallel
     loads = transferred_loads if extensions.load_transfer else static_loads
     forces = build_wheel_forces(extensions.brush_tyres, extensions.drivetrain)

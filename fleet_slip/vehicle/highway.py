@@ -128,9 +128,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         adhesion: float | None = None,
         extensions: Extensions | None = None,
     ) -> None:
-        """Put the car on a road, or none, at m, rad and m/s, straight ahead; else as its class has
-        it.
-        """
+        """Put the car on a road, or none, straight ahead, in m, rad and m/s."""
         self.parameters = self.PARAMETERS if parameters is None else parameters
         self.adhesion = self.ADHESION if adhesion is None else adhesion
         self.extensions = self.EXTENSIONS if extensions is None else extensions

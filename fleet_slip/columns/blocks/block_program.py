@@ -141,9 +141,7 @@ class BlockProgram:
         return len(self.code.kinds)
 
     def regions(self, rows: int) -> NDArray[np.int64]:
-        """Return each region's (begin, distance of parts) for so many rows, and last the memory's
-        size.
-        """
+        """Return each region's begin and stride for so many rows, and the memory's size last."""
         code = self.code
         shapes = {
             Region.CLIPPED: (1, STRIDE),

@@ -94,9 +94,7 @@ class Workspace:
         self._flags[GAPS] = not drive.whole
 
     def block(self, first: int) -> tuple[FloatArray, FloatArray]:
-        """Return the last block's columns, (columns, rows) with NaN, until the next, and its
-        clipping.
-        """
+        """Return the last block's columns, (columns, rows) with NaN, and its clipping."""
         place, stride = self._regions[Region.REGISTER]
         rows, columns = min(BLOCK_ROWS, self.rows - first), len(self.plan.names)
         registers = self._memory[place : place + columns * stride].reshape(columns, stride)
@@ -115,9 +113,7 @@ class Workspace:
         self._run(first, 0, self._products.astype(np.int64))
 
     def add_blocks(self, first: int, exact_rows: int, totals: NDArray[np.int64]) -> "Added":
-        """Add blocks from a row on to `totals` (`kernel.run`), until one lacks a value: see
-        `block`.
-        """
+        """Add blocks from a row on to `totals` (`kernel.run`), until one lacks a value."""
         return self._run(first, exact_rows, totals)
 
     def totals(self) -> NDArray[np.int64]:

@@ -106,9 +106,7 @@ def values_ago(memory: Any, places: Any, first: int, size: int, ticks: int) -> N
 
 @inner_loop
 def find_begins(memory: Any, of_ticks: int, rows: int, ticks: int, begins: int) -> None:
-    """Write each row's first row within the last `ticks` of rising ticks; 0 for all since the
-    start.
-    """
+    """Write the first row within `ticks` before each; 0 ticks reach back to the start."""
     at = 0
     for t in range(rows):
         while ticks and memory[of_ticks + at] <= memory[of_ticks + t] - ticks:

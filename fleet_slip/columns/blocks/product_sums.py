@@ -13,8 +13,7 @@ from fleet_slip.compiling import exact_loop, inner_loop
 
 @inner_loop
 def add_sums(memory: Any, place: int, stride: int, rows: int, columns: int, products: Any) -> Any:
-    """Add each column's sum to the last row of `products`; tell, and add nothing, if one is
-    missing.
+    """Add each column's sum to the last row of `products`, unless a value is missing.
 
     Columns lie `stride` apart from `place`; `products` is (columns + 1, columns), in whole tiles.
     """

@@ -46,8 +46,7 @@ class Expansion:
     def tables(
         self, batch: pa.RecordBatch | pa.Table
     ) -> Iterator[tuple[str, GramTable, BoolArray]]:
-        """Yield signals of Gram rows, their table with calibrated columns, and which rows these
-        are.
+        """Yield signals of Gram rows, their table with calibrated columns, and which these are.
 
         Rows of a car without a number lack the columns that need it.
         """

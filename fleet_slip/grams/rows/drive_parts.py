@@ -25,9 +25,7 @@ BLOCK_FORMAT = "block %04d"
 
 @dataclass(frozen=True)
 class Bands:
-    """The bands of a signal or feature, or its absolute value: the least count of all but the
-    first.
-    """
+    """The bands of a signal or feature, or of its size: the least count of all but the first."""
 
     of: str
     absolute: bool

@@ -84,9 +84,7 @@ def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
 
 
 def _files_to_merge(grams: Snapshot) -> set[str]:
-    """Return the smallest files, enough for one usual file, where too many are small: few each
-    night.
-    """
+    """Return small files that make one of usual size, if too many are: each night merges a few."""
     small = sorted((_fullness(file), file.path) for file in grams.files if _fullness(file) < 1)
     if len(small) <= SMALL_FILES_MAX:
         return set()

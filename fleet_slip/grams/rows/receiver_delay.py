@@ -38,9 +38,7 @@ FEWEST_DRIVES = 3
 
 @dataclass(frozen=True)
 class ReceiverDelay:
-    """The delay of a car's receiver behind its accelerometer and standard error, s; None of few
-    drives.
-    """
+    """The delay of a car's receiver behind its accelerometer, s; of few drives, of unknown error."""
 
     value: float
     uncertainty: float | None

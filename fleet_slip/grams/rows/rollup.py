@@ -166,9 +166,7 @@ def _tells_its_trips(rows: pa.Table) -> bool:
 
 
 def _cells_of(rows: pa.Table, columns: Collection[str]) -> tuple[list[str], IntArray, IntArray]:
-    """Return the columns to roll up by, each row's cell and each cell's first row; none for too
-    many.
-    """
+    """Return the columns to roll up by, each row's cell, each cell's first row; or no columns."""
     names = {*ALWAYS, *columns}.intersection(rows.column_names)
     codes = {name: _codes(rows[name]) for name in names}
     others = sorted(names.difference(ALWAYS), key=lambda name: (codes[name].max(), name))

@@ -63,8 +63,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class NestedChoice:
-    """A choice of the first `size` signals of an order, their exact fit in counts, and its
-    evidence.
+    """A choice of the first `size` signals of an order, their exact fit and its evidence.
 
     `values` of the criterion are for 0..k signals, smaller being better; of cross-validation they
     are the negative correlations.

@@ -127,8 +127,7 @@ class Gram:
         return Gram(self.signals, self.n, (0,) * len(self.sums), self.products)
 
     def combine(self, combinations: Mapping[str, Mapping[str, int]]) -> "Gram":
-        """Return the Gram of integer combinations of signals, such as {"difference": {"a": 1, "b":
-        -1}}.
+        """Return the Gram of integer combinations, such as {"difference": {"a": 1, "b": -1}}.
 
         Raises `DataError` for a signal that the Gram lacks.
         """

@@ -15,8 +15,7 @@ _MODULUS = 2**64
 
 @dataclass(frozen=True)
 class GramTable:
-    """Many Grams of the same signals, one a drive: n (drives,), sums (drives, k) and packed
-    products.
+    """Many Grams of the same k signals, one a drive: packed products are (drives, k(k+1)/2).
 
     Numbers are int64; sums and products that need more bits are integers of Python.
     """

@@ -26,9 +26,7 @@ LEAST_CARS = 20
 
 @dataclass(frozen=True)
 class Influential:
-    """A car, its influence over what its leverage gives and the median car's, and its share of
-    rows.
-    """
+    """A car, its influence over what its leverage gives and the median car's, and its rows."""
 
     car: int
     times: float

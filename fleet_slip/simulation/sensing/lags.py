@@ -100,9 +100,7 @@ class Wander:
 def _wander(
     drawn: FloatArray, ends: FloatArray, phase: int, step: tuple[float, float], values: FloatArray
 ) -> int:
-    """Fill in values from processes at the knots `ends`, (2, processes); return samples since the
-    last.
-    """
+    """Fill in values between the knots `ends`, shape (2, processes); return how far they reach."""
     decay, kick = step
     knot = 0
     for i in range(values.shape[1]):

@@ -108,9 +108,7 @@ class Recorder:
         self._saturated = 0
 
     def record(self, truth: Mapping[str, FloatArray]) -> None:
-        """Measure the next block of float64 arrays by SI column, but GPS; missing ones are
-        unmeasured.
-        """
+        """Measure the next block, float64 by SI column but GPS; a missing one is not measured."""
         ticks = len(next(iter(truth.values())))
         if self._distortion is not None:
             truth = self._distortion.apply(truth)
@@ -174,9 +172,7 @@ def noisy_counts(
     bias_and_std: tuple[float, float],
     signal: Signal,
 ) -> tuple[NDArray[np.int16], int]:
-    """Return `(physical + bias + std * noise) / scale`, halves to even, and how many (NaN too)
-    clipped.
-    """
+    """Return `(physical + bias + std * noise) / scale`, halves to even; count clipped and NaN."""
     counts = np.empty(len(physical), dtype=np.int16)
     valid = (float(signal.min_count), float(signal.max_count))
     clipped = _quantise(physical, noise, bias_and_std, float(signal.scale), valid, counts)
