@@ -64,7 +64,7 @@ def verify_grams(
     full: bool,
     executor: Executor | None,
 ) -> None:
-    """Look for Gram rows that are doubled, missing, left over, or wrong (`SAMPLE` files, or all)."""
+    """Look for Gram rows that are doubled, missing, left over, or wrong (in a sample, or all)."""
     _verify_unique(warehouse, sound.grams, report)
     _verify_each(warehouse, sound.grams, report)
     _verify_signatures(warehouse, sound.grams, report, full)

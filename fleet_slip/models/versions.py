@@ -92,7 +92,7 @@ class Registry:
         return names[0]
 
     def resolve(self, reference: str | None) -> ModelVersion:
-        """Return the version that a reference names, None the only model. Raises `QuestionError`."""
+        """Return the version of a reference, or the only model. Raises `QuestionError`."""
         name, _, which = (reference or self.only()).partition("@")
         self.require(name)
         which = which or CHAMPION

@@ -38,7 +38,7 @@ FEWEST_DRIVES = 3
 
 @dataclass(frozen=True)
 class ReceiverDelay:
-    """The delay of a car's receiver behind its accelerometer, s; of few drives, of unknown error."""
+    """The delay of a car's receiver behind its accelerometer, s; few drives tell no error."""
 
     value: float
     uncertainty: float | None
