@@ -1,12 +1,14 @@
 """Gram rows of sets with windows: the compiled kernel against the SQL that defines them.
 
     python -m benchmarks.wide ROOT [--campaign waterford] [--threads 2] [--rounds 3] [--sql-files 1]
+    python -m benchmarks.wide ROOT --campaign proving_ground --shipped gated
 
 For 12, 52, 100 and 200 columns of the logs below ROOT: whether both give the same bits, and how
 many rows a second each computes, Parquet reading included, and the kernel's processor time a row,
 which other load disturbs less. The kernel reads all files of the campaign, SQL as many
 as are asked for, perhaps none. The best of some rounds; columns that are no windows are signals and
-the label.
+the label. With `--shipped`, a set of configs/features.toml instead: the kernel's time over all
+drives of a file.
 """
 
 import argparse
@@ -101,6 +103,22 @@ def stages(warehouse: Warehouse, file: TableFile, known: FeatureCatalogue) -> di
     return {"read_cpu_ns_row": round(read), "kernel_cpu_ns_row": round(computed)}
 
 
+def measure_shipped(warehouse: Warehouse, file: TableFile, name: str) -> dict[str, Any]:
+    """Return the kernel's processor time a row for a shipped set, over the drives of a file."""
+    plan = ColumnPlan.of_set(features(), name)
+    workspace = Workspace(plan)
+    drives = [one.counts for one in read_drives(warehouse, file, plan)]
+    rows = sum(len(one.ticks) for one in drives)
+
+    def work() -> None:
+        for drive in drives:
+            wide.drive_sums(workspace, Parts(), drive)
+
+    work()  # compiles the kernel
+    spent = least_cpu_ns_row(rows, 10, work)
+    return {"columns": len(plan.names), "rows": rows, "kernel_cpu_ns_row": round(spent)}
+
+
 def files_of(warehouse: Warehouse, campaign: str) -> list[TableFile]:
     """Return the log files of a campaign."""
     return [one for one in warehouse.logs.snapshot().files if f"{campaign}-" in one.path]
@@ -154,9 +172,13 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--sql-files", type=int, default=1)
     parser.add_argument("--columns", type=int, nargs="*", default=COLUMNS)
+    parser.add_argument("--shipped", metavar="SET")
     options = parser.parse_args()
     warehouse = Warehouse(data_root(options.root))
     files = files_of(warehouse, options.campaign)
+    if options.shipped:
+        print(json.dumps(measure_shipped(warehouse, files[0], options.shipped)))
+        return
     plain, _ = best_rate(
         sum(file.rows for file in files),
         options.rounds,

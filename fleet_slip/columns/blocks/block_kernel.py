@@ -7,7 +7,7 @@ import numpy as np
 from fleet_slip.columns.blocks import block_operations as op
 from fleet_slip.columns.blocks.block_arithmetic import compute, compute_integers
 from fleet_slip.columns.blocks.lookback import add_up, divide_sums, find_begins, values_ago
-from fleet_slip.columns.blocks.product_sums import add_products, add_sums
+from fleet_slip.columns.blocks.product_sums import add_products, add_sums, find_pieces
 from fleet_slip.compiling import inner_loop, kernel
 
 GAPS, FOUND = 0, 1
@@ -40,7 +40,7 @@ def run(
     clipped.
     """
     added, clipped, waiting = 0, 0.0, 0
-    lacks = False
+    lacks, pieces = False, np.zeros(products.shape[1] // op.TILE, dtype=np.int64)
     while first < rows:
         size = min(op.BLOCK_ROWS, rows - first)
         memory[:size] = 0.0
@@ -51,10 +51,11 @@ def run(
         if waiting + size > exact_rows:
             _move_to_integers(products, totals)
             waiting = 0
-        if add_sums(memory, place, stride, size, columns, products):
-            lacks = True
+        lacks = find_pieces(memory, place, stride, size, pieces)
+        if lacks:
             break
-        add_products(memory, place, stride, size, products)
+        add_sums(memory, place, stride, size, columns, products)
+        add_products(memory, place, stride, size, pieces, products)
         for count in memory[:size]:
             clipped += count
         waiting += size

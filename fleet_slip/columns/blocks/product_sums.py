@@ -1,6 +1,7 @@
 """Compiled sums of products of columns: exact, because all are integers below 2^53.
 
-Tiles of 4 by 4 columns keep sixteen sums in registers while a block goes by.
+Tiles of 4 by 4 columns keep their sixteen sums in the processor's registers while rows go by. They
+pass over pieces of rows in which columns are zero, as those of a gate that is shut.
 """
 
 from typing import Any
@@ -10,29 +11,53 @@ import numpy as np
 from fleet_slip.columns.blocks.block_operations import TILE
 from fleet_slip.compiling import exact_loop, inner_loop
 
+PIECE_ROWS = 64
+"""Rows of a piece: with fewer, moving sums out of registers costs more than what is passed over."""
+
 
 @inner_loop
-def add_sums(memory: Any, place: int, stride: int, rows: int, columns: int, products: Any) -> Any:
-    """Add each column's sum to the last row of `products`, unless a value is missing.
+def find_pieces(memory: Any, place: int, stride: int, rows: int, pieces: Any) -> Any:
+    """Find in which pieces of rows a column of each tile is not zero; one bit of a number each.
 
-    Columns lie `stride` apart from `place`; `products` is (columns + 1, columns), in whole tiles.
+    Columns lie `stride` apart from `place` on. Returns whether a value is missing.
     """
     missing = 0.0
-    for i in range(columns):
-        missing += _total(memory, place + i * stride, rows) * 0.0
-    if np.isnan(missing):
-        return True
-    for i in range(columns):
-        products[products.shape[1], i] += _total(memory, place + i * stride, rows)
-    return False
+    for tile in range(len(pieces)):
+        begin, pieces[tile] = place + tile * TILE * stride, 0
+        for first in range(0, rows, PIECE_ROWS):
+            size = _size(memory, begin + first, stride, min(PIECE_ROWS, rows - first))
+            missing += size * 0.0
+            pieces[tile] |= (size > 0.0) << first // PIECE_ROWS
+    return np.isnan(missing)
 
 
 @inner_loop
-def add_products(memory: Any, place: int, stride: int, rows: int, products: Any) -> None:
+def add_sums(memory: Any, place: int, stride: int, rows: int, columns: int, products: Any) -> None:
+    """Add the sum of each column to the last row of `products`.
+
+    Its shape is (columns + 1, columns), padded to whole tiles.
+    """
+    for i in range(columns):
+        products[products.shape[1], i] += _total(memory, place + i * stride, rows)
+
+
+@inner_loop
+def add_products(
+    memory: Any, place: int, stride: int, rows: int, pieces: Any, products: Any
+) -> None:
     """Add the products of every two columns to the lower triangle."""
-    for i in range(0, products.shape[1], TILE):
-        for j in range(0, i + TILE, TILE):
-            _add_tile(memory, place + i * stride, place + j * stride, stride, rows, products, i, j)
+    for i in range(len(pieces)):
+        for j in range(i + 1):
+            a, b = place + i * TILE * stride, place + j * TILE * stride
+            tile = products[i * TILE : (i + 1) * TILE, j * TILE : (j + 1) * TILE]
+            both, end = pieces[i] & pieces[j], 0
+            while both >> end:
+                begin = end
+                while both >> end & 1:
+                    end += 1
+                first, last = begin * PIECE_ROWS, min(end * PIECE_ROWS, rows)
+                _add_tile(memory, a + first, b + first, stride, last - first, tile)
+                end += 1
 
 
 @exact_loop
@@ -44,9 +69,17 @@ def _total(memory: Any, place: int, rows: int) -> Any:
 
 
 @exact_loop
-def _add_tile(
-    memory: Any, a: int, b: int, stride: int, rows: int, products: Any, i: int, j: int
-) -> None:
+def _size(memory: Any, place: int, stride: int, rows: int) -> Any:
+    """Return the sum of the sizes of a tile's values."""
+    total = 0.0
+    for begin in range(place, place + TILE * stride, stride):
+        for value in memory[begin : begin + rows]:
+            total += abs(value)
+    return total
+
+
+@exact_loop
+def _add_tile(memory: Any, a: int, b: int, stride: int, rows: int, tile: Any) -> None:
     a0, a1 = memory[a : a + rows], memory[a + stride : a + stride + rows]
     a2 = memory[a + 2 * stride : a + 2 * stride + rows]
     a3 = memory[a + 3 * stride : a + 3 * stride + rows]
@@ -74,7 +107,6 @@ def _add_tile(
         s31 += x3 * y1
         s32 += x3 * y2
         s33 += x3 * y3
-    tile = products[i : i + TILE, j : j + TILE]
     tile[0, 0] += s00
     tile[0, 1] += s01
     tile[0, 2] += s02
