@@ -22,6 +22,10 @@ FEWEST_WITNESSES = 3
 STEERING_RATIO = (0.25, 1.0)
 """Track over wheelbase is about 0.5 to 0.65 in a car; less if steering is nearer to parallel."""
 
+UNBIASED_STEERING = 0.8
+"""Part of the drives that must have such a ratio, of either sign, for its sign to mean anything:
+the wheels differ by some 0.04 deg in the mean, and sensors by more."""
+
 
 @dataclass(frozen=True)
 class Fault:
@@ -91,6 +95,7 @@ def steering_swapped(moments: MeanMoments) -> dict[int, Fault]:
     With Ackermann's geometry cot(right) - cot(left) = track / wheelbase in a left turn, so that
     the mean of left - right is about that ratio times the mean of left * right, in radians.
     `STEERING_RATIO` bounds the ratio with the sign turned: beyond it a sensor is biased instead.
+    Where the sensors of many drives are, the ratio tells nothing of the others.
     """
     left, right = "steer_fl", "steer_fr"
     if not {left, right} <= set(moments.signals):
@@ -101,6 +106,8 @@ def steering_swapped(moments: MeanMoments) -> dict[int, Fault]:
     difference = (m[:, 0, i] - m[:, 0, j]) * scale
     ratio = np.divide(difference, product, out=np.zeros_like(product), where=product > 0)
     low, high = STEERING_RATIO
+    if ((np.abs(ratio) > low) & (np.abs(ratio) < high)).mean() < UNBIASED_STEERING:
+        return {}
     return {
         int(drive): Fault(
             "swapped", (left, right), f"inner wheel over outer {ratio[drive]:+.2f}, not +0.5"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.arrays import BoolArray
+from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalogue.car_numbers import DELAY
 from fleet_slip.catalogue.course_relation import relate
 from fleet_slip.catalogue.feature_sets import PLAIN
@@ -26,7 +26,9 @@ from fleet_slip.grams.cohorts.gram_cohort import (
 )
 from fleet_slip.grams.cohorts.reader import GramReader
 from fleet_slip.grams.rows.receiver_delay import changed_delays
+from fleet_slip.ingest.landing.marks import Origin
 from fleet_slip.monitoring.moments import DriveBatches
+from fleet_slip.monitoring.odd_days import find_odd_days
 from fleet_slip.monitoring.peers import settle
 from fleet_slip.monitoring.plausibility import Fault, find_implausible
 from fleet_slip.monitoring.repeated import find_repeated
@@ -93,17 +95,19 @@ def examine_drives(
     condition: str | Condition = TRAINING_DRIVES,
     limits: QualityThresholds | None = None,
 ) -> QualityReport:
-    """Examine the drives that satisfy a condition, with one vehicle model's at a time in memory.
+    """Examine the drives that satisfy a condition: labels beside all others, then model by model.
 
     Each drive is examined, whatever signals it has: the minimum cohort asks for enough cars in all.
     Raises like `fleet_slip.grams.cohorts.gram_cohort.load_cohort`.
     """
     drives = parse_cohort(condition)
     with GramReader(warehouse) as reader:
-        courses = _faulty_courses(reader, drives) | _changed_delays(reader, drives)
+        models = _vehicle_models(reader, drives)
+        known = _faulty_courses(reader, drives) | _changed_delays(reader, drives)
+        known |= find_wrong_labels(load_cohort(reader, drives, training=False), limits)
         reports = [
-            examine(load_cohort(reader, drives & of_model, training=False), limits, courses)
-            for of_model in _vehicle_models(reader, drives)
+            examine(load_cohort(reader, drives & of_model, training=False), limits, known)
+            for of_model in models
         ]
         revoked = reader.opened(PLAIN, drives).revoked(drives)
     findings = [finding for report in reports for finding in report.findings]
@@ -175,42 +179,74 @@ def _day_and_drive(finding: SensorFault) -> tuple[date, str]:
     return finding.day, finding.drive_id
 
 
+def find_wrong_labels(cohort: Cohort, limits: QualityThresholds | None = None) -> dict[str, Fault]:
+    """Return the drives whose label contradicts that of the others, of whatever vehicle model.
+
+    One that is reversed, and one with another factor or zero since a day or in a file: what is
+    wrong with many drives at once may be the usual in one vehicle model.
+    """
+    limits = limits or thresholds().quality
+    found: dict[str, Fault] = {}
+    start = 0
+    for whole in cohort.tables:
+        long = whole.n >= limits.min_rows
+        table = whole.take(long)
+        metadata = cohort.drives.slice(start, len(whole)).filter(pa.array(long))
+        start += len(whole)
+        in_order = np.ones(len(table), dtype=np.bool_)
+        in_order[list(find_implausible(table, limits.min_correlation))] = False
+        if in_order.sum() >= limits.min_drives:
+            faults = find_reversed_labels(table, in_order, catalogue().label)
+            in_order[list(faults)] = False
+            faults |= find_odd_days(table, in_order, *_days_and_files(metadata), limits)
+            names = metadata["drive_id"].to_pylist()
+            found |= {names[drive]: fault for drive, fault in faults.items()}
+    return found
+
+
 def examine(
     cohort: Cohort,
     limits: QualityThresholds | None = None,
-    courses: Mapping[str, Fault] | None = None,
+    known: Mapping[str, Fault] | None = None,
 ) -> QualityReport:
     """Examine each drive of a cohort, beside other drives of its car and of its vehicle model.
 
     First for what no car does (`find_implausible`), then by comparison with its peers, if it has
-    `min_drives` of them; see `_peer_groups`. `courses` are drives whose course is known as faulty.
+    `min_drives` of them; see `_peer_groups`. `known` are drives that are not in order.
     """
     limits = limits or thresholds().quality
     drives = compared = 0
-    known = {**(courses or {}), **find_repeated(cohort.drives)}
+    known = {**(known or {}), **find_repeated(cohort.drives)}
     findings = []
     for table, metadata in _groups(cohort, limits.min_rows):
+        names = metadata["drive_id"].to_pylist()
         faults = find_implausible(table, limits.min_correlation)
         faults |= _saturated(table, metadata, limits)
+        before = {drive: known[name] for drive, name in enumerate(names) if name in known}
+        faults = before | faults
         in_order = np.array([drive not in faults for drive in range(len(table))])
-        if in_order.sum() >= limits.min_drives:
-            turned = find_reversed_labels(table, in_order, catalogue().label)
-            in_order[list(turned)] = False
-            faults |= turned
         beside_peers = np.zeros(len(table), dtype=np.bool_)
         for group in _peer_groups(metadata, limits.min_drives):
             if in_order[group].sum() >= limits.min_drives:
                 beside_peers[group] = True
                 found = _unlike_peers(table, group, in_order, limits)
                 faults |= {drive: fault for drive, fault in found.items() if drive not in faults}
-        for drive, name in enumerate(metadata["drive_id"].to_pylist()):
-            if name in known and drive not in faults:
-                faults[drive] = known[name]
         drives += len(table)
         compared += int(beside_peers.sum())
         findings += _findings(metadata, faults)
     findings.sort(key=_day_and_drive)
     return QualityReport(drives, compared, tuple(findings))
+
+
+def _days_and_files(metadata: pa.Table) -> tuple[list[IntArray], IntArray]:
+    """Return the days of drives and the files that they came in, as numbers, and their cars."""
+    origins = [Origin.of_drive(drive) for drive in metadata["drive_id"].to_pylist()]
+    files = [one.digest if one else "" for one in origins]
+    of_day, of_file, of_car = (
+        np.unique(np.array(values, dtype=str), return_inverse=True)[1]
+        for values in (metadata["day"].to_pylist(), files, metadata["vehicle_id"].to_pylist())
+    )
+    return [of_day, of_file], of_car
 
 
 def _peer_groups(metadata: pa.Table, enough: int) -> Iterator[BoolArray]:

@@ -43,7 +43,7 @@ def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> d
 
 def _gains(drives: DriveBatches, label: int) -> FloatArray | None:
     """Return the gain of each drive's label on the relation that most keep to; None without one."""
-    parts = [_parts(batch.covariances(), label) for batch in drives]
+    parts = [label_parts(batch.covariances(), label) for batch in drives]
     inputs = sum(part[0].sum(axis=0) for part in parts)
     with_label = np.concatenate([part[1] for part in parts])
     variance = float(sum(part[2].sum() for part in parts))
@@ -66,7 +66,7 @@ def _settle(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return signs that agree with the relation that they make, the relation, and the gains."""
     for _ in range(ROUNDS):
-        weights = _solve(inputs, signs @ with_label)
+        weights = solve(inputs, signs @ with_label)
         gains = np.concatenate([_gain(b.covariances(), label, weights) for b in drives])
         agreeing = np.where(gains < 0, -1.0, 1.0)
         if (agreeing == signs).all():
@@ -75,7 +75,7 @@ def _settle(
     return signs, weights, gains
 
 
-def _parts(covariances: FloatArray, label: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def label_parts(covariances: FloatArray, label: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the covariances of the inputs, theirs with the label, and the label's variances."""
     others = np.delete(np.arange(covariances.shape[1]), label)
     inputs = covariances[:, others[:, None], others]
@@ -83,7 +83,7 @@ def _parts(covariances: FloatArray, label: int) -> tuple[FloatArray, FloatArray,
 
 
 def _gain(covariances: FloatArray, label: int, weights: FloatArray) -> FloatArray:
-    inputs, with_label, _ = _parts(covariances, label)
+    inputs, with_label, _ = label_parts(covariances, label)
     predicted = np.einsum("i,dij,j->d", weights, inputs, weights)
     least = np.finfo(np.float64).tiny
     return np.asarray(with_label @ weights / np.maximum(predicted, least))
@@ -99,7 +99,8 @@ def _leading_signs(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
     return np.where(directions @ vectors[:, -1] < 0, -1.0, 1.0)
 
 
-def _solve(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
+def solve(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
+    """Return the weights of least squares, scaled so that units do not matter."""
     scale = np.sqrt(np.maximum(np.diagonal(inputs), np.finfo(np.float64).tiny))
     solution, *_ = np.linalg.lstsq(inputs / np.outer(scale, scale), with_label / scale, rcond=1e-12)
     return np.asarray(solution / scale)

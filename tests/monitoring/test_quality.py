@@ -11,7 +11,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.monitoring.plausibility import Fault
-from fleet_slip.monitoring.quality import QualityReport, examine, examine_drives
+from fleet_slip.monitoring.quality import QualityReport, examine, examine_drives, find_wrong_labels
 from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import TICKS, Signals, broken, counts, drive
@@ -98,7 +98,7 @@ def test_a_label_that_is_reversed_for_one_car_is_found(warehouse: Warehouse, tur
     ]
     land(warehouse, "all", *one, *other)
     update_grams(warehouse)
-    findings = examine(load_cohort(warehouse)).findings
+    findings = examine_drives(warehouse).findings
     assert [(one.drive_id, one.vehicle_id) for one in findings] == [
         (f"b{i:02d}", "b") for i in range(turned)
     ]
@@ -151,7 +151,8 @@ def test_vehicle_models_are_examined_one_after_the_other(warehouse: Warehouse) -
         land(warehouse, str(file), *rows)
     update_grams(warehouse)
     for condition in ("true", "drive_id LIKE '%-1' -- and '%-11'", "vehicle_model IS NULL"):
-        together = examine(load_cohort(warehouse, f"{condition}\n"), few())
+        cohort = load_cohort(warehouse, f"{condition}\n")
+        together = examine(cohort, few(), find_wrong_labels(cohort, few()))
         assert examine_drives(warehouse, condition, few()) == together
         assert together.drives > 0
     with pytest.raises(DataError, match="no drive satisfies"):

@@ -66,6 +66,7 @@ TINY = {
     "store_history": "--sizes 10",
     "suggest": "",
     "validation": "",
+    "wrong_labels": "{root}",
     "wide": "{root} --campaign smoke --rounds 1 --columns 12",
     "work_precision": "",
     "year": "--cars 2 --days 10 --rows-days 1",
