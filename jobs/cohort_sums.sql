@@ -1,7 +1,7 @@
 -- The Gram rows of a cohort with what their fold is told from, in any order: only their sums are of interest.
 -- The condition may use any column of the view "drives". Rows without any signal serve no model.
 SELECT
-    drive_id, vehicle_id, source, track, mass_kg, adhesion, speed_factor, day, part, signals, n, sums, products,
+    drive_id, vehicle_id, {receiver}, source, track, mass_kg, adhesion, speed_factor, day, part, signals, n, sums, products,
     coalesce(trip, drive_id) AS trip
 FROM grams
 LEFT JOIN (

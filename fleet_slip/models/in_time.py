@@ -27,7 +27,7 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
     condition = parse_cohort(manifest.trained_on.cohort)
     with open_grams(warehouse, DELAY, condition) as opened:
         told = opened.batches(parse_condition(ALL_DRIVES))
-        delays = receiver_delays(told)
+        delays = receiver_delays(told).cars
     feature_set = features().name_of(manifest.trained_on.feature_set)
     with open_grams(warehouse, feature_set, condition) as opened:
         cars = dict(opened.course_delays(condition))

@@ -54,6 +54,7 @@ class DriveLog:
             "campaign": spec.campaign,
             "track": spec.track.name,
             "mass_kg": spec.vehicle.body.sprung_mass_kg,
+            "receiver": spec.receiver.name if spec.receiver else None,
             "adhesion": spec.adhesion,
             "speed_factor": spec.speed_factor,
             "duration_s": (self.rows - 1) / SAMPLE_RATE_HZ,

@@ -109,8 +109,9 @@ def test_tyres_need_a_column_of_the_catalogue(
         catalogue.cache_clear()
 
 
-def test_tyres_of_a_column_are_known_of_each_drive(tmp_path: Path) -> None:
-    said = MAPPING.replace('"car" } }', '"car" }, tyres = { column = "shoes" } }')
+@pytest.mark.parametrize("fact", ["tyres", "receiver"])
+def test_a_fact_of_a_column_is_known_of_each_drive(tmp_path: Path, fact: str) -> None:
+    said = MAPPING.replace('"car" } }', f'"car" }}, {fact} = {{ column = "shoes" }} }}')
     columns = {**COLUMNS, "shoes": ["slick", "slick", "wet", "wet"]}
     drives = read_columns(tmp_path, columns, load(tmp_path, mapping=said)).drives.to_pylist()
-    assert {(d["vehicle_id"], d["tyres"]) for d in drives} == {("A7", "slick"), ("B2", "wet")}
+    assert {(d["vehicle_id"], d[fact]) for d in drives} == {("A7", "slick"), ("B2", "wet")}

@@ -5,7 +5,8 @@ that they are the same in whatever order drives came, and a drive that is forgot
 them. `car_evidence` tells how sure they are.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +20,13 @@ from fleet_slip.grams.calibration.car_evidence import CalibratedNumber, CarEvide
 from fleet_slip.grams.calibration.tell_numbers import KINDS
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
-from fleet_slip.grams.rows.receiver_delay import RECEIVER_DELAY, receiver_delays
+from fleet_slip.grams.rows.receiver_delay import (
+    LASTING_S,
+    RECEIVER_DELAY,
+    SPREAD,
+    ReceiverDelays,
+    receiver_delays,
+)
 from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -77,6 +84,7 @@ class Calibration:
 TABLE = pa.schema(
     [
         ("vehicle_id", pa.string()),
+        ("receiver", pa.string()),
         ("number", pa.string()),
         ("value", pa.float64()),
         ("uncertainty", pa.float64()),
@@ -85,9 +93,10 @@ TABLE = pa.schema(
         ("grain", pa.float64()),
         ("drives", pa.int64()),
         ("rows", pa.int64()),
+        ("cars", pa.int64()),
     ]
 )
-"""The table `calibration`."""
+"""The table `calibration`. A row of a type of receiver has no `vehicle_id`, but `cars`."""
 
 
 def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
@@ -101,20 +110,9 @@ def calibration_table(opened: OpenedGrams, of_delay: OpenedGrams) -> pa.Table:
     """Return the table `calibration` that SQL sees: a row for each car and number.
 
     Of the Gram rows that there are: none are required. `of_delay` are those of the set `delay`,
-    which tell how late satellite receivers are.
+    which tell how late satellite receivers are: also a row for each type, and one for its spread.
     """
-    grain = float(SAMPLE_TIME_S)
-    delays = [
-        {
-            "vehicle_id": car,
-            "number": RECEIVER_DELAY,
-            **vars(one),
-            "unit": "s",
-            "count": round(one.value / grain),
-            "grain": grain,
-        }
-        for car, one in receiver_delays(of_delay.batches(parse_condition(ALL_DRIVES))).items()
-    ]
+    told = receiver_delays(of_delay.batches(parse_condition(ALL_DRIVES)))
     found = calibration_of(opened, parse_condition(ALL_DRIVES))
     rows = [
         {
@@ -127,7 +125,27 @@ def calibration_table(opened: OpenedGrams, of_delay: OpenedGrams) -> pa.Table:
         for car, numbers in found.cars.items()
         for name, one in numbers.items()
     ]
-    return pa.Table.from_pylist([*rows, *delays], schema=TABLE)
+    return pa.Table.from_pylist([*rows, *_rows_of_delay(told)], schema=TABLE)
+
+
+def _rows_of_delay(told: ReceiverDelays) -> Iterator[dict[str, Any]]:
+    rows = [{"vehicle_id": car, **vars(one)} for car, one in told.cars.items()]
+    for name, one in told.types.items():
+        cars = [car for car in told.cars.values() if car.receiver == name]
+        of_type = {
+            "receiver": name,
+            "cars": len(cars),
+            "drives": sum(car.drives for car in cars),
+            "rows": sum(car.rows for car in cars),
+        }
+        error = math.hypot(one.mean_error, LASTING_S)
+        rows.append({**of_type, "value": one.mean, "uncertainty": error})
+        spread = {"number": SPREAD, "value": one.spread, "uncertainty": one.spread_error}
+        rows.append({**of_type, **spread})
+    grain = float(SAMPLE_TIME_S)
+    for row in rows:
+        count = round(row["value"] / grain)
+        yield {"number": RECEIVER_DELAY, "unit": "s", "count": count, "grain": grain, **row}
 
 
 def calibrate(

@@ -24,6 +24,7 @@ from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.outweighing import Outweighing, find_outweighing
 from fleet_slip.grams.received.signatures import CarKey, load_car_keys
 from fleet_slip.grams.rows.backlog import find_backlog
+from fleet_slip.grams.rows.receiver_delay import RECEIVER
 from fleet_slip.grams.rows.same_drives import has_received
 from fleet_slip.regression.exact.gram import packed_size
 from fleet_slip.resources import read_sql
@@ -59,6 +60,7 @@ class OpenedGrams:
             feature_set=self.identity, longest_pause_s=LONGEST_PAUSE_S
         )
         values |= {"condition": sql, "feature_set": self.identity, "trips": trips}
+        values |= {"receiver": RECEIVER if RECEIVER in catalogue().drive else f"NULL AS {RECEIVER}"}
         return read_sql("jobs", name).format(**values)
 
     def revoked(self, condition: Condition) -> dict[str, int]:

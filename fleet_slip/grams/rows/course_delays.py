@@ -14,16 +14,18 @@ from fleet_slip.catalogue.course_change import COURSE_LATE, LATE_PARTS, MOST_EAR
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.catalogue.sources import RECEIVED_FILES
-from fleet_slip.delta import Snapshot, TableFile
-from fleet_slip.grams.rows.receiver_delay import ReceiverDelay, receiver_delays
+from fleet_slip.delta import Snapshot
+from fleet_slip.grams.rows.receiver_delay import RECEIVER, ReceiverDelay, receiver_delays
 
 GRAIN_S = float(SAMPLE_TIME_S) / LATE_PARTS
 """What a delay is a whole number of, s."""
+_OF_DELAY = ("file", "day", "vehicle_id", "drive_id", "signals", "n", "sums", "products")
 
 
 def course_delays(grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
     """Return each car's course delay in parts of a tick, of Gram rows of the `active` log files."""
-    return {car: in_parts(one) for car, one in receiver_delays(_of_delay(grams, active)).items()}
+    told = receiver_delays(_of_delay(grams, active)).cars
+    return {car: in_parts(one) for car, one in told.items()}
 
 
 def in_parts(one: ReceiverDelay) -> int:
@@ -34,14 +36,11 @@ def in_parts(one: ReceiverDelay) -> int:
 
 def _of_delay(grams: Snapshot, active: frozenset[str]) -> Iterator[pa.RecordBatch]:
     identity = features().identity(DELAY)
-    wanted = ["feature_set", "file", "day", "vehicle_id", "drive_id", "signals", "n", "sums"]
-    for file in _files_of(grams, identity):
-        rows = grams.table.read(file.path, [*wanted, "products"])
+    for rows in _rows_of(grams, identity, *_OF_DELAY, RECEIVER):
         files = rows["file"].cast(pa.string())
         counts = pc.is_in(files, pa.array(sorted(active), pa.string()))
         counts = pc.or_(counts, pc.starts_with(files, RECEIVED_FILES))
-        mine = pc.and_(pc.equal(rows["feature_set"], identity), counts)
-        yield from rows.filter(mine).to_batches()
+        yield from rows.filter(counts).to_batches()
 
 
 def files_of_other_delay(grams: Snapshot, identity: str, late: Mapping[str, int]) -> set[str]:
@@ -63,21 +62,20 @@ def recorded_cars(grams: Snapshot, identity: str, log_file: str) -> dict[str, in
 def _recorded(grams: Snapshot, identity: str) -> set[tuple[str, str, int]]:
     """Return each log file, car and delay that Gram rows of a set are of; 0 where none was told."""
     found: set[tuple[str, str, int]] = set()
-    for file in _files_of(grams, identity):
-        there = COURSE_LATE in grams.table.read_metadata(file.path).schema.names
-        wanted = ["feature_set", "file", "vehicle_id", *([COURSE_LATE] if there else [])]
-        rows = grams.table.read(file.path, wanted)
-        mine = rows.filter(pc.equal(rows["feature_set"], identity))
-        told = mine[COURSE_LATE].fill_null(0).to_pylist() if there else [0] * len(mine)
-        found.update(
-            zip(mine["file"].to_pylist(), mine["vehicle_id"].to_pylist(), told, strict=True)
-        )
+    for rows in _rows_of(grams, identity, "file", "vehicle_id", COURSE_LATE):
+        files, cars, told = (rows[name].to_pylist() for name in ("file", "vehicle_id", COURSE_LATE))
+        found.update(zip(files, cars, (late or 0 for late in told), strict=True))
     return found
 
 
-def _files_of(grams: Snapshot, identity: str) -> Iterator[TableFile]:
-    """Yield the files that have Gram rows of a feature set."""
+def _rows_of(grams: Snapshot, identity: str, *columns: str) -> Iterator[pa.Table]:
+    """Yield the Gram rows of a feature set, file by file; null in columns that came later."""
     for file in grams.files:
-        sets = grams.table.read(file.path, ["feature_set"])["feature_set"].unique()
-        if identity in sets.to_pylist():
-            yield file
+        mine = pc.equal(grams.table.read(file.path, ["feature_set"])["feature_set"], identity)
+        if not pc.any(mine).as_py():
+            continue
+        there = grams.table.read_metadata(file.path).schema.to_arrow_schema().names
+        rows = grams.table.read(file.path, [name for name in columns if name in there])
+        for name in sorted(set(columns).difference(there)):
+            rows = rows.append_column(name, pa.nulls(len(rows)))
+        yield rows.filter(mine)

@@ -4,12 +4,13 @@ A receiver's speed is as late as its course. The change of speed over 0.4 s is t
 longitudinal acceleration; changes of both over 0.4 s more are free of its offset. The lag of the
 integral with the smallest sum of squares, by a parabola, is the delay. The integral k ticks late is
 that of 40 + k ticks less that of k, which Gram rows have. Its uncertainty is a jackknife over
-drives, and what all have in common.
+drives, and what all have in common. Cars with one type of receiver are drawn towards its delay, the
+more so the fewer drives they have (`regression/shrinkage/partial_pooling.py`).
 """
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pyarrow as pa
@@ -18,9 +19,13 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
 from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.regression.shrinkage.partial_pooling import Pooled, pool
 
 RECEIVER_DELAY = "receiver_delay"
-"""What the view `calibration` calls it."""
+SPREAD = f"{RECEIVER_DELAY}_spread"
+"""What the view `calibration` calls it, and by how much cars of one type of receiver differ."""
+RECEIVER = "receiver"
+"""The drive column that says of which type a receiver is."""
 
 SPAN, STEP, STEPS = 40, 5, 12
 """Ticks of the integral, between two lags, and how many lags there are beside the first. Receivers
@@ -32,18 +37,36 @@ LASTING_S = 0.003
 """Standard error that is the same in all drives: tilt and low-pass of the accelerometer."""
 SURE_ERRORS = 5.0
 """Standard errors, of a usual car and of the car itself, by which a delay has changed."""
+TINY = 1e-9
+"""Share of the sum of squares that a drive's bend has at least: it may tell nothing."""
 FEWEST_DRIVES = 3
 """Of fewer the uncertainty is that of a usual drive of other cars."""
 
 
 @dataclass(frozen=True)
 class ReceiverDelay:
-    """The delay of a car's receiver behind its accelerometer, s; few drives tell no error."""
+    """The delay of a car's receiver behind its accelerometer, s; few drives tell no error.
+
+    `information` is how much a wrong lag adds to the sum of squares, per s^2; `differing` the sum
+    over drives of their own pulls by it: on average the noise times one less than the drives.
+    `receiver` is its type; None if no drive says it, or drives say several.
+    """
 
     value: float
     uncertainty: float | None
     drives: int
     rows: int
+    information: float
+    differing: float
+    receiver: str | None = None
+
+
+@dataclass(frozen=True)
+class ReceiverDelays:
+    """The delay of each car's receiver, and of the types of which there are enough, by name."""
+
+    cars: dict[str, ReceiverDelay]
+    types: dict[str, Pooled]
 
 
 @dataclass(frozen=True)
@@ -75,14 +98,15 @@ def _weights() -> FloatArray:
     return weights
 
 
-def receiver_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, ReceiverDelay]:
-    """Return the delay of each car that Gram rows of the feature set `delay` tell."""
+def receiver_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> ReceiverDelays:
+    """Return the delays of cars and of types that Gram rows of the feature set `delay` tell."""
     found = {}
-    for car, (products, rows) in _by_car(rows_of_delay).items():
-        one = _delay(np.array(list(products.values())), rows)
+    for car, told in _by_car(rows_of_delay).items():
+        one = _delay(np.array(list(told.products.values())), told.rows)
         if one is not None:
-            found[car] = one
-    return with_pooled(found)
+            receiver = told.receivers.pop() if len(told.receivers) == 1 else None
+            found[car] = replace(one, receiver=receiver)
+    return with_types(with_pooled(found))
 
 
 def changed_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, ChangedDelay]:
@@ -92,8 +116,8 @@ def changed_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, Changed
     """
     halves = {
         car: split
-        for car, (products, _) in _by_car(rows_of_delay).items()
-        if (split := _best_split(products)) is not None
+        for car, told in _by_car(rows_of_delay).items()
+        if (split := _best_split(told.products)) is not None
     }
     squares = [
         one.drives * ((one.uncertainty or 0.0) ** 2 - LASTING_S**2)
@@ -111,25 +135,36 @@ def changed_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, Changed
     return found
 
 
-def _by_car(
-    rows_of_delay: Iterable[pa.RecordBatch],
-) -> dict[str, tuple[dict[tuple[str, str], FloatArray], int]]:
-    """Return the products of each car's drives about their means, by day and name, and its rows."""
+@dataclass
+class _Told:
+    """What one car's drives tell: products about their means, by day and name, and its rows."""
+
+    products: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
+    receivers: set[str] = field(default_factory=set)
+    rows: int = 0
+
+
+def _by_car(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, _Told]:
+    """Return what the drives of each car tell, in the order of their days and names."""
     columns = delay_columns()
-    found: dict[str, tuple[dict[tuple[str, str], FloatArray], int]] = {}
+    found: dict[str, _Told] = {}
     for batch in rows_of_delay:
         for names, some, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
             if not set(columns) <= set(names.split(",")):
                 continue
             table = gram_table(names, some).restrict(columns)
-            keys = (some[name].to_pylist() for name in ("vehicle_id", "day", "drive_id"))
-            for (car, day, drive), about, n in zip(
+            names_of = ("vehicle_id", "day", "drive_id", RECEIVER)
+            keys = (some[name].to_pylist() for name in names_of)
+            for (car, day, drive, receiver), about, n in zip(
                 zip(*keys, strict=True), _about_means(table), table.n.tolist(), strict=True
             ):
-                own, rows = found.get(car, ({}, 0))
-                own[str(day), drive] = own.get((str(day), drive), 0.0) + about
-                found[car] = own, rows + n
-    return {car: (dict(sorted(own.items())), rows) for car, (own, rows) in sorted(found.items())}
+                told = found.setdefault(car, _Told())
+                told.products[str(day), drive] = told.products.get((str(day), drive), 0.0) + about
+                told.receivers |= {receiver} - {None}
+                told.rows += n
+    for told in found.values():
+        told.products = dict(sorted(told.products.items()))
+    return dict(sorted(found.items()))
 
 
 def _about_means(table: GramTable) -> FloatArray:
@@ -149,19 +184,49 @@ def _about_means(table: GramTable) -> FloatArray:
 
 def with_pooled(delays: dict[str, ReceiverDelay]) -> dict[str, ReceiverDelay]:
     """Add the spread of other cars' drives to cars with few; None if all have too few."""
-    known = [one for one in delays.values() if one.uncertainty is not None]
-    free = sum(one.drives - 1 for one in known)
-    scatters = ((one, (one.uncertainty or 0.0) ** 2 - LASTING_S**2) for one in known)
-    total = math.fsum((one.drives - 1) * one.drives * square for one, square in scatters)
-    usual = total / free if free >= FEWEST_DRIVES - 1 else None
+    noise = _noise(delays.values())
     return {
         car: one
         if one.drives >= FEWEST_DRIVES and one.uncertainty is not None
         else replace(
-            one, uncertainty=None if usual is None else math.sqrt(usual / one.drives + LASTING_S**2)
+            one,
+            uncertainty=None
+            if noise is None
+            else math.sqrt(noise / one.information + LASTING_S**2),
         )
         for car, one in delays.items()
     }
+
+
+def with_types(delays: dict[str, ReceiverDelay]) -> ReceiverDelays:
+    """Return the delays with those of cars of one type of receiver drawn towards the type's.
+
+    Their variances follow from how much drives of the type differ. What is the same in all drives
+    of a car is no part of what drawing makes smaller.
+    """
+    cars, types = dict(delays), {}
+    for name in sorted({one.receiver for one in delays.values() if one.receiver is not None}):
+        of_type = {car: one for car, one in delays.items() if one.receiver == name}
+        noise = _noise(of_type.values())
+        own = np.array([(one.value, one.information) for one in of_type.values()])
+        pooled = pool(own[:, 0], noise / own[:, 1]) if noise else None
+        if pooled is not None:
+            types[name] = pooled
+            for (car, one), value, error in zip(
+                of_type.items(), pooled.values.tolist(), pooled.errors.tolist(), strict=True
+            ):
+                cars[car] = replace(one, value=value, uncertainty=math.hypot(error, LASTING_S))
+    return ReceiverDelays(cars, types)
+
+
+def _noise(delays: Iterable[ReceiverDelay]) -> float | None:
+    """Return the noise of cars as their drives differ: the variance of a delay times information.
+
+    None of too few drives.
+    """
+    known = list(delays)
+    free = sum(one.drives - 1 for one in known)
+    return math.fsum(one.differing for one in known) / free if free >= FEWEST_DRIVES - 1 else None
 
 
 def _best_split(
@@ -187,6 +252,7 @@ def _delay(products: FloatArray, rows: int) -> ReceiverDelay | None:
     lag = _best_lag(total)
     if lag is None:
         return None
+    slope, bend = _parabolas(products)
     without = [found for one in products if (found := _best_lag(total - one)) is not None]
     uncertainty = None
     if len(without) == drives > 1:
@@ -194,7 +260,36 @@ def _delay(products: FloatArray, rows: int) -> ReceiverDelay | None:
         square = math.fsum((one - mean) ** 2 for one in without)
         scatter = math.sqrt(square * (drives - 1) / drives) * float(SAMPLE_TIME_S)
         uncertainty = math.hypot(scatter, LASTING_S)
-    return ReceiverDelay(lag * float(SAMPLE_TIME_S), uncertainty, drives, rows)
+    return ReceiverDelay(
+        value=lag * float(SAMPLE_TIME_S),
+        uncertainty=uncertainty,
+        drives=drives,
+        rows=rows,
+        information=float(bend.sum()),
+        differing=float(((slope - bend * slope.sum() / bend.sum()) ** 2 / bend).sum()),
+    )
+
+
+def _parabolas(products: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the first and second derivatives of each drive's sum of squares by the delay in s.
+
+    Where the delay, and what the integral is multiplied by, are those of all drives.
+    """
+    total = products.sum(axis=0)
+    middle = _middle(total)
+    at = np.arange(middle, middle + 3)  # the first is of the speed
+    ratio = total[0, middle + 1] / total[middle + 1, middle + 1]
+    squares = ratio**2 * products[:, at, at] - 2 * ratio * products[:, 0, at]
+    before, here, after = squares.T
+    step = STEP * float(SAMPLE_TIME_S)
+    bend = np.maximum(after - 2 * here + before, TINY * abs(total[0, 0]))
+    return (after - before) / (2 * step), bend / step**2
+
+
+def _middle(products: FloatArray) -> int:
+    """Return the lag that explains most of the speed's changes, and has one on either side."""
+    explained = products[0, 1:] ** 2 / np.diag(products)[1:]
+    return min(max(int(np.argmax(explained)), 1), STEPS - 1)
 
 
 def _best_lag(products: FloatArray) -> float | None:
@@ -203,7 +298,7 @@ def _best_lag(products: FloatArray) -> float | None:
     if not (sizes > 0).all():
         return None
     explained = products[0, 1:] ** 2 / sizes
-    middle = min(max(int(np.argmax(explained)), 1), STEPS - 1)
+    middle = _middle(products)
     before, here, after = explained[middle - 1 : middle + 2]
     bend = 2 * here - before - after
     if bend <= 0:

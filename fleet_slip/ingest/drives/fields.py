@@ -289,6 +289,7 @@ _METADATA: dict[str, Callable[[str, str, pl.Schema, Mapping], Field]] = {
     "track": _text,
     "mass_kg": _positive,
     "tyres": _text,
+    "receiver": _text,
     "adhesion": _positive,
     "day": _day,
 }

@@ -38,7 +38,10 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _EARLIEST_S = 10**8
 """Times before 1973 are counted from the start of a recording, not from 1970."""
 _FROM_FILE = ("drive_name", "source_file", "trip_id")
-_FROM_MAPPING = ("vehicle_id", "vehicle_model", "track", "mass_kg", "tyres", "adhesion", "day")
+_FROM_MAPPING = (
+    *("vehicle_id", "vehicle_model", "track", "mass_kg"),
+    *("tyres", "receiver", "adhesion", "day"),
+)
 
 
 @dataclass(frozen=True)

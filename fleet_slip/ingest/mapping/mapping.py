@@ -33,7 +33,7 @@ from fleet_slip.ingest.mapping.units import require_unit
 from fleet_slip.ingest.mapping.vehicle_facts import (
     VehicleFacts,
     read_vehicle_facts,
-    require_tyres_column,
+    require_drive_column,
 )
 from fleet_slip.resources import find_config
 
@@ -103,6 +103,12 @@ def _is_empty(value: object) -> bool:
     return value in ((), None)
 
 
+OptionalFact = Annotated[
+    Annotated[Name | FromColumn, AfterValidator(require_drive_column)] | None,
+    Field(exclude_if=_is_empty),
+]
+
+
 class DriveMetadata(Config):
     """What is known of each drive, given here or taken from a column; absent stays null."""
 
@@ -114,9 +120,8 @@ class DriveMetadata(Config):
     vehicle_model: Name | FromColumn | None = None
     track: Name | FromColumn | None = None
     mass_kg: PositiveFloat | FromColumn | None = None
-    tyres: Annotated[Name | FromColumn, AfterValidator(require_tyres_column)] | None = Field(
-        default=None, exclude_if=_is_empty
-    )
+    tyres: OptionalFact = None
+    receiver: OptionalFact = None
     adhesion: PositiveFloat | FromColumn | None = None
 
 

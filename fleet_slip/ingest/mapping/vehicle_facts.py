@@ -5,7 +5,7 @@ import io
 from pathlib import Path
 from typing import Annotated, TypeVar
 
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError, ValidationInfo
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import Config, Name, PositiveFloat, faults_of, read_named_file
@@ -14,14 +14,20 @@ from fleet_slip.errors import ConfigError
 Told = TypeVar("Told")
 
 
-def require_tyres_column(told: Told) -> Told:
-    """Return what is told of tyres. Raises `ValueError` if no column of the catalogue takes it."""
-    if "tyres" not in catalogue().drive:
+def require_drive_column(told: Told, info: ValidationInfo) -> Told:
+    """Return what is told of a drive. Raises `ValueError` if the catalogue has no such column."""
+    if info.field_name not in catalogue().drive:
         raise ValueError(
             "the catalogue has no such drive column. Copy it from the shipped one: "
             "configs/signals.toml"
         )
     return told
+
+
+OptionalFact = Annotated[
+    Annotated[Name, AfterValidator(require_drive_column)] | None,
+    Field(exclude_if=lambda value: value is None),
+]
 
 
 class VehicleFacts(Config):
@@ -30,9 +36,8 @@ class VehicleFacts(Config):
     vehicle_id: Name
     vehicle_model: Name | None = None
     mass_kg: PositiveFloat | None = None
-    tyres: Annotated[Name, AfterValidator(require_tyres_column)] | None = Field(
-        default=None, exclude_if=lambda value: value is None
-    )
+    tyres: OptionalFact = None
+    receiver: OptionalFact = None
 
 
 def read_vehicle_facts(file: Path) -> tuple[VehicleFacts, ...]:

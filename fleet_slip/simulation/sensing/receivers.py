@@ -1,6 +1,7 @@
 """Satellite receivers as cars have them: course and speed over ground, now and then, and late."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from pydantic import Field, FiniteFloat
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import HALF_TURN, catalogue
 from fleet_slip.compiling import equation, kernel
-from fleet_slip.config import Config
+from fleet_slip.config import Config, Name
 from fleet_slip.simulation.imperfections import Latency, NotNegative, Range
 from fleet_slip.simulation.sensing.lags import Delay, Wander
 from fleet_slip.simulation.sensing.sensors import Gps, Outages
@@ -24,6 +25,8 @@ Place = tuple[float, float]
 class Receiver(Gps):
     """One car's receiver. White noise is of each fix and each of the velocity's two components."""
 
+    name: Annotated[Name | None, Field(exclude=True)] = None
+    """What the drive column `receiver` says. Not part of the digest, which is as it was."""
     wander_std_mps: NotNegative = 0.0
     """Of errors of velocity that last, in the directions of the earth."""
     wander_s: FiniteFloat = Field(default=10.0, ge=1)

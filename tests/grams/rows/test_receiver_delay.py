@@ -3,15 +3,26 @@
 import math
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
 import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.catalogue.car_numbers import DELAY
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.rows.receiver_delay import ReceiverDelay, with_pooled
+from fleet_slip.grams.cohorts.reader import open_grams
+from fleet_slip.grams.rows.receiver_delay import (
+    ReceiverDelay,
+    receiver_delays,
+    with_pooled,
+    with_types,
+)
+from fleet_slip.warehouse.condition import parse_condition
 
 CAMPAIGN = """
 name = "late"
@@ -24,6 +35,7 @@ laps = 1
 delay_error_s = {{ min = {0}, max = {0} }}
 
 [[receivers.types]]
+name = "box"
 rate_hz = 10
 velocity_std_mps = 0.03
 time_between_outages_s = 60.0
@@ -54,11 +66,65 @@ def test_the_delay_is_found_with_its_uncertainty(tmp_path: Path, delay_s: float)
 
 
 def test_a_car_of_few_drives_is_as_sure_as_usual_drives_make_it() -> None:
-    known, few = ReceiverDelay(0.1, 0.004, 4, 9000), ReceiverDelay(0.09, None, 1, 2000)
+    known = ReceiverDelay(0.1, 0.004, 4, 9000, information=40.0, differing=3.0)
+    few = ReceiverDelay(0.09, None, 1, 2000, information=10_000.0, differing=0.0)
     assert with_pooled({"a": few}) == {"a": few}
     found = with_pooled({"a": few, "b": known})
     assert found["b"] == known
-    assert found["a"].uncertainty == pytest.approx(math.sqrt(4 * (0.004**2 - 0.003**2) + 0.003**2))
+    assert found["a"].uncertainty == pytest.approx(math.sqrt(1 / 10_000 + 0.003**2))
+
+
+def test_a_car_of_few_drives_takes_the_delay_of_its_type_and_one_of_many_its_own() -> None:
+    drives = {"many": 300, "a": 1, **dict.fromkeys("bcdefghijklm", 4)}
+    values = {"many": 0.1, "a": 0.15}
+    values |= {car: 0.12 + 0.003 * (n % 5 - 2) for n, car in enumerate("bcdefghijklm")}
+    cars = {
+        car: ReceiverDelay(
+            value=values[car],
+            uncertainty=math.hypot(0.03 / math.sqrt(n), 0.003),
+            drives=n,
+            rows=100,
+            information=n / 0.03**2,
+            differing=n - 1.0,
+            receiver="box",
+        )
+        for car, n in drives.items()
+    }
+    told = with_types(cars | {"other": replace(cars["a"], receiver=None)})
+    assert told.cars["other"] == replace(cars["a"], receiver=None)
+    kind = told.types["box"]
+    assert abs(told.cars["many"].value - 0.1) < 0.002
+    assert abs(told.cars["a"].value - kind.mean) < 0.2 * abs(values["a"] - kind.mean)
+    for car in "abcdefghijklm":
+        assert told.cars[car].uncertainty < cars[car].uncertainty  # type: ignore[operator]
+    assert all(one.drives == drives[car] for car, one in told.cars.items() if car in drives)
+    few = with_types({car: cars[car] for car in ("a", "b", "c")})
+    assert not few.types
+    assert few.cars["a"] == cars["a"]
+
+
+def test_the_delay_of_a_type_is_told_by_its_cars(tmp_path: Path) -> None:
+    """The drives of one car stand in for those of five, of which one has had two receivers."""
+    fleet = late_fleet(tmp_path, 0.087)
+    condition = parse_condition("true")
+    with open_grams(fleet.warehouse, DELAY, condition) as opened:
+        rows = pa.Table.from_batches(opened.batches(condition)).sort_by("drive_id")
+    assert rows["receiver"].unique().to_pylist() == ["box"]
+    cars = pa.array(list("aabbcdee"))
+    order = np.unique(rows["drive_id"].to_pylist(), return_inverse=True)[1]
+    cars = cars.take(pa.array(order))
+    rows = rows.set_column(rows.column_names.index("vehicle_id"), "vehicle_id", cars)
+    told = receiver_delays(rows.to_batches())
+    kind = told.types["box"]
+    assert abs(kind.mean - 0.087) < 0.005
+    assert kind.mean_error < 0.003
+    assert kind.spread + kind.spread_error < 0.01
+    assert all(abs(one.value - 0.087) < 0.005 for one in told.cars.values())
+    several = pa.array(["telephone" if drive == 7 else "box" for drive in order])
+    rows = rows.set_column(rows.column_names.index("receiver"), "receiver", several)
+    told = receiver_delays(rows.to_batches())
+    assert told.cars["e"].receiver is None
+    assert told.cars["a"].receiver == "box"
 
 
 MODEL = "steering_mean_16,ay_mean_16,ay_square_mean_8,yaw_rate_speed_mean_8"
