@@ -6,9 +6,12 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
+from dataclasses import fields
 from datetime import date
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar, get_args, get_origin
+
+from typing_extensions import Doc
 
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.extras import needed
@@ -67,7 +70,7 @@ def record_call(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[
 def takes(
     options: Callable[P, T],
 ) -> Callable[[Callable[[S, T], R]], Callable[Concatenate[S, P], R]]:
-    """Let a method take the fields, the signature and the docstring of a dataclass of options."""
+    """Let a method take the fields of a dataclass of options, and say what they are."""
 
     def expand(method: Callable[[S, T], R]) -> Callable[Concatenate[S, P], R]:
         @functools.wraps(method)
@@ -77,12 +80,32 @@ def takes(
         own = inspect.signature(method)
         first = next(iter(own.parameters.values()))
         given = inspect.signature(options).parameters.values()
-        signature = own.replace(parameters=[first, *given])
+        plain = [one.replace(annotation=type_of(one.annotation)) for one in given]
+        signature = own.replace(parameters=[first, *plain])
         call.__signature__ = signature  # type: ignore[attr-defined]
-        call.__doc__ = "\n\n".join(inspect.cleandoc(one.__doc__ or "") for one in (method, options))
+        told = (f"    {name}: {text}" for name, text in documented(options).items())
+        call.__doc__ = "\n".join([inspect.getdoc(method) or "", "", "Args:", *told])
         return call
 
     return expand
+
+
+def documented(options: Any) -> dict[str, str]:
+    """Return what is said of the fields of a dataclass, by name; those without `Doc` are left out.
+
+    Commands take the same fields and texts: there, a field in backticks is an option.
+    """
+    return {
+        one.name: note.documentation
+        for one in fields(options)
+        for note in getattr(one.type, "__metadata__", ())
+        if isinstance(note, Doc)
+    }
+
+
+def type_of(annotation: Any) -> Any:
+    """Return a type without what is said of it."""
+    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
 
 
 def _as_typed(arguments: Sequence[object], options: Mapping[str, object]) -> list[str]:

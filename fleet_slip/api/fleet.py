@@ -1,21 +1,18 @@
 """A fleet's warehouse in Python."""
 
 import time
-from collections.abc import Callable
-from datetime import date
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fleet_slip.api.calls import ShowStep, Workers, of_step, open_workers, record_call
+from fleet_slip.api.calls import of_step, open_workers, record_call, takes
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.health_and_upkeep import HealthAndUpkeep
 from fleet_slip.api.logs_and_grams import LogsAndGrams
+from fleet_slip.api.requests import NightRequest, RunRequest
 from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.runs.log import step
-from fleet_slip.selection.request import DEFAULT_MODELS
 
 if TYPE_CHECKING:
     import duckdb
@@ -23,7 +20,6 @@ if TYPE_CHECKING:
     from fleet_slip.api.run_report import RunReport
     from fleet_slip.api.session import Session
     from fleet_slip.monitoring.night_report import NightReport
-    from fleet_slip.simulation.campaign import Campaign
 
 
 class Fleet(LogsAndGrams, HealthAndUpkeep):
@@ -78,30 +74,15 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         return FleetCohort(self.warehouse, condition)
 
     @record_call
-    def run(
-        self,
-        campaign: "str | Campaign" = "waterford",
-        *,
-        days: int | None = None,
-        through: date | None = None,
-        name: str | None = None,
-        models: str = DEFAULT_MODELS,
-        worth: str | None = None,
-        sign_key: Path | None = None,
-        workers: Workers = None,
-        progress: ShowStep | None = None,
-        waiting: Callable[[], None] = lambda: None,
-    ) -> "RunReport":
+    @takes(RunRequest)
+    def run(self, request: RunRequest) -> "RunReport":
         """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
 
         It can be repeated at any time, and after any interruption: what is done is not done again.
-        A second run of the campaign on this machine at the same time waits for the first; `waiting`
-        is called once before. `name` is that of the model, by default the campaign's; `models` the
-        model list that is compared; `worth` the smallest gain that is worth a signal, by default
-        what the list says; `sign_key` the private key that signs the version. A winner that is
-        worse than the champion is no error: the report says so. Progress is in rows of each step.
-
-        Raises what `simulate`, `gram`, `FleetCohort.select` and `publish` raise.
+        A second run of the campaign on this machine waits for the first; `waiting` is called once
+        before. A winner that is worse than the champion is no error: the report says so. `sign_key`
+        is the private key to sign with. Progress is in rows of each step. Raises what `simulate`,
+        `gram`, `FleetCohort.select` and `publish` raise.
         """
         from fleet_slip.api.run_report import RunReport, Training
         from fleet_slip.catalogue.features import features
@@ -110,35 +91,39 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         from fleet_slip.simulation.campaign import load_campaign
 
         begun = time.monotonic()
-        chosen = load_campaign(campaign) if isinstance(campaign, str) else campaign
-        model_name = require_model_name(name or chosen.name)
-        parse_worth(worth)  # before anything is written
+        chosen = request.campaign
+        if isinstance(chosen, str):
+            chosen = load_campaign(chosen)
+        model_name = require_model_name(request.name or chosen.name)
+        parse_worth(request.worth)  # before anything is written
         condition = f"campaign = '{chosen.name}'"
-        with self.root.exclusive(f".run-{chosen.name}.lock", waiting):
-            with open_workers(self.root, workers) as executor:
+        with self.root.exclusive(f".run-{chosen.name}.lock", request.waiting):
+            with open_workers(self.root, request.workers) as executor:
                 simulation = self.simulate(
                     chosen,
-                    days=days,
-                    through=through,
+                    days=request.days,
+                    through=request.through,
                     workers=executor,
-                    progress=of_step(progress, "simulate"),
+                    progress=of_step(request.progress, "simulate"),
                 )
-                gram = self.gram(workers=executor, progress=of_step(progress, "gram"))
-                feature_set = load_model_list(models).features
+                gram = self.gram(workers=executor, progress=of_step(request.progress, "gram"))
+                feature_set = load_model_list(request.models).features
                 wide = None
                 if feature_set != PLAIN:
                     wide = self.gram(
                         feature_set,
                         cohort=condition,
                         workers=executor,
-                        progress=of_step(progress, f"gram {feature_set}"),
+                        progress=of_step(request.progress, f"gram {feature_set}"),
                     )
                 if features().feature_set(feature_set).change_ticks:
                     # What the intercept follows from, and whether the course came in time.
                     for name_of_set in (CALIBRATION, DELAY):
                         self.gram(name_of_set, cohort=condition, workers=executor)
             refusal, selection = "", None
-            training = Training(model_name, condition, models, worth, sign_key)
+            training = Training(
+                model_name, condition, request.models, request.worth, request.sign_key
+            )
             publication = training.made_already(self)
             if publication is None:
                 with step("select"):
@@ -159,52 +144,25 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         )
 
     @record_call
-    def nightly(
-        self,
-        landing: Path | str,
-        mapping: str,
-        name: str,
-        *,
-        cohort: str = TRAINING_DRIVES,
-        models: str = DEFAULT_MODELS,
-        worth: str | None = None,
-        candidate: bool = False,
-        retention: str | None = None,
-        night: date | None = None,
-        sign_key: Path | None = None,
-        workers: Workers = None,
-        progress: ShowStep | None = None,
-        waiting: Callable[[], None] = lambda: None,
-    ) -> "NightReport":
+    @takes(NightRequest)
+    def nightly(self, request: NightRequest) -> "NightReport":
         """Do all that a night with real cars asks for, and tell how each step went.
 
-        Ingest what is new in the folder `landing`, a path or a URL, through a mapping, forget what
-        is too old, update Gram rows, examine sensors, chart the champion's error, train again
-        without the faulty drives, and verify some log files, the next ones on the next night. The
-        winner becomes champion of the model `name` if it is not worse, else, or if `candidate`, a
-        candidate. A night that was killed and is given again ends where it would have ended;
-        `night` is its date, today unless told otherwise. A second one of the model on this machine
-        waits for the first; `waiting` is called once before.
+        Ingest what is new, forget what is too old, update Gram rows, examine sensors, chart the
+        champion's error, train again without the faulty drives, and verify some log files, the next
+        ones on the next night. The winner becomes champion if it is not worse, else a candidate. A
+        night that was killed and is given again ends where it would have ended. A second one of the
+        model on this machine waits for the first; `waiting` is called once before. `sign_key` is
+        the private key to sign with.
 
         What goes wrong in a step is in the report, whose `problem` is what a command fails with;
         later steps go on where they can. Raises `UsageError` for an invalid name or worth, and
         `StorageError` if the night cannot be recorded.
         """
         from fleet_slip.api.nightly import Night
-        from fleet_slip.api.run_report import Training
         from fleet_slip.selection.request import parse_worth
 
-        parse_worth(worth)
-        training = Training(require_model_name(name), cohort, models, worth, sign_key)
-        with self.root.exclusive(f".nightly-{name}.lock", waiting):
-            return Night(
-                fleet=self,
-                landing=landing,
-                mapping=mapping,
-                training=training,
-                night=night or date.today(),
-                candidate=candidate,
-                retention=retention,
-                workers=workers,
-                progress=progress,
-            ).run()
+        parse_worth(request.worth)
+        require_model_name(request.name)
+        with self.root.exclusive(f".nightly-{request.name}.lock", request.waiting):
+            return Night(self, request).run()

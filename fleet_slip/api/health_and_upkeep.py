@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from datetime import date
-from functools import partial
 from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import (
@@ -11,10 +10,12 @@ from fleet_slip.api.calls import (
     count_from_start,
     open_workers,
     record_call,
+    takes,
     unless_local,
     within_reach,
 )
 from fleet_slip.api.judged_models import JudgedModels
+from fleet_slip.api.requests import ForgetRequest
 from fleet_slip.catalogue.sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.runs.log import step
@@ -178,38 +179,27 @@ class HealthAndUpkeep(JudgedModels):
         return preview_vacuum(self.warehouse, hours)
 
     @record_call
-    def forget(
-        self,
-        *,
-        vehicle: str | None = None,
-        drive: str | None = None,
-        drive_name: str | None = None,
-        source_file: str | None = None,
-        now: bool = False,
-        progress: ShowProgress | None = None,
-    ) -> "ForgetReport":
+    @takes(ForgetRequest)
+    def forget(self, request: ForgetRequest) -> "ForgetReport":
         """Forget a vehicle, a drive, or drives of a name or file; mark their models.
 
         They leave logs, Gram rows and quarantine, and no job brings them back until `allow`. Others
-        under the same name or file land. `now` deletes old files at once; while anything is
-        `pending`, repeat it. Progress is in files, or in drives. Raises `UsageError` unless one
-        subject is given, `QuestionError` if there never was such a drive, `StorageError` and
-        `ConflictError`.
+        under the same name or file land. While anything is `pending` in the report, repeat it.
+        Progress is in files, or in drives. Raises `UsageError` unless one subject is given,
+        `QuestionError` if there never was such a drive, `StorageError` and `ConflictError`.
         """
         from fleet_slip.maintenance.forget import forget, forget_called
+        from fleet_slip.warehouse.audit import Forgettable
 
-        if sum(one is not None for one in (vehicle, drive, drive_name, source_file)) != 1:
-            raise UsageError("give one of vehicle, drive, drive_name and source_file.")
-        told = count_from_start(progress)
+        kind, value = request.subject
+        now, told = request.now, count_from_start(request.progress)
         with step("forget") as figures:
-            called = partial(forget_called, self.warehouse, now=now, progress=told)
-            if drive_name is not None:
-                report = called("drive_name", drive_name)
-            elif source_file is not None:
-                report = called("source_file", source_file)
-            else:
-                subject = _forgettable(vehicle, drive)
-                report = forget(self.warehouse, subject, now=now, progress=told)
+            match kind:
+                case "drive_name" | "source_file":
+                    report = forget_called(self.warehouse, kind, value, now=now, progress=told)
+                case _:
+                    subject = Forgettable(kind, value)
+                    report = forget(self.warehouse, subject, now=now, progress=told)
             figures.rows = report.rows
         return report
 

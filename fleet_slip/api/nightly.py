@@ -9,13 +9,14 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fleet_slip.api.calls import ShowStep, Workers, of_step
+from fleet_slip.api.calls import ShowProgress, of_step
+from fleet_slip.api.requests import NightRequest
 from fleet_slip.api.run_report import Training
 from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError
-from fleet_slip.ingest.logs.log_files import Place, find_logs, is_url
+from fleet_slip.ingest.logs.log_files import find_logs, is_url
 from fleet_slip.ingest.mapping.mapping import load_mapping
 from fleet_slip.models.aliases import CANDIDATE
 from fleet_slip.models.model_version import ModelVersion
@@ -61,18 +62,17 @@ class Night:
     """
 
     fleet: "Fleet"
-    landing: Place
-    mapping: str
-    training: Training
-    night: date
-    candidate: bool = False
-    retention: str | None = None
-    workers: Workers = None
-    progress: ShowStep | None = None
+    asked: NightRequest
+    training: Training = field(init=False)
     before: Beginning = field(init=False)
     steps: list[NightStep] = field(default_factory=list)
     faults: "tuple[SensorFault, ...]" = ()
     chart: "Chart | None" = None
+
+    def __post_init__(self) -> None:
+        one = self.asked
+        self.training = Training(one.name, one.cohort, one.models, one.worth, one.sign_key)
+        self.night = one.night or date.today()
 
     def run(self) -> NightReport:
         """Do the night and record it."""
@@ -124,6 +124,9 @@ class Night:
         seconds = round(time.monotonic() - began, 3)
         self.steps.append(NightStep(name, state, told, seconds, error))
 
+    def _show(self, name: str) -> ShowProgress | None:
+        return of_step(self.asked.progress, name)
+
     def _hindrance(self, name: str) -> str:
         """Return why a step cannot be done."""
         warehouse = self.fleet.warehouse
@@ -156,13 +159,14 @@ class Night:
         return f"{name}@{pointed}" if waits else None
 
     def _ingest(self) -> Told:
-        mapping = load_mapping(self.mapping)
-        if not is_url(self.landing) and not Path(self.landing).is_dir():
+        mapping = load_mapping(self.asked.mapping)
+        landing = self.asked.landing
+        if not is_url(landing) and not Path(landing).is_dir():
             raise InputError(
-                f"{self.landing}: no such folder. Name the folder where logs land, or mount it."
+                f"{landing}: no such folder. Name the folder where logs land, or mount it."
             )
         try:
-            find_logs([self.landing])
+            find_logs([self.asked.landing])
         except InputError:  # a night in which no car came home is no fault
             never = not self.before.drives
             return ("attention" if never else "done"), "No log is in the folder."
@@ -170,12 +174,12 @@ class Night:
         again = ""
         try:
             self.fleet.ingest(
-                self.landing,
+                self.asked.landing,
                 mapping,
                 replace="corrected",
-                workers=self.workers,
+                workers=self.asked.workers,
                 each=reports.append,
-                progress=of_step(self.progress, "ingest"),
+                progress=self._show("ingest"),
             )
         except RepeatedError as error:  # what is there counts once
             again = str(error)
@@ -203,8 +207,8 @@ class Night:
             self.fleet.gram(
                 name,
                 cohort=None if name == PLAIN else self.training.cohort,
-                workers=self.workers,
-                progress=of_step(self.progress, f"gram {name}"),
+                workers=self.asked.workers,
+                progress=self._show(f"gram {name}"),
             )
         return "done", f"Of {number_of(self._now().drives, 'drive')}."
 
@@ -248,7 +252,7 @@ class Night:
         selection = self.training.select(self.fleet)
         name, key = self.training.name, self.training.sign_key
         publication, refusal = None, ""
-        if not self.candidate:
+        if not self.asked.candidate:
             publication, refusal = self.training.publish_if_not_worse(
                 self.fleet, selection, replace_marked=False
             )
@@ -260,7 +264,9 @@ class Night:
 
     def _verify(self) -> Told:
         checked = self.fleet.check(
-            SAMPLE_FILES, begin=self.night.toordinal(), progress=of_step(self.progress, "verify")
+            SAMPLE_FILES,
+            begin=self.night.toordinal(),
+            progress=self._show("verify"),
         )
         return "done", (
             f"{number_of(checked.rows, 'row')} of {number_of(checked.files, 'file')} are what was "
@@ -268,7 +274,7 @@ class Night:
         )
 
     def _retain(self) -> Told:
-        report = self.fleet.retain(self.retention, progress=of_step(self.progress, "retain"))
+        report = self.fleet.retain(self.asked.retention, progress=self._show("retain"))
         forgotten, removed = report.forgotten.drives, len(report.vacuumed.files)
         return "done", (
             f"{number_of(forgotten, 'drive')} before {report.before} forgotten, "

@@ -2,132 +2,104 @@
 
 import functools
 import inspect
+import re
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from typing import Annotated, Any, TypeVar
 
 import typer
 
+from fleet_slip.api.calls import documented, type_of
 from fleet_slip.cli.completing import complete_config, complete_feature_set, complete_model
+from fleet_slip.cli.dates import date_of, last_day
 from fleet_slip.errors import UsageError
 from fleet_slip.grams.cohorts.folding import FoldKey
-from fleet_slip.regression.choice.criteria import CRITERIA
-from fleet_slip.regression.choice.signal_orders import RANKINGS
-from fleet_slip.regression.choice.stepwise import METHODS
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
-from fleet_slip.selection.model_list import DEFAULT_MOST
-from fleet_slip.selection.request import DEFAULT_MODELS, LOGGED_MODELS, SelectionRequest
+from fleet_slip.selection.request import SelectionRequest
 
 R = TypeVar("R")
 
-SELECTION: dict[str, Any] = {
-    "models": typer.Option(
-        help=f"A model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, or "
-        f"{LOGGED_MODELS} with --features, unless --nested or an option that searches is given.",
-        autocompletion=complete_config("models"),
-        show_default=False,
-    ),
-    "model": typer.Option(
-        help="The inputs of the one model to take, separated by commas, such as "
-        '"ax, ay, yaw_rate", instead of a list.',
-        show_default=False,
-    ),
-    "nested": typer.Option(
-        help="Add the nested models of an order of signals, separated by commas; 'catalogue' is "
-        "all inputs in the order of configs/signals.toml."
-    ),
-    "features": typer.Option(
-        help="Feature set of configs/features.toml, computed before with: fleet-slip gram "
-        "--features NAME. Default: what the list says, else the logged signals.",
-        autocompletion=complete_feature_set,
-    ),
-    "label": typer.Option(
-        help="course: learn without a reference sensor, from changes of the course over ground; "
-        "course+sideslip: from these, and the label of the cars that have it. Feature set and "
-        "model list are then those called course, unless others are named.",
-        show_default=False,
-    ),
-    "by": typer.Option(
-        help="What a fold is made of. Default: what the list says. By row is WEKA's way and leaks."
-    ),
-    "folds": typer.Option(
-        "--folds",
-        metavar="NUMBER|each",
-        help="Number of folds, or each: every drive, or whatever folds are made of, is a fold of "
-        "its own. Default: what the list says.",
-    ),
-    "rank": typer.Option(
-        help=f"Rank the inputs of --nested first: {', '.join(RANKINGS)}. Default: declared.",
-        show_default=False,
-    ),
-    "criterion": typer.Option(
-        help="What decides how many of the ranked inputs are kept: cv (the smallest model that "
-        f"falls negligibly short of the best; see --worth), {', '.join(CRITERIA)}. Default: cv.",
-        show_default=False,
-    ),
-    "worth": typer.Option(
-        "--worth",
-        help="The smallest gain that is worth a signal: as an angle such as 0.025deg, the root of "
-        "the difference of the mean squared errors, in which the label's noise cancels; or a share "
-        "of the RMSE, such as 2%. Of the models that fall less short of the best, or by no more "
-        "than one standard error of the difference, that with the fewest signals wins. "
-        "Default: 0.025deg, or the rule of the list.",
-        show_default=False,
-    ),
-    "all_subsets": typer.Option(
-        "--all-subsets", help="Search all subsets of the inputs of --nested instead of an order."
-    ),
-    "robust": typer.Option(
-        "--robust",
-        help="Leave out the cars whose influence on the model no honest car of their rows has, and "
-        "say which; diagnose says it before.",
-    ),
-    "naive": typer.Option(
-        "--naive",
-        help="Take rows for independent evidence, not drives or cars. At 100 Hz they are not: "
-        "then every criterion keeps nearly everything.",
-    ),
-    "cluster": typer.Option(
-        help="What is independent evidence: vehicle, since a car's drives share its biases and "
-        "tyres, or drive. Default: vehicle where there are several, else drive.",
-        show_default=False,
-    ),
-    "intercept": typer.Option(
-        help="Whether models have an intercept. Without it they go through the origin: a car that "
-        "drives straight on then has no side-slip, and no sensor an offset."
-    ),
-    "search": typer.Option(
-        "--search",
-        help=f"Search among the inputs of --nested, or all: {', '.join(METHODS)}; the search is "
-        "made again in every fold. Adds its models of 1, 2, ... columns.",
-        show_default=False,
-    ),
-    "most": typer.Option(
-        min=1, max=200, help=f"Most columns of --search. Default: {DEFAULT_MOST}."
-    ),
-    "repeat": typer.Option(
-        min=2, help="Cross-validate the winner again with so many other deals of folds."
-    ),
-    "bootstrap": typer.Option(
-        min=100,
-        help="Confidence interval of the winner's correlation by drawing the drives so many times.",
-    ),
+DETAILS: dict[str, dict[str, Any]] = {
+    "campaign": {"autocompletion": complete_config("campaigns")},
+    "days": {"min": 1},
+    "features": {"autocompletion": complete_feature_set},
+    "folds": {"metavar": "NUMBER|each"},
+    "mapping": {"autocompletion": complete_config("mappings")},
+    "models": {"autocompletion": complete_config("models")},
+    "most": {"min": 1, "max": 200},
+    "repeat": {"min": 2},
+    "bootstrap": {"min": 100},
 }
-"""The option of each field of `SelectionRequest`, which has their types and defaults."""
+"""What options need on the command line beside what is said of the fields of requests."""
 
-TEXTS = {"folds": str | None}
-"""Fields that may be a number or a word: on the command line they are text."""
+READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
+    "campaign": (str, str),
+    "folds": (str | None, lambda folds: folds),
+    "landing": (str, str),
+    "night": (str | None, lambda night: date_of(night, "--night")),
+    "through": (str | None, last_day),
+}
+"""Fields of other types on the command line, and what reads them."""
 
 RESAMPLING = ("repeat", "bootstrap")
 """Fields that tell more of a winner and choose none."""
 
-Models = Annotated[
-    str,
-    typer.Option(
-        help="A model list of configs/models, or a TOML file.",
-        autocompletion=complete_config("models"),
-    ),
-]
+
+def option(request: type, name: str, *names: str) -> Any:
+    """Return the option for a field of a request, under other names if these are given."""
+    told = documented(request)
+    text = _NAMED.sub(lambda one: "--" + one[1].replace("_", "-"), told[name])
+    default = next(one.default for one in fields(request) if one.name == name)
+    alone = (f"--{name.replace('_', '-')}",) if default is False else ()
+    return typer.Option(*(names or alone), help=text, **DETAILS.get(name, {}))
+
+
+_NAMED = re.compile("`([a-z_]+)`")
+
+
+def request_options(
+    request: type, *, without: Collection[str] = (), **names: str
+) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """Give a command the options of a request in place of its parameter of that type.
+
+    `names` are options that are called otherwise than their fields.
+    """
+    given = [
+        inspect.Parameter(
+            one.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if one.default is MISSING else one.default,
+            annotation=Annotated[
+                READ[one.name][0] if one.name in READ else type_of(one.type),
+                option(request, one.name, *filter(None, [names.get(one.name)])),
+            ],
+        )
+        for one in fields(request)
+        if one.name in documented(request) and one.name not in without
+    ]
+
+    def expand(command: Callable[..., R]) -> Callable[..., R]:
+        own = inspect.signature(command).parameters.values()
+        taken = next(one.name for one in own if one.annotation is request)
+        parameters = [
+            each.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            for one in own
+            for each in (given if one.name == taken else [one])
+        ]
+
+        @functools.wraps(command)
+        def run(**values: Any) -> R:
+            chosen = {one.name: values.pop(one.name) for one in given}
+            read = {name: READ[name][1](chosen[name]) for name in chosen.keys() & READ.keys()}
+            return command(**values, **{taken: request(**chosen | read)})
+
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {one.name: one.annotation for one in parameters}
+        return run
+
+    return expand
+
+
 Cohort = Annotated[
     str,
     typer.Option(help="SQL condition on the view drives, such as \"track = 'waterford_hills'\"."),
@@ -140,48 +112,10 @@ Unexamined = Annotated[
     ),
 ]
 By = Annotated[FoldKey, typer.Option(help="What a fold is made of.")]
-FoldCount = Annotated[str | None, SELECTION["folds"]]
-Worth = Annotated[str | None, SELECTION["worth"]]
-Naive = Annotated[bool, SELECTION["naive"]]
-Cluster = Annotated[ClusterUnit | None, SELECTION["cluster"]]
-
-
-def selection_options(
-    *, without: Collection[str] = ()
-) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Give a command the options of a selection in place of its parameter `SelectionRequest`."""
-    given = [
-        inspect.Parameter(
-            field.name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=field.default,
-            annotation=Annotated[TEXTS.get(field.name, field.type), SELECTION[field.name]],
-        )
-        for field in fields(SelectionRequest)
-        if field.name not in without
-    ]
-
-    def expand(command: Callable[..., R]) -> Callable[..., R]:
-        own = inspect.signature(command).parameters.values()
-        request = next(one.name for one in own if one.annotation is SelectionRequest)
-        parameters = [
-            each.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-            for one in own
-            for each in (given if one.name == request else [one])
-        ]
-
-        @functools.wraps(command)
-        def run(**values: Any) -> R:
-            chosen = {one.name: values.pop(one.name) for one in given}
-            return command(**values, **{request: SelectionRequest(**chosen)})
-
-        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {one.name: one.annotation for one in parameters}
-        return run
-
-    return expand
-
-
+FoldCount = Annotated[str | None, option(SelectionRequest, "folds")]
+Worth = Annotated[str | None, option(SelectionRequest, "worth")]
+Naive = Annotated[bool, option(SelectionRequest, "naive")]
+Cluster = Annotated[ClusterUnit | None, option(SelectionRequest, "cluster")]
 Model = Annotated[
     str | None,
     typer.Argument(

@@ -15,7 +15,7 @@ from fleet_slip.grams.cohorts.fold_sums import SummedCohort
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.resources import find_config
-from fleet_slip.selection.request import Label
+from fleet_slip.selection.request import DEFAULT_MOST, Label
 
 
 class CandidateModel(Config):
@@ -40,9 +40,6 @@ class CandidateModel(Config):
         if len(set(self.signals)) < len(self.signals):
             raise ValueError(f"model {self.name!r} names a signal twice")
         return self
-
-
-DEFAULT_MOST = 24
 
 
 class Search(Config):

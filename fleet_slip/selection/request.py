@@ -3,10 +3,15 @@
 import math
 import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from typing_extensions import Doc
 
 from fleet_slip.errors import UsageError
 from fleet_slip.grams.cohorts.folding import FoldKey
+from fleet_slip.regression.choice.criteria import CRITERIA
+from fleet_slip.regression.choice.signal_orders import RANKINGS
+from fleet_slip.regression.choice.stepwise import METHODS
 from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Worth
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 
@@ -24,63 +29,130 @@ COURSE = "course"
 BOTH: Label = "course+sideslip"
 """The course of most cars, and the label of those that have it."""
 
+DEFAULT_MOST = 24
+"""Columns of a search."""
+
+WORTH = Doc(
+    "The smallest gain that is worth a signal: as an angle such as 0.025deg, the root of the "
+    "difference of the mean squared errors, in which the label's noise cancels; or a share of the "
+    "RMSE, such as 2%. Of the models that fall less short of the best, or by no more than one "
+    "standard error of the difference, that with the fewest signals wins. Default: 0.025deg, or "
+    "the rule of the list."
+)
+
 _WORTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionRequest:
-    """How models are compared and one is chosen; without options, those of Table I.
+    """How models are compared and one is chosen; without options, those of the usual list."""
 
-    Attributes:
-        models: a model list of `configs/models`, or the path of a TOML file; by default `estimator`
-            unless inputs are named or searched, and `table1` where a feature set is named or the
-            Gram rows of `estimator` are not there, which `remark` of the answer says.
-        model: the inputs of the one model to take, separated by commas, instead of a list.
-        nested: an order of inputs, separated by commas, or `catalogue` for all inputs; adds the
-            nested models of its first 1, 2 ... inputs.
-        features: a feature set; by default what the list says, else the logged signals.
-        label: `course` to learn without a reference sensor, from changes of the course, or
-            `course+sideslip` from these and the label of the cars that have it; the feature set and
-            the list are then those called `course` unless others are named.
-        by: what a fold is made of; by default what the list says. By `row` leaks.
-        folds: how many folds, or `each`: every drive, or whatever folds are made of, is one.
-        rank: ranks the inputs of `nested` first, such as `backward`.
-        criterion: what decides how many of the ranked inputs are kept: `cv`, `bic` ...
-        worth: the smallest gain that is worth a signal: of an error that the label's noise is no
-            part of, such as `0.025deg`, or of the RMSE, such as `2%`; by default what the list
-            says, which is the former unless its rule is the best correlation.
-        all_subsets: search all subsets of the inputs of `nested` instead of an order.
-        robust: leave out the cars whose influence on the model no honest car of their rows has;
-            they are `left_out` of the answer, and its cohort names them.
-        naive: take rows for independent evidence, not drives or cars.
-        cluster: what is independent evidence, `vehicle` or `drive`; by default cars where there
-            are several.
-        intercept: whether models have one; without it they go through the origin.
-        search: search among the inputs of `nested`, or all, in every fold, as by `exchange`.
-        most: the most columns of `search`.
-        repeat: cross-validate the winner again with so many other deals of folds.
-        bootstrap: draw the drives so many times for an interval of the winner's correlation.
-    """
-
-    models: str | None = None
-    model: str | None = None
-    nested: str | None = None
-    features: str | None = None
-    label: Label | None = None
-    by: FoldKey | None = None
-    folds: int | str | None = None
-    rank: str | None = None
-    criterion: str | None = None
-    worth: str | None = None
-    all_subsets: bool = False
-    robust: bool = False
-    naive: bool = False
-    cluster: ClusterUnit | None = None
-    intercept: bool = True
-    search: str | None = None
-    most: int | None = None
-    repeat: int | None = None
-    bootstrap: int | None = None
+    models: Annotated[
+        str | None,
+        Doc(
+            f"A model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, or "
+            f"{LOGGED_MODELS} with `features` or without its Gram rows, unless `nested` or an "
+            "option that searches is given."
+        ),
+    ] = None
+    model: Annotated[
+        str | None,
+        Doc(
+            "The inputs of the one model to take, separated by commas, such as "
+            '"ax, ay, yaw_rate", instead of a list.'
+        ),
+    ] = None
+    nested: Annotated[
+        str | None,
+        Doc(
+            "Add the nested models of an order of signals, separated by commas; 'catalogue' is all "
+            "inputs in the order of configs/signals.toml."
+        ),
+    ] = None
+    features: Annotated[
+        str | None,
+        Doc(
+            "Feature set of configs/features.toml, computed before with: fleet-slip gram "
+            "--features NAME. Default: what the list says, else the logged signals."
+        ),
+    ] = None
+    label: Annotated[
+        Label | None,
+        Doc(
+            "course: learn without a reference sensor, from changes of the course over ground; "
+            "course+sideslip: from these, and the label of the cars that have it. Feature set and "
+            "model list are then those called course, unless others are named."
+        ),
+    ] = None
+    by: Annotated[
+        FoldKey | None,
+        Doc("What a fold is made of. Default: what the list says. By row is WEKA's way and leaks."),
+    ] = None
+    folds: Annotated[
+        int | str | None,
+        Doc(
+            "Number of folds, or each: every drive, or whatever folds are made of, is a fold of "
+            "its own. Default: what the list says."
+        ),
+    ] = None
+    rank: Annotated[
+        str | None,
+        Doc(f"Rank the inputs of `nested` first: {', '.join(RANKINGS)}. Default: declared."),
+    ] = None
+    criterion: Annotated[
+        str | None,
+        Doc(
+            "What decides how many of the ranked inputs are kept: cv (the smallest model that "
+            f"falls negligibly short of the best; see `worth`), {', '.join(CRITERIA)}. Default: cv."
+        ),
+    ] = None
+    worth: Annotated[str | None, WORTH] = None
+    all_subsets: Annotated[
+        bool, Doc("Search all subsets of the inputs of `nested` instead of an order.")
+    ] = False
+    robust: Annotated[
+        bool,
+        Doc(
+            "Leave out the cars whose influence on the model no honest car of their rows has, and "
+            "say which; diagnose says it before."
+        ),
+    ] = False
+    naive: Annotated[
+        bool,
+        Doc(
+            "Take rows for independent evidence, not drives or cars. At 100 Hz they are not: then "
+            "every criterion keeps nearly everything."
+        ),
+    ] = False
+    cluster: Annotated[
+        ClusterUnit | None,
+        Doc(
+            "What is independent evidence: vehicle, since a car's drives share its biases and "
+            "tyres, or drive. Default: vehicle where there are several, else drive."
+        ),
+    ] = None
+    intercept: Annotated[
+        bool,
+        Doc(
+            "Whether models have an intercept. Without it they go through the origin: a car that "
+            "drives straight on then has no side-slip, and no sensor an offset."
+        ),
+    ] = True
+    search: Annotated[
+        str | None,
+        Doc(
+            f"Search among the inputs of `nested`, or all: {', '.join(METHODS)}; the search is "
+            "made again in every fold. Adds its models of 1, 2, ... columns."
+        ),
+    ] = None
+    most: Annotated[int | None, Doc(f"Most columns of `search`. Default: {DEFAULT_MOST}.")] = None
+    repeat: Annotated[
+        int | None, Doc("Cross-validate the winner again with so many other deals of folds.")
+    ] = None
+    bootstrap: Annotated[
+        int | None,
+        Doc("Confidence interval of the winner's correlation by drawing the drives so many times."),
+    ] = None
 
     @property
     def ordered(self) -> bool:

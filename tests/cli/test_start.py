@@ -12,7 +12,7 @@ import pytest
 
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.cli.commands import COMMANDS, MARKUP, CommandGroup, load_command
-from fleet_slip.cli.options import RESAMPLING, SELECTION
+from fleet_slip.cli.options import RESAMPLING
 from fleet_slip.selection.request import SelectionRequest
 from tests.support.commands import run
 
@@ -90,7 +90,6 @@ def test_summaries_are_read_without_running_a_module() -> None:
 
 def test_a_selections_options_stand_once_and_are_those_of_the_api() -> None:
     options = {field.name for field in fields(SelectionRequest)}
-    assert set(SELECTION) == options
     in_python = set(inspect.signature(FleetCohort.select).parameters) - {"self"}
     assert in_python == options
     taken = {name: {one.name for one in load_command(name).params} for name in COMMANDS}

@@ -8,7 +8,7 @@ from fleet_slip.cli.begin.select_command import print_selection
 from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.left_out import examine_before_publishing
 from fleet_slip.cli.models.signing_commands import SignKey, signing_key
-from fleet_slip.cli.options import RESAMPLING, Unexamined, selection_options
+from fleet_slip.cli.options import RESAMPLING, Unexamined, request_options
 from fleet_slip.cli.output import All, Json, print_json, say
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.models.manifest import require_model_name
@@ -20,7 +20,7 @@ from fleet_slip.selection.request import SelectionRequest
 
 
 @record_run
-@selection_options(without=RESAMPLING)
+@request_options(SelectionRequest, without=RESAMPLING)
 def publish(
     context: typer.Context,
     name: Annotated[

@@ -1,47 +1,29 @@
 """The command that does the whole job: simulate what is missing, gram, select, publish."""
 
-from typing import Annotated
-
 import typer
 
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.api.requests import RunRequest
 from fleet_slip.api.run_report import RunReport
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.cli.begin.publish_command import print_publication
 from fleet_slip.cli.begin.select_command import print_selection
-from fleet_slip.cli.completing import complete_config
-from fleet_slip.cli.data.log_commands import Days, Through, last_day
 from fleet_slip.cli.models.signing_commands import signing_key
 from fleet_slip.cli.next_steps import next_steps
-from fleet_slip.cli.options import Models, Worth
+from fleet_slip.cli.options import request_options
 from fleet_slip.cli.output import All, Json, print_json, say
 from fleet_slip.cli.progress_bar import progress_of_steps
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
-from fleet_slip.selection.request import DEFAULT_MODELS
 from fleet_slip.words import number_of
-
-DEFAULT_CAMPAIGN = "waterford"
 
 
 @record_run
+@request_options(RunRequest)
 def run(
     context: typer.Context,
-    campaign: Annotated[
-        str,
-        typer.Option(
-            help="A campaign of configs/campaigns, or the path of a TOML file.",
-            autocompletion=complete_config("campaigns"),
-        ),
-    ] = DEFAULT_CAMPAIGN,
-    days: Days = None,
-    through: Through = None,
-    name: Annotated[
-        str | None, typer.Option(help="Name of the model. Default: the campaign's.")
-    ] = None,
-    models: Models = DEFAULT_MODELS,
-    worth: Worth = None,
+    request: RunRequest,
     threads: Threads = None,
     cluster: Cluster = None,
     everything: All = False,
@@ -58,24 +40,25 @@ def run(
     from fleet_slip.simulation.campaign import load_campaign  # noqa: PLC0415 - the simulator takes a while
 
     fleet: Fleet = context.obj
-    plan = load_campaign(campaign)
+    plan = load_campaign(str(request.campaign))
     doing = {"simulate": f"simulate {plan.name}", "gram": f"gram {PLAIN}"}
+
+    def tell(name: str, done: int, total: int) -> None:
+        show(doing.get(name, name), done, total)
+
     with (
         open_workers(fleet.root, cluster or threads) as executor,
         progress_of_steps("rows", executor) as show,
     ):
-        report = fleet.run(
-            plan,
-            days=days,
-            through=last_day(through),
-            name=name,
-            models=models,
-            worth=worth,
-            sign_key=signing_key(None),
-            workers=executor,
-            progress=lambda step, done, total: show(doing.get(step, step), done, total),
-            waiting=lambda: say(f"{plan.name}: waiting for another run"),
-        )
+        options = {
+            **vars(request),
+            "campaign": plan,
+            "sign_key": signing_key(None),
+            "workers": executor,
+            "progress": tell,
+            "waiting": lambda: say(f"{plan.name}: waiting for another run"),
+        }
+        report = fleet.run(**options)
     if json:
         print_json(report)
     else:

@@ -15,7 +15,7 @@ from fleet_slip.cli.left_out import (
     say_untold,
     say_without_log,
 )
-from fleet_slip.cli.options import Cohort, Unexamined, selection_options
+from fleet_slip.cli.options import Cohort, Unexamined, request_options
 from fleet_slip.cli.output import (
     All,
     Json,
@@ -53,7 +53,7 @@ BEST = 10
 """So many models are shown unless all are asked for."""
 
 
-@selection_options()
+@request_options(SelectionRequest)
 def select(
     context: typer.Context,
     request: SelectionRequest,

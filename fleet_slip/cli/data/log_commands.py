@@ -2,7 +2,6 @@
 
 import logging
 import sys
-from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,8 +9,10 @@ import typer
 
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.api.requests import RunRequest
 from fleet_slip.cli.completing import complete_config
-from fleet_slip.cli.dates import date_of
+from fleet_slip.cli.dates import last_day
+from fleet_slip.cli.options import option
 from fleet_slip.cli.output import Json, print_json, print_table, print_text, say
 from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
@@ -32,19 +33,8 @@ CampaignName = Annotated[
         autocompletion=complete_config("campaigns"),
     ),
 ]
-Through = Annotated[
-    str | None, typer.Option(help="Last day to simulate, YYYY-MM-DD or today. Default: all days.")
-]
-Days = Annotated[
-    int | None, typer.Option(min=1, help="Simulate the first N days only. Default: all.")
-]
-
-
-def last_day(through: str | None) -> date | None:
-    """Return the day that --through names. Raises `UsageError` for anything but a date or today."""
-    if through == "today":
-        return date.today()
-    return date_of(through, "--through", "2024-05-01, or today")
+Through = Annotated[str | None, option(RunRequest, "through")]
+Days = Annotated[int | None, option(RunRequest, "days")]
 
 
 @record_run

@@ -10,11 +10,13 @@ import typer
 
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.api.requests import ForgetRequest
+from fleet_slip.cli.options import request_options
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster
-from fleet_slip.errors import DamageError, PendingError
+from fleet_slip.errors import DamageError, PendingError, UsageError
 from fleet_slip.maintenance.compaction import TARGET_ROWS
 from fleet_slip.maintenance.forget import ForgetReport
 from fleet_slip.maintenance.vacuum import RETENTION_HOURS, VacuumReport
@@ -170,19 +172,10 @@ def _vacuumed(report: VacuumReport) -> str:
 
 
 @record_run
+@request_options(ForgetRequest)
 def forget(
     context: typer.Context,
-    vehicle: Annotated[str | None, typer.Option(help="The vehicle_id to forget.")] = None,
-    drive: Annotated[str | None, typer.Option(help="The drive_id to forget.")] = None,
-    drive_name: Annotated[
-        str | None, typer.Option(help="The drive_name whose drives are to be forgotten.")
-    ] = None,
-    source_file: Annotated[
-        str | None, typer.Option(help="The source_file whose drives are to be forgotten.")
-    ] = None,
-    now: Annotated[
-        bool, typer.Option("--now", help="Delete the old files at once, not when vacuum is due.")
-    ] = False,
+    request: ForgetRequest,
     allow: Annotated[
         bool, typer.Option("--allow", help="Let it come back: land its new rows again from now on.")
     ] = False,
@@ -195,37 +188,29 @@ def forget(
 
     Example: **fleet-slip forget --vehicle car-7 --now**
     """
-    subjects = {
-        "vehicle": vehicle,
-        "drive": drive,
-        "drive_name": drive_name,
-        "source_file": source_file,
-    }
-    given = {name: value for name, value in subjects.items() if value is not None}
-    if len(given) != 1:
-        raise typer.BadParameter("give one of --vehicle, --drive, --drive-name and --source-file.")
-    if allow and drive_name is not None:
-        raise typer.BadParameter("give --allow with --vehicle, --drive or --source-file.")
-    if allow and now:
-        raise typer.BadParameter("give one of --allow and --now.")
+    name, value = request.subject
+    if allow and name == "drive_name":
+        raise UsageError("give --allow with --vehicle, --drive or --source-file.")
+    if allow and request.now:
+        raise UsageError("give one of --allow and --now.")
     fleet: Fleet = context.obj
     if allow:
-        changed = fleet.allow(**given)
+        changed = fleet.allow(**{name: value})
         if json:
             print_json({"allowed": True, "changed": changed})
         else:
             say(
                 "its new rows are landed again from now on; what was forgotten stays forgotten"
-                + (" until the file is ingested again" if source_file is not None else "")
+                + (" until the file is ingested again" if name == "source_file" else "")
             )
         return
     with progress("forget", "files") as show:
-        report = fleet.forget(**given, now=now, progress=show)
+        report = fleet.forget(**{**vars(request), "progress": show})
     if json:
         print_json(report)
     else:
         _say_forgotten(report)
-    if now and report.pending:
+    if request.now and report.pending:
         raise PendingError(
             f"{len(report.pending)} may still have its rows, in files that no reader sees: "
             f"{', '.join(report.pending[:PENDING_SHOWN])}. Repeat this command when they have "
