@@ -87,7 +87,6 @@ def _sources_stamp(file: str) -> str:
 
 
 def _sources_of(file: Path) -> set[Path]:
-    """Return a source file and those of this package that it imports, if by way of others."""
     found, waiting = set[Path](), [file]
     while waiting:
         source = waiting.pop()
@@ -138,8 +137,6 @@ class _CheckedFiles(IndexDataCacheFile):
 
 
 class _NoFolder(NullCache):
-    """No place for compiled code."""
-
     def save_overload(self, sig: Any, cres: Any) -> None:  # noqa: ARG002
         """Keep nothing, and say so."""
         _remark("there is no folder where compiled code can be kept")

@@ -66,7 +66,6 @@ def connect_unlocked(
 def _open_views(
     root: Folder, query: str | None, threads: int | None = None, *, scenarios: bool
 ) -> tuple[duckdb.DuckDBPyConnection, list[str]]:
-    """Return a connection with views, and the paths of all files that they read."""
     warehouse = Warehouse(root)
     warehouse.require()
     wanted = VIEWS - {CALIBRATION} if query is None else needed_views(query)

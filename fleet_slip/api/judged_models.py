@@ -158,7 +158,6 @@ class JudgedModels(PublishedModels):
 
 
 def _rivals_if(wanted: bool) -> "TrainRivals | None":
-    """Return what trains the rivals, where they are wanted."""
     if not wanted:
         return None
     from fleet_slip.comparison.rivals import compare  # an optional extra

@@ -110,7 +110,6 @@ class Night:
         return report
 
     def _do(self, name: str, work: Callable[[], Told]) -> None:
-        """Do a step, unless what it needs is not there; keep what came of it."""
         began = time.monotonic()
         if reason := self._hindrance(name):
             self.steps.append(NightStep(name, "left out", reason, 0.0))
@@ -140,7 +139,6 @@ class Night:
         return f"{missing[0]} was not done." if missing else ""
 
     def _now(self) -> Beginning:
-        """Return what the root has at this moment."""
         warehouse, champion = self.fleet.warehouse, None
         if self.fleet.root.exists():
             champion = self.fleet.registry().champion(self.training.name)
@@ -152,7 +150,6 @@ class Night:
         )
 
     def _candidate(self) -> str | None:
-        """Return the candidate, unless a later version is champion."""
         registry, name = self.fleet.registry(), self.training.name
         pointed, champion = registry.history(name).pointed_at(CANDIDATE), registry.champion(name)
         waits = pointed and (champion is None or pointed > champion.version)
@@ -283,7 +280,6 @@ class Night:
 
 
 def _count_drives(warehouse: Warehouse) -> int:
-    """Return the number of drives that have Gram rows."""
     if not warehouse.grams.snapshot().rows:
         return 0
     query = "SELECT count(DISTINCT drive_id) FROM grams"

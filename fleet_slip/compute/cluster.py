@@ -150,8 +150,6 @@ def _marker(root: Folder) -> Iterator[Marker]:
 
 @dataclass(eq=False)
 class _Task:
-    """A task that was submitted and is not done."""
-
     content: bytes
     future: Future[Any] = field(default_factory=Future)
     sent_by: object = None
@@ -210,7 +208,6 @@ class ClusterExecutor(Executor):
         task.future.add_done_callback(lambda ours: ours.cancelled() and future.cancel())
 
     def _settle(self, task: _Task, future: Future[Any]) -> None:
-        """Pass on what became of a task."""
         if future.cancelled():
             task.sent_by = None
             return

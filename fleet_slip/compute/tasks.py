@@ -166,5 +166,4 @@ def map_ahead(
 
 
 def _take(items: Iterator[Item]) -> tuple[Item, ...]:
-    """Return the next item alone, nothing at the end."""
     return tuple(islice(items, 1))

@@ -56,7 +56,6 @@ def on_newest(
 
 
 def _versions(tables: Sequence["Table"]) -> list[int | None]:
-    """Return the versions of tables; None for one whose log cannot be read."""
     found: list[int | None] = []
     for table in tables:
         try:

@@ -145,7 +145,6 @@ def read_leading_part(folder: Folder, path: str, wanted: int) -> bytes | None:
 
 
 def _places(content: bytes, where: str) -> list[tuple[int, int, int]]:
-    """Return where each part begins, its length and its checksum."""
     if not content.startswith(_PARQUET + _MAGIC) or len(content) < len(_PARQUET) + _HEAD.size:
         return []
     begin = len(_PARQUET)

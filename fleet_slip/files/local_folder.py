@@ -259,7 +259,6 @@ def _pass_over(error: OSError) -> None:
 
 
 def _flush(folder: Path) -> None:
-    """Make renames inside a folder durable."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

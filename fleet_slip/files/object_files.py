@@ -180,7 +180,6 @@ class ObjectFilesystem(_ReadOnlyFilesystem):
         self._sizes: dict[str, int] = {}
 
     def _key(self, path: str) -> tuple[str, str]:
-        """Return the key of an object, and its URL."""
         key = path.removeprefix(f"{self.protocol}://").removeprefix(f"{self._name}/")
         return key, f"{self.protocol}://{self._name}/{key}"
 

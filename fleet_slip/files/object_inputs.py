@@ -139,7 +139,6 @@ def copy_object(file: StoredFile, copy: Path) -> None:
 
 
 def _copy_once(file: StoredFile, copy: Path) -> str:
-    """Copy an object; return the MD5 of what arrived, which is what stores tell."""
     folder = file.folder
     assert isinstance(folder, ObjectFolder)  # noqa: S101 - where else?
     md5, copied = hashlib.md5(usedforsecurity=False), 0

@@ -116,7 +116,6 @@ def read_old_files(snapshot: Snapshot) -> Iterator[OldFile]:
 
 
 def _with_day(file: StoredFile, rows: pa.Table) -> pa.Table:
-    """Return the rows of a partitioned file with the day that its folder tells."""
     key, _, day = file.path.partition("/")[0].partition("=")
     if key != "day":
         return rows

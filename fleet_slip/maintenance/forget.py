@@ -131,7 +131,6 @@ def _begin(
     located: Located,
     source_file: str | None,
 ) -> list[str]:
-    """Record what is to be forgotten; return the model versions that were trained on it."""
     judged = newest_versions(warehouse.root)
     models = models_trained_on(warehouse, drives)
     known = () if subject.kind == "before" else recordings_of(warehouse, subject, located)
@@ -154,8 +153,6 @@ def _drives_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> 
 def _rewrite_logs(
     warehouse: Warehouse, subject: Forgettable, located: Located, progress: Progress
 ) -> tuple[int, int, int]:
-    """Commit the logs without the drives; return rows forgotten, files rewritten, removed."""
-
     def attempt() -> tuple[int, int, int]:
         logs = warehouse.logs.snapshot()
         drives = drives_by_file(logs, subject, located)

@@ -55,8 +55,6 @@ def newest_versions(root: Folder) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class _PresentDrives:
-    """The drives that have Gram rows, read when they are asked for."""
-
     warehouse: Warehouse
     hashed: dict[str, Hashes] = field(default_factory=dict)
 

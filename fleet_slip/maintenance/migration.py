@@ -175,7 +175,6 @@ def _rewrite(table: Table, file: TableFile, ratios: Mapping[str, Fraction]) -> A
 
 
 def _now(table: Table) -> DeltaTable:
-    """Return a table that exists, as it is now."""
     delta = table.open_delta()
     if delta is None:
         raise StorageError(f"{table.folder}: the table is gone. Restore it from a backup.")
@@ -184,7 +183,6 @@ def _now(table: Table) -> DeltaTable:
 
 @contextlib.contextmanager
 def _conflicts(table: Table) -> Iterator[None]:
-    """Turn a lost race into `ConflictError`."""
     try:
         yield
     except CommitFailedError:

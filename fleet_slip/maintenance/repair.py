@@ -102,7 +102,6 @@ def _simulate_again(
 
 
 def _drives_of(warehouse: Warehouse, paths: Collection[str]) -> dict[str, frozenset[str]]:
-    """Return the drives that log files have, which their Gram rows tell."""
     found: dict[str, set[str]] = {}
     for rows in _readable_grams(warehouse).values():
         concerned = rows.filter(pc.is_in(rows["file"], pa.array(sorted(paths), pa.string())))

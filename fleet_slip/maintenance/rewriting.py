@@ -129,7 +129,6 @@ def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:
 
 
 def _order(rows: pa.Table) -> IntArray:
-    """Return the order by drive, then tick."""
     ids = rows["drive_id"].combine_chunks()
     rank = np.argsort(np.argsort(np.array(ids.dictionary.to_pylist(), dtype=object)))
     drive = rank[ids.indices.to_numpy()] if len(rank) else np.empty(0, dtype=np.int64)

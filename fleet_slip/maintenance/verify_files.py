@@ -115,7 +115,6 @@ def verify_files(
 
 
 def _groups(files: Sequence[TableFile]) -> Iterator[tuple[TableFile, ...]]:
-    """Divide files into groups that each take a task about a second."""
     group: tuple[TableFile, ...] = ()
     for file in files:
         group = (*group, file)
@@ -154,7 +153,6 @@ def read_whole(table: Table, file: TableFile) -> ReadFile:
 
 
 def _contradiction(file: TableFile, metadata: pq.FileMetaData) -> str | None:
-    """Return in what a file's footer and the Delta log differ, or None."""
     if metadata.num_rows != file.rows:
         return f"has {metadata.num_rows:,} rows, the Delta log says {file.rows:,}"
     if (nulls := _null_counts(metadata)).items() - file.null_counts.items():
@@ -166,7 +164,6 @@ def _contradiction(file: TableFile, metadata: pq.FileMetaData) -> str | None:
 
 
 def _null_counts(metadata: pq.FileMetaData) -> dict[str, int]:
-    """Return the number of nulls of each plain column, from the file's own statistics."""
     counts: dict[str, int] = {}
     for group in range(metadata.num_row_groups):
         for number in range(metadata.num_columns):

@@ -43,7 +43,6 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
 
 
 def _unsure(delays: Mapping[str, ReceiverDelay], cars: Iterable[str]) -> Iterator[str]:
-    """Yield a sentence where the delays of some cars are not known well enough."""
     unsure = {car: delays[car] for car in cars if car in delays and not _sure(delays[car])}
     if unsure:
         yield f"delays are not known to {1000 * SURE_S:g} ms ({_named(unsure)})"
@@ -54,7 +53,6 @@ def _unsure(delays: Mapping[str, ReceiverDelay], cars: Iterable[str]) -> Iterato
 def _not_corrected(
     delays: Mapping[str, ReceiverDelay], cars: Mapping[str, tuple[int, int]]
 ) -> Iterator[str]:
-    """Yield a sentence where Gram rows are not corrected by the delays that are known by now."""
     late = {
         car: delays[car]
         for car, corrected in cars.items()

@@ -47,7 +47,6 @@ class ModelVersion:
         )
 
     def _repr_html_(self) -> str:
-        """Return the coefficients as a table, drawn per count of its signal."""
         terms = self.manifest.terms
         rows = [[term.column, term.unit, f"{term.coefficient:.6g}"] for term in terms]
         rows.append(["intercept", self.manifest.label.unit, f"{self.manifest.intercept:.6g}"])

@@ -76,7 +76,6 @@ def _newest(registry: Registry, name: str) -> ModelVersion | None:
 
 
 def _kept(version: ModelVersion) -> tuple[SelectionRequest, str]:
-    """Return what a version was asked for, and of which drives. Raises `QuestionError`."""
     manifest = version.manifest
     chosen = manifest.selected_by
     cohort = with_all_drives(manifest.trained_on.cohort)

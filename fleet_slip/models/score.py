@@ -85,7 +85,6 @@ def score_statement(manifest: Manifest, condition: str | Condition) -> str:
 
 
 def _scored_rows(manifest: Manifest, condition: Condition) -> dict[str, str]:
-    """Return what says in SQL which rows are scored."""
     columns = [term.column for term in manifest.terms] + [manifest.label.column]
     return {
         "rows": _rows(manifest),

@@ -110,7 +110,6 @@ def _read_private_key(path: Path) -> bytes:
 
 
 def _read_key(path: Path) -> tuple[bytes, int]:
-    """Return a key's file and its mode."""
     return read_named_file(path), path.stat().st_mode
 
 

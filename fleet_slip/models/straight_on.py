@@ -131,7 +131,6 @@ def _by_offsets(rows: FloatArray, offsets: FloatArray, means: FloatArray) -> Lin
 
 
 def _by_car(cohort: Cohort, signals: Sequence[str]) -> list[tuple[str, Gram, Mapping[str, object]]]:
-    """Return the sums of each car's drives that have the signals, and what is known of the car."""
     found: dict[str, tuple[Gram, Mapping[str, object]]] = {}
     first = 0
     for table in cohort.tables:

@@ -216,7 +216,6 @@ def _exists(root: Folder) -> bool:
 
 
 def _append(root: Folder, file: str, *records: Mapping[str, Any]) -> bool:
-    """Append records in one write; False where that is not possible."""
     text = b"".join(b"\n" + write_line(record) + b"\n" for record in records)
     try:
         root.append(file, text)

@@ -182,7 +182,6 @@ def _answer_without(
 
 
 def _given(request: SelectionRequest) -> ModelList | None:
-    """Return the one model that was asked for, if there is one, as a list."""
     if request.model is None:
         return None
     feature_set = request.features or (COURSE if request.label else PLAIN)
@@ -267,7 +266,6 @@ def _checksum(compared: str, worth: str | None, intercept: bool) -> str:
 
 
 def _search_of(request: SelectionRequest, model_list: ModelList | None) -> Search | None:
-    """Return how to search: as asked for, else as the list says, if at all."""
     if request.search:
         if request.search not in METHODS:
             raise QuestionError(f"unknown search {request.search!r}. Known: {', '.join(METHODS)}.")

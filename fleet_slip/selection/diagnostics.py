@@ -203,7 +203,6 @@ def _serial(fitted: Fit, lagged: Cohort) -> SerialDiagnosis:
 
 
 def _cars(*cohorts: Served | None) -> list[str]:
-    """Return the cars of some cohorts."""
     return [car for one in cohorts if one for car in one.drives["vehicle_id"].to_pylist()]
 
 

@@ -251,7 +251,6 @@ def _model(folds: Folds, sums: Sequence[ErrorSums], fitted: Fit, search: Search)
 
 
 def _fits(gram: Gram, inputs: Sequence[str], label: str, search: Search) -> list[Fit]:
-    """Return the exact fits of the sets that a search chooses, of sizes 1, 2, ..."""
     sets = stepwise_order(gram, inputs, label, search.method, search.most)
     nested = all(sets[size][:-1] == sets[size - 1] for size in range(1, len(sets)))
     if sets and nested:

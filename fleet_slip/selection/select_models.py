@@ -71,7 +71,6 @@ class Selection(Generic[AnyCohort]):
         )
 
     def _repr_html_(self) -> str:
-        """Return the best models as a table, with their errors drawn."""
         best = sorted(self.models, key=lambda model: model.pooled.rmse)[:10]
         rows = [
             [

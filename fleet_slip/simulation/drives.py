@@ -148,7 +148,6 @@ def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
 
 
 def _counts(log: DriveLog, name: str) -> pa.Array:
-    """Return the counts of a signal without a copy; all null if the car lacks the sensor."""
     if log.fixes and name in log.fixes.counts:
         return pa.array(log.fixes.counts[name], mask=~log.fixes.fix)
     if name not in log.measurement.counts:

@@ -166,7 +166,6 @@ def _end(kind: type[Config], name: str, bounds: Range, end: str) -> float:
 
 
 def _draw(kind: type[ConfigT], ranges: dict[str, Range], generator: np.random.Generator) -> ConfigT:
-    """Draw the named fields, in the order in which the class declares them."""
     drawn = {}
     for name, field in kind.model_fields.items():
         if name in ranges:

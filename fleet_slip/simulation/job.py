@@ -123,7 +123,6 @@ def _open_days(snapshot: Snapshot, campaign: Campaign, days: Iterable[date]) -> 
 
 
 def _complete(warehouse: Warehouse, campaign: Campaign, days: Iterable[date]) -> None:
-    """Record that all batches of some days have landed."""
     snapshot = warehouse.logs.snapshot()
     units = [unit for unit, _ in day_units(campaign, _open_days(snapshot, campaign, days))]
     if units:
@@ -226,7 +225,6 @@ def _write(warehouse: Warehouse, batch: Batch) -> _Written:
 
 
 def _not_forgotten(warehouse: Warehouse, drives: tuple[DriveSpec, ...]) -> tuple[DriveSpec, ...]:
-    """Return the drives that were not forgotten, nor their cars."""
     barred = Audit(warehouse.root).barred(
         {drive.vehicle_id for drive in drives}, {drive.drive_id for drive in drives}
     )

@@ -95,7 +95,6 @@ class Track(Config):
 
     @cached_property
     def _knots_m(self) -> FloatArray:
-        """Stations of the segments' ends, from 0 to the length of the track."""
         return np.concatenate([[0.0], np.cumsum([s.length_m for s in self.segments])])
 
     @cached_property
@@ -142,7 +141,6 @@ class Track(Config):
         return float(np.hypot(line.x_m[-1], line.y_m[-1])), float(gap_rad)
 
     def _integrate(self, nodes: FloatArray) -> tuple[FloatArray, ...]:
-        """Return x, y and heading at sorted stations between which curvature is linear."""
         step = np.diff(nodes)
         curvature = self.curvature(nodes)
         if self.closed:

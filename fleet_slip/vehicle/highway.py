@@ -65,7 +65,6 @@ def _compiled_derivative(extensions: Extensions) -> Callable[..., Any]:
 
 @cache
 def _compiled_steps(extensions: Extensions) -> Callable[..., Motion]:
-    """Compile successive steps of one car with some of the extensions."""
     derivative = build_derivative(extensions)
 
     @equation

@@ -113,7 +113,6 @@ def _imperfect_wheel(
 def _wheels(
     x: State, give: Give, around: Around, load: Loads, c: Constants, t: Traits
 ) -> tuple[WheelForces, GiveRates]:
-    """Return the forces of the wheels and the rates of what follows them."""
     tangent = rack_tangent(give, c, t)
     bend = c.ackermann * tangent
     left = direction_of(*wheel_tangent(tangent, 1.0 - bend, -t.toe))

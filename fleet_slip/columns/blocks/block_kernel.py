@@ -69,7 +69,6 @@ def run(
 def _do(
     step: Any, ratio: Any, memory: Any, flags: Any, rows: int, ticks: int, first: int, size: int
 ) -> None:
-    """Do a step for some rows."""
     operation, slot, kind = step[op.OPERATION], step[op.SLOT], step[op.KIND]
     out = step[op.OUT] + step[op.MOVES + op.OUT] * first
     a, b = step[op.A] + step[op.MOVES + op.A] * first, step[op.B] + step[op.MOVES + op.B] * first

@@ -98,7 +98,6 @@ class _Writer:
         return None
 
     def _plain(self, number: int, guard: int | None) -> Value:
-        """Return an operation that has a loop of its own."""
         name, plain = operation_of(self._steps[number]), plain_of(self._steps[number])
         if name == "at_least" and self._whole(plain[0]):
             # Rounded to binary64, the difference keeps its sign.
@@ -124,7 +123,6 @@ class _Writer:
         return found["guard"] if guards and found["#least"] > 0 else None
 
     def _divided(self, quotient: Value, divisor: int, guard: int | None) -> Value:
-        """Return a quotient where its divisor is positive."""
         if self._is_positive(divisor, guard):
             return quotient
         return self._do(op.WHERE, quotient, self._above_zero(divisor, guard))
@@ -149,7 +147,6 @@ class _Writer:
         return self._is_positive(number, guard) if constant is None else constant > 0
 
     def _constant(self, number: int) -> int | None:
-        """Return the value of a step that is the same everywhere, and nowhere missing."""
         step = self._steps[number]
         if step[0] == "constant":
             return plain_of(step)[0]
@@ -216,7 +213,6 @@ class _Writer:
         )
 
     def _scale(self, number: int, found: Found, guard: int | None) -> Value:
-        """Write x * numerator / fixed, rounded, within the limit, if there is one."""
         value, limit = self.value(found["x"], guard), float(found.get("#limit", inf))
         numerator, fixed = found.get("#numerator", 1), found["#fixed"]
         _require_positive(fixed)
@@ -234,7 +230,6 @@ class _Writer:
         return self._do(op.CLIP, value, ratio=(0.0, 1.0, 0.0, float(limit)), number=times)
 
     def _share(self, _: int, found: Found, guard: int | None) -> Value:
-        """Write x * y / fixed, rounded."""
         factors = (self.value(found[one], guard) for one in "xy")
         return self._do(op.SHARE, *factors, ratio=(1.0, float(found["#fixed"]), 0.0, inf))
 
@@ -288,5 +283,4 @@ def _require_positive(divisor: int) -> None:
 
 
 def _number(known: dict[Any, int], key: object) -> int:
-    """Return the number of a key, in the order in which they came."""
     return known.setdefault(key, len(known))

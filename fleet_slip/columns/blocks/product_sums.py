@@ -70,7 +70,6 @@ def _total(memory: Any, place: int, rows: int) -> Any:
 
 @exact_loop
 def _size(memory: Any, place: int, stride: int, rows: int) -> Any:
-    """Return the sum of the sizes of a tile's values."""
     total = 0.0
     for begin in range(place, place + TILE * stride, stride):
         for value in memory[begin : begin + rows]:

@@ -147,7 +147,6 @@ class RollupReader:
 
 
 def _chosen(rollups: Sequence[Rollup], wanted: Sequence[str], condition: Condition) -> pa.Table:
-    """Return the cells that satisfy a condition on some columns."""
     kept = dict.fromkeys([*Rollup.COUNTS, "source", "day", "signals", *wanted])
     every = pa.concat_tables(
         one.cells.select([*kept, "n", "sums", "products"])

@@ -118,7 +118,6 @@ class _Day:
 
 
 def _add_rows(days: dict[date, _Day], names: str, table: GramTable, rows: pa.RecordBatch) -> None:
-    """Add Gram rows of the same signals to their days."""
     here = rows["day"].dictionary_encode()
     number, values = here.indices.to_numpy(), here.dictionary.to_pylist()
     ids = hash_numbers(rows["drive_id"])

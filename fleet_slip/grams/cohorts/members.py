@@ -99,12 +99,10 @@ def received_among(rows: pa.Table | pa.RecordBatch) -> BoolArray:
 
 
 def _kinds_with(hashed: Mapping[str, Hashed], signals: Collection[str]) -> frozenset[str]:
-    """Return the sets of signals that have all of some."""
     return frozenset(names for names in hashed if set(signals) <= set(names.split(",")))
 
 
 def _count(hashed: Mapping[str, Hashed], kinds: frozenset[str]) -> int:
-    """Return the number of hashes of some sets of signals."""
     found = [hashed[names] for names in hashed if names in kinds]
     if len(found) == 1 and found[0].once is not None:
         return found[0].once

@@ -102,7 +102,6 @@ def _left_out(
 
 
 def _rows_of_groups(cars: pa.Table, cells: Cells) -> IntArray:
-    """Return the rows of each bucket of cars: of their Gram rows, and of cells."""
     totals = np.zeros(BUCKETS, dtype=np.int64)
     buckets = (hash_numbers(cars["vehicle_id"].cast(pa.string())) % BUCKETS).astype(np.int64)
     np.add.at(totals, buckets, cars["n"].to_numpy())

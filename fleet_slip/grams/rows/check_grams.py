@@ -85,13 +85,11 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
 
 
 def _evenly(files: Sequence[TableFile], count: int, begin: int) -> list[TableFile]:
-    """Return evenly chosen files, counted from the number `begin` on."""
     many = len(files)
     return [files[(begin + i * many // count) % many] for i in range(min(count, many))]
 
 
 def _computed_wide_sets(warehouse: Warehouse) -> tuple[str, ...]:
-    """Return the feature sets with windows for which there are Gram rows."""
     known, grams = features(), warehouse.grams.snapshot()
     return tuple(
         name

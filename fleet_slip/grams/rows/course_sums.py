@@ -103,7 +103,6 @@ def course_changes(fixes: Fixes, apart: int) -> Changes:
 
 
 def _fixes(drive: DriveCounts, ticks: IntArray, whole: int) -> tuple[IntArray, IntArray]:
-    """Return the rows that a fix is of, so many ticks before it, and the course there."""
     fixed = np.flatnonzero(drive.present.get(COURSE, np.ones(len(ticks), dtype=np.bool_)))
     place = np.searchsorted(ticks, ticks[fixed] - whole)
     there = ticks[np.minimum(place, len(ticks) - 1)] == ticks[fixed] - whole
@@ -119,7 +118,6 @@ def _straight(before: FloatArray, now: FloatArray, turned: IntArray) -> IntArray
 
 
 def _pairs(ticks: IntArray, apart: int) -> tuple[IntArray, IntArray]:
-    """Return the numbers of fixes that are so many ticks apart: the earlier and the later."""
     if not ticks.size:
         return ticks, ticks
     place = np.minimum(np.searchsorted(ticks, ticks - apart), ticks.size - 1)
@@ -149,6 +147,5 @@ def _change(course: IntArray, turned: IntArray, rest: IntArray) -> tuple[IntArra
 
 
 def _rounded(number: IntArray, divisor: int) -> IntArray:
-    """Return integers over another, to the nearest, halves away from zero."""
     half: IntArray = (2 * np.abs(number) + divisor) // (2 * divisor)
     return np.sign(number) * half

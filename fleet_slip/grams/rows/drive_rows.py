@@ -82,7 +82,6 @@ def drives_of_stream(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
 
 
 def _by_drive(rows: pa.Table) -> Iterator[pa.Table]:
-    """Yield the rows of each drive, in their order."""
     ids = rows["drive_id"].combine_chunks()
     if not pa.types.is_dictionary(ids.type):
         ids = pc.dictionary_encode(ids)

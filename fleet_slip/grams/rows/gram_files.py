@@ -64,7 +64,6 @@ def _is_empty(rows: pa.Table, name: str) -> bool:
 
 
 def _only(rows: pa.Table, some: pa.ChunkedArray) -> pa.Table:
-    """Return some rows; not copied if that is all."""
     return rows if pc.all(some).as_py() else rows.filter(some)
 
 

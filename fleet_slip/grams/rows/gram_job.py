@@ -92,7 +92,6 @@ def reconcile(
 def _unique(
     grams: Snapshot, identity: str, column: str, drives: pa.Array | None = None
 ) -> pa.Array:
-    """Return the values of a column in the Gram rows of a feature set, of some drives or all."""
     found = [pa.array([], pa.string())]
     for file in grams.files:
         rows = grams.table.read(file.path, list({"feature_set", "drive_id", column}))

@@ -53,7 +53,6 @@ def land_ahead(
 
 
 def _as_file(action: AddAction) -> TableFile:
-    """Return a file as the Delta log will have it once it is added."""
     stated = json.loads(action.stats)
     day = action.partition_values.get("day")
     return TableFile(

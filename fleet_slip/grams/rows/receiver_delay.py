@@ -145,7 +145,6 @@ class _Told:
 
 
 def _by_car(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, _Told]:
-    """Return what the drives of each car tell, in the order of their days and names."""
     columns = delay_columns()
     found: dict[str, _Told] = {}
     for batch in rows_of_delay:
@@ -247,7 +246,6 @@ def _best_split(
 
 
 def _delay(products: FloatArray, rows: int) -> ReceiverDelay | None:
-    """Return the delay that a car's drives tell, shape (drives, 2 + STEPS, 2 + STEPS)."""
     drives, total = len(products), products.sum(axis=0)
     lag = _best_lag(total)
     if lag is None:

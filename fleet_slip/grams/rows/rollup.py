@@ -229,7 +229,6 @@ def _packed(cells: pa.Table) -> bytes:
 
 
 def _unpacked(content: bytes) -> tuple[pa.Table, dict[str, Any]]:
-    """Return cells, and what is said of them all."""
     with pa.ipc.open_stream(content) as reader:
         cells = reader.read_all()
     return cells.replace_schema_metadata(), json.loads(cells.schema.metadata[b"rollup"])

@@ -207,7 +207,6 @@ def _add_by_kind(
 
 
 def _kinds(block: FloatArray, numbers: IntArray | None) -> Iterator[tuple[Kind, NDArray[np.int64]]]:
-    """Yield each kind of rows in a block, and which rows those are."""
     lacks = np.isnan(block)
     some = np.flatnonzero(lacks.any(axis=0))  # few, as a rule: patterns take sorting
     pattern_of_row, absents = np.zeros(block.shape[1], dtype=np.int64), [0]

@@ -80,7 +80,6 @@ class _Search:
         self.usable = self._independent()
 
     def _independent(self) -> list[int]:
-        """Return the inputs that others, taken before them, do not explain."""
         work, left = self.matrix.copy(), set(range(self.inputs))
         taken: list[int] = []
         while left:
@@ -128,7 +127,6 @@ class _Search:
         return [order[:size] for size in range(1, min(most, len(order)) + 1)]
 
     def _best_entry(self, work: LongArray, chosen: Sequence[int]) -> int | None:
-        """Return the input that lowers the residual sum of squares most."""
         free = [i for i in self.usable if i not in chosen and work[i, i] >= DEPENDENT]
         if not free:
             return None

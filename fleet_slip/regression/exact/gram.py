@@ -185,7 +185,6 @@ class Gram:
 
 
 def _mirrored(lower: Sequence[Sequence[int]]) -> list[list[int]]:
-    """Return a symmetric matrix, given the rows of its lower triangle."""
     return [[*row, *(below[i] for below in lower[i + 1 :])] for i, row in enumerate(lower)]
 
 

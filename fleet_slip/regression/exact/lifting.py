@@ -43,8 +43,6 @@ def solve_by_lifting(
 
 
 class _Lifting:
-    """The digits of one solution, lowest first."""
-
     def __init__(
         self, matrix: Sequence[Sequence[int]], right: Sequence[int], prime: int, inverse: Integers
     ) -> None:
@@ -84,7 +82,6 @@ class _Lifting:
 
 
 def _inverse(matrix: Sequence[Sequence[int]], prime: int) -> Integers | None:
-    """Return the inverse modulo a prime, shape (k, k); None if there is none."""
     size = len(matrix)
     left = [[entry % prime for entry in row] for row in matrix]
     work = np.hstack([np.array(left, dtype=np.int64), np.eye(size, dtype=np.int64)])

@@ -68,7 +68,6 @@ def bootstrap_correlations(products: FloatArray, replicates: int, seed: int) -> 
 
 
 def _correlation(n: Any, p: Any, pp: Any, py: Any, y: Any, yy: Any) -> Any:
-    """Return the correlation of predictions p with labels y from sums over n rows."""
     return (py - p * y / n) / np.sqrt((pp - p * p / n) * (yy - y * y / n))
 
 

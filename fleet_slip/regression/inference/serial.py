@@ -86,7 +86,6 @@ def fit_autoregressive(lagged: LagGram, inputs: Sequence[str], label: str) -> Au
 
 
 def _residual_products(model: LinearModel, lagged: LagGram) -> tuple[Fraction, Fraction]:
-    """Return sum e_t e_{t-1} and sum e_{t-1}^2."""
     before = LinearModel(
         tuple(map(lagged.before, model.signals)),
         lagged.before(model.label),

@@ -128,7 +128,6 @@ def cluster_influences(fitted: Fit, drives: DriveMoments) -> FloatArray:
 
 
 def _to_counts(drives: DriveMoments, at: Sequence[int]) -> FloatArray:
-    """Return what takes coefficients from (1, (c - centre)/spread), in spreads, to counts."""
     spread = drives.spread[[i - 1 for i in at[1:]]]
     centre = np.array([drives.centre[i - 1] for i in at[1:]], dtype=np.float64)
     back = np.diag([1.0, *(1 / spread)])

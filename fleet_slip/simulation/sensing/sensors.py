@@ -162,7 +162,6 @@ class Recorder:
 
 
 def _joined(parts: list[NDArray[Scalar]]) -> NDArray[Scalar]:
-    """Return the parts as one array, without a copy if there is only one."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 

@@ -140,7 +140,6 @@ def _simulate_alike(
 
 
 def _car(drive: LaneDrive) -> tuple[float, ...]:
-    """Return what the kernel knows of a car."""
     return (
         *constants(drive.vehicle, drive.adhesion),
         *handling(drive.vehicle, math.radians(drive.flaws.steering_compliance_deg_per_kn) / 1000),
@@ -149,7 +148,6 @@ def _car(drive: LaneDrive) -> tuple[float, ...]:
 
 
 def _routes(drives: Sequence[LaneDrive]) -> tuple[NDArray[np.void], FloatArray]:
-    """Return what the kernel knows of the drives, `ROUTE`, and the table of all roads."""
     roads = {id(drive.road): drive.road for drive in drives}
     tables = [road_table(road) for road in roads.values()]
     ends = np.cumsum([len(table) for table in tables])
@@ -161,7 +159,6 @@ def _routes(drives: Sequence[LaneDrive]) -> tuple[NDArray[np.void], FloatArray]:
 def _route(
     drive: LaneDrive, first: int, last: int
 ) -> tuple[int, int, float, float, bool, float, int]:
-    """Return a drive's row of `ROUTE`."""
     road = drive.road
     distance_m = (drive.laps if road.closed else min(drive.laps, 1.0)) * road.length_m
     samples = math.ceil((PATIENCE * planned_time_s(road, distance_m) + GRACE_S) / SAMPLE_S)

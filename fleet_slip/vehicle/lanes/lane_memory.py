@@ -42,7 +42,6 @@ def _address(context: Any, builder: Any, array_type: Any, args: Any, index: int)
 
 @intrinsic
 def _read(_typing_context: Any, memory: Any, _first_row: Any, _lane: Any, kind: Any) -> Any:
-    """Type and emit `read`."""
     fields = kind.instance_class
     count = len(fields._fields)
     result = types.NamedUniTuple(types.float64, count, fields)  # type: ignore[no-untyped-call]
@@ -60,8 +59,6 @@ def _read(_typing_context: Any, memory: Any, _first_row: Any, _lane: Any, kind: 
 
 @intrinsic
 def _write(_typing_context: Any, memory: Any, _first_row: Any, _lane: Any, values: Any) -> Any:
-    """Type and emit `write`."""
-
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array_type = signature.args[0]
         for index in range(signature.args[3].count):

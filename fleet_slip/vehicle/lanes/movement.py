@@ -56,7 +56,6 @@ from fleet_slip.vehicle.state import Controls, State
 
 @equation
 def _wheel_tangents(give: Give, c: Constants, t: Traits) -> tuple[float, float]:
-    """Return the tangents of the angles of both front wheels."""
     tangent = rack_tangent(give, c, t)
     bend = c.ackermann * tangent
     along_l, across_l = wheel_tangent(tangent, 1.0 - bend, -t.toe)
@@ -91,8 +90,6 @@ def look_around(memory: Any, book: Any, routes: Any, surfaces: Any, truth: Any) 
 
 
 def _build_integrate(imperfect: bool) -> Callable[[Any, float, bool], None]:
-    """Compile a step of all cars: of those of the textbook, or of those with imperfections."""
-
     @equation
     def integrate(memory: Any, step_s: float, first_step: bool) -> None:
         """Move all cars on; keep the specific force at the first step of a sample."""
