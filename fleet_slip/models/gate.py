@@ -26,13 +26,14 @@ from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.models.counts_model import counts_model
-from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.manifest import Manifest, TrainedOn
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.regression.choice.winner import Shortfall, Worth, compare_paired, compare_typical
 from fleet_slip.regression.exact.figures import error_sums
 from fleet_slip.regression.exact.least_squares import LinearModel
 from fleet_slip.regression.validation.crossval import (
     CrossValidation,
+    Procedure,
     assemble,
     cross_validate,
     least_squares,
@@ -53,6 +54,8 @@ class Floor(Config):
     min_vehicles: int = Field(ge=1)
     min_part_of_champion: float = Field(ge=0, le=1)
     worth_deg: float = Field(ge=0)
+    max_columns_per_drive: float = Field(default=3.0, gt=0)
+    min_rows_per_column: int = Field(default=100, ge=1)
 
 
 @cache
@@ -136,11 +139,32 @@ class Comparison:
         )
 
 
-def compare(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Comparison:
-    """Compare a selection's winner with the own coefficients of published versions.
+@dataclass(frozen=True)
+class Contest:
+    """How a selection's winner is made again without what is held out, and whom it meets.
 
-    Over the drives that have the signals of all. Raises `DataError` or `QuestionError` if there
-    are none, or the features of a version are not defined as they were.
+    Attributes:
+        signals: all that any of them needs.
+        by: what is held out, vehicle or drive.
+        procedure: makes the challenger, its columns searched for anew if a search found them.
+        models: those that it meets, as they are, in counts.
+    """
+
+    signals: tuple[str, ...]
+    by: FoldKey
+    procedure: Procedure
+    models: tuple[LinearModel, ...]
+
+
+def worth() -> Worth:
+    """Return what a challenger may lack that is no reason to refuse it."""
+    return Worth(math.radians(floor().worth_deg))
+
+
+def contest(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Contest:
+    """Return how a selection's winner meets published versions, over drives with all signals.
+
+    Raises `DataError` or `QuestionError` if the features of a version are not defined as they were.
     """
     for version in incumbents:
         _require_same_features(version)
@@ -148,29 +172,40 @@ def compare(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Co
     searched = found is not None and winner in found.models
     inputs = found.inputs if found is not None and searched else winner.signals
     feature_set = selection.cohort.feature_set
-    models = [counts_model(version.manifest, feature_set) for version in incumbents]
+    models = tuple(counts_model(version.manifest, feature_set) for version in incumbents)
     every = (name for model in models for name in model.signals)
     signals = tuple(dict.fromkeys((*inputs, *every)))
     cars = selection.cohort.members.count_vehicles_with((*signals, label))
     by: FoldKey = "vehicle" if cars >= LEAST_VEHICLES else "drive"
-    groups = selection.cohort.folds(by, GROUPS).serving(signals, label, sparse=True)
     intercept = selection.intercept
     if found is not None and searched:
         procedure = searching(found, len(winner.signals), intercept=intercept)
     else:
         procedure = least_squares(inputs, label, intercept=intercept)
-    challenger = cross_validate(winner.name, groups, procedure, input_scales())
+    return Contest(signals, by, procedure, models)
+
+
+def compare(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Comparison:
+    """Compare a selection's winner with the own coefficients of published versions.
+
+    Raises `DataError` or `QuestionError` if no drive has the signals of all, and as `contest`.
+    """
+    asked = contest(selection, incumbents)
+    label, name = catalogue().label, selection.winner.model.name
+    folds = selection.cohort.folds(asked.by, GROUPS)
+    groups = folds.serving(asked.signals, label, sparse=True)
+    challenger = cross_validate(name, groups, asked.procedure, input_scales())
     others = tuple(
-        _as_it_is(version.reference, model, groups)
-        for version, model in zip(incumbents, models, strict=True)
+        as_it_is(version.reference, model, groups)
+        for version, model in zip(incumbents, asked.models, strict=True)
     )
-    worth = Worth(math.radians(floor().worth_deg))
-    shortfalls = tuple(compare_paired(challenger, other, worth) for other in others)
-    typical = tuple(compare_typical(challenger, other, worth) for other in others)
-    return Comparison(by, challenger, others, shortfalls, typical if by == "vehicle" else ())
+    shortfalls = tuple(compare_paired(challenger, other, worth()) for other in others)
+    typical = tuple(compare_typical(challenger, other, worth()) for other in others)
+    by_car = asked.by == "vehicle"
+    return Comparison(asked.by, challenger, others, shortfalls, typical if by_car else ())
 
 
-def _as_it_is(name: str, model: LinearModel, folds: Folds) -> CrossValidation:
+def as_it_is(name: str, model: LinearModel, folds: Folds) -> CrossValidation:
     """Return the figures of a published model over folds, none of which it is fitted to again."""
     tests = [error_sums(model, test) for test in folds.grams]
     return assemble(name, folds, tests, model, input_scales())
@@ -193,6 +228,22 @@ def faults(manifest: Manifest, champion: Manifest | None) -> list[str]:
         found.append(f"it was trained on {cars}, fewer than {least.min_vehicles}")
     if champion is not None:
         found += _shrunk(manifest, champion, least.min_part_of_champion)
+    elif manifest.learned_from is None:
+        found += _thin(len(manifest.terms), trained, least)
+    return found
+
+
+def _thin(columns: int, trained: TrainedOn, least: Floor) -> list[str]:
+    """Return of what a first champion has too little for its columns."""
+    found = []
+    if columns > least.max_columns_per_drive * trained.drives:
+        drives = number_of(trained.drives, "drive")
+        most = f"{least.max_columns_per_drive:g}"
+        found.append(f"it has {columns} columns on {drives}, more than {most} a drive")
+    if trained.rows < least.min_rows_per_column * columns:
+        rows = number_of(trained.rows, "row")
+        few = f"{least.min_rows_per_column} for each of its {columns} columns"
+        found.append(f"it was trained on {rows}, fewer than {few}")
     return found
 
 

@@ -27,13 +27,11 @@ from fleet_slip.models.recipe import asked_of
 from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.models.trained_drives import checksum_of_drives, pack_drives
 from fleet_slip.models.versions import Registry
+from fleet_slip.models.vouched import ODD, odd_gain
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.select_models import RequestedSelection, Selection
 from fleet_slip.warehouse.condition import parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
-
-ODD = 2.0
-"""A champion whose error is so many times what it was meets drives that are odd: a person looks."""
 
 
 @dataclass(frozen=True)
@@ -314,6 +312,8 @@ def _judge(
                 f"it, and has {now:.4f} deg on these: most of it comes from drives unlike those "
                 f"that vouch for it. Look at them before they teach: {comparison}"
             )
+    if not problems and (odd := odd_gain(registry, selection, champion)):
+        problems.append(odd)
     best = next((one.version for one in incumbents if one.reference == comparison.best), None)
     return _Judgement(tuple(problems), str(comparison), best, comparison.drifts)
 

@@ -19,7 +19,7 @@ from fleet_slip.models import gate
 from fleet_slip.models.aliases import CANDIDATE
 from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.diff import compare_versions
-from fleet_slip.models.publish import Publication, manifest_of, publish
+from fleet_slip.models.publish import Publication, judge_only, manifest_of, publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.choice.stepwise import stepwise_order
 from fleet_slip.regression.exact.least_squares import fit
@@ -103,6 +103,16 @@ def test_what_the_floor_lets_pass_must_still_be_as_good_as_the_champions_own_coe
     write(champion, "again", 48)
     with pytest.raises(RefusedError, match=r"the coefficients of beta@1 have"):
         publish_from(champion, "drive_id LIKE 'again%' OR drive_id LIKE 'good%'", "ay")
+
+
+def test_what_is_better_on_odd_new_drives_alone_waits(champion: Warehouse) -> None:
+    write(champion, "odd", 8, label=1.25)
+    with pytest.raises(RefusedError, match=r"better on odd drives alone: .* made beta@1 it has"):
+        publish_from(champion)
+    answer = answer_request(champion, SelectionRequest(nested="ay,yaw_rate"))
+    assert not judge_only(registry_of(champion), manifest_of(answer, "beta"), answer).publishes
+    waiting = publish_from(champion, candidate=True)
+    assert waiting.candidate and registry_of(champion).champion("beta") != waiting.version
 
 
 def test_few_drives_are_no_reason_to_replace_a_champion_of_many(champion: Warehouse) -> None:
@@ -198,6 +208,8 @@ def test_what_was_forced_is_where_it_begins_anew(warehouse: Warehouse) -> None:
         ("min_drives = 49", "on 48 drives, fewer than 49"),
         ("min_vehicles = 9", "on 8 cars, fewer than 9"),
         ("min_correlation = 0.99999", "below 0.99999"),
+        ("max_columns_per_drive = 0.04", "2 columns on 48 drives, more than 0.04 a drive"),
+        ("min_rows_per_column = 9999", "9,600 rows, fewer than 9999 for each of its 2 columns"),
     ],
 )
 def test_a_person_sets_the_floor(
