@@ -1,12 +1,13 @@
 """The part of a `Fleet` that publishes models and serves them."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fleet_slip.api.calls import Rooted, record_call
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.errors import UsageError
+from fleet_slip.errors import StorageError, UsageError
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.model_version import ModelVersion
@@ -81,6 +82,7 @@ class PublishedModels(Rooted):
         from fleet_slip.models.in_time import require_in_time
         from fleet_slip.models.publish import manifest_of, publish, with_straight_intercept
         from fleet_slip.models.sound_course import require_sound_course
+        from fleet_slip.models.trained_drives import read_trained_drives
 
         require_model_name(name)
         selection = self._chosen(name, choice)
@@ -89,8 +91,13 @@ class PublishedModels(Rooted):
             delays_s = require_in_time(self.warehouse, manifest)
             require_sound_course(self.warehouse, manifest, delays_s)
         registry = self.registry(sign_key)
-        if not (force or candidate or registry.champion(name)):
-            require_sound_drives(self.warehouse, manifest)
+        if not (force or candidate):
+            champion, made = registry.champion(name), None
+            if champion:
+                with suppress(StorageError):
+                    made = read_trained_drives(registry.folder_of(name), champion.manifest)
+            if champion is None or made is not None:
+                require_sound_drives(self.warehouse, manifest, made)
         return publish(registry, manifest, selection, force=force, candidate=candidate)
 
     def would_publish(

@@ -1,21 +1,25 @@
-"""Looks at drives before the first champion: nobody can be worse than no champion.
+"""Looks at drives before they teach: what is wrong with all of them alike, no comparison tells.
 
-Later ones are compared with a champion on held-out drives. A first one has only its data, and
-where these are wrong alike, such as a label with the other sign, no drive is unlike its peers. So a
-few of the longest drives are looked at as a file is at `ingest`: for what contradicts any car.
+A first champion has only its data, and where these are wrong alike, such as a label with the other
+sign, no drive is unlike its peers. A label that is late on a new day hardly changes what Gram rows
+tell. So a few of the longest drives that are new to the champion, or of all if there is none, are
+looked at as a file is at `ingest`: for what contradicts any car.
 """
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import RefusedError
+from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
 from fleet_slip.ingest.drives.measured_drives import SOURCE
 from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.trained_drives import salt_drives
 from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
@@ -23,28 +27,36 @@ from fleet_slip.warehouse.tables import Warehouse
 DRIVES = 5
 """That are looked at, of as many cars if there are so many."""
 
+FEWEST_NEW = 3
+"""New drives that are looked at if there is a champion: one alone may be odd."""
+
 MOST_TICKS = 100_000
 
 _LONGEST = """
     SELECT drive_id, day FROM drives WHERE source = $source AND ({condition})
     ORDER BY row_number() OVER (PARTITION BY vehicle_id ORDER BY rows DESC, drive_id),
         rows DESC, drive_id
-    LIMIT $drives
 """
 
 
-def require_sound_drives(warehouse: Warehouse, manifest: Manifest) -> None:
+def require_sound_drives(
+    warehouse: Warehouse, manifest: Manifest, made: Hashes | None = None
+) -> None:
     """Raise `RefusedError` if most of some measured drives of a cohort contradict any car.
 
-    What is looked at is the label, and the signals that a model has columns of. Simulated drives,
-    and those of cars that sent no log, are passed over.
+    `made` are the drives that made the champion. What is looked at is the label, and the signals
+    that a model has columns of. Simulated drives, and those of cars that sent no log, are passed
+    over.
     """
-    found, looked_at = _look(warehouse, manifest.trained_on.cohort)
+    found, looked_at = _look(warehouse, manifest, made)
+    if made is not None and looked_at < FEWEST_NEW:
+        return
     used = {manifest.label.signal}
     for term in manifest.terms:
         used |= set(term.definition.signals) if term.definition else {term.signal}
     for (_, signals), examples in found.items():
-        if used.isdisjoint(signals) or 2 * len(examples) <= looked_at:
+        # Beside a champion, whose drives are in order, half of them are enough.
+        if used.isdisjoint(signals) or 2 * len(examples) + (made is not None) <= looked_at:
             continue
         raise RefusedError(
             f"{manifest.name} was not published: {len(examples)} of {looked_at} drives that were "
@@ -55,23 +67,27 @@ def require_sound_drives(warehouse: Warehouse, manifest: Manifest) -> None:
 
 
 def _look(
-    warehouse: Warehouse, cohort: str
+    warehouse: Warehouse, manifest: Manifest, made: Hashes | None
 ) -> tuple[dict[tuple[str, tuple[str, ...]], list[Suspicion]], int]:
     """Return what looks wrong in some long drives, and how many these are."""
     found: dict[tuple[str, tuple[str, ...]], list[Suspicion]] = {}
-    condition = parse_condition(cohort)
+    condition = parse_condition(manifest.trained_on.cohort)
     query = _LONGEST.format(condition=condition.sql)
     with connect_tables(warehouse, query + "log_counts") as database, asking(database, condition):
-        given = {"source": SOURCE, "drives": DRIVES}
-        chosen = database.execute(query, given).fetchall()
+        drives = database.execute(query, {"source": SOURCE}).fetchall()
+        if made is not None:
+            numbers = hash_numbers(pa.array([drive for drive, _ in drives], pa.string()))
+            seen = np.isin(salt_drives(manifest.name, numbers), made).tolist()
+            drives = [drive for drive, known in zip(drives, seen, strict=True) if not known]
+        chosen = drives[:DRIVES]
         for drive, day in chosen:
             columns = database.execute(
                 "SELECT * FROM log_counts WHERE day = $day AND drive_id = $drive ORDER BY tick "
                 f"LIMIT {MOST_TICKS}",
                 {"day": day, "drive": drive},
             ).fetchnumpy()
-            for one in find_suspicions(_signals(columns)):
-                found.setdefault((one.kind, one.signals), []).append(one)
+            for suspicion in find_suspicions(_signals(columns)):
+                found.setdefault((suspicion.kind, suspicion.signals), []).append(suspicion)
     return found, len(chosen)
 
 

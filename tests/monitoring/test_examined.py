@@ -85,6 +85,24 @@ def test_a_first_champion_of_a_label_that_is_turned_in_all_drives_is_refused(
     assert fleet.publish("m", cohort, force=True).new
 
 
+def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
+    tmp_path: Path, smoke_root: Path
+) -> None:
+    landing = Landing(tmp_path / "landing", smoke_root)
+    landing.prepare()
+    fleet, drives = fleet_slip.open(tmp_path / "data"), landing.drives()
+    late = "coalesce(lag(sideslip_rad, 60) OVER (PARTITION BY drive_id ORDER BY time_s), 0)"
+    for name, some, changes in (("a", drives[:4], {}), ("b", drives[4:], {"sideslip_rad": late})):
+        day = date(2026, 10, 5 + (name == "b"))
+        fleet.ingest(landing.land(name, some, day, **changes), str(landing.mapping))
+        fleet.gram()
+        if name == "a":
+            assert fleet.publish("m", fleet.cohort()).new
+    with pytest.raises(RefusedError, match=r"of 4 drives .* contradict .*delay of sideslip"):
+        fleet.publish("m", fleet.cohort())
+    assert fleet.publish("m", fleet.cohort(), candidate=True).candidate
+
+
 def test_a_cohort_tells_what_it_was_before_drives_were_left_out() -> None:
     asked = "day > '2026-01-01' AND (mass_kg < 1500)"
     once = without_drives(asked, "drive", [hash_drive("drive", "a")])
