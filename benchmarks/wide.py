@@ -5,10 +5,10 @@
 
 For 12, 52, 100 and 200 columns of the logs below ROOT: whether both give the same bits, and how
 many rows a second each computes, Parquet reading included, and the kernel's processor time a row,
-which other load disturbs less. The kernel reads all files of the campaign, SQL as many
-as are asked for, perhaps none. The best of some rounds; columns that are no windows are signals and
-the label. With `--shipped`, a set of configs/features.toml instead: the kernel's time over all
-drives of a file.
+which other load disturbs less. The kernel reads all files of the campaign, SQL as many as are asked
+for, perhaps none. The best of some rounds; columns that are no windows are signals and the label.
+With `--solve`, how long the exact regression on all columns takes. With `--shipped`, a set of
+configs/features.toml instead: the kernel's time over all drives of a file.
 """
 
 import argparse
@@ -18,7 +18,9 @@ from collections.abc import Callable
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from fleet_slip.catalogue import features as features_module
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
@@ -33,10 +35,12 @@ from fleet_slip.grams.rows import aggregation, statement, wide
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.drive_parts import Parts
 from fleet_slip.grams.rows.drive_rows import read_drives
+from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.warehouse.tables import Warehouse
 
 COLUMNS = (12, 52, 100, 200)
-TICKS = tuple(range(4, 4 + 24 * 16, 16))
+TICKS = tuple(range(4, 4 + 64 * 16, 16))
 SET = "bench"
 
 
@@ -50,7 +54,7 @@ def catalogue_with(columns: int) -> FeatureCatalogue:
     means = {
         name: one.model_copy(update={"ticks": TICKS})
         for name, one in known.windows.items()
-        if one.over != "running_mean"
+        if one.over in {"mean", "sum"}
     }
     names = [
         member
@@ -103,6 +107,20 @@ def stages(warehouse: Warehouse, file: TableFile, known: FeatureCatalogue) -> di
     return {"read_cpu_ns_row": round(read), "kernel_cpu_ns_row": round(computed)}
 
 
+def solve(gram_rows: pa.Table) -> dict[str, Any]:
+    """Return the processor time of the exact regression of the label on all columns."""
+    names = max(gram_rows["signals"].unique().to_pylist(), key=len)
+    rows = gram_rows.filter(pc.equal(gram_rows["signals"], names)).combine_chunks()
+    totals = (
+        tuple(np.sum([np.asarray(one.values).astype(object) for one in rows[name]], axis=0))
+        for name in ("sums", "products")
+    )
+    gram = Gram(tuple(names.split(",")), pc.sum(rows["n"]).as_py(), *totals)
+    started = time.process_time()
+    found = fit(gram, gram.signals[:-1], gram.signals[-1])
+    return {"solve_cpu_s": round(time.process_time() - started, 1), "inputs": found.size}
+
+
 def measure_shipped(warehouse: Warehouse, file: TableFile, name: str) -> dict[str, Any]:
     """Return the kernel's processor time a row for a shipped set, over the drives of a file."""
     plan = ColumnPlan.of_set(features(), name)
@@ -145,11 +163,13 @@ def measure(warehouse: Warehouse, columns: int, options: Any) -> dict[str, Any]:
             lambda: aggregate(warehouse, files, threads=options.threads, feature_set=SET),
         )
         compared: dict[str, Any] = {}
+        if options.solve:
+            compared = solve(aggregate(warehouse, files[:1], feature_set=SET))
         if few:
             few_rows = sum(file.rows for file in few)
             sql_rate, defined = best_rate(few_rows, 1, lambda: by_sql(warehouse, few, SET))
             kernel = aggregate(warehouse, few, threads=options.threads, feature_set=SET)
-            compared = {
+            compared |= {
                 "sql_million_rows_s": round(sql_rate, 3),
                 "same_bits": kernel.equals(defined.cast(kernel.schema)),
             }
@@ -172,6 +192,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--sql-files", type=int, default=1)
     parser.add_argument("--columns", type=int, nargs="*", default=COLUMNS)
+    parser.add_argument("--solve", action="store_true")
     parser.add_argument("--shipped", metavar="SET")
     options = parser.parse_args()
     warehouse = Warehouse(data_root(options.root))
