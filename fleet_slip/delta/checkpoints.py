@@ -26,10 +26,7 @@ COMMIT_FILE = re.compile(r"\d{20}\.json")
 
 
 def keep_checksum_of_new(table: Folder, before: int | None) -> None:
-    """Keep the checksums of checkpoints if one has come since version `before`, older ones too.
-
-    What cannot be kept now is kept with the next checkpoint.
-    """
+    """Keep checksums of checkpoints that came since version `before`, if possible by now."""
     latest = None
     with contextlib.suppress(StorageError, ValueError, KeyError, TypeError, RecursionError):
         latest = int(json.loads((table / LOG).read(LATEST))["version"])

@@ -127,10 +127,7 @@ def pack_leading_parts(parts: Sequence[bytes]) -> bytes:
 
 
 def read_leading_part(folder: Folder, path: str, wanted: int) -> bytes | None:
-    """Return a part before a file's rows, from 0; None without, or of an unknown layout.
-
-    Raises `StorageError` if it is not what was written.
-    """
+    """Return a part before a file's rows, or None. Raises `StorageError` if it is damaged."""
     content = folder.read(path, FIRST_BYTES)
     places = _places(content, f"{folder}/{path}")
     if wanted >= len(places):

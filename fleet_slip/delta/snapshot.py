@@ -135,10 +135,7 @@ class Snapshot:
             raise
 
     def commit(self, change: Change) -> None:
-        """Apply a change in one atomic commit on top of this snapshot.
-
-        Raises `ConflictError` if one of its units landed or a file went, and `StorageError`.
-        """
+        """Apply a change in one atomic commit. Raises `ConflictError` and `StorageError`."""
         table, actions = self.table, change.actions()
         note = checked_note(change.note, actions, {u.name: u.version for u in change.units})
         with storage_errors(table.folder):

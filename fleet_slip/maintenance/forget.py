@@ -29,7 +29,13 @@ from fleet_slip.maintenance.find_drives import (
     remove_old_files,
 )
 from fleet_slip.maintenance.marked_models import models_trained_on, newest_versions
-from fleet_slip.maintenance.rewriting import Rewriting, drop_unused_names, forget_received, rewrite
+from fleet_slip.maintenance.rewriting import (
+    Rewriting,
+    drop_unused_names,
+    forget_received,
+    rewrite,
+    write_without,
+)
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.history import runs_under_way
 from fleet_slip.views import connect
@@ -178,14 +184,7 @@ def _forget_quarantined(
 ) -> None:
     def attempt() -> None:
         snapshot = warehouse.quarantine.snapshot()
-        add, remove = [], []
-        for file in snapshot.files:
-            rows = warehouse.quarantine.read(file.path)
-            kept = rows.filter(pc.invert(quarantined_of(rows, subject, drives)))
-            if kept.num_rows < rows.num_rows:
-                remove.append(file)
-                if kept.num_rows:
-                    add.append(warehouse.quarantine.write_file("kept", kept))
+        add, remove = write_without(snapshot, lambda rows: quarantined_of(rows, subject, drives))
         if remove:
             snapshot.commit_or_discard(Change(add=add, remove=remove, note={"job": "forget"}))
 
@@ -205,10 +204,7 @@ def forget_called(
     now: bool = False,
     progress: Progress = no_progress,
 ) -> ForgetReport:
-    """Forget every drive that is called like that, one after another; later ones land.
-
-    Raises `QuestionError` if there is none, and as `forget`.
-    """
+    """Forget every drive of a name or file. Raises `QuestionError` if there is none."""
     drives = sorted(_drives_called(warehouse, calling, value, old=now))
     if not drives:
         raise QuestionError(

@@ -5,7 +5,7 @@ from the drives, and can be simulated again.
 """
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -133,6 +133,21 @@ def _order(rows: pa.Table) -> IntArray:
     rank = np.argsort(np.argsort(np.array(ids.dictionary.to_pylist(), dtype=object)))
     drive = rank[ids.indices.to_numpy()] if len(rank) else np.empty(0, dtype=np.int64)
     return np.lexsort((rows["tick"].to_numpy(), drive))
+
+
+def write_without(
+    snapshot: Snapshot, gone: Callable[[pa.Table], pa.ChunkedArray]
+) -> tuple[list[AddAction], list[TableFile]]:
+    """Write the files of a table again that have rows which go; return them, and the old ones."""
+    add: list[AddAction] = []
+    remove: list[TableFile] = []
+    for file in snapshot.files:
+        rows = snapshot.table.read(file.path)
+        kept = rows.filter(pc.invert(gone(rows)))
+        if kept.num_rows < rows.num_rows:
+            remove.append(file)
+            add += [snapshot.table.write_file("kept", kept)] if kept.num_rows else []
+    return add, remove
 
 
 def drop_unused_names(warehouse: Warehouse) -> int:

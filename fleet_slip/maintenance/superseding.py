@@ -18,7 +18,7 @@ from fleet_slip.ingest.landing.data_files import TableName
 from fleet_slip.ingest.landing.known_files import WITHDRAWALS
 from fleet_slip.ingest.landing.marks import MEASURED, KnownMarks, Origin
 from fleet_slip.ingest.landing.same_recordings import is_from
-from fleet_slip.maintenance.rewriting import Rewriting, rewriting_units, write_again
+from fleet_slip.maintenance.rewriting import Rewriting, rewriting_units, write_again, write_without
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -46,16 +46,12 @@ class TakingOut:
         return Change(write_again(self.warehouse, snapshot, kept), concerned, units)
 
     def _without_refused(self, snapshot: Snapshot, origins: Collection[Origin]) -> Change:
-        add, remove = [], []
-        for file in snapshot.files:
-            rows = snapshot.table.read(file.path)
+        def mine(rows: pa.Table) -> pa.ChunkedArray:
             names = rows["drive_id"].cast(pa.string())
-            mine = [n for n in names.unique().drop_null().to_pylist() if is_from(n, origins)]
-            if mine:
-                gone = pc.fill_null(pc.is_in(names, pa.array(mine, pa.string())), False)
-                kept = rows.filter(pc.invert(gone))
-                remove.append(file)
-                add += [snapshot.table.write_file("kept", kept)] if kept.num_rows else []
+            some = [n for n in names.unique().drop_null().to_pylist() if is_from(n, origins)]
+            return pc.fill_null(pc.is_in(names, pa.array(some, pa.string())), False)
+
+        add, remove = write_without(snapshot, mine)
         files = {one for one in origins if one == one.file}
         return Change(add, remove, KnownMarks(snapshot.units).withdraw((), files))
 

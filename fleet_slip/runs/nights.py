@@ -8,7 +8,7 @@ hashes: the record outlives what is forgotten.
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from datetime import date
 from hashlib import sha256
 from typing import Any
@@ -62,16 +62,11 @@ class Nights:
             if content["night"] < night.isoformat():
                 break
             if content["night"] == night.isoformat() and content["event"] == "begun":
-                return Beginning(
-                    content["champion"],
-                    content["drives"],
-                    content["rows"],
-                    content["quarantined"],
-                    frozenset(content["known"]),
-                )
+                kept = {name: content[name] for name in vars(now)}
+                return Beginning(**{**kept, "known": frozenset(content["known"])})
         before = next(self.ended(before=night), None)
         known = before.faulty if before else frozenset()
-        begun = Beginning(now.champion, now.drives, now.rows, now.quarantined, known)
+        begun = replace(now, known=known)
         self._append("begun", night, {**vars(begun), "known": sorted(begun.known)})
         return begun
 
@@ -87,21 +82,12 @@ class Nights:
             late = before is not None and content["night"] > before.isoformat()
             if content["event"] == "ended" and content["night"] not in seen and not late:
                 seen.add(content["night"])
-                yield PastNight(
-                    date.fromisoformat(content["night"]),
-                    content["exit_code"],
-                    content["drives"],
-                    content["rows"],
-                    content["champion"],
-                    content["steps"],
-                    frozenset(content["faulty"]),
-                )
-
-    def _documents(self) -> DocumentFolder:
-        return DocumentFolder(self.root / FOLDER)
+                kept = {field.name: content[field.name] for field in fields(PastNight)}
+                kept |= {"night": date.fromisoformat(content["night"])}
+                yield PastNight(**{**kept, "faulty": frozenset(content["faulty"])})
 
     def _newest_first(self) -> Iterator[Mapping[str, Any]]:
-        documents = self._documents()
+        documents = DocumentFolder(self.root / FOLDER)
         for number in reversed(documents.numbers()):
             content = documents.read(number).content
             if content["model"] == self.model:
@@ -109,7 +95,7 @@ class Nights:
 
     def _append(self, event: str, night: date, content: Mapping[str, Any]) -> None:
         known = {"event": event, "model": self.model, "night": night.isoformat()}
-        self._documents().append({**known, **content})
+        DocumentFolder(self.root / FOLDER).append({**known, **content})
 
 
 def without_drives(cohort: str, model: str, hashes: Iterable[str]) -> str:

@@ -16,10 +16,7 @@ HASH_CHARACTERS = 16
 
 
 def influential_cars(served: Served, moments: DriveMoments) -> dict[str, Influential]:
-    """Return named cars of unusual influence, the most unusual first, by the moments of drives.
-
-    Raises `DataError` for fewer cars than tell what is usual.
-    """
+    """Return cars of unusual influence by name, most unusual first. Raises `DataError` for few."""
     owners = np.array([name or "" for name in served.drives["vehicle_id"].to_pylist()])
     names, cars = np.unique(owners, return_inverse=True)
     found = find_influential(moments, cars.astype(np.int64))

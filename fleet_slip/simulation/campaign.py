@@ -121,10 +121,7 @@ _BATCH = TypeAdapter(Batch)
 
 
 class Campaign(Config):
-    """A plan of drives over days, which stay the same when days are added.
-
-    With a `base` it says only in what it differs; the rest is drawn as the base's.
-    """
+    """A plan of drives over days, or what differs from its `base`; more days change no drive."""
 
     name: Identifier
     description: str = Field(min_length=1)

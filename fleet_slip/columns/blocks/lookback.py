@@ -93,10 +93,7 @@ def divide_sums(
 
 @inner_loop
 def values_ago(memory: Any, places: Any, first: int, size: int, ticks: int) -> None:
-    """Write the values of so many ticks before, NaN where not logged; windows as in `find_begins`.
-
-    `places`: out, values, ticks, begins.
-    """
+    """Write values of so many ticks before, or NaN; `places`: out, values, ticks, begins."""
     at, of_values, of_ticks, of_begins = places
     for i in range(size):
         begin = int(memory[of_begins + first + i])

@@ -33,10 +33,7 @@ def find_pieces(memory: Any, place: int, stride: int, rows: int, pieces: Any) ->
 
 @inner_loop
 def add_sums(memory: Any, place: int, stride: int, rows: int, columns: int, products: Any) -> None:
-    """Add the sum of each column to the last row of `products`.
-
-    Its shape is (columns + 1, columns), padded to whole tiles.
-    """
+    """Add each column's sum to the last row of `products`, (columns + 1, columns), padded."""
     for i in range(columns):
         products[products.shape[1], i] += _total(memory, place + i * stride, rows)
 

@@ -13,7 +13,7 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.grams.cohorts.expansion import expansion_of
 from fleet_slip.grams.cohorts.folding import EACH, Folding
 from fleet_slip.grams.cohorts.gram_cohort import empty_cohort, require_training
-from fleet_slip.grams.cohorts.members import Hashed, Members, add_hashed
+from fleet_slip.grams.cohorts.members import Hashed, Members
 from fleet_slip.grams.cohorts.reader import GramReader, open_grams
 from fleet_slip.grams.rows.gram_rows import gram_table
 from fleet_slip.grams.rows.rollup import hash_numbers
@@ -97,19 +97,12 @@ class _Day:
     """What a day comes to: its Grams, drives and cars by the signals of the Gram rows."""
 
     grams: dict[str, Gram] = field(default_factory=dict)
-    drives: dict[str, Hashed] = field(default_factory=dict)
-    vehicles: dict[str, Hashed] = field(default_factory=dict)
+    members: Members = field(default_factory=Members)
 
     def add(self, names: str, gram: Gram, drives: Hashed, vehicles: Hashed) -> None:
         """Add Gram rows of the same signals."""
         self.grams[names] = self.grams[names] + gram if names in self.grams else gram
-        add_hashed(self.drives, names, drives)
-        add_hashed(self.vehicles, names, vehicles)
-
-    @property
-    def members(self) -> Members:
-        """The drives and cars of the day."""
-        return Members(self.drives, self.vehicles)
+        self.members.add(names, drives, vehicles)
 
     def total(self, kinds: Collection[str]) -> Gram:
         """Return the sum of the Grams of some sets of signals."""

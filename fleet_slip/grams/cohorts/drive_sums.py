@@ -18,10 +18,7 @@ Drive = tuple[str, date, str]
 
 @dataclass(frozen=True)
 class DriveSums:
-    """Sums of some columns over the rows that have them all, by drive, sorted by car.
-
-    `cars` tells where the drives of each begin and end.
-    """
+    """Sums of columns over rows that have them all, by drive; `cars` tells where each begins."""
 
     drives: tuple[Drive, ...]
     table: GramTable

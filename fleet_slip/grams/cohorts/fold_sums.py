@@ -3,7 +3,7 @@
 Comparing given models needs the Gram of each fold alone: any number of rows fits in memory.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,7 +26,7 @@ from fleet_slip.grams.cohorts.folding import (
     require_divided,
 )
 from fleet_slip.grams.cohorts.gram_cohort import empty_cohort, require_training
-from fleet_slip.grams.cohorts.members import Hashed, Members, add_hashed, received_among
+from fleet_slip.grams.cohorts.members import Hashed, Members, received_among
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
 from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
@@ -96,12 +96,13 @@ def sum_cohort(
     found, told = len(sums.tables), sums.members.told()
     if not told:
         require_vehicles(0, f"the cohort {condition.text!r}, with any one set of signals,")
-    sums.keep(told)
+    sums.tables = {signals: sums.tables[signals] for signals in sums.tables if signals in told}
     members = sums.members
+    members.keep(told)
     return SummedCohort(
         **{**vars(origin), "untold": found - len(told)},
         folding=folding,
-        sums=sums.of_folds(members),
+        sums=sums.of_folds(),
         rows=sum(gram.n for grams in sums.tables.values() for gram in grams),
         drive_count=members.count_drives(members.drives),
         members=members,
@@ -174,9 +175,7 @@ class _Sums:
     known: _Folds
     expansion: Expansion
     tables: dict[str, list[Gram]] = field(default_factory=dict)
-    drives: dict[str, Hashed] = field(default_factory=dict)
-    vehicles: dict[str, Hashed] = field(default_factory=dict)
-    received: dict[str, Hashed] = field(default_factory=dict)
+    members: Members = field(default_factory=Members)
 
     def add(self, batch: pa.RecordBatch) -> None:
         """Add a batch of Gram rows."""
@@ -186,9 +185,8 @@ class _Sums:
         for signals, table, here in self.expansion.tables(batch):
             self._add(signals, table, folds[here])
             cars = hash_numbers(batch["vehicle_id"].filter(pa.array(here)).unique())
-            add_hashed(self.drives, signals, Hashed.of(drives[here], once=once))
-            add_hashed(self.vehicles, signals, Hashed.of(cars))
-            add_hashed(self.received, signals, Hashed.of(drives[here & came], once=once))
+            own, sent = (Hashed.of(drives[some], once=once) for some in (here, here & came))
+            self.members.add(signals, own, Hashed.of(cars), sent)
 
     def add_cells(self, cells: Cells, condition: Condition) -> None:
         """Add cells of rollups. Raises `RefusedError` for those of scenarios."""
@@ -201,9 +199,8 @@ class _Sums:
         for signals, some, here in by_signals(batch):
             self._add(signals, gram_table(signals, some), folds[here])
         for (signals,), mine in cells.by("signals"):
-            add_hashed(self.drives, signals, cells.drives(mine))
-            add_hashed(self.vehicles, signals, cells.vehicles(mine))
-            add_hashed(self.received, signals, cells.received(mine))
+            found = cells.drives(mine), cells.vehicles(mine), cells.received(mine)
+            self.members.add(signals, *found)
 
     def _add(self, signals: str, table: GramTable, folds: IntArray) -> None:
         totals = table.totals(folds, len(self.known.names))
@@ -212,18 +209,7 @@ class _Sums:
             [a + b for a, b in zip(before, totals, strict=True)] if before else totals
         )
 
-    def keep(self, kinds: Collection[str]) -> None:
-        """Drop all but some sets of signals."""
-        for sums in (self.tables, self.drives, self.vehicles, self.received):
-            for signals in sums.keys() - kinds:
-                del sums[signals]
-
-    @property
-    def members(self) -> Members:
-        """Which drives and cars the Gram rows are of."""
-        return Members(self.drives, self.vehicles, self.received)
-
-    def of_folds(self, members: Members) -> CohortFolds:
+    def of_folds(self) -> CohortFolds:
         """Return the folds that have drives. Raises `DataError` if only one has."""
         names, order = self.known.names, sorted(self.tables)
         used = [
@@ -239,5 +225,5 @@ class _Sums:
         return CohortFolds(
             tuple(names[fold] for fold in used),
             tuple(tuple(self.tables[signals][fold] for fold in used) for signals in order),
-            lambda tables: members.count_drives([order[i] for i in tables]),
+            lambda tables: self.members.count_drives([order[i] for i in tables]),
         )

@@ -97,10 +97,7 @@ def _require_row_folds(feature_set: str, count: FoldCount) -> None:
 
 
 def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssignment:
-    """Assign Gram rows to folds by a key's values, unnamed where a minimum cohort hides drives.
-
-    Raises `DataError` if there are not two folds, or too many.
-    """
+    """Assign Gram rows to folds by a key's values. Raises `DataError` for one fold, or too many."""
     of_their_own = len({*values}) <= (MOST_FOLDS if count == EACH else count)
     if by in ("drive", "vehicle") and of_their_own and not tells_single_cars():
         place = {name: i for i, name in enumerate(sorted({*values} - {None}), 1)}

@@ -38,18 +38,28 @@ class Hashed:
 class Members:
     """The drives of each Gram row, and their cars, by its signals, and the `received` drives."""
 
-    drives: Mapping[str, Hashed]
-    vehicles: Mapping[str, Hashed]
-    received: Mapping[str, Hashed] = field(default_factory=dict)
+    drives: dict[str, Hashed] = field(default_factory=dict)
+    vehicles: dict[str, Hashed] = field(default_factory=dict)
+    received: dict[str, Hashed] = field(default_factory=dict)
+
+    def add(self, signals: str, *new: Hashed | None) -> None:
+        """Add drives, cars and received drives that are new to those with the same signals."""
+        for known, more in zip(vars(self).values(), new, strict=False):
+            if more is not None:
+                known[signals] = known[signals] + more if signals in known else more
+
+    def keep(self, kinds: Collection[str]) -> None:
+        """Keep those of some sets of signals alone."""
+        for known in vars(self).values():
+            for signals in known.keys() - kinds:
+                del known[signals]
 
     def __add__(self, other: "Members") -> "Members":
-        found = []
-        for own, more in zip(vars(self).values(), vars(other).values(), strict=True):
-            both = dict(own)
-            for signals, hashed in more.items():
-                add_hashed(both, signals, Hashed(hashed.parts))
-            found.append(both)
-        return Members(*found)
+        both = Members(*(dict(known) for known in vars(self).values()))
+        for signals in other.vehicles:
+            found = (known.get(signals) for known in vars(other).values())
+            both.add(signals, *(hashed and Hashed(hashed.parts) for hashed in found))
+        return both
 
     def drives_with(self, signals: Collection[str]) -> Hashes:
         """Return the hashes of the drives that have all of some signals, each once, sorted."""
@@ -83,12 +93,6 @@ class Members:
             for names, cars in self.vehicles.items()
             if cars.least >= least or _count(self.vehicles, frozenset({names})) >= least
         )
-
-
-def add_hashed(known: dict[str, Hashed], signals: str, more: Hashed | None) -> None:
-    """Add drives or cars that are new to those with the same signals."""
-    if more is not None:
-        known[signals] = known[signals] + more if signals in known else more
 
 
 def received_among(rows: pa.Table | pa.RecordBatch) -> BoolArray:

@@ -4,7 +4,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.grams.rows.course_delays import recorded_cars
+from fleet_slip.grams.rows.drive_rows import rows_by_drive
 from fleet_slip.grams.rows.gram_job import unit_name
 from fleet_slip.grams.rows.gram_rows import is_received
 from fleet_slip.grams.rows.wide import wide_grams
@@ -182,23 +182,11 @@ def read_counts(warehouse: Warehouse, file: TableFile) -> pa.Table:
     return rows.select(names)
 
 
-def _drives(rows: pa.Table) -> list[tuple[str, pa.Table]]:
-    ids = pc.dictionary_encode(rows["drive_id"].cast(pa.string()).combine_chunks())
-    drive_of_row = ids.indices.to_numpy()
-    order = np.argsort(drive_of_row, kind="stable")
-    if (order[1:] < order[:-1]).any():
-        rows, drive_of_row = rows.take(order), drive_of_row[order]
-    starts = np.flatnonzero(np.diff(drive_of_row, prepend=-1))
-    return [
-        (ids.dictionary[int(drive_of_row[start])].as_py(), rows.slice(start, end - start))
-        for start, end in pairwise([*starts.tolist(), rows.num_rows])
-    ]
-
-
 def grams_by_blocks(warehouse: Warehouse, counts: pa.Table) -> DriveGrams:
     """Compute Gram rows by matrix products in float64, exact because blocks are small."""
     found: DriveGrams = {}
-    for drive, rows in _drives(counts):
+    for rows in rows_by_drive(counts):
+        drive = rows["drive_id"][0].as_py()
         for signals, matrix in _complete_parts(warehouse, rows):
             found[drive, signals] = Gram.from_counts(signals, matrix)
     return found
@@ -227,7 +215,8 @@ def _complete_parts(
 
 def _check_by_integers(warehouse: Warehouse, file: TableFile, counts: pa.Table) -> int:
     """Compare the float64 blocks with plain Python sums on the first drive's first rows."""
-    drive, rows = _drives(counts)[0]
+    rows = next(rows_by_drive(counts))
+    drive = rows["drive_id"][0].as_py()
     for signals, matrix in _complete_parts(warehouse, rows.slice(0, INTEGER_ROWS)):
         columns = [[int(count) for count in column] for column in matrix.T]
         by_integers = Gram(

@@ -30,7 +30,7 @@ def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iter
     present = warehouse.logs.read_metadata(file.path).schema.to_arrow_schema().names
     wanted = [name for name in (*drive_columns, "tick", *plan.signals) if name in present]
     rows = warehouse.logs.read(file.path, wanted)
-    for one in _by_drive(rows):
+    for one in rows_by_drive(rows):
         ticks = one["tick"].to_numpy()
         if (ticks[1:] < ticks[:-1]).any():
             order = np.argsort(ticks, kind="stable")
@@ -72,7 +72,7 @@ def drives_of_stream(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
     """Yield the rows of each drive from batches that are sorted by drive."""
     waiting: list[pa.Table] = []
     for batch in batches:
-        for part in _by_drive(pa.Table.from_batches([batch])):
+        for part in rows_by_drive(pa.Table.from_batches([batch])):
             if waiting and waiting[0]["drive_id"][0] != part["drive_id"][0]:
                 yield pa.concat_tables(waiting)
                 waiting = []
@@ -81,7 +81,8 @@ def drives_of_stream(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
         yield pa.concat_tables(waiting)
 
 
-def _by_drive(rows: pa.Table) -> Iterator[pa.Table]:
+def rows_by_drive(rows: pa.Table) -> Iterator[pa.Table]:
+    """Yield the rows of each drive, in their order."""
     ids = rows["drive_id"].combine_chunks()
     if not pa.types.is_dictionary(ids.type):
         ids = pc.dictionary_encode(ids)

@@ -67,10 +67,7 @@ def update_grams(
 def reconcile(
     warehouse: Warehouse, progress: Progress = no_progress, *, unreadable: Collection[str] = ()
 ) -> list[GramReport]:
-    """Bring every feature set up to date that was computed here, for the drives that it was.
-
-    `unreadable` log files are left for later.
-    """
+    """Bring up to date what was computed here before, but for `unreadable` log files."""
     grams = warehouse.grams.snapshot()
     identities = {name: features().identity(name) for name in (PLAIN, *features().sets)}
     used = [n for n, i in identities.items() if grams.landed(unit_name(i)) is not None]

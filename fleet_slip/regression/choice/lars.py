@@ -43,10 +43,7 @@ class LarsPath:
 
 
 def lars_path(gram: Gram, inputs: Sequence[str], label: str) -> LarsPath:
-    """Return the path of least-angle regression; ties enter in the declared order.
-
-    Raises `DataError` for constant or dependent signals.
-    """
+    """Return the path of least-angle regression. Raises `DataError` for dependent signals."""
     return lars_path_of_moments(*_correlations(gram, inputs, label), inputs)
 
 

@@ -32,10 +32,7 @@ from fleet_slip.regression.validation.folds import Folds
 def nested_fits(
     gram: Gram, order: Sequence[str], label: str, *, intercept: bool = True
 ) -> list[Fit]:
-    """Return the exact fits of the first 0..k signals of an order, from one Bareiss pass.
-
-    Raises `DataError` for dependent signals.
-    """
+    """Return the exact fits of the first 0..k signals. Raises `DataError` for dependent ones."""
     part = gram.restrict([*order, label])
     triangle = eliminate(moments(part, intercept=intercept))
     if triangle.singular is not None:
@@ -140,10 +137,7 @@ class TrainingFolds:
 def select_nested(
     training: TrainingFolds, inputs: Sequence[str], label: str, rule: Rule
 ) -> NestedChoice:
-    """Rank the inputs, and choose one of the nested models.
-
-    Raises `DataError` for dependent signals or a label without noise, `QuestionError` for the rule.
-    """
+    """Rank the inputs and choose a nested model. Raises `DataError` and `QuestionError`."""
     order = rank(rule.ranking, training.total, inputs, label)
     fits = training.nested_fits(order, label)
     evidence = training.evidence(fits)

@@ -120,10 +120,7 @@ def _moments(gram: Gram, inputs: Sequence[str], label: str) -> Matrix:
 
 
 def _full_model(matrix: Matrix) -> tuple[Matrix, int]:
-    """Return the rows (adj N, d b) of the full model and its determinant d.
-
-    Pivoting on row i, over d, gives those without signal i (Jacobi's identity).
-    """
+    """Return the rows (adj N, d b) of the full model and its determinant d (Jacobi's identity)."""
     inverse, determinant = adjugate([row[:-1] for row in matrix[:-1]])
     numerators = [
         sum(a * row[-1] for a, row in zip(line, matrix, strict=False)) for line in inverse

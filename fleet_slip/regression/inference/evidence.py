@@ -111,10 +111,7 @@ class Evidence:
         return np.asarray((rss - self.full_rss) / (self.variance * self.design_effect))
 
     def distances(self) -> tuple[float, ...]:
-        """Return unbiased estimates of the distance D of equation (2), j = 0..k.
-
-        D_j = sum_{i>j} A_i + 2j - k (Mallows 1973), since E A_i = A*_i + 1.
-        """
+        """Return unbiased D_j = sum_{i>j} A_i + 2j - k of equation (2), j = 0..k (Mallows 1973)."""
         size = np.arange(self.inputs + 1)
         return tuple((self.excess() + 2 * size - self.inputs).tolist())
 
