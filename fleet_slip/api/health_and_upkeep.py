@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class HealthAndUpkeep(JudgedModels):
-    """Health, quality and drift; checking, compacting, forgetting. Answers tell alarms, damage."""
+    """Health, quality and drift; checking, compacting, forgetting. Answers say what is wrong."""
 
     def status(self, max_age_hours: float | None = None) -> "WarehouseStatus":
         """Return the warehouse's health: freshness, backlog, last runs, disk, champions.

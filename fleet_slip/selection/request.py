@@ -45,7 +45,7 @@ _WORTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionRequest:
-    """How models are compared and one is chosen; without options, those of the usual list."""
+    """How models are compared and one is chosen; without options, by the usual list."""
 
     models: Annotated[
         str | None,

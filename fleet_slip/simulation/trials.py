@@ -61,8 +61,8 @@ class Manoeuvres(Config):
 class TrialPlan(Plan):
     """One car on every road, at every speed and load, and now and then one of other cars.
 
-    The first vehicle is tested, mostly as usual; planned lateral acceleration goes up to a share of
-    the road's friction, beyond one too.
+    The first vehicle is the tested one, mostly as usual. Lateral acceleration is planned up to a
+    share of the road's friction; above one the driver expects more than there is.
     """
 
     kind: Literal["trials"]

@@ -10,7 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from fleet_slip.api.calls import documented
 from fleet_slip.api.cohort import FleetCohort
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.api.requests import ForgetRequest, NightRequest, RunRequest
 from fleet_slip.cli.commands import COMMANDS, MARKUP, CommandGroup, load_command
 from fleet_slip.cli.options import RESAMPLING
 from fleet_slip.selection.request import SelectionRequest
@@ -95,3 +98,19 @@ def test_a_selections_options_stand_once_and_are_those_of_the_api() -> None:
     taken = {name: {one.name for one in load_command(name).params} for name in COMMANDS}
     assert taken["select"] - {"json", "cohort", "everything", "unexamined"} == options
     assert taken["publish"] & options == options - set(RESAMPLING)
+
+
+@pytest.mark.parametrize(
+    ("command", "request_type"),
+    [("run", RunRequest), ("nightly", NightRequest), ("forget", ForgetRequest)],
+)
+def test_options_are_the_fields_of_a_request_with_their_words(
+    command: str, request_type: type
+) -> None:
+    in_python = set(inspect.signature(getattr(Fleet, command)).parameters) - {"self"}
+    assert in_python == {field.name for field in fields(request_type)}
+    taken = {one.name: one.help for one in load_command(command).params}
+    told = documented(request_type)
+    assert told
+    assert {name: taken[name] for name in told} == told
+    assert all(text in getattr(Fleet, command).__doc__ for text in told.values())

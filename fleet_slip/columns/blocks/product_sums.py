@@ -33,7 +33,7 @@ def find_pieces(memory: Any, place: int, stride: int, rows: int, pieces: Any) ->
 
 @inner_loop
 def add_sums(memory: Any, place: int, stride: int, rows: int, columns: int, products: Any) -> None:
-    """Add each column's sum to the last row of `products`, (columns + 1, columns), padded."""
+    """Add each column's sum to the last row of `products`, whose shape is padded to whole tiles."""
     for i in range(columns):
         products[products.shape[1], i] += _total(memory, place + i * stride, rows)
 

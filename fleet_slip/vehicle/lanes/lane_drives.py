@@ -81,11 +81,11 @@ def simulate_blocks(
 ) -> Iterator[TruthBlock]:
     """Yield what happens in each drive, sampled at 100 Hz from its start, block by block.
 
-    A drive's blocks come in order, drives in any. It ends after its laps, at an open road's end,
-    `AFTER_LOSS` samples after the car was lost, or after `PATIENCE` times the planned time. Its
-    bits depend on the drive alone: not on others, threads or machine. Releases the GIL; takes at
-    most 63 MB. Cars and roads with imperfections have a kernel of their own, and
-    `IMPERFECT_CHANNELS` too. Raises `ConfigError` for an unusable road's table.
+    The blocks of a drive come in order, those of different drives in any. A drive ends after its
+    laps, at the end of an open road, `AFTER_LOSS` samples after the car was lost, or after
+    `PATIENCE` times the planned time. Its bits depend on the drive alone, not on others, threads or
+    machine. Releases the GIL; takes at most 63 MB. Cars and roads with imperfections have a kernel
+    of their own, and `IMPERFECT_CHANNELS` too. Raises `ConfigError` for an unusable road's table.
     """
     for drive in drives:
         require_usable(drive.road)
