@@ -3,6 +3,7 @@
 python -m benchmarks.suggest
 """
 
+from collections import Counter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -24,6 +25,21 @@ def main() -> None:
         cells = (name, len(one.names), len(one.names) - len(wrong), ", ".join(wrong) or "none")
         print("|", " | ".join(map(str, cells)), "|", ", ".join(others) or "none", "|", flush=True)
     print(f"| all | {whole} | {right} | | |")
+    _judge_strangers()
+
+
+def _judge_strangers() -> None:
+    """Print how many lines are right of logs with names that departments publish, by half."""
+    from tests.support.strangers import score, strangers  # noqa: PLC0415 - of the tests
+
+    found: dict[str, Counter[str]] = {"build": Counter(), "judge": Counter()}
+    for columns in strangers().values():
+        with TemporaryDirectory() as folder:
+            found[columns[0].half] += score(columns, Path(folder))
+    kinds = ("right", "asked", "wrong", "missing", "extra")
+    print("\n| half |", " | ".join(kinds), "|")
+    for half, counts in found.items():
+        print("|", " | ".join([half, *(str(counts[kind]) for kind in kinds)]), "|", flush=True)
 
 
 if __name__ == "__main__":

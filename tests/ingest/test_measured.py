@@ -173,7 +173,7 @@ def test_drives_from_columns_may_alternate(tmp_path: Path) -> None:
     }
     columns["car"][3] = ""
     columns["mass"][4] = "-5"
-    columns["date"][5] = "31.5.2024"
+    columns["date"][5] = "31/5/2024"
     drive = {
         "vehicle_id": {"column": "car"},
         "mass_kg": {"column": "mass"},

@@ -20,7 +20,8 @@ from fleet_slip.ingest.drives import drive_cutter, open_drives, stream
 from fleet_slip.ingest.drives.drive_cutter import DriveCutter
 from fleet_slip.ingest.formats import csv_batches
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers, open_csv
+from fleet_slip.ingest.formats.csv_batches import PlainNumbers, open_csv
+from fleet_slip.ingest.formats.csv_text import CsvFormat
 from fleet_slip.ingest.landing import data_files
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import PATIENCE_S

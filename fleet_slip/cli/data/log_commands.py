@@ -182,11 +182,11 @@ def ingest(
         print_json(reports)
     elif folders:
         say(_summed_up(reports))
-    _require_few_refused(reports)
+    _require_sound(reports)
 
 
-def _require_few_refused(reports: "list[IngestReport]") -> None:
-    """Raise `AlarmError` if more than a tenth of a file's rows were refused."""
+def _require_sound(reports: "list[IngestReport]") -> None:
+    """Raise `AlarmError` for much that was refused, an assumed rate, or a sign that is lost."""
     from fleet_slip.ingest.drives.suspicion import (  # noqa: PLC0415 - takes a while
         FEWEST_REFUSED,
         LARGEST_REFUSED,
@@ -200,6 +200,12 @@ def _require_few_refused(reports: "list[IngestReport]") -> None:
                 'fleet-slip sql "FROM quarantine". Correct the mapping and give the command again '
                 "with --replace."
             )
+        for one in report.suspicions:
+            if one.kind in {"time", "magnitude"}:
+                raise AlarmError(
+                    f"{report.file}: {one} Its rows are in. Give the command again with --replace "
+                    "when the mapping is right."
+                )
 
 
 def _take_back(fleet: Fleet, what: str, json: bool, *, alone: bool) -> None:

@@ -5,54 +5,34 @@ where there is one way to do so: a sign, or left for right. The rest is left to 
 """
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import UTC, date, datetime
+from datetime import date
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.ingest.drafting.guessing import (
-    OTHER_UNITS,
     Guess,
     guess_signals,
     guess_unnamed_wheels,
     headings,
-    parts_of,
 )
 from fleet_slip.ingest.drafting.preview import preview_log
-from fleet_slip.ingest.drafting.profile import FileProfile, Profile, sample_rate_hz
-from fleet_slip.ingest.drives.suspicion import (
-    RADIUS_M,
-    WHEELS,
-    Suspicion,
-    find_suspicions,
-    speed_ratio,
-)
+from fleet_slip.ingest.drafting.profile import FileProfile
+from fleet_slip.ingest.drafting.times_and_cars import TimeGuess, guess_cars, guess_time
+from fleet_slip.ingest.drafting.unit_choice import choose_units, steering_ratio
+from fleet_slip.ingest.drafting.vocabulary import parts_of
+from fleet_slip.ingest.drives.suspicion import WHEELS, Suspicion, find_suspicions
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.ingest.mapping.signal_column import COURSE, SPEED
 from fleet_slip.words import shown
 
-_TIME_NAMES = ("time", "timestamp", "zeit", "t", "sec", "seconds")
-_TIME_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
-_STEPS = ((0.5, "s"), (500.0, "ms"), (500_000.0, "us"), (np.inf, "ns"))
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_EPOCH_S = (6e8, 4e9)
-"""Times between 1989 and 2096 are counted from 1970."""
 _STAND_IN: dict[str, Any] = {"vehicle_id": "car", "vehicle_model": "car", "day": date(2000, 1, 1)}
-
-
-@dataclass(frozen=True)
-class TimeGuess:
-    """Where time is from."""
-
-    keys: dict[str, Any]
-    reason: str
-    rate_hz: float | None
-    day: date | None = None
-    """What times tell of it; None if they tell nothing."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +43,11 @@ class Draft:
     profile: FileProfile
     time: TimeGuess
     guesses: dict[str, Guess]
+    """Those that nothing speaks against."""
+    questions: dict[str, Guess]
+    """Those with doubts, or with rivals."""
+    drive: dict[str, dict[str, str]]
+    """The columns that tell cars and trips apart, by key of `[drive]`."""
     open_questions: tuple[str, ...]
     """What looks wrong in what it makes of the file, or why it makes nothing."""
 
@@ -81,25 +66,109 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
             f"{shown(file)}: none of its channels looks like a signal: {names}. Write the mapping "
             "by hand: docs/mapping.md."
         )
-    time = _guess_time(profile, guesses)
+    drive_keys, group = guess_cars(profile.profiles)
+    bases = [guess.profile.channel.base for guess in guesses.values()]
+    taken = {guess.profile.channel.name for guess in guesses.values()}
+    time = guess_time(profile, taken, bases, group)
+    tried = _Tried(file, profile, time, drive_keys)
+    failures: tuple[str, ...] = ()
+    suspicions: list[Suspicion] = []
     try:
         if unnamed and set(WHEELS) <= set(guesses):
-            guesses |= _place_wheels(guesses, _drive(file, profile, time, guesses))
-        guesses |= _other_wheels(guesses, _drive(file, profile, time, guesses))
-        suspicions = find_suspicions(_drive(file, profile, time, guesses))
-        for name in _doubtful_units(guesses, suspicions):
-            other = _with_other_unit(guesses, name, suspicions)
-            found = find_suspicions(_drive(file, profile, time, other))
-            if len(found) < len(suspicions):
-                guesses, suspicions = other, found
-        corrected = _correct(guesses, suspicions)
-        if corrected != guesses:
-            guesses = corrected
-            suspicions = find_suspicions(_drive(file, profile, time, guesses))
+            guesses |= _place_wheels(guesses, tried.drive(guesses))
+        guesses = choose_units(guesses, tried.drive(guesses))
+        drive = tried.drive(guesses)
+        guesses = _road_wheels(guesses, drive)
+        corrected = _correct(guesses, find_suspicions(drive))
+        guesses = corrected
+        suspicions = find_suspicions(tried.drive(guesses))
     except FleetSlipError as error:
-        return Draft(file, profile, time, guesses, (str(error),))
+        failures = (str(error),)
+    guesses = _doubted(guesses, suspicions)
+    asked_for = {name for name, guess in guesses.items() if guess.doubts or guess.rivals}
+    if COURSE in guesses and asked_for & {COURSE, SPEED, "yaw_rate"}:
+        asked_for |= {COURSE, SPEED}  # which stand together
+    sure = {name: guess for name, guess in guesses.items() if name not in asked_for}
+    left = {name: guess for name, guess in guesses.items() if name in asked_for}
     asked = () if COURSE in guesses else _ask_of_headings(profile, guesses)
-    return Draft(file, profile, time, guesses, (*map(str, suspicions), *asked))
+    notes = (*failures, *map(str, suspicions), *asked, *_notes(profile, guesses))
+    return Draft(file, profile, time, sure, left, drive_keys, notes)
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """What a draft makes of its file."""
+
+    file: Path
+    profile: FileProfile
+    time: TimeGuess
+    drive_keys: dict[str, dict[str, str]]
+
+    def drive(self, guesses: dict[str, Guess]) -> dict[str, FloatArray]:
+        """Return the signals of the longest drive, of all guesses that the catalogue can hold."""
+        usable = {name: guess for name, guess in guesses.items() if not guess.doubts}
+        if COURSE in usable and not {SPEED, "yaw_rate"} <= set(usable):
+            usable.pop(COURSE)
+        if not usable:
+            return {}
+        mapping = as_mapping(self.profile, self.time, usable, self.drive_keys)
+        return preview_log(self.file, mapping).longest
+
+
+def _road_wheels(guesses: dict[str, Guess], drive: dict[str, FloatArray]) -> dict[str, Guess]:
+    """Return an angle called that of steering as the road wheels', where the car turns so."""
+    guess = guesses.get("steering_wheel")
+    ratio = steering_ratio(drive, "steering_wheel")
+    if guess is None or ratio is None or not 0.3 < ratio < 4:
+        return guesses
+    figure = f"it is {ratio:.1f} times the angle of the road wheels in bends, not 12 to 20 times"
+    named = {"wheel", "whl", "rad", "lenkrad"} & set(parts_of(guess.profile.channel.name))
+    if "steer" in guesses or named:
+        return {**guesses, "steering_wheel": guess.doubted(figure)}
+    others = {name: one for name, one in guesses.items() if name != "steering_wheel"}
+    return {**others, "steer": replace(guess.because(figure), signal="steer")}
+
+
+def _doubted(guesses: dict[str, Guess], suspicions: list[Suspicion]) -> dict[str, Guess]:
+    """Return the guesses with what the car's motion has against them.
+
+    Of several signals that contradict one another, those are doubted of which the file does not
+    say the unit, if there are some. A weak name without a unit needs something that agrees.
+    """
+    found = dict(guesses)
+    for one in suspicions:
+        if one.kind in {"delay", "absent"}:
+            continue
+        concerned = [name for name in one.signals if name in found]
+        if one.kind == "stuck":  # a gear, a pedal and a brake may well be
+            concerned = [n for n in concerned if catalogue()[n].unit not in {"1", "Pa"}]
+        weak = [n for n in concerned if found[n].is_without_unit or found[n].is_weak]
+        for name in weak or concerned:
+            found[name] = found[name].doubted(one.figure)
+    agreeing = {"yaw_rate", "ay", "steering_wheel"} & set(guesses)
+    for name, guess in guesses.items():
+        if guess.is_weak and guess.is_without_unit and len(agreeing - {name}) < 1:
+            found[name] = found[name].doubted("its name may mean something else, and so its unit")
+    return found
+
+
+def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
+    """Yield what a person is to know of values that mean none, and of a label that is not there."""
+    for name, number in profile.absent.doubtful:
+        yield (
+            f"{shown(name)}: {number:g} looks like no value, but is one in another column: leave "
+            f"such rows out with where = '\"{name}\" != {number:g}'."
+        )
+    if {"vx", "vy"} <= set(guesses) and "sideslip" not in guesses:
+        yield (
+            "there is no side-slip angle, and vx and vy tell it if they are a sensor's: [label] "
+            "from_velocities = true, sensor_x_m = ... before the centre of gravity."
+        )
+    elif "sideslip" in guesses:
+        yield (
+            "sideslip: where is its sensor? If not at the centre of gravity: [label] sensor_x_m = "
+            "... before it, sensor_y_m = ... to its left."
+        )
 
 
 def _ask_of_headings(profile: FileProfile, guesses: dict[str, Guess]) -> tuple[str, ...]:
@@ -114,16 +183,21 @@ def _ask_of_headings(profile: FileProfile, guesses: dict[str, Guess]) -> tuple[s
     )
 
 
-def as_mapping(profile: FileProfile, time: TimeGuess, guesses: dict[str, Guess]) -> Mapping:
+def as_mapping(
+    profile: FileProfile,
+    time: TimeGuess,
+    guesses: dict[str, Guess],
+    drive_keys: dict[str, dict[str, str]],
+) -> Mapping:
     """Return a mapping of the guesses, with stand-ins for what nobody said of the drive."""
     signals = {name: signal_keys(guess) for name, guess in guesses.items()}
     if COURSE in signals:
         signals[COURSE] |= {"antenna_x_m": 0.0, "antenna_y_m": 0.0}
     formats = profile.formats
     given: dict[str, Any] = {"csv": formats.csv, "can": formats.can, "duckdb": formats.duckdb}
-    return Mapping.model_validate(
-        {"name": "draft", "time": time.keys, "drive": _STAND_IN, "signals": signals, **given}
-    )
+    drive = {**_STAND_IN, **{key: told.get("drive", told) for key, told in drive_keys.items()}}
+    given |= {"missing": profile.absent.texts, "drive": drive}
+    return Mapping.model_validate({"name": "draft", "time": time.keys, "signals": signals, **given})
 
 
 def signal_keys(guess: Guess) -> dict[str, Any]:
@@ -133,6 +207,9 @@ def signal_keys(guess: Guess) -> dict[str, Any]:
         keys["radius_m"] = guess.radius_m
     if guess.negate:
         keys["negate"] = True
+    if guess.sign is not None:
+        column, negative = guess.sign
+        keys["sign"] = {"column": column, "negative": negative}
     if guess.component is not None:
         keys["component"] = guess.component
     if guess.clockwise_from_north is not None:
@@ -143,98 +220,20 @@ def signal_keys(guess: Guess) -> dict[str, Any]:
     return keys
 
 
-def _drive(
-    file: Path, profile: FileProfile, time: TimeGuess, guesses: dict[str, Guess]
-) -> dict[str, FloatArray]:
-    mapping = as_mapping(profile, time, guesses)
-    return preview_log(file, mapping).longest
-
-
-def _guess_time(profile: FileProfile, guesses: dict[str, Guess]) -> TimeGuess:
-    if profile.has_clock:
-        return TimeGuess({"own_clock": True}, "the file says when each sample was taken", None)
-    taken = {guess.profile.channel.name for guess in guesses.values()}
-    bases = [guess.profile.channel.base for guess in guesses.values()]
-    for one in profile.profiles:
-        channel = one.channel
-        goes_on = one.values.size > 1 and bool((np.diff(one.values) >= 0).all())
-        named = any(part in _TIME_NAMES for part in parts_of(channel.name))
-        if goes_on and named and channel.name not in taken and channel.base in bases:
-            return _time_of(one)
-    keys = {"rate_hz": 100}
-    return TimeGuess(keys, "no channel looks like a time: 100 Hz is a mere assumption", 100.0)
-
-
-def _time_of(one: Profile) -> TimeGuess:
-    step = float(np.median(np.diff(one.values)))
-    ends = parts_of(one.channel.name)[-1]
-    told = _TIME_UNITS.get(one.channel.unit.lower()) or _TIME_UNITS.get(ends)
-    unit = told or next(name for limit, name in _STEPS if step < limit)
-    reason = f"its name, it goes on in steps of {step:g}" + (
-        f", its unit is {told}" if told else ""
-    )
-    start_s = float(one.values[0]) * _SECONDS[unit]
-    rate_hz = sample_rate_hz(one.values * _SECONDS[unit])
-    keys: dict[str, Any] = {"column": one.channel.name, "unit": unit}
-    if rate_hz is not None and rate_hz < 20:
-        keys |= {
-            "longest_gap_s": round(2 / rate_hz, 2),
-            "split_gap_s": max(1.0, round(4 / rate_hz)),
-        }
-    day = None
-    if _EPOCH_S[0] < start_s < _EPOCH_S[1]:
-        day = datetime.fromtimestamp(start_s, UTC).date()
-    return TimeGuess(keys, reason, rate_hz, day)
-
-
-def _doubtful_units(guesses: dict[str, Guess], suspicions: list[Suspicion]) -> list[str]:
-    """Return the signals with a suspicious unit that the file does not tell."""
-    doubtful = [name for one in suspicions if one.kind == "unit" for name in one.signals]
-    able = (n for n in dict.fromkeys(doubtful) if n in guesses and guesses[n].is_without_unit)
-    return [name for name in able if guesses[name].unit in OTHER_UNITS]
-
-
-def _other_wheels(guesses: dict[str, Guess], drive: dict[str, FloatArray]) -> dict[str, Guess]:
-    """Return wheel speeds without a unit as rad/s instead of km/h, or the other way round.
-
-    They differ by an eighth, as tyres do: what is nearer to the lateral acceleration is taken.
-    """
-    wheels = [name for name in WHEELS if name in guesses and guesses[name].is_without_unit]
-    ratio = speed_ratio(drive)
-    if not wheels or ratio is None:
-        return {}
-    in_kmh = guesses[wheels[0]].radius_m is not None
-    kmh_in_rad_s = 1 / (3.6 * RADIUS_M)
-    if_other = ratio * (kmh_in_rad_s if in_kmh else 1 / kmh_in_rad_s)
-    if abs(np.log(if_other)) >= abs(np.log(ratio)):
-        return {}
-    unit, radius_m = ("rad/s", None) if in_kmh else ("km/h", RADIUS_M)
-    reason = f"ay is {ratio:.2f} times yaw rate times speed, with {unit} {if_other:.2f} times"
-    return {n: guesses[n].because(reason, unit=unit, radius_m=radius_m) for n in wheels}
-
-
-def _with_other_unit(
-    guesses: dict[str, Guess], name: str, suspicions: list[Suspicion]
-) -> dict[str, Guess]:
-    guess = guesses[name]
-    unit = OTHER_UNITS[guess.unit]
-    figure = next(s.figure for s in suspicions if s.kind == "unit" and name in s.signals)
-    changed = guess.because(f"as {guess.unit} {figure}, so it is {unit}", unit=unit)
-    return {**guesses, name: changed}
-
-
 def _correct(guesses: dict[str, Guess], suspicions: list[Suspicion]) -> dict[str, Guess]:
     """Return the guesses with signs turned and pairs swapped, each with its figure."""
     corrected = dict(guesses)
     for one in suspicions:
         if one.kind == "sign":
             (name,) = one.signals
+            if name not in corrected:
+                continue
             if name == COURSE:
                 corrected |= _turned_round(corrected, one.figure)
                 continue
             turned = not corrected[name].negate
             corrected[name] = corrected[name].because(one.figure, negate=turned)
-        elif one.kind == "swapped" and len(one.signals) == 2:
+        elif one.kind == "swapped" and len(one.signals) == 2 and {*one.signals} <= {*corrected}:
             left, right = one.signals
             corrected[left], corrected[right] = (
                 replace(corrected[right].because(one.figure), signal=left),

@@ -1,9 +1,9 @@
 """Guesses which channel is which signal, by its name, its unit and its values.
 
-Every guess has its reasons as texts, for a person to correct.
+Every guess has its reasons as texts, for a person to correct; what speaks against it are doubts,
+and with a doubt it is a question.
 """
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -11,100 +11,27 @@ import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.drafting.profile import Profile
+from fleet_slip.ingest.drafting.vocabulary import (
+    CORNERS,
+    best_words,
+    fits_any,
+    parts_of,
+    split_unit,
+    unit_behind,
+    unit_called,
+    vocabulary,
+)
+from fleet_slip.ingest.drives.one_sided import TURNING
 from fleet_slip.ingest.drives.suspicion import RADIUS_M
 from fleet_slip.ingest.mapping.signal_column import COURSE, SPEED, Component
 from fleet_slip.ingest.mapping.units import conversion_factor
 
-NAMES: dict[str, tuple[str, ...]] = {
-    "ax": ("ax", "a x", "acc x", "accel x", "long acc", "long accel", "laengs beschl"),
-    "ay": ("ay", "a y", "acc y", "accel y", "lat acc", "lat accel", "quer beschl"),
-    "yaw_rate": ("yaw rate", "yawrate", "yaw vel", "gyro z", "omega z", "angular vel z", "gier"),
-    "steering_wheel": (
-        "steering wheel", "steer wheel", "sw pos", "sw ang", "swa", "lenkrad", "lwi",
-        "steering ang", "steer ang", "hand wheel",
-    ),
-    "sideslip": ("side slip", "sideslip", "slip angle", "beta", "schwimm", "correvit ang"),
-    "vx": ("vx", "v x", "vel x", "speed x", "long vel", "vel long"),
-    "vy": ("vy", "v y", "vel y", "speed y", "lat vel", "vel lat"),
-    "steer": ("road wheel ang", "front wheel ang", "wheel steer ang", "steer front", "delta f"),
-    "vehicle_speed": ("vehicle speed", "veh speed", "veh spd", "speed", "fahrzeug geschw"),
-    "roll_rate": ("roll rate", "rollrate", "gyro x", "omega x", "angular vel x", "wank"),
-    "brake_pressure": ("brake press", "brk press", "brake pres", "master cylinder", "brems druck"),
-    "throttle": ("throttle", "accel pedal", "gas pedal", "fahrpedal", "drosselklappe"),
-    "gear": ("gear", "gang"),
-    "course": ("course", "cog", "track angle", "heading motion", "head mot", "kurs"),
-    "satellite_speed": (
-        "gps speed", "gnss speed", "gps vel", "gnss vel", "ground speed", "speed over ground",
-        "sog", "speed 2d", "gspeed", "g speed", "gps geschw",
-    ),
-    "north": (
-        "vel north", "speed north", "v north", "vn", "vel n", "north vel", "north speed",
-        "geschw nord",
-    ),
-    "east": (
-        "vel east", "speed east", "v east", "ve", "vel e", "east vel", "east speed", "geschw ost",
-    ),
-}  # fmt: skip
-"""Words by which a signal is called, each at the beginning of a part of the name."""
-HEADINGS = ("heading", "hdg", "track", "bearing", "yaw ang", "azimuth", "fahrt richtung")
-"""Words for where a car points, or goes: which of the two, people must say."""
-_NOT_NAMES = {
-    "vx": ("angular", "ned", "enu"),
-    "vy": ("angular", "ned", "enu"),
-    "vehicle_speed": (
-        "wheel", "whl", "engine", "motor", "wind", "fan", "turbo", "rad", "x", "y", "z", "east",
-        "north", "up", "down", "nord", "ost", "n", "e", "lateral", "vertical", "limit",
-    ),
-    "gear": ("ratio", "box", "torque", "temp"),
-    "steer": ("rear", "rate", "vel", "speed"),
-    "course": ("std", "acc", "accuracy", "error", "rate"),
-    "satellite_speed": (
-        "std", "acc", "accuracy", "error", "x", "y", "z", "east", "north", "up", "down",
-        "n", "e", "d", "nord", "ost",
-    ),
-    "north": ("std", "acc", "accuracy", "error"),
-    "east": ("std", "acc", "accuracy", "error"),
-}  # fmt: skip
-"""Words that say that something else is called so."""
-_CORNERS = {
-    "fl": ("fl", "vl", "lf", "front left"),
-    "fr": ("fr", "vr", "rf", "front right"),
-    "rl": ("rl", "hl", "lr", "rear left"),
-    "rr": ("rr", "hr", "rear right"),
-}
-_WHEEL_WORDS = ("wheel", "whl", "vel", "speed", "spd", "omega", "rad", "rpm", "n")
-for _corner, _aliases in _CORNERS.items():
-    NAMES[f"wheel_{_corner}"] = tuple(f"{w} {a}" for w in _WHEEL_WORDS for a in _aliases)
-for _corner in ("fl", "fr"):
-    NAMES[f"steer_{_corner}"] = tuple(f"steer {a}" for a in _CORNERS[_corner])
-
 NO_UNIT = "the file has no unit"
-OTHER_UNITS = {
-    "g": "m/s^2",
-    "m/s^2": "g",
-    "deg": "rad",
-    "rad": "deg",
-    "deg/s": "rad/s",
-    "rad/s": "deg/s",
-    "m/s": "km/h",
-    "km/h": "m/s",
-}
-"""What else values without a unit may be in."""
-
-_PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
-_UNITS = {
-    "m/s²": "m/s^2", "m/s2": "m/s^2", "m/s^2": "m/s^2", "m/s/s": "m/s^2", "mps2": "m/s^2",
-    "g": "g", "°/s": "deg/s", "deg/s": "deg/s", "dps": "deg/s", "degps": "deg/s",
-    "rad/s": "rad/s", "radps": "rad/s", "°": "deg", "deg": "deg", "degree": "deg",
-    "degrees": "deg", "rad": "rad", "km/h": "km/h", "kmh": "km/h", "kph": "km/h",
-    "m/s": "m/s", "mps": "m/s", "mph": "mph", "rpm": "rpm", "1/min": "rpm", "u/min": "rpm",
-    "bar": "bar", "kpa": "kPa", "mpa": "MPa", "pa": "Pa", "psi": "psi", "%": "%", "1": "1",
-}  # fmt: skip
-_SUFFIXES = (
-    (r"m_?p?s_?\^?2", "m/s^2"), (r"deg_?p?_?s", "deg/s"), (r"dps", "deg/s"),
-    (r"rad_?p?_?s", "rad/s"), (r"km_?p?h|kph", "km/h"), (r"mps|m_s", "m/s"), (r"rpm", "rpm"),
-    (r"deg", "deg"), (r"rad", "rad"), (r"g", "g"),
-)  # fmt: skip
+_WEAK = 0.5
+"""What a word that may mean something else counts against one that does not."""
+_UNIT_FITS = 4.0
+_SIGN_WORDS = {"vz", "vorzeichen", "sign", "signum", "sgn"}
+_ALIKE = 0.02
 
 
 @dataclass(frozen=True)
@@ -120,6 +47,14 @@ class Guess:
     negate: bool = False
     component: Component | None = None
     clockwise_from_north: bool | None = None
+    sign: tuple[str, int] | None = None
+    """The column with its sign, and what stands there where it is negative."""
+    is_weak: bool = False
+    """Whether its name may as well mean something else."""
+    doubts: tuple[str, ...] = ()
+    """What speaks against it."""
+    rivals: tuple["Guess", ...] = ()
+    """Others that its name and unit fit as well."""
 
     @property
     def is_without_unit(self) -> bool:
@@ -131,22 +66,57 @@ class Guess:
         changed: Guess = replace(self, reasons=(*self.reasons, reason), **changes)  # type: ignore[arg-type]
         return changed
 
+    def doubted(self, doubt: str) -> "Guess":
+        """Return the guess as one that has something against it."""
+        return replace(self, doubts=(*self.doubts, doubt))
+
 
 def guess_signals(profiles: tuple[Profile, ...]) -> dict[str, Guess]:
     """Return the best guess for each signal that has one; a channel is one signal at most."""
-    scored = [(_score(words, p.channel.name), s, words, p) for s, words, p in _pairs(profiles)]
+    scored = [one for p in profiles if p.is_number for one in _scored(p)]
     scored.sort(key=lambda one: -one[0])
     guesses: dict[str, Guess] = {}
+    best: dict[str, float] = {}
     taken: set[str] = set()
-    for score, signal, words, profile in scored:
-        if not score or signal in guesses or profile.channel.name in taken:
+    for score, guess in scored:
+        signal, name = guess.signal, guess.profile.channel.name
+        if name in taken:
             continue
-        guess = _guess(signal, profile, words)
-        if guess is not None:
-            guesses[signal] = guess
-            taken.add(profile.channel.name)
+        if signal not in guesses:
+            guesses[signal], best[signal] = guess, score
+            taken.add(name)
+        elif score == best[signal] and not _same_values(guess, guesses[signal]):
+            first = guesses[signal]
+            guesses[signal] = replace(first, rivals=(*first.rivals, guess))
     guesses = _satellites(guesses)
-    return {name: guesses[name] for name in catalogue().signals if name in guesses}
+    signed = {name: _with_sign(guess, profiles) for name, guess in guesses.items()}
+    return {name: signed[name] for name in catalogue().signals if name in signed}
+
+
+def _scored(profile: Profile) -> Iterator[tuple[float, Guess]]:
+    """Yield what a channel may be, with how well it fits."""
+    name = profile.channel.name
+    if not name.isprintable():
+        return
+    for signal in vocabulary()["signals"]:
+        score, words = best_words(signal, name)
+        weak = not score
+        if weak:
+            score, words = best_words(signal, name, "weak")
+            score *= _WEAK
+        if not score or (guess := _guess(signal, profile, words)) is None:
+            continue
+        fits = 0.0 if guess.is_without_unit else _UNIT_FITS
+        yield score + fits, replace(guess, is_weak=weak)
+
+
+def _same_values(one: Guess, other: Guess) -> bool:
+    a, b = one.profile.values, other.profile.values
+    if a.size != b.size:
+        return False
+    both = np.isfinite(a) & np.isfinite(b)
+    spread = float(np.std(b[both])) if both.any() else 0.0
+    return bool(both.any() and np.std(a[both] - b[both]) <= _ALIKE * max(spread, 1e-9))
 
 
 def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
@@ -168,15 +138,33 @@ def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
     return found
 
 
+def _with_sign(guess: Guess, profiles: tuple[Profile, ...]) -> Guess:
+    """Return a magnitude with the column of its sign, where another is called so."""
+    if guess.signal not in TURNING or guess.profile.range[0] < 0:
+        return guess
+    own = sorted(parts_of(split_unit(guess.profile.channel.name)[0]))
+    for other in profiles:
+        parts = parts_of(split_unit(other.channel.name)[0])
+        if sorted(p for p in parts if p not in _SIGN_WORDS) != own or len(parts) == len(own):
+            continue
+        values = sorted({float(v) for v in np.unique(other.values[np.isfinite(other.values)])[:3]})
+        if len(values) == 2 and all(value.is_integer() for value in values):
+            negative = int(values[0] if values[0] < 0 else values[1])
+            told = f"{other.channel.name!r} is called its sign, and it is never negative"
+            return guess.because(told, sign=(other.channel.name, negative))
+    return guess
+
+
 def headings(profiles: tuple[Profile, ...], taken: set[str]) -> list[str]:
     """Return the channels that are a heading or a course, whichever."""
+    never = set(vocabulary()["never"]["course"])
     return [
         p.channel.name
         for p in profiles
         if p.is_number
         and p.channel.name not in taken
-        and any(_score(words, p.channel.name) for words in HEADINGS)
-        and not set(_NOT_NAMES["course"]) & set(parts_of(p.channel.name))
+        and fits_any(vocabulary()["headings"]["words"], p.channel.name)
+        and not never & set(parts_of(p.channel.name))
     ]
 
 
@@ -189,69 +177,62 @@ def guess_unnamed_wheels(profiles: tuple[Profile, ...], taken: set[str]) -> list
         and p.channel.name not in taken
         and {"wheel", "whl"} & {part[:5] for part in parts_of(p.channel.name)}
     ]
-    corners = ("fl", "fr", "rl", "rr")
-    guesses = [_guess(f"wheel_{c}", p, "wheel") for c, p in zip(corners, found, strict=False)]
+    guesses = [_guess(f"wheel_{c}", p, "wheel") for c, p in zip(CORNERS, found, strict=False)]
     return [g for g in guesses if g] if len(found) == 4 and all(guesses) else []
 
 
-def parts_of(name: str) -> list[str]:
-    """Return the parts of a name, in lower case: WhlSpdFL is whl, spd, fl."""
-    return [part.lower() for part in _PARTS.findall(name)]
-
-
-def unit_of(profile: Profile) -> str | None:
-    """Return the unit that a channel has or that its name ends in, as a mapping writes it."""
-    told = profile.channel.unit.strip().lower()
-    if told in _UNITS:
-        return _UNITS[told]
-    name = profile.channel.name.lower()
-    return next((u for end, u in _SUFFIXES if re.search(rf"[_\W](?:{end})$", name)), None)
-
-
-def _pairs(profiles: tuple[Profile, ...]) -> Iterator[tuple[str, str, Profile]]:
-    for profile in profiles:
-        if profile.is_number and profile.channel.name.isprintable():
-            for signal, called in NAMES.items():
-                best = max(called, key=lambda words: _score(words, profile.channel.name))
-                if not set(_NOT_NAMES.get(signal, ())) & set(parts_of(profile.channel.name)):
-                    yield signal, best, profile
-
-
-def _score(words: str, name: str) -> int:
-    """Return how many letters of the words begin parts of a name; 0 unless all do."""
-    parts, score = parts_of(name), 0
-    for word in words.split():
-        fitting = [p for p in parts if p == word or (len(word) > 2 and p.startswith(word))]
-        if not fitting:
-            return 0
-        score += len(word)
-    return score
+def told_unit(profile: Profile) -> tuple[str, str | None]:
+    """Return the unit that a channel has, as the file says it, and as a mapping writes it."""
+    name, in_brackets = split_unit(profile.channel.name)
+    text = profile.channel.unit.strip() or in_brackets
+    return text, unit_called(text) or unit_behind(name)
 
 
 def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
     """Return a guess with a unit that the signal can have, or None."""
     si_unit = "m/s" if signal in {"north", "east"} else catalogue()[signal].unit
     named = f"its name has {words!r}"
-    told = unit_of(profile)
+    text, told = told_unit(profile)
+    largest = float(np.nanquantile(np.abs(profile.values), 0.999))
     for unit, radius_m in ((told, None), (told, RADIUS_M)):
         measures = si_unit if radius_m is None else "m/s"
         if unit is None or (radius_m is not None and not signal.startswith("wheel_")):
             continue
         try:
-            conversion_factor(unit, measures)
+            factor = conversion_factor(unit, measures) / (radius_m or 1.0)
         except ValueError:
             continue
-        return Guess(signal, profile, unit, (named, f"its unit is {unit}"), radius_m)
+        guess = Guess(signal, profile, unit, (named, f"its unit is {unit}"), radius_m)
+        return _within_range(guess, largest * factor)
     if told is not None:
         return None
-    unit, radius_m = _unit_of_values(si_unit, signal, float(np.nanmax(np.abs(profile.values))))
-    reason = f"{NO_UNIT}; values up to {np.nanmax(np.abs(profile.values)):.3g} look like {unit}"
-    return Guess(signal, profile, unit, (named, reason), radius_m)
+    unit, radius_m = _unit_of_values(si_unit, signal, largest)
+    unknown = f" that is known: {text!r}" if text else ""
+    reason = f"{NO_UNIT}{unknown}; values up to {largest:.3g} look like {unit}"
+    guess = Guess(signal, profile, unit, (named, reason), radius_m)
+    factor = conversion_factor(unit, si_unit if radius_m is None else "m/s") / (radius_m or 1.0)
+    return _within_range(guess, largest * factor)
+
+
+def _within_range(guess: Guess, largest: float) -> Guess:
+    """Return a guess, with a doubt if its values are beyond what the catalogue can hold."""
+    if guess.signal not in catalogue().signals:
+        return guess
+    signal = catalogue()[guess.signal]
+    most = float(max(-signal.min, signal.max))
+    if largest <= most or signal.cyclic:
+        return guess
+    return guess.doubted(
+        f"in {guess.unit} it would be up to {largest:.3g} {signal.unit}, and the catalogue has "
+        f"{most:g}"
+    )
 
 
 def _unit_of_values(si_unit: str, signal: str, largest: float) -> tuple[str, float | None]:
     """Return the unit that values of a car on a road are likely to have."""
     if signal.startswith("wheel_"):
+        if largest > 300:
+            return "rpm", None
         return ("rad/s", None) if largest > 110 else ("km/h", RADIUS_M)
     if signal == "gear":
         return "1", None

@@ -60,7 +60,7 @@ class Preview:
 def preview_log(log: Log, mapping: Mapping) -> Preview:
     """Read a log through a mapping, and look at what came out. Raises `InputError`."""
     longest: MeasuredDrive | None = None
-    found = {name: _Found() for name in mapping.signals}
+    found = {name: _Found() for name in mapping.signal_names}
     with local_copy(log) as file, open_measured(file, mapping) as stream:
         for piece in stream.pieces():
             for drive in piece.drives:
@@ -69,7 +69,7 @@ def preview_log(log: Log, mapping: Mapping) -> Preview:
                 for name, counts in drive.counts.items():
                     found[name].add(counts)
     signals = signals_of(longest) if longest is not None else {}
-    ranges = tuple(_range(name, found[name]) for name in mapping.signals)
+    ranges = tuple(_range(name, found[name]) for name in mapping.signal_names)
     suspicions = (*stream.suspicions(), *find_suspicions(signals))
     return Preview(str(log), stream.counts(), ranges, suspicions, signals)
 

@@ -9,7 +9,7 @@ import polars as pl
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.ingest.drives.checking import describe_refused, join_refused, no_rows
 from fleet_slip.ingest.drives.resampling import STEP_S, TIME_EPSILON_S
-from fleet_slip.ingest.mapping.mapping import TimeBase
+from fleet_slip.ingest.mapping.time_base import TimeBase
 
 LONGEST_DRIVE_S = 2**19 * STEP_S
 """A longer stretch is cut after this time, some 87 minutes, so that a drive fits into memory."""

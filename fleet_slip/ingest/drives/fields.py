@@ -97,7 +97,7 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
         name = held(str(source.column if source else condition.column), schema)
         column = pl.col(RAW + name)
         if of is not None and source is not None:
-            number = _number(name, schema, mapping)[1]
+            number = _signed(source, name, schema, mapping)[1]
             met &= condition.is_met(_si_value(of, source, number), column)
         elif condition.one_of:
             met &= condition.is_met(column, _as_text(name, schema, mapping))
@@ -135,7 +135,7 @@ def _disorder(time: pl.Expr) -> Field:
 def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
     """A signal in SI units. Its range is checked on the count that it will become."""
     source = mapping.signals[name]
-    raw, number, present = _number(source.column, schema, mapping)
+    raw, number, present = _signed(source, source.column, schema, mapping)
     (signal, least, most), value = count_range(name, source), pl.col(name)
     count = value / float(signal.scale)
     outside = (count <= least - 0.5) | (count >= most + 0.5)
@@ -153,6 +153,19 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
         return _lies_within(found, least - 0.5, most + 0.5, signal.scale)
 
     return Field(name, "signal", raw, _si_value(name, source, number), problem, is_sound)
+
+
+def _signed(
+    source: SignalColumn, column: str, schema: pl.Schema, mapping: Mapping
+) -> tuple[pl.Expr, pl.Expr, pl.Expr]:
+    """Return a column as `_number` does, with the sign that stands in another one."""
+    raw, number, present = _number(column, schema, mapping)
+    if source.sign is None:
+        return raw, number, present
+    told = _as_text(held(source.sign.column, schema), schema, mapping)
+    negative = told == str(source.sign.negative)
+    signed = pl.when(negative).then(-number).when(told.is_not_null()).then(number)
+    return raw, signed, present & told.is_not_null()
 
 
 def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
@@ -205,7 +218,8 @@ def _day(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
     match schema[RAW + column]:
         case pl.String:
             text = _without_missing(raw, mapping)
-            day = text.str.to_date("%Y-%m-%d", strict=False)
+            days = [text.str.to_date(f, strict=False) for f in ("%Y-%m-%d", "%d.%m.%Y")]
+            day = pl.coalesce(days)
         case pl.Date | pl.Datetime:
             day = raw.cast(pl.Date)
         case other:
@@ -243,12 +257,20 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
     kind = schema[RAW + column]
     if kind == pl.String and mapping.time.format is not None:
         text = _without_missing(raw, mapping)
+        if not mapping.time.is_dated:  # the time of day
+            clock_s = text.str.to_time(mapping.time.format, strict=False).cast(pl.Int64) / 1e9
+            cases = ((text.is_null(), "missing"), (value.is_null(), "not_a_time"))
+            return Field("time", "time", raw, clock_s, find_problems(*cases))
         moment = text.str.to_datetime(mapping.time.format, time_unit="us", strict=False)
     elif isinstance(kind, pl.Datetime):
         text = moment = raw
     else:
         needed = "a time: add 'unit' for numbers, 'format' for timestamps as text"
         raise _unfit(column, kind, needed)
+    if mapping.time.zone is not None and getattr(kind, "time_zone", None) is None:
+        moment = moment.dt.replace_time_zone(
+            mapping.time.zone, ambiguous="earliest", non_existent="null"
+        )
     first, end = (datetime.combine(day, datetime.min.time()) for day in (_FIRST_DAY, _END_DAY))
     outside = (value < 0) | (value >= (end - first).total_seconds())
     problem = find_problems(
@@ -260,14 +282,18 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
 def _number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr, pl.Expr, pl.Expr]:
     """Return a column as it is, as float64 with null for missing, and whether there is a text."""
     raw = pl.col(RAW + column)
+    absent = [float(text) for text in mapping.missing if is_number(text)]
     match schema[RAW + column]:
         case pl.String:
             text = _without_missing(raw, mapping)
             if mapping.csv.decimal_comma:
                 text = text.str.replace(",", ".", literal=True)
-            return raw, text.cast(pl.Float64, strict=False), text.is_not_null()
+            number = text.cast(pl.Float64, strict=False)
+            if not absent:
+                return raw, number, text.is_not_null()
+            is_told = text.is_not_null() & ~number.is_in(absent).fill_null(value=False)
+            return raw, pl.when(is_told).then(number), is_told
         case pl.Float64:
-            absent = [float(text) for text in mapping.missing if is_number(text)]
             number = pl.when(~raw.is_in(absent)).then(raw) if absent else raw
             return raw, number, pl.lit(value=False)
         case other:

@@ -17,6 +17,7 @@ from fleet_slip.catalogue.counts import round_chunks
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import LONGEST_PAUSE_S
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.drives.label_place import physical, place_label
 from fleet_slip.ingest.drives.open_drives import DriveRows
 from fleet_slip.ingest.drives.resampling import (
     SNAP_TOLERANCE_S,
@@ -102,6 +103,7 @@ def to_ticks(
         counts[signal] = round_chunks(values, catalogue()[signal])
     if COURSE in mapping.signals:
         counts |= _fixes(rows, resampler, intervals_s, mapping, counts)
+    counts |= place_label(mapping, counts)
     for signal in counts:
         if not counts[signal].null_count:
             somewhere[:] = True
@@ -125,11 +127,6 @@ def _fixes(
     counts: dict[str, pa.Array],
 ) -> dict[str, pa.Array]:
     """Return the counts of course and speed over ground, null between fixes."""
-
-    def physical(name: str) -> FloatArray:
-        told = pl.Series(counts[name]).cast(pl.Float64).fill_null(float("nan")).to_numpy()
-        return np.asarray(told * float(catalogue()[name].scale))
-
     source = mapping.signals[COURSE]
     if len(intervals_s) == 1:
         first, second = rows.column(COURSE), rows.column(SPEED)
@@ -142,8 +139,8 @@ def _fixes(
         resampler,
         source.delay_s,
         Antenna(source.antenna_x_m or 0.0, source.antenna_y_m or 0.0),
-        physical("yaw_rate"),
-        physical("ay") if "ay" in counts else None,
+        physical(counts, "yaw_rate"),
+        physical(counts, "ay") if "ay" in counts else None,
     )
     both = zip((COURSE, SPEED), fixes, strict=True)
     return {name: round_chunks([values], catalogue()[name]) for name, values in both}

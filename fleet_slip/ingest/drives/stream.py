@@ -39,7 +39,7 @@ from fleet_slip.ingest.drives.measured_drives import (
 )
 from fleet_slip.ingest.drives.open_drives import MAX_OPEN_ROWS, DriveRows, OpenDrives
 from fleet_slip.ingest.drives.resampling import STEP_S, TIME_EPSILON_S
-from fleet_slip.ingest.drives.suspicion import Suspicion, find_refusals
+from fleet_slip.ingest.drives.suspicion import Suspicion, assumed_rate, find_refusals
 from fleet_slip.ingest.formats.parquet_batches import partition_keys
 from fleet_slip.ingest.formats.reading import log_digest, require_unchanged_log
 from fleet_slip.ingest.logs.log_files import parts_of
@@ -263,7 +263,9 @@ class MeasuredStream:
         for (_, reason), count in self.totals.refused.items():
             of_signals[reason] += count
         others = self.totals.quarantined - of_signals
-        return tuple(find_refusals(self.totals.refused, self.checker.rows, others))
+        found = tuple(find_refusals(self.totals.refused, self.checker.rows, others))
+        time = self.mapping.time
+        return (*found, *assumed_rate(time.rate_hz if time.assumed else None))
 
     def look_alikes(self) -> tuple[tuple[str, ...], ...]:
         """Return names of drives or cars in the file that differ only in their Unicode form."""

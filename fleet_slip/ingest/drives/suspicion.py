@@ -15,6 +15,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.catalogue.turning import WITNESSES
 from fleet_slip.ingest.drives.course_suspicion import course_fault
+from fleet_slip.ingest.drives.one_sided import find_one_sided
 from fleet_slip.ingest.drives.relations import (
     FEWEST_TICKS,
     find_delay,
@@ -46,7 +47,7 @@ class Suspicion:
     """What looks wrong.
 
     Attributes:
-        kind: sign, swapped, unit, delay, stuck or absent.
+        kind: sign, magnitude, swapped, unit, delay, stuck, absent, values or time.
         signals: those concerned.
         figure: what shows it.
         remedy: what to try in the mapping.
@@ -69,7 +70,11 @@ def find_suspicions(signals: Signals) -> list[Suspicion]:
     still = list(_still(signals))
     usual = {name: v for name, v in signals.items() if name not in {s.signals[0] for s in still}}
     speed = speed_mps(usual)
-    found = [*still, *_turning(usual, speed)]
+    one_sided = find_one_sided(usual, None if speed is None else moving(speed))
+    remedy = 'Where another column has its sign: sign = { column = "..." }.'
+    magnitudes = [Suspicion("magnitude", (name,), figure, remedy) for name, figure in one_sided]
+    usual = {name: v for name, v in usual.items() if name not in {m.signals[0] for m in magnitudes}}
+    found = [*still, *magnitudes, *_turning(usual, speed)]
     for check in (_wheels_differ, _rates_differ, _accelerates, _axles_swapped):
         found += check(usual, speed)
     if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
@@ -101,6 +106,14 @@ def find_refusals(
             yield Suspicion("values", ("time",), figure, remedy)
         else:
             yield Suspicion("values", ("rows",), figure, "Look at the view quarantine.")
+
+
+def assumed_rate(rate_hz: float | None) -> Iterator[Suspicion]:
+    """Yield that a log has no times, and that its mapping assumes a rate; None: it does not."""
+    if rate_hz is not None:
+        figure = f"the log has no times, and {rate_hz:g} Hz are assumed"
+        remedy = "Find out, correct rate_hz, and remove assumed = true."
+        yield Suspicion("time", ("rate_hz",), figure, remedy)
 
 
 def speed_mps(signals: Signals) -> FloatArray | None:

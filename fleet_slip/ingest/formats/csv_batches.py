@@ -4,56 +4,35 @@ import csv
 from collections.abc import Iterator, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
-from io import BufferedReader, BytesIO
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import polars as pl
-import pyarrow as pa
-from pydantic import field_validator, model_validator
 
 from fleet_slip.arrays import is_finite
 from fleet_slip.compute.tasks import map_ahead
-from fleet_slip.config import Config
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.csv_text import (
+    MAX_LINE_BYTES,
+    CsvFormat,
+    decompressed,
+    recoded,
+    text_of,
+)
 from fleet_slip.ingest.formats.source import Channel, require_columns
 from fleet_slip.words import shown
 
 BLOCK_BYTES = 2**22
 """CSV is parsed in blocks of about this size."""
 
-MAX_LINE_BYTES = 2**20
 LINE_BLOCKS = 4
 """Blocks that one line may fill. Where it fills more, usually a quote was not closed."""
 
 EXTRA_FIELDS = "\0extra fields"
 """Column of a CSV batch: what a line has after the header's last column, null if nothing."""
-
-
-COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd"}
-"""What compressed files begin with."""
-
-
-class CsvFormat(Config):
-    """How a CSV file is written. It is always UTF-8, with or without a byte order mark."""
-
-    separator: str = ","
-    decimal_comma: bool = False
-
-    @field_validator("separator")
-    @classmethod
-    def _one_character(cls, separator: str) -> str:
-        if len(separator) != 1 or not separator.isascii() or separator in '"\r\n\0':
-            raise ValueError("must be one ASCII character such as ',', ';' or a tab")
-        return separator
-
-    @model_validator(mode="after")
-    def _unambiguous(self) -> "CsvFormat":
-        if self.decimal_comma and self.separator == ",":
-            raise ValueError("with decimal_comma the separator cannot be ',': set it, often ';'")
-        return self
 
 
 @dataclass(frozen=True)
@@ -91,13 +70,14 @@ class CsvSource:
     def channels(self) -> list[Channel]:
         """Return the columns of the header."""
         with self.file.open("rb") as stream:
-            names = _csv_header(_decompressed(stream), self.file, self.csv_format)
+            names = _csv_header(text_of(stream, self.csv_format), self.file, self.csv_format)
         return [Channel(name) for name in names if names.count(name) == 1]
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield the named columns as text or plain numbers, and `EXTRA_FIELDS`."""
         with self.file.open("rb") as stream:
-            plain = _decompressed(stream)
+            unfolded = decompressed(stream)
+            plain = recoded(unfolded, self.csv_format.encoding)
             names = _csv_header(plain, self.file, self.csv_format)
             positions = require_columns(self.file, names, columns)
             numbers = set(self.numbers.columns & set(columns))
@@ -117,7 +97,7 @@ class CsvSource:
             # from looking like a compressed file.
             padding = self.csv_format.separator.encode() * len(names) + b"\n"
             blocks = _whole_lines(plain, self.file, padding)
-            if plain is not stream:
+            if unfolded is not stream:
                 blocks = _within(self.budget, blocks)
             yield from map_ahead(parse, blocks)
 
@@ -149,18 +129,6 @@ def open_csv(
     yield CsvSource(budget, csv_format, numbers or PlainNumbers())
 
 
-def _decompressed(stream: BinaryIO) -> BinaryIO:
-    """Return the text of a stream, whatever it is compressed with."""
-    start = stream.read(max(map(len, COMPRESSED)))
-    stream.seek(0)
-    for magic, codec in COMPRESSED.items():
-        if start.startswith(magic):
-            # Text is read in blocks: what a small file may become is never in memory at once.
-            plain = pa.CompressedInputStream(stream, codec)
-            return BufferedReader(plain, BLOCK_BYTES)
-    return stream
-
-
 def _within(budget: Budget, blocks: Iterator[bytes]) -> Iterator[bytes]:
     """Yield the blocks of a compressed file as long as they, and the lines in them, are few."""
     unfolded = lines = 0
@@ -173,10 +141,14 @@ def _within(budget: Budget, blocks: Iterator[bytes]) -> Iterator[bytes]:
 
 
 def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str]:
+    """Return the names of the columns, and leave the stream where the data begin."""
+    for _ in range(csv_format.header_line - 1):
+        stream.readline(MAX_LINE_BYTES)
     line = stream.readline(MAX_LINE_BYTES + 1)
     if not line.strip():
+        number = "first line" if csv_format.header_line == 1 else f"line {csv_format.header_line}"
         raise InputError(
-            f"{shown(file)}: {'its first line is' if line else 'it is'} empty. Export it again."
+            f"{shown(file)}: {f'its {number} is' if line else 'it is'} empty. Export it again."
         )
     if len(line) > MAX_LINE_BYTES:
         raise InputError(
@@ -187,6 +159,8 @@ def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str
         names = next(csv.reader([text], delimiter=csv_format.separator, strict=True))
     except csv.Error as error:
         raise InputError(f"{shown(file)}: its header is not CSV: {error}.") from None
+    for _ in range(csv_format.lines_between):
+        stream.readline(MAX_LINE_BYTES)
     return [name.strip() for name in names]
 
 
@@ -232,7 +206,10 @@ def _require_text(block: bytes, file: Path) -> None:
 
 
 def _decode(block: bytes, file: Path) -> str:
-    advice = "Save it as UTF-8 text, or give a Parquet file."
+    advice = (
+        "Write encoding under [csv] in the mapping: 'cp1252' of Western Windows, or 'utf-16'; or "
+        "give a Parquet file."
+    )
     if b"\0" in block:
         raise InputError(f"{shown(file)}: binary or UTF-16, not a UTF-8 CSV file. {advice}")
     try:

@@ -163,7 +163,7 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
             columns[field.name] = pa.chunked_array(
                 [as_arrow(drive.ticks) for drive in drives], field.type
             )
-        elif field.name in mapping.signals:
+        elif field.name in mapping.signal_names:
             columns[field.name] = pa.chunked_array([drive.counts[field.name] for drive in drives])
         elif field.name in catalogue().extras:
             continue

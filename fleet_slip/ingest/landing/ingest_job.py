@@ -99,7 +99,7 @@ def ingest_files(
     write = partial(write_batch, warehouse, mapping, replace=replace)
     if executor is None:
         write = partial(write, progress=progress)
-    warehouse.logs.require_writable(mapping.signals)
+    warehouse.logs.require_writable(mapping.signal_names)
     failures: list[InputError] = []
     asked = (AskedFile(file, known.digest_of(file) if known else None) for file in files)
     for batch, written in _written(executor, write, _batches(asked)):

@@ -1,10 +1,9 @@
 """The mapping of a measured log: which column is which signal, in which unit, with which sign."""
 
-from datetime import UTC, date, datetime
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Any
 
-import polars as pl
 from pydantic import (
     AfterValidator,
     BeforeValidator,
@@ -19,17 +18,19 @@ from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, Name, PositiveFloat, load_config
 from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database
-from fleet_slip.ingest.formats.csv_batches import CsvFormat, PlainNumbers
+from fleet_slip.ingest.formats.csv_batches import PlainNumbers
+from fleet_slip.ingest.formats.csv_text import CsvFormat
 from fleet_slip.ingest.formats.duckdb_table import DuckdbRows
 from fleet_slip.ingest.formats.reading import FileFormats
-from fleet_slip.ingest.formats.source import OWN_TIME, describe_unknown
+from fleet_slip.ingest.formats.source import describe_unknown
+from fleet_slip.ingest.mapping.label_sensor import LabelSensor
 from fleet_slip.ingest.mapping.row_condition import RowCondition, text_conditions
 from fleet_slip.ingest.mapping.signal_column import (
     SignalColumn,
     require_satellites,
     split_components,
 )
-from fleet_slip.ingest.mapping.units import require_unit
+from fleet_slip.ingest.mapping.time_base import TimeBase
 from fleet_slip.ingest.mapping.vehicle_facts import (
     VehicleFacts,
     read_vehicle_facts,
@@ -42,61 +43,6 @@ class FromColumn(Config):
     """A drive's metadata that stand in a column of the file; a new value begins a new drive."""
 
     column: Name
-
-
-class TimeBase(Config):
-    """Where time is from, and which gaps are bridged or end a drive.
-
-    Either `column` with a `unit` (numbers) or a `format` (timestamps as text, strftime codes; naive
-    ones are UTC; a Parquet timestamp column needs neither), or `rate_hz` for equally spaced rows,
-    or `own_clock` for a format that says itself when a sample was taken.
-    """
-
-    column: Name | None = None
-    unit: str | None = None
-    format: Name | None = None
-    rate_hz: Annotated[float, Field(ge=1, le=100_000)] | None = None
-    own_clock: bool = Field(default=False, exclude_if=lambda value: not value)
-    longest_gap_s: Annotated[PositiveFloat, Field(le=10)] = 0.1
-    """Samples of a signal that lie further apart are not interpolated between."""
-    split_gap_s: Annotated[PositiveFloat, Field(le=60)] = 1.0
-    """A step in time larger than this, forward or back, begins a new drive."""
-
-    @field_validator("format")
-    @classmethod
-    def _format_is_known(cls, text: str | None) -> str | None:
-        if text is not None and not _reads_back(text):
-            raise ValueError(f"{text!r} is not a strftime format with date and time")
-        return text
-
-    @model_validator(mode="after")
-    def _consistent(self) -> "TimeBase":
-        if [self.column is None, self.rate_hz is None, not self.own_clock].count(False) != 1:
-            raise ValueError(
-                "needs either 'column' or 'rate_hz', or 'own_clock' for MDF files and CAN traces"
-            )
-        if self.column is None and (self.unit is not None or self.format is not None):
-            raise ValueError("'unit' and 'format' describe a column, and there is none")
-        if self.unit is not None and self.format is not None:
-            raise ValueError("'unit' is for numbers and 'format' for timestamps: give one of them")
-        if self.longest_gap_s > self.split_gap_s:
-            raise ValueError("longest_gap_s cannot be larger than split_gap_s")
-        if self.unit is not None:
-            try:
-                require_unit(self.unit, "s")
-            except ValueError as error:
-                raise ValueError(f"{self.column} {error}") from None
-        return self
-
-    @property
-    def is_dated(self) -> bool:
-        """Whether times can tell the day."""
-        return self.unit is None and self.rate_hz is None
-
-    @property
-    def key(self) -> str | None:
-        """The column that has the times of a batch, None if the rows are equally spaced."""
-        return OWN_TIME if self.own_clock else self.column
 
 
 def _is_empty(value: object) -> bool:
@@ -139,6 +85,8 @@ class Mapping(Config):
     signals: Annotated[
         dict[str, SignalColumn], BeforeValidator(split_components), Field(min_length=1)
     ]
+    label: LabelSensor | None = Field(default=None, exclude_if=_is_empty)
+    """Where the label's sensor is, and whether it tells two velocities instead of an angle."""
     where: tuple[RowCondition, ...] = Field(default=(), exclude_if=_is_empty)
     """Conditions that a row meets, all of them, or is left out and only counted; also as text."""
     vehicles: tuple[VehicleFacts, ...] | Name = Field(default=(), exclude_if=_is_empty)
@@ -170,6 +118,8 @@ class Mapping(Config):
             except ValueError as error:
                 raise ValueError(f"signals.{name}: {column.column} {error}") from None
         require_satellites(self.signals)
+        if self.label is not None:
+            self.label.require_signals(self.signals)
         if self.drive.day is None and not self.time.is_dated:
             raise ValueError("drive.day is needed: the time has no date. Give a date or a column")
         if self.drive.vehicle_model is None and not self.vehicles:
@@ -204,7 +154,14 @@ class Mapping(Config):
         for condition in self.where:
             of = condition.signal
             names.append(condition.column if of is None else self.signals[of].column)
+        names += [signal.sign.column for signal in self.signals.values() if signal.sign]
         return list(dict.fromkeys(name for name in names if name is not None))
+
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """All signals that drives have, those computed from others too."""
+        derived = self.label is not None and self.label.from_velocities
+        return (*self.signals, *([catalogue().label] if derived else []))
 
     @property
     def formats(self) -> FileFormats:
@@ -240,17 +197,6 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _reads_back(timestamp_format: str) -> bool:
-    """Whether a moment that is written in this format can be read, to the minute."""
-    moment = datetime(2024, 5, 31, 12, 34, tzinfo=UTC)
-    try:
-        written = pl.Series([moment]).dt.to_string(timestamp_format)
-        read = written.str.to_datetime(timestamp_format, strict=False)[0]
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
-        return False
-    return isinstance(read, datetime) and read.replace(tzinfo=UTC) == moment
 
 
 def load_mapping(name_or_path: str) -> Mapping:

@@ -46,6 +46,14 @@ def _absent(value: object) -> bool:
     return value in (None, (), 0.0)
 
 
+class SignBit(Config):
+    """The column that says the sign of another one, which has the magnitude alone."""
+
+    column: Name
+    negative: int | Name = 1
+    """What stands there where the value is negative."""
+
+
 class SignalColumn(Config):
     """One column of the file: `signal = factor(unit) * (±gain * table(value) + offset) / radius`.
 
@@ -57,6 +65,8 @@ class SignalColumn(Config):
     unit: str
     negate: bool = False
     """For axes that are not ISO 8855, such as y to the right."""
+    sign: SignBit | None = Field(default=None, exclude_if=lambda value: value is None)
+    """Where a column of its own says the sign, as on the buses of some cars."""
     offset: FiniteFloat = 0.0
     """Added after the sign, in the column's unit."""
     gain: FiniteFloat = Field(default=1.0, exclude_if=lambda value: value == 1.0)

@@ -1,0 +1,132 @@
+"""What departments call their signals and units: `vocabulary.toml`, and how a name is compared."""
+
+import re
+import tomllib
+from collections.abc import Iterable
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+CORNERS = ("fl", "fr", "rl", "rr")
+_PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_UMLAUTS = str.maketrans(
+    {"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"}
+)
+_IN_BRACKETS = re.compile(r"\s*[\[(<{]\s*([^\[\](){}<>]*?)\s*[\])>}]\s*$")
+_NUMBERING = {"id", "nr", "no", "num", "number", "nummer", "name", "code"}
+
+
+@cache
+def vocabulary() -> dict[str, Any]:
+    """Return the words by section, those of wheels at each corner under `signals`."""
+    text = (files(__package__) / "vocabulary.toml").read_text(encoding="utf-8")
+    told = tomllib.loads(text)
+    wheels = told["wheels"]
+    for corner in CORNERS:
+        places = [f"{word} {alias}" for word in wheels["words"] for alias in wheels[corner]]
+        told["signals"][f"wheel_{corner}"] = places
+        told["never"][f"wheel_{corner}"] = told["never"]["wheels"]
+    for corner in ("fl", "fr"):
+        told["signals"][f"steer_{corner}"] = [f"steer {alias}" for alias in wheels[corner]]
+    return told
+
+
+def parts_of(name: str) -> list[str]:
+    """Return the parts of a name, in lower case: WhlSpdFL is whl, spd, fl."""
+    return [part.lower() for part in _PARTS.findall(name.translate(_UMLAUTS))]
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Return a name without the unit that stands behind it in brackets, and that unit or ''."""
+    found = _IN_BRACKETS.search(name)
+    return (name[: found.start()], found[1]) if found else (name, "")
+
+
+@cache
+def unit_called(text: str) -> str | None:
+    """Return a unit as a mapping writes it, None for what is not known."""
+    told = text.strip().strip("[]()<>{} ").lower().replace("·", "*")
+    called = {alias: unit for unit, aliases in vocabulary()["units"].items() for alias in aliases}
+    return called.get(told)
+
+
+@cache
+def unit_behind(name: str) -> str | None:
+    """Return the unit that a name ends in, behind a blank or an underscore."""
+    patterns = vocabulary()["suffixes"].items()
+    return next((u for u, end in patterns if re.search(rf"[_\s.](?:{end})$", name.lower())), None)
+
+
+@cache
+def best_words(signal: str, name: str, section: str = "signals") -> tuple[float, str]:
+    """Return how well a name fits the words of a signal, 0 if not at all, and the words.
+
+    What stands behind the name of a message or a topic counts twice, and parts of it that no word
+    explains count against it.
+    """
+    never = {*vocabulary()["never"]["all"], *vocabulary()["never"].get(signal, ())}
+    plain, _ = split_unit(name)
+    behind = plain.partition(".")[2] or plain
+    own, every = _stems_of(behind), _stems_of(plain)
+    if any(_says(word, part) for word in never for pieces in own for part in pieces):
+        return 0.0, ""
+    called = vocabulary()[section].get(signal, ())
+    return max(((_fit(words, own, every), words) for words in called), default=(0.0, ""))
+
+
+def fits_any(words: Iterable[str], name: str) -> bool:
+    """Whether a name has one of the words."""
+    parts = _stems_of(split_unit(name)[0])
+    return any(_fit(one, parts, parts) > 0 for one in words)
+
+
+def is_called(words: Iterable[str], name: str) -> bool:
+    """Whether a name is one of the words and nothing but a number or a name of it."""
+    parts = [part for part in parts_of(split_unit(name)[0]) if not part.isdigit()]
+    kept = [part for part in parts if part not in _NUMBERING]
+    return any(kept == [w for w in one.split() if w not in _NUMBERING] for one in words)
+
+
+def _fit(words: str, own: list[list[str]], every: list[list[str]]) -> float:
+    score, explained = 0.0, set()
+    for word in words.split():
+        place = _place(word, own)
+        if place is not None:
+            score += 2 * len(word)
+            explained.add(place)
+        elif _place(word, every) is not None:
+            score += len(word)
+        else:
+            return 0.0
+    return max(score - 0.5 * (len(own) - len(explained)), 0.1)
+
+
+def _place(word: str, parts: list[list[str]]) -> int | None:
+    """Return which part has a word, or begins with it."""
+    for place, pieces in enumerate(parts):
+        if any(p == word or (len(word) > 2 and p.startswith(word)) for p in pieces):
+            return place
+    return None
+
+
+def _says(never: str, part: str) -> bool:
+    return part == never or (len(never) > 4 and part.startswith(never))
+
+
+@cache
+def _stems_of(name: str) -> list[list[str]]:
+    """Return for each part of a name the part, and what it is compounded of."""
+    return [[part, *_pieces(part)] for part in parts_of(name)]
+
+
+@cache
+def _pieces(part: str) -> tuple[str, ...]:
+    """Return the stems that a part is made of, nothing unless they are all of it."""
+    if not part:
+        return ()
+    for stem in sorted(vocabulary()["words"]["stems"], key=len, reverse=True):
+        if part == stem:
+            return (stem,)
+        if part.startswith(stem) and (rest := _pieces(part[len(stem) :])):
+            return (stem, *rest)
+    return ()
