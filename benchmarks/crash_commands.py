@@ -17,6 +17,7 @@ from fleet_slip.warehouse.tables import Warehouse
 
 SIMULATE = ("simulate", "{campaign}", "--threads", "1")
 INGEST = ("ingest", "{measured}", "--mapping", "{mapping}")
+REPLACE = ("ingest", "{measured}", "--mapping", "{corrected}", "--replace")
 PUBLISH = ("publish", "sideslip")
 WORSE = ("publish", "sideslip", "--nested", "ax", "--force")
 
@@ -43,7 +44,8 @@ sideslip = { column = "beta", unit = "rad" }
 class Command:
     """A command to kill.
 
-    `arrange` changes the root after the commands before; `damaged` says that it leaves damage.
+    `arrange` changes the root after the commands before; `damaged` says that it leaves damage;
+    `done` is its exit code if it had been done already.
     """
 
     name: str
@@ -51,15 +53,18 @@ class Command:
     arguments: tuple[str, ...]
     arrange: Callable[[Path], None] | None = None
     damaged: bool = False
+    done: int = 0
 
 
 def prepare_inputs(folder: Path) -> dict[str, str]:
     """Write a campaign of eight very short drives, and a measured log with rows to refuse."""
     text = find_config("campaigns", "smoke").read_text(encoding="utf-8")
     text = text.replace("laps = 0.5", "laps = 0.04").replace("15_000", "1_500")
-    campaign, mapping, measured = (folder / name for name in ("smoke.toml", "m.toml", "log.csv"))
+    names = ("smoke.toml", "m.toml", "corrected.toml", "log.csv")
+    campaign, mapping, corrected, measured = (folder / name for name in names)
     campaign.write_text(text, encoding="utf-8")
     mapping.write_text(MAPPING, encoding="utf-8")
+    corrected.write_text(MAPPING.replace('unit = "rad" }', 'unit = "rad", negate = true }'))
     rng = random.Random(1)  # noqa: S311
     with measured.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -69,7 +74,8 @@ def prepare_inputs(folder: Path) -> dict[str, str]:
                 ay = 3 * math.sin(tick / 50) + rng.gauss(0, 0.1)
                 row = [rng.gauss(0, 1), "broken" if tick % 97 == 5 else ay, ay / 20, -ay / 200]
                 writer.writerow([tick / 100, car, *row])
-    return {"campaign": str(campaign), "mapping": str(mapping), "measured": str(measured)}
+    paths = {"campaign": campaign, "mapping": mapping, "corrected": corrected, "measured": measured}
+    return {name: str(path) for name, path in paths.items()}
 
 
 def let_time_pass(root: Path) -> None:
@@ -114,6 +120,8 @@ MODEL = (*LOGS, ("gram",), PUBLISH)
 COMMANDS = (
     Command("simulate", (), SIMULATE),
     Command("ingest", (SIMULATE,), INGEST),
+    Command("replace", (*LOGS, ("gram",)), REPLACE),
+    Command("undo", (*LOGS, ("gram",)), ("ingest", "--undo", "log.csv"), done=5),
     Command("gram", LOGS, ("gram",)),
     Command("gram of features", (*LOGS, ("gram",)), ("gram", "--features", "all")),
     Command("select", (*LOGS, ("gram",)), ("select", "--json")),

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from fleet_slip.monitoring.examined import Examined
 
 
+TELLING = 0.01
+"""Part of a cohort's rows without the label or a signal that is worth a remark."""
+
 READ_ON_THE_WAY = 20_000_000
 """Rows of logs that are read for their Gram rows before drives are examined: seconds."""
 
@@ -87,4 +90,13 @@ def say_untold(many: int, what: str) -> None:
         say(
             f"{number_of(many, what)} left out: fewer cars have them than "
             f"${MINIMUM_VARIABLE} asks for."
+        )
+
+
+def say_without_information(rows: int, of: int) -> None:
+    """Say how many rows of a cohort told nothing, if they are more than windows begin with."""
+    if rows > TELLING * of:
+        say(
+            f"{rows:,} of {number_of(of, 'row')} tell nothing: the label or a signal of the model "
+            "is missing there."
         )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,8 @@ class Score:
     drives_trained: int | None = None
     drives_left_out: int = 0
     """How many of these are not scored, since no cohort was asked for."""
+    rows_without: int = 0
+    """Of the cohort, that tell nothing of the model: the label or a signal is missing."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `score --json` prints."""
@@ -150,7 +152,14 @@ def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) 
             f"no row of the cohort {condition.text!r} has {', '.join(manifest.signals)} and "
             f"{manifest.label.signal}. Choose another cohort, or a model with fewer signals."
         )
-    return found
+    return replace(found, rows_without=_count_rows(warehouse, condition) - found.rows)
+
+
+def _count_rows(warehouse: Warehouse, condition: Condition) -> int:
+    statement = f"SELECT count(*) FROM log WHERE {condition.sql}"
+    with connect_tables(warehouse, statement) as database, asking(database, condition):
+        [(rows,)] = database.execute(statement).fetchall()
+    return int(rows)
 
 
 def cohort_of_rows(condition: str | Condition) -> Condition:

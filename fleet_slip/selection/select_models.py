@@ -85,6 +85,11 @@ class Selection(Generic[AnyCohort]):
         title = f"winner: {self.winner.model.name}. {self.winner.reason}"
         return notebook_table(title, header, rows, [one.pooled.rmse_deg for one in best])
 
+    @property
+    def rows_without(self) -> int:
+        """Rows of the cohort that tell nothing of the winner: the label or a column is missing."""
+        return max(self.cohort.rows - self.winner.model.pooled.rows, 0)
+
     def _gram_rows(self, model: CrossValidation) -> dict[str, str]:
         """Return which Gram rows a model is made of, for SQL; it may name cars."""
         if not tells_single_cars():
@@ -101,6 +106,7 @@ class Selection(Generic[AnyCohort]):
             "feature_set": features().identity(self.cohort.feature_set),
             "drives": self.cohort.drive_count,
             "rows": self.cohort.rows,
+            "rows_without": self.rows_without,
             "drives_without_log": self.cohort.members.count_received,
             "drives_left_out": self.cohort.left_out,
             "drives_revoked": dict(self.cohort.revoked),

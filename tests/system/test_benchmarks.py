@@ -47,6 +47,7 @@ TINY = {
     "observers": "--rows 500 --drives 2",
     "on_board": "{root} smoke --seconds 0.01",
     "on_paper": "",
+    "overnight": "--hours 0 --kills 1 --folder {folder}/overnight",
     "peers": "--root {root} --campaign smoke --only fleet_slip duckdb scikit-learn",
     "pipeline": "--root {root} --campaign smoke --threads 1 --gram-rows 200",
     "poisoned": "--root {root} --campaign smoke --draws 1",

@@ -7,6 +7,7 @@ import typer
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.accuracy.evaluation_tables import print_blind, print_evaluation, print_summary
 from fleet_slip.cli.completing import complete_config
+from fleet_slip.cli.left_out import say_without_information
 from fleet_slip.cli.model_argument import OnlyModel
 from fleet_slip.cli.models.diff_command import score_against
 from fleet_slip.cli.output import Json, print_json, print_table, say
@@ -76,6 +77,7 @@ def score(
             if name.startswith(("error", "rmse", "correlation")) and value is not None
         ],
     )
+    say_without_information(found.rows_without, found.rows + found.rows_without)
     _say_trained(found, version.reference)
 
 

@@ -13,6 +13,7 @@ from fleet_slip.cli.left_out import (
     say_outweighing,
     say_revoked,
     say_untold,
+    say_without_information,
     say_without_log,
 )
 from fleet_slip.cli.options import Cohort, Unexamined, request_options
@@ -213,6 +214,8 @@ def _say_without_label(told: WithoutLabel) -> None:
 
 def _say_left_out(selection: Selection[Any]) -> None:
     """Say which drives of the cohort the models were not made of, and which have no log."""
+    if not isinstance(selection.cohort, TaughtCohort):
+        say_without_information(selection.rows_without, selection.cohort.rows)
     if without_log := selection.cohort.members.count_received:
         say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
     say_without_log(selection.cohort.left_out, selection.cohort.feature_set)
