@@ -13,7 +13,6 @@ from fleet_slip.catalogue.arithmetic import nearest, truncated
 
 Step = tuple[str | int, ...]
 Range = tuple[int, int]
-"""The smallest and the largest value."""
 
 Missing = Literal["never", "given", "operands", "divisor", "less", "both"]
 """Where a step is missing: never; where what is given or remembered is; where an operand is; also

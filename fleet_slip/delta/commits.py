@@ -20,10 +20,8 @@ from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Folder
 
 NOTE = "fleet_slip"
-"""Key of the note in a commit's own metadata."""
 
 CHECKSUM_KEY = "sha256"
-"""Key of the checksum in the note."""
 
 Action = Mapping[str, Any]
 """One action as the log has it: `{"add": {...}}`, `{"remove": {...}}`, `{"txn": {...}}`."""

@@ -19,7 +19,6 @@ ATTEMPTS = 1000
 T = TypeVar("T")
 
 MAX_DIGITS = 9
-"""Digits of a document's number."""
 
 _NUMBER = re.compile(rf"([1-9][0-9]{{0,{MAX_DIGITS - 1}}})\.json")
 

@@ -13,7 +13,6 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 
 NAMES_SHOWN = 20
-"""Columns of a frame that an error names."""
 
 
 @dataclass(frozen=True)

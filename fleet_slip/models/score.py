@@ -36,7 +36,6 @@ from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
 
 BATCH_ROWS = 2**17
-"""Rows that are read at a time."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,6 @@ BOTH: Label = "course+sideslip"
 """The course of most cars, and the label of those that have it."""
 
 DEFAULT_MOST = 24
-"""Columns of a search."""
 
 WORTH = Doc(
     "The smallest gain that is worth a signal: as an angle such as 0.025deg, the root of the "

@@ -48,7 +48,6 @@ class CarImperfections(Config):
 
 
 PERFECT = CarImperfections()
-"""The textbook's car."""
 
 
 class Traits(NamedTuple):

@@ -126,4 +126,3 @@ def build_derivative(extensions: Extensions) -> Callable[[State, Controls, Const
 
 
 derivative = build_derivative(Extensions())
-"""The equations of motion with all extensions."""

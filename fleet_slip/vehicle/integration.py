@@ -14,7 +14,6 @@ from fleet_slip.vehicle.state import State
 from fleet_slip.vehicle.wheels import WheelRate
 
 STEP_S = 0.002
-"""Time step of the integration."""
 
 FIRST_ORDER = 0.0
 """Extrapolation of the first step: the step is Euler's."""
@@ -129,7 +128,6 @@ class Path(NamedTuple):
     """The road as it was looked up at the last sample."""
 
     station: float
-    """Where it was looked up."""
     curvature: float
     curvature_slope: float
     """Per metre: within a sample curvature is linear in the station."""

@@ -19,7 +19,6 @@ class Backlog:
     """How `grams` and `logs` differ."""
 
     missing: tuple[TableFile, ...]
-    """Log files without Gram rows of the feature set."""
     stale: frozenset[str]
     """Paths in `grams`, of any set, that are no active log file, and none that may become one."""
 

@@ -116,7 +116,6 @@ def _check_wide(warehouse: Warehouse, file: TableFile, feature_set: str) -> int:
 
 
 DriveGrams = dict[tuple[str, tuple[str, ...]], Gram]
-"""Gram of each drive and set of signals."""
 
 
 def grams_of(rows: pa.Table) -> DriveGrams:

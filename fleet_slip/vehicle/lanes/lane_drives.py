@@ -67,11 +67,9 @@ class TruthBlock:
     """What happened in a part of a drive: at most `BLOCK` samples, without a gap."""
 
     drive: int
-    """Which of the drives."""
     channels: dict[str, FloatArray]
     """The arrays of `CHANNELS`. Their memory is used again for the next block."""
     last: bool
-    """Whether the drive ends with it."""
     lost_control_tick: int | None
     """First tick of the drive at which the driver had lost the car; None in a block before."""
 

@@ -217,7 +217,5 @@ def _source_digest() -> str:
 
 
 simulate = kernel(build_kernel(_source_digest()))
-"""The kernel; see `build_kernel`."""
 
 simulate_imperfect = kernel(build_kernel(_source_digest(), imperfect=True))
-"""The kernel of cars with imperfections."""

@@ -87,7 +87,6 @@ ROUTE = np.dtype(
         ("samples", np.int64),  # most that the drive may take
     ]
 )
-"""What the kernel knows of a drive."""
 
 
 @equation
@@ -173,7 +172,6 @@ CHANNELS = (
     "station_m",
     "lateral_offset_m",
 )
-"""What a lane records."""
 
 IMPERFECT_CHANNELS = ("yaw_acceleration_rad_s2", "leaning_ax_mps2", "leaning_ay_mps2")
 """What a lane records besides of a car with imperfections, for its sensors: how the body begins to
@@ -187,7 +185,6 @@ STRIDE = BLOCK + 8
 few lines of the processor's cache."""
 
 BLOCK_SHAPE = (LANES, len(CHANNELS), STRIDE)
-"""Shape of the blocks of all lanes."""
 
 
 IMPERFECT_BLOCK_SHAPE = (LANES, len(IMPERFECT_CHANNELS), STRIDE)

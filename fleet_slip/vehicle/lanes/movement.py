@@ -131,7 +131,5 @@ def _build_integrate(imperfect: bool) -> Callable[[Any, float, bool], None]:
 
 
 integrate = _build_integrate(imperfect=False)
-"""A step of the cars of the textbook."""
 
 integrate_imperfect = _build_integrate(imperfect=True)
-"""A step of cars with imperfections."""
