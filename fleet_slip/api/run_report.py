@@ -66,7 +66,7 @@ class Training:
         """Return the champion if a selection would come to it again, whatever it looks at."""
         from fleet_slip.maintenance.marked_models import marked_models
         from fleet_slip.models.publish import Publication
-        from fleet_slip.models.up_to_date import is_up_to_date
+        from fleet_slip.models.recipe import is_up_to_date
 
         champion = fleet.registry().champion(self.name)
         if champion is None or champion.reference in marked_models(fleet.root):

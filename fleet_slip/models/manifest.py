@@ -7,14 +7,12 @@ import math
 import re
 from decimal import Decimal
 from fractions import Fraction
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import (
     AfterValidator,
     Field,
     FiniteFloat,
-    PlainSerializer,
-    PlainValidator,
     model_validator,
 )
 
@@ -22,42 +20,7 @@ from fleet_slip.catalogue.definitions import Definition, integer_arithmetic, pla
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
-
-MOST_DIGITS = 4000
-"""Most decimal digits of a number that stands in decimal; Python refuses longer ones as text."""
-
-_FRACTION = re.compile(r"-?[0-9]{1,4000}/[0-9]{1,4000}")
-_LONG_FRACTION = re.compile(r"-?0x[0-9a-f]{1,30000}/0x[0-9a-f]{1,30000}")
-"""In hexadecimal, as models of hundreds of inputs need it."""
-
-
-def _exact_fraction(value: Any) -> Fraction:
-    """Return a fraction, also from its text "3/4". Raises `ValueError` for anything else."""
-    if isinstance(value, Fraction):
-        return value
-    if isinstance(value, str) and _FRACTION.fullmatch(value):
-        base = 10
-    elif isinstance(value, str) and _LONG_FRACTION.fullmatch(value):
-        base = 16
-    else:
-        raise ValueError("is not a fraction such as 3/4")
-    numerator, denominator = (int(part, base) for part in value.split("/"))
-    if not denominator:
-        raise ValueError("is divided by zero")
-    return Fraction(numerator, denominator)
-
-
-def _fraction_text(value: Fraction) -> str:
-    """Return the text of a fraction, such as "3/4"; "0x3/0x4" if it were too long in decimal."""
-    numerator, denominator = value.numerator, value.denominator
-    if max(abs(numerator), denominator) < 10**MOST_DIGITS:
-        return f"{numerator}/{denominator}"
-    return f"{numerator:#x}/{denominator:#x}"
-
-
-ExactFraction = Annotated[
-    Fraction, PlainValidator(_exact_fraction), PlainSerializer(_fraction_text)
-]
+from fleet_slip.models.exact_fraction import ExactFraction
 
 Scale = Annotated[Decimal, Field(ge=Decimal("1e-12"), le=Decimal("1e12"), allow_inf_nan=False)]
 

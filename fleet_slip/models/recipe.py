@@ -1,6 +1,7 @@
-"""How a model is trained again: as its champion was, unless something else is asked for."""
+"""How a model is trained again: as its champion was, and whether that would change anything."""
 
 from dataclasses import asdict, dataclass, fields, replace
+from importlib.metadata import version as package_version
 from typing import Any
 
 from fleet_slip.catalogue.features import features
@@ -10,10 +11,11 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
 from fleet_slip.runs.nights import with_all_drives
-from fleet_slip.selection.answer_request import GIVEN
+from fleet_slip.selection.answer_request import GIVEN, checksum_of_list
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.selection.select_models import RequestedSelection
+from fleet_slip.warehouse.tables import Warehouse
 
 COHORT = "cohort"
 """Key of the condition that was asked, where cars were left out of it."""
@@ -99,3 +101,32 @@ def _of_list(manifest: Manifest, reference: str) -> SelectionRequest:
             "compare, such as models = estimator."
         ) from None
     return SelectionRequest(models=name)
+
+
+def is_up_to_date(
+    manifest: Manifest, warehouse: Warehouse, cohort: str, models: str, worth: str | None
+) -> bool:
+    """Return whether a selection from a model list would come to this manifest again.
+
+    It is a function of table versions, cohort, list and program. Raises `ConfigError` for the list.
+    """
+    model_list = load_model_list(models)
+    trained, chosen = manifest.trained_on, manifest.selected_by
+    made_from = (
+        trained.cohort,
+        trained.feature_set,
+        trained.logs_version,
+        trained.grams_version,
+        chosen.model_list,
+        chosen.config_sha256,
+        manifest.package_version,
+    )
+    return manifest.imported_from is None and made_from == (
+        cohort,
+        features().identity(model_list.features),
+        warehouse.logs.snapshot().version or 0,  # none, where cars send Gram rows alone
+        warehouse.grams.snapshot().version,
+        models,
+        checksum_of_list(model_list, worth),
+        package_version("fleet-slip"),
+    )

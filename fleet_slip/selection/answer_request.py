@@ -113,21 +113,10 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
     )
     if distances:
         inputs = inputs_of(cohort, request.nested or WHOLE_SET)
-        measured = try_distances(
-            cohort, inputs, folds, cluster=request.cluster, intercept=request.intercept
-        )
-        answer = replace(answer, distances=measured)
+        answer = replace(answer, distances=try_distances(cohort, inputs, folds, request))
     if not request.resampled:
         return answer
-    figures = estimate_uncertainty(
-        cohort,
-        answer.winner.model,
-        folds,
-        bootstrap=request.bootstrap,
-        repeat=request.repeat,
-        cluster=request.cluster,
-        intercept=request.intercept,
-    )
+    figures = estimate_uncertainty(cohort, answer.winner.model, folds, request)
     return replace(answer, uncertainty=figures)
 
 
@@ -283,15 +272,7 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Reques
     criterion = require_criterion(request.criterion or "cv")
     ranking = ALL_SUBSETS if request.all_subsets else request.rank or "declared"
     rule = Rule(ranking, criterion, parse_worth(request.worth))
-    found = select_inputs(
-        cohort,
-        inputs,
-        folds,
-        rule,
-        naive=request.naive,
-        cluster=request.cluster,
-        intercept=request.intercept,
-    )
+    found = select_inputs(cohort, inputs, folds, rule, request)
     described = ModelList(
         description="Inputs to choose from",
         features=cohort.feature_set,

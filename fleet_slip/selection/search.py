@@ -32,7 +32,6 @@ from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Winner, Worth, ch
 from fleet_slip.regression.exact.figures import ErrorSums
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import Fit, LinearModel, fit
-from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.validation.crossval import (
     CrossValidation,
@@ -42,6 +41,7 @@ from fleet_slip.regression.validation.crossval import (
 )
 from fleet_slip.regression.validation.folds import Folds
 from fleet_slip.selection.model_list import Search
+from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 ALL_SUBSETS = "all-subsets"
@@ -109,10 +109,7 @@ def select_inputs(
     inputs: Sequence[str],
     folding: Folding,
     rule: Rule,
-    *,
-    naive: bool = False,
-    cluster: ClusterUnit | None = None,
-    intercept: bool = True,
+    request: SelectionRequest,
 ) -> SearchResult:
     """Choose a nested model by the rule's ranking, or of the best subsets, on the drives that fit.
 
@@ -121,11 +118,16 @@ def select_inputs(
     """
     label = catalogue().label
     if folding.by == ROW_FOLDS:
-        training = row_training(cohort, inputs, folding, intercept=intercept)
+        training = row_training(cohort, inputs, folding, intercept=request.intercept)
         fold = np.empty(0, dtype=np.int64)
     else:
         ready = drive_folds(
-            cohort, inputs, folding, naive=naive, cluster=cluster, intercept=intercept
+            cohort,
+            inputs,
+            folding,
+            naive=request.naive,
+            cluster=request.cluster,
+            intercept=request.intercept,
         )
         training, fold = ready.training, ready.fold
     if rule.ranking == ALL_SUBSETS:
@@ -156,16 +158,12 @@ def select_inputs(
 
 
 def try_distances(
-    cohort: Cohort,
-    inputs: Sequence[str],
-    folding: Folding,
-    *,
-    cluster: ClusterUnit | None = None,
-    intercept: bool = True,
+    cohort: Cohort, inputs: Sequence[str], folding: Folding, request: SelectionRequest
 ) -> NestedDistances | str:
     """Return the distances of the nested models of an order as given, or why there are none."""
     try:
-        ready = drive_folds(cohort, inputs, folding, cluster=cluster, intercept=intercept)
+        unit, intercept = request.cluster, request.intercept
+        ready = drive_folds(cohort, inputs, folding, cluster=unit, intercept=intercept)
         return measure_distances(ready.training, inputs, catalogue().label)
     except (DataError, QuestionError) as error:
         return str(error)

@@ -15,6 +15,7 @@ from fleet_slip.regression.inference.bootstrap import (
 )
 from fleet_slip.regression.inference.drive_moments import ClusterUnit, DriveMoments
 from fleet_slip.regression.validation.crossval import CrossValidation, least_squares
+from fleet_slip.selection.request import SelectionRequest
 
 SEED = 1
 """Resampling is reproducible: the same command prints the same figures."""
@@ -38,18 +39,15 @@ def estimate_uncertainty(
     cohort: Cohort,
     model: CrossValidation,
     folding: Folding,
-    *,
-    bootstrap: int | None,
-    repeat: int | None,
-    cluster: ClusterUnit | None = None,
-    intercept: bool = True,
+    request: SelectionRequest,
 ) -> Uncertainty:
     """Draw drives, or cars of several, `bootstrap` times; deal the folds anew `repeat` times.
 
     Raises `QuestionError` for folds of rows, `DataError` for too few drives.
     """
+    bootstrap, repeat, intercept = request.bootstrap, request.repeat, request.intercept
     label = catalogue().label
-    ready = drive_folds(cohort, model.signals, folding, cluster=cluster)
+    ready = drive_folds(cohort, model.signals, folding, cluster=request.cluster)
     interval = None
     if bootstrap:
         splits = ready.training.folds.splits()

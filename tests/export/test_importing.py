@@ -21,9 +21,9 @@ from fleet_slip.files.documents import checksum
 from fleet_slip.maintenance.verify import verify_models
 from fleet_slip.maintenance.verify_files import Verification
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.recipe import is_up_to_date
 from fleet_slip.models.signing import VERIFY_VARIABLE, make_keys
 from fleet_slip.models.trained_drives import read_trained_drives
-from fleet_slip.models.up_to_date import is_up_to_date
 from fleet_slip.monitoring.monitor import monitor
 from tests.export.models import model_of
 from tests.support.commands import PATIENCE_S

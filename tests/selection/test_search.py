@@ -15,7 +15,7 @@ from fleet_slip.regression.choice.nested_choice import CROSS_VALIDATION, Rule, s
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.regression.validation.crossval import cross_validate, least_squares
 from fleet_slip.selection.model_list import Search
-from fleet_slip.selection.request import parse_worth
+from fleet_slip.selection.request import SelectionRequest, parse_worth
 from fleet_slip.selection.search import (
     ALL_SUBSETS,
     choose_by,
@@ -29,6 +29,7 @@ from tests.support.counts import dense_fit
 STRONG_FIRST = (0.0, 0.4, 0.9, 0.0)
 """Only ay and yaw_rate say anything of the label, yaw_rate more."""
 
+USUAL = SelectionRequest()
 FIVE = Folding(by="drive", count=5)
 
 
@@ -55,7 +56,7 @@ def test_a_criterion_is_known_by_its_names() -> None:
 def test_a_ranking_begins_with_what_says_most_and_ends_before_what_says_nothing(
     drives: list[Driven], ranking: str, criterion: str
 ) -> None:
-    found = select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ranking, criterion))
+    found = select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ranking, criterion), USUAL)
     assert found.choice.nested is not None
     assert found.choice.nested.order[:2] == ("yaw_rate", "ay")
     assert found.winner.model.signals == ("yaw_rate", "ay")
@@ -66,7 +67,7 @@ def test_each_nested_model_has_the_figures_of_its_own_cross_validation(
     drives: list[Driven],
 ) -> None:
     cohort = cohort_of(drives)
-    found = select_inputs(cohort, INPUTS, FIVE, Rule("forward", "bic"))
+    found = select_inputs(cohort, INPUTS, FIVE, Rule("forward", "bic"), USUAL)
     folds = cohort.folds("drive", 5).serving(INPUTS, LABEL)
     for model in found.models:
         procedure = least_squares(model.signals, LABEL)
@@ -77,7 +78,9 @@ def test_each_nested_model_has_the_figures_of_its_own_cross_validation(
 def test_the_honest_figures_are_of_the_choice_itself_and_need_three_folds() -> None:
     rule, two = Rule("forward", "aic"), Folding(by="drive", count=2)
     drives = driven(5, (0.3, 0.1, 0.1, 0.1), drives=9, rows=15, noise=300)
-    honest = select_inputs(cohort_of(drives), INPUTS, FIVE, rule, cluster="drive").choice.honest
+    honest = select_inputs(
+        cohort_of(drives), INPUTS, FIVE, rule, SelectionRequest(cluster="drive")
+    ).choice.honest
     fold = assign_folds([one.drive for one in drives], "drive", 5).fold
     errors, choices = [], set()
     for number in set(fold):
@@ -93,7 +96,7 @@ def test_the_honest_figures_are_of_the_choice_itself_and_need_three_folds() -> N
     assert honest is not None
     counts = honest.pooled.rmse / float(catalogue()[LABEL].scale)
     assert counts == pytest.approx(np.sqrt(np.mean(np.concatenate(errors) ** 2)), rel=1e-9)
-    assert select_inputs(cohort_of(drives), INPUTS, two, rule).choice.honest is None
+    assert select_inputs(cohort_of(drives), INPUTS, two, rule, USUAL).choice.honest is None
 
 
 @pytest.mark.parametrize(
@@ -104,14 +107,12 @@ def test_what_counts_as_independent_is_what_was_asked_for(
     drives: list[Driven], naive: bool, cluster: ClusterUnit | None, kind: str
 ) -> None:
     rule = Rule("forward", "bic")
-    cohort = cohort_of(drives)
-    choice = select_inputs(cohort, INPUTS, FIVE, rule, naive=naive, cluster=cluster).choice
+    cohort, asked = cohort_of(drives), SelectionRequest(naive=naive, cluster=cluster)
+    choice = select_inputs(cohort, INPUTS, FIVE, rule, asked).choice
     assert choice.evidence.kind == kind
     assert (choice.evidence.rows == 30 * 80) is naive
     assert choice.as_dict()["evidence"] == choice.evidence.kind
-    subsets = select_inputs(
-        cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"), naive=naive, cluster=cluster
-    ).choice
+    subsets = select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"), asked).choice
     assert subsets.evidence.kind == choice.evidence.kind
 
 
@@ -120,13 +121,13 @@ def test_where_nothing_says_more_than_chance_there_is_no_winner(search: str) -> 
     cohort = cohort_of(driven(3, (0.0, 0.0, 0.0, 0.0), drives=20))
     with pytest.raises(DataError, match="the criterion bic keeps no signal"):
         if search == ALL_SUBSETS:
-            select_inputs(cohort, INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"))
+            select_inputs(cohort, INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"), USUAL)
         else:
-            select_inputs(cohort, INPUTS, FIVE, Rule("forward", "bic"))
+            select_inputs(cohort, INPUTS, FIVE, Rule("forward", "bic"), USUAL)
 
 
 def test_the_best_subset_of_every_size_is_that_of_the_rows(drives: list[Driven]) -> None:
-    found = select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"))
+    found = select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"), USUAL)
     assert found.choice.subsets is not None
     assert found.choice.honest is None
     for size, result in enumerate(found.choice.subsets):
@@ -146,7 +147,9 @@ def test_the_best_subset_of_every_size_is_that_of_the_rows(drives: list[Driven])
 
 
 def test_subsets_can_be_chosen_by_cross_validation(drives: list[Driven]) -> None:
-    found = select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, CROSS_VALIDATION))
+    found = select_inputs(
+        cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, CROSS_VALIDATION), USUAL
+    )
     assert set(found.winner.model.signals) == {"ay", "yaw_rate"}
     best = max(found.models, key=lambda model: model.correlation)
     assert found.winner.best is best
@@ -180,14 +183,16 @@ def test_rows_can_be_the_folds() -> None:
     ]
     cohort = cohort_of(parts, feature_set="rows")
     rows = Folding(by="row", count=10)
-    ranked = select_inputs(cohort, INPUTS, rows, Rule("forward", "bic"))
-    subsets = select_inputs(cohort, INPUTS, rows, Rule(ALL_SUBSETS, "bic"))
+    ranked = select_inputs(cohort, INPUTS, rows, Rule("forward", "bic"), USUAL)
+    subsets = select_inputs(cohort, INPUTS, rows, Rule(ALL_SUBSETS, "bic"), USUAL)
     assert set(ranked.winner.model.signals) == set(subsets.winner.model.signals)
     assert ranked.choice.evidence.kind == subsets.choice.evidence.kind == "rows"
     assert len(ranked.winner.model.folds) == 10
     assert ranked.winner.model.pooled.rows == 6 * 80
     with pytest.raises(QuestionError, match="whole drives"):
-        select_inputs(cohort_of(driven(4, STRONG_FIRST)), INPUTS, rows, Rule("forward", "bic"))
+        select_inputs(
+            cohort_of(driven(4, STRONG_FIRST)), INPUTS, rows, Rule("forward", "bic"), USUAL
+        )
 
 
 def test_a_signal_that_repeats_another_is_named() -> None:
@@ -195,5 +200,5 @@ def test_a_signal_that_repeats_another_is_named() -> None:
     for one in drives:
         one.counts[:, 3] = 2 * one.counts[:, 1]
     with pytest.raises(DataError, match="steering_wheel"):
-        select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"))
+        select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"), USUAL)
     assert np.linalg.matrix_rank(rows_of(drives)[:, :4]) == 3

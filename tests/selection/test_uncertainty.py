@@ -10,6 +10,7 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohorts.folding import Folding, assign_folds
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
+from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.selection.uncertainty import estimate_uncertainty
 from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
 
@@ -26,7 +27,9 @@ def test_the_interval_holds_the_figure_and_narrows_with_more_drives() -> None:
     for count in (8, 80):
         drives = driven(1, (0.1, 0.2, 0.1, 0.05), drives=count, noise=150)
         model = validated(drives)
-        found = estimate_uncertainty(cohort_of(drives), model, FIVE, bootstrap=400, repeat=None)
+        found = estimate_uncertainty(
+            cohort_of(drives), model, FIVE, SelectionRequest(bootstrap=400)
+        )
         assert found.interval is not None
         assert found.interval.low < model.correlation < found.interval.high
         assert (found.interval.level, found.interval.replicates) == (0.95, 400)
@@ -41,7 +44,7 @@ def test_the_interval_is_that_of_drawing_clusters_by_hand(cluster: ClusterUnit) 
     drives = driven(2, (0.1, 0.2, 0.1, 0.05), drives=20, noise=150)
     cohort = cohort_of(drives)
     found = estimate_uncertainty(
-        cohort, validated(drives), FIVE, bootstrap=1000, repeat=None, cluster=cluster
+        cohort, validated(drives), FIVE, SelectionRequest(bootstrap=1000, cluster=cluster)
     )
     assert found.drawn == cluster
     assignment = assign_folds([one.drive for one in drives], "drive", 5).fold
@@ -71,7 +74,7 @@ def test_folds_dealt_again_give_about_the_same_figure_and_the_same_each_time() -
     drives = driven(3, (0.1, 0.2, 0.1, 0.05), drives=30, noise=150)
     model = validated(drives)
     found, again = (
-        estimate_uncertainty(cohort_of(drives), model, FIVE, bootstrap=None, repeat=20)
+        estimate_uncertainty(cohort_of(drives), model, FIVE, SelectionRequest(repeat=20))
         for _ in range(2)
     )
     assert found == again
@@ -88,4 +91,5 @@ def test_rows_are_no_drives_to_draw() -> None:
     drives = driven(4, (0.1, 0.2, 0.1, 0.05))
     rows = Folding(by="row", count=5)
     with pytest.raises(QuestionError, match="no drives to hold out"):
-        estimate_uncertainty(cohort_of(drives), validated(drives), rows, bootstrap=100, repeat=None)
+        asked = SelectionRequest(bootstrap=100)
+        estimate_uncertainty(cohort_of(drives), validated(drives), rows, asked)

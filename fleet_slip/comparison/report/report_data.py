@@ -44,6 +44,7 @@ from fleet_slip.regression.choice.nested_choice import NestedDistances
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.resources import config_file
 from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.selection.search import try_distances
 from fleet_slip.selection.select_models import Selection, select
 from fleet_slip.simulation.scenario import Scenario, load_scenario, shipped_scenarios
@@ -187,7 +188,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
         histogram=held_out_histogram(warehouse, trained.selection, choice),
         ordering=compare_orders(cohort, signals),
         by_speed=_by_speed(trained.selection),
-        distances=try_distances(cohort, signals, trained.selection.folds),
+        distances=try_distances(cohort, signals, trained.selection.folds, SelectionRequest()),
         memory=weigh_memory(own, manifest, trained.selection.folds, runs)
         if looks_back(manifest) and len(manifest.terms) <= MOST_TERMS
         else None,
