@@ -130,7 +130,7 @@ class FleetCohort(Rooted):
         *,
         model: "str | ModelVersion | None" = None,
         over: Sequence[str] = (),
-        features: str = "regimes",
+        features: str | None = None,
         by: "FoldKey" = "drive",
         folds: int | str | None = None,
         worth: str | None = None,
@@ -139,10 +139,11 @@ class FleetCohort(Rooted):
 
         One model for all rows is cross-validated against one a regime. `signals` are inputs
         separated by commas, by default those of `model`, or all; `over` the regimes, by default all
-        of `features` (`fleet.gram("regimes")` makes them); `worth` as in `select`. Raises
+        of `features` (`fleet.gram("regimes")` makes them), by default the first set that divides
+        rows and has the inputs; `worth` as in `select`. Raises
         `DataError` for a feature set without such regimes.
         """
-        from fleet_slip.selection.regimes import compare_regimes
+        from fleet_slip.selection.regimes import compare_regimes, divided_set
         from fleet_slip.selection.request import parse_worth
 
         gain = parse_worth(worth)
@@ -151,6 +152,7 @@ class FleetCohort(Rooted):
                 raise UsageError("name a published model or signals, not both.")
             version = self._examined(model, None, None).version
             signals = ",".join(version.manifest.signals) if version else None
+        features = features or divided_set(signals)
         return compare_regimes(*self._dealt(signals, features, by, folds), over, gain)
 
     def shrink(

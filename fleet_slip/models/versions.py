@@ -24,6 +24,7 @@ from fleet_slip.models.signing import require_signature, require_signing_key, si
 from fleet_slip.models.trained_drives import keep_drives
 
 _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
+_NONE = "none yet; publish one with: fleet-slip publish NAME"
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Registry:
     def require(self, name: str) -> None:
         """Raise `QuestionError` if no model is called so."""
         if name not in self.names():
-            known = ", ".join(self.names()) or "none yet; publish one with: fleet-slip publish"
+            known = ", ".join(self.names()) or _NONE
             raise QuestionError(f"no model is called {name!r}. Models: {known}.")
 
     def versions(self, name: str) -> list[int]:
@@ -87,7 +88,7 @@ class Registry:
         """Return the name of the only model. Raises `QuestionError` if there is not one."""
         names = self.names()
         if len(names) != 1:
-            known = ", ".join(names) or "none yet; publish one with: fleet-slip publish NAME"
+            known = ", ".join(names) or _NONE
             raise QuestionError(f"name a published model{or_else}. Models: {known}.")
         return names[0]
 
@@ -251,6 +252,6 @@ def _unknown(
     aliases: Mapping[str, int] | None = None,
 ) -> str:
     if name not in names:
-        return f"no model is called {name!r}. Models: {', '.join(names) or 'none yet'}."
+        return f"no model is called {name!r}. Models: {', '.join(names) or _NONE}."
     known = [str(number) for number in versions] + sorted(aliases or {})
     return f"{name} has no version or alias {which!r}. It has: {', '.join(known)}."

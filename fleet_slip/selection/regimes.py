@@ -98,6 +98,17 @@ class RegimeComparison:
         }
 
 
+def divided_set(signals: str | None) -> str:
+    """Return the first feature set that divides rows by regimes and has inputs, comma-separated.
+
+    The first at all if none has them: who takes its rows says which inputs are unknown.
+    """
+    wanted = {name.strip() for name in signals.split(",")} if signals else set()
+    divided = [name for name in features().sets if features().feature_set(name).regimes]
+    having = [name for name in divided if wanted <= set(features().feature_set(name).columns)]
+    return (having or divided)[0]
+
+
 def regime_names(cohort: Cohort, over: Sequence[str]) -> list[str]:
     """Return the regime of each Gram row, by some or all of its set's. Raises `QuestionError`."""
     divided = features().feature_set(cohort.feature_set).regimes

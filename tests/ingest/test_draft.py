@@ -97,7 +97,9 @@ def test_wheels_without_a_place_are_told_by_how_they_turn(
     rows = rows.with_columns(pl.Series(f"Wheel_{i}", car[WHEELS[o]]) for i, o in enumerate(order))
     rows.insert_column(0, pl.Series("t", np.arange(rows.height) / 100))
     rows.write_parquet(tmp_path / "log.parquet")
-    signals = suggest(tmp_path, tmp_path / "log.parquet")["signals"]
+    drafted = suggest(tmp_path, tmp_path / "log.parquet")
+    assert "csv" not in drafted
+    signals = drafted["signals"]
     assert {name: signals[name]["column"] for name in WHEELS} == {n: names[n] for n in WHEELS}
 
 

@@ -13,6 +13,7 @@ from fleet_slip.selection.regimes import (
     ROWS_PER_COEFFICIENT,
     band_order,
     compare_regimes,
+    divided_set,
     regime_names,
 )
 from tests.support.cohorts import INPUTS, Driven, cohort_of, driven
@@ -45,6 +46,14 @@ def held_out(drives: list[Driven], *, own: bool) -> dict[str, np.ndarray]:
                     np.array([b[0] + counts[:, :-1] @ b[1:], counts[:, -1]])
                 )
     return {part: np.concatenate(pairs, axis=1) for part, pairs in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("signals", "name"),
+    [(None, "regimes"), ("ay,curvature", "regimes"), ("ay, ay_mean_16", "windows_regimes")],
+)
+def test_rows_are_divided_by_a_set_that_has_the_inputs(signals: str | None, name: str) -> None:
+    assert divided_set(signals) == name
 
 
 def test_figures_by_regime_are_those_of_the_rows() -> None:

@@ -35,8 +35,13 @@ def regimes(
     ] = None,
     cohort: Cohort = TRAINING_DRIVES,
     feature_set: Annotated[
-        str, typer.Option("--features", help="Feature set that divides rows by regimes.")
-    ] = "regimes",
+        str | None,
+        typer.Option(
+            "--features",
+            help="Feature set that divides rows by regimes. Default: the first with the signals.",
+            show_default=False,
+        ),
+    ] = None,
     by: By = "drive",
     folds: FoldCount = None,
     worth: Worth = None,

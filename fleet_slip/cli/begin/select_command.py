@@ -112,7 +112,9 @@ def print_selection(selection: Selection[Any], everything: bool = False) -> None
     if isinstance(selection.distances, str):
         say(f"the distances of the nested models cannot be told: {selection.distances}")
     for name, reason in selection.skipped.items():
-        say(f"model {name} was left out: {reason}")
+        one, *others = reason.split("; ")
+        more = f"; and {number_of(len(others), 'relation')} more, see --json." if others else ""
+        say(f"model {name} was left out: {one}{more}")
     if selection.choice is not None and (honest := selection.choice.honest) is not None:
         print_line(
             "made again inside every training fold, the whole choice has a correlation of "

@@ -160,7 +160,9 @@ def _velocity(columns: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray
     wheels = [columns[f"wheel_{wheel}_rad_s"] for wheel in WHEELS]
     if not np.isfinite(wheels).any():
         raise DataError("the drive has neither a velocity nor wheel speeds: nothing can be shown.")
-    rolling = 0.31 * np.nan_to_num(np.nanmean(wheels, axis=0))
+    here = np.isfinite(wheels)  # a tick may lack them all, of which nanmean would warn
+    mean = np.where(here, wheels, 0.0).sum(axis=0) / np.maximum(here.sum(axis=0), 1)
+    rolling = 0.31 * mean
     return rolling, rolling * np.tan(np.nan_to_num(columns["sideslip_rad"]))
 
 

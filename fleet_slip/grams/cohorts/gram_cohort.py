@@ -211,7 +211,8 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
         )
     examples = opened.database.execute(
         "SELECT string_agg(DISTINCT source, ', ' ORDER BY source), "
-        "string_agg(DISTINCT campaign, ', ' ORDER BY campaign) FROM grams"
+        "string_agg(DISTINCT campaign, ', ' ORDER BY campaign) FROM grams "
+        f"WHERE {TRAINING_DRIVES}"
     ).fetchone()
     sources, campaigns = examples or ("", "")
     return DataError(

@@ -1,5 +1,6 @@
 """What ingesting a file would do, and a picture of it: nothing is stored."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,14 @@ def _range(name: str, found: _Found) -> SignalRange:
     return SignalRange(name, signal.unit, low, high, 1 - found.values / max(found.ticks, 1))
 
 
+_SHOWN = {
+    "rad": ("deg", 180 / math.pi),
+    "rad/s": ("deg/s", 180 / math.pi),
+    "m/s": ("km/h", 3.6),
+}
+"""What people read a unit in, and how many of it one is; others are drawn as they are."""
+
+
 def draw_preview(preview: Preview, file: Path) -> None:
     """Draw the signals to a file of any format. Raises `ConfigError`, `StorageError`."""
     with needed("report", "a picture of a measured log"):
@@ -124,12 +133,13 @@ def draw_preview(preview: Preview, file: Path) -> None:
     FigureCanvasAgg(figure)
     panels = np.atleast_1d(figure.subplots(len(names), sharex=True))
     for name, axes in zip(names, panels, strict=True):
-        values = preview.longest[name]
+        values, signal = preview.longest[name], catalogue()[name]
         wrong = [s.kind for s in preview.suspicions if name in s.signals]
         time_s = np.arange(values.size) * float(SAMPLE_TIME_S)
-        axes.plot(time_s, values, color="tab:red" if wrong else "tab:blue", linewidth=0.8)
+        unit, factor = _SHOWN.get(signal.unit, (signal.unit, 1.0))
+        axes.plot(time_s, values * factor, color="tab:red" if wrong else "tab:blue", linewidth=0.8)
         axes.axhline(0, color="0.8", linewidth=0.5, zorder=0)
-        axes.set_title(f"{name}, {catalogue()[name].unit}", loc="left", fontsize="small")
+        axes.set_title(f"{name}, {unit}", loc="left", fontsize="small")
         axes.set_title("; ".join(f"{kind}?" for kind in wrong), loc="right", fontsize="small")
         axes.spines[["top", "right"]].set_visible(False)
     panels[-1].set_xlabel("time, s")
