@@ -51,6 +51,7 @@ lint: $(VENV)/.dev-installed
 
 docs: $(VENV)/.docs-installed
 	$(BIN)/python -m zensical build --clean --strict
+	(printf 'window.searchIndex = '; cat site/search.json) > site/search.js
 
 bench: $(VENV)/.dev-installed
 	$(BIN)/python -m benchmarks
