@@ -1,6 +1,7 @@
 """How fast measured logs come in, by format, and how much memory that takes.
 
     python -m benchmarks.ingest [--rows 100000,1000000] [--formats parquet,csv,mf4] [--only-ours]
+        [--course 5]
 
 Files with eleven noisy signals at 100 Hz, in drives of half an hour, are written on the fly, int16
 counts with a factor in MF4. Each is ingested by a process of its own, after a small one of the same
@@ -10,6 +11,9 @@ ticks, round signals to int16 counts and write one Parquet file; asammdf exports
 is. They check nothing, and have the whole file in memory. Rows a second are by the clock; those of
 processor time tell more where the machine has other work. Memory is the peak of the whole process,
 and `times ours` is by the clock. Of several sizes, the slope is what each further second brings.
+
+With `--course`, so many pairs are ingested instead: the same file of each size, Parquet or CSV, by
+a mapping that takes the course from north and east velocity at 10 Hz, and by one that does not.
 
 A thousand million rows take 19 GB as Parquet, 79 as CSV and 13 as MF4, and up to 30 more for each
 program: what has no room in the temporary folder (`TMPDIR`) is refused before it is written.
@@ -22,7 +26,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +45,17 @@ SIGNALS = {
     "wheel_fl": "rad/s", "wheel_fr": "rad/s", "wheel_rl": "rad/s", "wheel_rr": "rad/s",
     "steer_fl": "rad", "steer_fr": "rad", "sideslip": "rad",
 }  # fmt: skip
+
+_TURNED = 10 + 0.5 * 7 * (1 - (pl.col("t") / 7).cos())
+_FIX = (pl.col("t") * 100).round().cast(pl.Int64) % 10 == 0
+_VELOCITY = {
+    name: pl.when(_FIX).then((20 * part).round(3))
+    for name, part in (("north", _TURNED.sin()), ("east", _TURNED.cos()))
+}
+"""What a receiver of 10 Hz says; null between fixes."""
+COURSE = """
+course = { north = "north", east = "east", unit = "m/s", antenna_x_m = 0.5, antenna_y_m = 0.0 }
+"""
 
 _INGEST = """
 from fleet_slip.ingest.landing.ingest_job import ingest_files
@@ -113,9 +128,11 @@ WAYS = {
 }
 
 
-def write_log(file: Path, rows: int) -> None:
+def write_log(file: Path, rows: int, *, course: bool = False) -> None:
     """Write a log in the format of the file's suffix, a million rows at a time."""
     tables = (_rows(start, min(start + CHUNK, rows)) for start in range(0, rows, CHUNK))
+    if course:
+        tables = (table.with_columns(**_VELOCITY) for table in tables)
     if file.suffix == ".mf4":
         _write_mf4(file, tables)
         return
@@ -196,8 +213,14 @@ def main() -> None:
     parser.add_argument("--rows", default="1000000", help="numbers of rows, with commas")
     parser.add_argument("--formats", default=",".join(WAYS))
     parser.add_argument("--only-ours", action="store_true", help="not the other programs")
+    parser.add_argument("--course", type=int, metavar="PAIRS", help="with and without a course")
     given = parser.parse_args()
     sizes = sorted(int(rows) for rows in given.rows.split(","))
+    if given.course:
+        for kind, rows in product(set(given.formats.split(",")) - {"mf4"}, sizes):
+            with tempfile.TemporaryDirectory() as folder:
+                print(f"{kind:8} {rows:13,} {pairs(Path(folder), kind, rows, given.course)}")
+        return
     print(
         f"{'format':8} {'rows':>13} {'program':12} {'million rows/s':>14} {'per CPU s':>10} "
         f"{'MiB':>6} {'times ours':>10}  goal"
@@ -212,6 +235,29 @@ def main() -> None:
                 (sizes[-1] - sizes[0]) / (taken[-1][i] - taken[0][i]) / 1e6 for i in (0, 1)
             )
             print(f"{kind:8} {'slope':>13} {'fleet_slip':12} {wall:14.2f} {cpu:10.2f}")
+
+
+def pairs(folder: Path, kind: str, rows: int, count: int) -> str:
+    """Return what a course costs beside none, in processor time, of so many pairs."""
+    file, small = (folder / f"{name}.{kind}" for name in ("log", "small"))
+    for log, size in ((file, rows), (small, 1000)):
+        write_log(log, size, course=True)
+    mappings = [folder / f"{name}.toml" for name in ("without", "with")]
+    for mapping in mappings:
+        write_mapping(mapping, kind)
+    mappings[1].write_text(mappings[1].read_text() + COURSE)
+    cpu_s = np.empty((count, 2))
+    for pair, column in np.ndindex(count, 2):
+        root, mapping = folder / f"{pair}-{column}", mappings[column]
+        given = {"file": str(file), "small": str(small), "root": str(root), "mapping": str(mapping)}
+        cpu_s[pair, column] = measure(_INGEST.format(**given, rows=rows))[1]
+        shutil.rmtree(root)
+    ratios = cpu_s[:, 1] / cpu_s[:, 0]
+    without, with_course = np.median(cpu_s, axis=0)
+    return (
+        f"CPU {without:.2f} s without a course, {with_course:.2f} s with one: "
+        f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f}) times"
+    )
 
 
 def compare(folder: Path, kind: str, rows: int, *, only_ours: bool) -> tuple[float, float]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
-from fleet_slip.ingest.drives.sound_fixes import is_backwards, is_held, on_grid
+from fleet_slip.ingest.drives.sound_fixes import find_ticks, is_backwards, is_held, on_grid
 from fleet_slip.ingest.mapping.signal_column import SignalColumn
 
 Method = Literal["snap", "interpolate", "average"]
@@ -89,8 +89,7 @@ class Resampler:
         """Return a signal with each sample at its nearest tick, the last of several, else NaN."""
         present = np.flatnonzero(~np.isnan(values))
         nearest = np.rint((self.time_s[present] - delay_s - self.at_s[0]) / STEP_S)
-        place = np.searchsorted(self.ticks, nearest)
-        found = np.isin(nearest, self.ticks)
+        place, found = find_ticks(self.ticks, nearest)
         placed = np.full(self.ticks.size, np.nan)
         placed[place[found]] = values[present[found]]
         return placed
@@ -211,8 +210,7 @@ def fixes_on_ticks(
     """
     present = np.flatnonzero(_is_new(course, speed))
     nearest, late_s = _nearest(resampler, present, delay_s)
-    place = np.searchsorted(resampler.ticks, nearest)
-    found = np.isin(nearest, resampler.ticks)
+    place, found = find_ticks(resampler.ticks, nearest)
     place, late_s, fixes = place[found], late_s[found], present[found]
     r = yaw_rate[place]
     across = r * antenna.x_m

@@ -5,6 +5,7 @@ apart.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
@@ -91,9 +92,19 @@ def on_grid(
     return found[0] + heading, found[1]
 
 
+def find_ticks(
+    ticks: IntArray, wanted: IntArray | FloatArray
+) -> tuple[NDArray[np.intp], BoolArray]:
+    """Return where ticks are among others, which are in order, and whether they are at all."""
+    place = np.searchsorted(ticks, wanted)
+    found: BoolArray = place < ticks.size
+    found[found] = ticks[place[found]] == wanted[found]
+    return place, found
+
+
 def _is_regular(fixes: IntArray) -> bool:
     """Return whether most fixes that have one about a second later have one exactly then."""
-    later = np.isin(fixes + SECOND, fixes)
+    later = find_ticks(fixes, fixes + SECOND)[1]
     next_one = np.searchsorted(fixes, fixes + SECOND - SECOND // 10)
     there = next_one < fixes.size
     there[there] = fixes[next_one[there]] <= fixes[there] + SECOND + SECOND // 10
