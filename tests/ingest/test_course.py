@@ -183,6 +183,7 @@ def test_a_heading_is_a_question_and_no_line(tmp_path: Path, name: str) -> None:
     ("north", "east"),
     [
         ("vel_north", "vel_east"),
+        ("gnss_north_mps", "gnss_east_mps"),
         ("Vn", "Ve"),
         ("Geschwindigkeit Nord", "Geschwindigkeit Ost"),
         ("GpsVelN", "GpsVelE"),

@@ -110,6 +110,12 @@ def test_a_car_that_lags_behind_its_inputs_is_not_taken_for_a_late_label(
     assert [s.value for s in find_suspicions(late) if s.kind == "delay"] == [
         pytest.approx(0.2, abs=0.02)
     ]
+    rough = {**lazy, "ay": lazy["yaw_rate"] * speed}  # no witness, but for the course
+    assert "delay" in {kind for kind, _ in kinds(rough)}
+    course = np.where(ticks % 10, np.nan, angle + np.cumsum(lazy["yaw_rate"]) / 100)
+    rough |= {"course": (course + np.pi) % (2 * np.pi) - np.pi, "satellite_speed": speed}
+    assert "delay" not in {kind for kind, _ in kinds(rough)}
+    assert "delay" in {kind for kind, _ in kinds(rough | {"sideslip": np.roll(angle, 20)})}
     monkeypatch.setattr(relations, "LEAST_EXPLAINED", 1.0)  # without the witness
     assert "delay" in {kind for kind, _ in kinds(lazy)}
 

@@ -53,7 +53,7 @@ TINY = {
     "poisoned": "--root {root} --campaign smoke --draws 1",
     "quality": "{root}",
     "realism": "",
-    "receiver_delay": "--cars 2 --drives 2",
+    "receiver_delay": "--cars 6 --drives 2 --types",
     "receive": "--cars 3 --drives 1",
     "refit": "{root} true",
     "reliability": "--writers 2 --commits 2 --bits 2",

@@ -92,6 +92,18 @@ def find_delay(
     return None if min(left.values()) > 1 / 2 else _judged(left, LEAST_LAG, LEAST_GAIN)
 
 
+def is_in_time(angle_rad: FloatArray, course_rad: FloatArray, yaw_rate_rad_s: FloatArray) -> bool:
+    """Return whether a side-slip angle changes when the course does beyond the heading."""
+    n, apart = min(angle_rad.size, MOST_TICKS), 4 * HALF_CHANGE
+    turned = np.cumsum(np.nan_to_num(yaw_rate_rad_s)) * float(SAMPLE_TIME_S)
+    series = np.array([angle_rad, course_rad - turned, turned])[:, :n]
+    changes = series[:, apart:] - series[:, :-apart]
+    angle, slip = (changes[:2] + np.pi) % (2 * np.pi) - np.pi
+    left = _unexplained(angle, np.array([slip, changes[2]]), np.ones(angle.size, dtype=np.bool_))
+    best = min(left, key=lambda lag: left[lag])
+    return 1 - left[best] > LEAST_EXPLAINED and abs(best) < LEAST_KINEMATIC_LAG
+
+
 def _unexplained(label: FloatArray, inputs: FloatArray, rows: BoolArray) -> dict[int, float]:
     """Return what part of a label's variance its inputs leave, by how many ticks it is late."""
     n, m = label.size, MOST_LAG

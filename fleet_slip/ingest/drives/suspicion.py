@@ -20,6 +20,7 @@ from fleet_slip.ingest.drives.relations import (
     FEWEST_TICKS,
     find_delay,
     fit,
+    is_in_time,
     moving,
     slope_of,
 )
@@ -254,7 +255,8 @@ def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
         inputs = [signals["ay"], signals["yaw_rate"] / speed, signals["yaw_rate"] * speed]
     steering = [signals[n] for n in ("steering_wheel", *ROAD_WHEELS) if n in signals]
     delay = find_delay(angle, signals["ay"], signals["yaw_rate"], speed, [*inputs, *steering])
-    if delay is not None:
+    told = "course" in signals and is_in_time(angle, signals["course"], signals["yaw_rate"])
+    if delay is not None and not told:
         seconds, gain = delay
         figure = f"its inputs explain it best {abs(seconds):.2f} s " + (
             "earlier" if seconds > 0 else "later"
