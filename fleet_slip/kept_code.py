@@ -76,10 +76,7 @@ class _KeptCode(FunctionCache):
 
 @functools.cache
 def _sources_stamp(file: str) -> str:
-    """Return a checksum of a source file, of what it imports, and of how it is compiled.
-
-    numba looks at the file alone, but compiled code has functions of others in it.
-    """
+    """Return a checksum of a source file, of those that it imports, and of how it is compiled."""
     digest = hashlib.sha256()
     for source in sorted({*_sources_of(Path(file)), Path(__file__), COMPILING}):
         digest.update(source.read_bytes())

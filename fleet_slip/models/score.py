@@ -95,10 +95,7 @@ def _scored_rows(manifest: Manifest, condition: Condition) -> dict[str, str]:
 
 
 def _step_rad(manifest: Manifest) -> float:
-    """Return the power of two in which angles are counted to be added up exactly.
-
-    None has more than 2^45 steps, so that 2^34 squares of differences fit into HUGEINT.
-    """
+    """Return a power of two of which no angle has 2^45, so that 2^34 squares fit into HUGEINT."""
     largest = abs(manifest.intercept) + float(manifest.label.scale) * COUNT_MAX
     for term in manifest.terms:
         limit = limit_of(term.definition.bits) if term.definition else COUNT_MAX + 1

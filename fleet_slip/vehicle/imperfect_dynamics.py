@@ -96,10 +96,7 @@ def _imperfect_wheel(
     c: Constants,
     t: Traits,
 ) -> _Wheel:
-    """Return the force of a wheel whose tyre follows the lateral velocity after a way.
-
-    Pacejka 2012, section 7.2: L times the followed velocity's rate is rolling speed times the rest.
-    """
+    """Return the force of a wheel whose tyre lags by its relaxation length (Pacejka 2012, 7.2)."""
     cosine, sine = to
     along = cosine * vx + sine * vy
     across = cosine * vy - sine * vx

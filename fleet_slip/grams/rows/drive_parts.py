@@ -128,10 +128,7 @@ class Parts:
 
 
 def _row_fold_sql(count: int) -> str:
-    """Number the folds by a hash of drive and tick that is the same everywhere and for ever.
-
-    MD5 of the id, then two rounds of the 32-bit hash of Thomas Mueller, all below 2^63.
-    """
+    """Number the folds by MD5 of the drive and the 32-bit hash of Thomas Mueller of the tick."""
     value = "((md5_number_lower(drive_id) % 4294967296)::BIGINT + tick) % 4294967296"
     for _ in range(2):
         value = f"xor({value}, ({value}) >> 16) * 73244475 % 4294967296"

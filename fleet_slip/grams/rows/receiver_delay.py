@@ -167,10 +167,7 @@ def _by_car(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, _Told]:
 
 
 def _about_means(table: GramTable) -> FloatArray:
-    """Return the products of speed and late integrals about their means in each drive.
-
-    Shape (drives, 2 + STEPS, 2 + STEPS), free of the accelerometer's offset.
-    """
+    """Return products about the means of drives, (drives, 2 + STEPS, 2 + STEPS)."""
     weights, k = _weights(), len(table.signals)
     full = np.zeros((len(table), k, k))
     full[:, *np.tril_indices(k)] = table.products
@@ -219,10 +216,7 @@ def with_types(delays: dict[str, ReceiverDelay]) -> ReceiverDelays:
 
 
 def _noise(delays: Iterable[ReceiverDelay]) -> float | None:
-    """Return the noise of cars as their drives differ: the variance of a delay times information.
-
-    None of too few drives.
-    """
+    """Return the variance of a delay times information, as drives of cars differ, or None."""
     known = list(delays)
     free = sum(one.drives - 1 for one in known)
     return math.fsum(one.differing for one in known) / free if free >= FEWEST_DRIVES - 1 else None
@@ -269,10 +263,7 @@ def _delay(products: FloatArray, rows: int) -> ReceiverDelay | None:
 
 
 def _parabolas(products: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the first and second derivatives of each drive's sum of squares by the delay in s.
-
-    Where the delay, and what the integral is multiplied by, are those of all drives.
-    """
+    """Return the slope and bend of each drive's sum of squares by the delay of all, in s."""
     total = products.sum(axis=0)
     middle = _middle(total)
     at = np.arange(middle, middle + 3)  # the first is of the speed
