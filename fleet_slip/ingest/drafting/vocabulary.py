@@ -3,7 +3,7 @@
 import re
 import tomllib
 from collections.abc import Iterable
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from typing import Any
 
@@ -36,13 +36,14 @@ def parts_of(name: str) -> list[str]:
     return [part.lower() for part in _PARTS.findall(name.translate(_UMLAUTS))]
 
 
+@lru_cache(maxsize=2**10)
 def split_unit(name: str) -> tuple[str, str]:
     """Return a name without the unit that stands behind it in brackets, and that unit or ''."""
     found = _IN_BRACKETS.search(name)
     return (name[: found.start()], found[1]) if found else (name, "")
 
 
-@cache
+@lru_cache(maxsize=2**10)
 def unit_called(text: str) -> str | None:
     """Return a unit as a mapping writes it, None for what is not known."""
     told = text.strip().strip("[]()<>{} ").lower().replace("·", "*")
@@ -50,34 +51,49 @@ def unit_called(text: str) -> str | None:
     return called.get(told)
 
 
-@cache
+@lru_cache(maxsize=2**10)
 def unit_behind(name: str) -> str | None:
     """Return the unit that a name ends in, behind a blank or an underscore."""
     patterns = vocabulary()["suffixes"].items()
     return next((u for u, end in patterns if re.search(rf"[_\s.](?:{end})$", name.lower())), None)
 
 
-@cache
+@lru_cache(maxsize=2**14)
 def best_words(signal: str, name: str, section: str = "signals") -> tuple[float, str]:
     """Return how well a name fits the words of a signal, 0 if not at all, and the words.
 
     What stands behind the name of a message or a topic counts twice, and parts of it that no word
     explains count against it.
     """
-    never = {*vocabulary()["never"]["all"], *vocabulary()["never"].get(signal, ())}
     plain, _ = split_unit(name)
     behind = plain.partition(".")[2] or plain
-    own, every = _stems_of(behind), _stems_of(plain)
-    if any(_says(word, part) for word in never for pieces in own for part in pieces):
-        return 0.0, ""
-    called = vocabulary()[section].get(signal, ())
-    return max(((_fit(words, own, every), words) for words in called), default=(0.0, ""))
+    exact, prefixes = _never(signal)
+    for pieces in _stems_of(behind):
+        if any(part in exact or part.startswith(prefixes) for part in pieces):
+            return 0.0, ""
+    called = _called(signal, section)
+    return max(
+        ((_fit(words, behind, plain), " ".join(words)) for words in called), default=(0.0, "")
+    )
+
+
+@cache
+def _never(signal: str) -> tuple[frozenset[str], tuple[str, ...]]:
+    """Return words that something else is called by: whole parts, and how parts begin."""
+    never = vocabulary()["never"]
+    words = {*never["all"], *never.get(signal, ())}
+    return frozenset(words), tuple(word for word in words if len(word) > 4)
+
+
+@cache
+def _called(signal: str, section: str) -> tuple[tuple[str, ...], ...]:
+    return tuple(tuple(words.split()) for words in vocabulary()[section].get(signal, ()))
 
 
 def fits_any(words: Iterable[str], name: str) -> bool:
     """Whether a name has one of the words."""
-    parts = _stems_of(split_unit(name)[0])
-    return any(_fit(one, parts, parts) > 0 for one in words)
+    plain, _ = split_unit(name)
+    return any(_fit(tuple(one.split()), plain, plain) > 0 for one in words)
 
 
 def is_called(words: Iterable[str], name: str) -> bool:
@@ -87,46 +103,48 @@ def is_called(words: Iterable[str], name: str) -> bool:
     return any(kept == [w for w in one.split() if w not in _NUMBERING] for one in words)
 
 
-def _fit(words: str, own: list[list[str]], every: list[list[str]]) -> float:
+def _fit(words: tuple[str, ...], own: str, every: str) -> float:
     score, explained = 0.0, set()
-    for word in words.split():
+    for word in words:
         place = _place(word, own)
         if place is not None:
             score += 2 * len(word)
             explained.add(place)
-        elif _place(word, every) is not None:
+        elif own != every and _place(word, every) is not None:
             score += len(word)
         else:
             return 0.0
-    return max(score - 0.5 * (len(own) - len(explained)), 0.1)
+    return max(score - 0.5 * (len(_stems_of(own)) - len(explained)), 0.1)
 
 
-def _place(word: str, parts: list[list[str]]) -> int | None:
-    """Return which part has a word, or begins with it."""
-    for place, pieces in enumerate(parts):
+@lru_cache(maxsize=2**14)
+def _place(word: str, name: str) -> int | None:
+    """Return which part of a name has a word, or begins with it."""
+    for place, pieces in enumerate(_stems_of(name)):
         if any(p == word or (len(word) > 2 and p.startswith(word)) for p in pieces):
             return place
     return None
 
 
-def _says(never: str, part: str) -> bool:
-    return part == never or (len(never) > 4 and part.startswith(never))
-
-
-@cache
+@lru_cache(maxsize=2**10)
 def _stems_of(name: str) -> list[list[str]]:
     """Return for each part of a name the part, and what it is compounded of."""
     return [[part, *_pieces(part)] for part in parts_of(name)]
 
 
-@cache
+@lru_cache(maxsize=2**12)
 def _pieces(part: str) -> tuple[str, ...]:
     """Return the stems that a part is made of, nothing unless they are all of it."""
     if not part:
         return ()
-    for stem in sorted(vocabulary()["words"]["stems"], key=len, reverse=True):
+    for stem in _stems():
         if part == stem:
             return (stem,)
         if part.startswith(stem) and (rest := _pieces(part[len(stem) :])):
             return (stem, *rest)
     return ()
+
+
+@cache
+def _stems() -> tuple[str, ...]:
+    return tuple(sorted(vocabulary()["words"]["stems"], key=len, reverse=True))
