@@ -226,3 +226,17 @@ def test_a_heading_and_a_reversed_course_are_found(warehouse: Warehouse) -> None
         "heading": ("no slip", ("course",)),
         "turned": ("reversed", ("course",)),
     }
+
+
+def test_steering_of_cars_with_biased_sensors_is_not_called_swapped(warehouse: Warehouse) -> None:
+    """The mean difference of the wheels is some hundredths of a degree; sensors are off by more."""
+    rng = np.random.default_rng(8)
+    rows = []
+    for number in range(DRIVES):
+        signals = drive(rng)
+        signals["steer_fl"] = 0.4 * signals["steer_fl"] + rng.normal(0, 0.005)
+        signals["steer_fr"] = 0.4 * signals["steer_fr"]
+        rows.append(log_rows(f"d{number}", counts(signals), vehicle_id=f"car-{number}"))
+    land(warehouse, "all", *rows)
+    update_grams(warehouse)
+    assert examine_drives(warehouse).findings == ()
