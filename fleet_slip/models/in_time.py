@@ -36,7 +36,8 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
         raise RefusedError(
             f"{manifest.name} was not published: a course that is late looks like a side-slip "
             f"angle, and {'; '.join(problems)}. The view calibration has the number receiver_delay "
-            "of each car. Choose other cars, or more drives of them. To publish all the same: "
+            "of each car. Choose other cars, more drives of them, or tell the type of their "
+            "receivers: receiver in a mapping or its table of cars. To publish all the same: "
             f"fleet-slip publish {manifest.name} --label course --force"
         )
     return {car: max(_left(delays[car], corrected), key=abs) for car, corrected in cars.items()}
