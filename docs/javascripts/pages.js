@@ -53,7 +53,7 @@ if (location.protocol === "file:") {
   function search(event) {
     event.preventDefault();
     event.stopImmediatePropagation();
-    dialog.showModal();
+    if (!dialog.open) dialog.showModal();
     if (window.searchIndex) return;
     const script = document.createElement("script");
     script.src = new URL("search.js", base);
@@ -66,6 +66,7 @@ if (location.protocol === "file:") {
     if (event.target.closest(".md-search__button, [for=__search]")) search(event);
   }, true);
   document.addEventListener("keydown", event => {
-    if (event.key === "/" && !dialog.open && !/INPUT|TEXTAREA/.test(event.target.tagName)) search(event);
+    const asks = event.key === "/" && !dialog.open || event.key === "k" && (event.ctrlKey || event.metaKey);
+    if (asks) search(event);
   }, true);
 }
