@@ -76,14 +76,21 @@ def _tiles(data: ReportData, claims: Sequence[Judged]) -> list[Tile]:
             f"training rows of {number_of(data.version.manifest.trained_on.drives, 'drive')}",
         ),
     ]
-    nominal = data.evaluated.figures("nominal", data.choice)
-    if nominal is not None and nominal.error_std_deg is not None:
+    reported, chosen = (
+        None if found is None else found.error_std_deg
+        for found in (
+            data.evaluated.figures("nominal", data.version.reference),
+            data.evaluated.figures("nominal", data.choice),
+        )
+    )
+    if reported is not None and chosen is not None:
         number = data.choice_number
-        paper = PAPER_TABLE_TWO[number][1]
         tiles.append(
             Tile(
-                degrees(nominal.error_std_deg),
-                f"error std of model {number} on the nominal drive; the paper: {degrees(paper)}",
+                degrees(reported),
+                f"error std of {data.version.reference} on the nominal drive; "
+                f"of model {number} {degrees(chosen)}, in the paper "
+                f"{degrees(PAPER_TABLE_TWO[number][1])}",
             )
         )
     logs = data.tables[0]

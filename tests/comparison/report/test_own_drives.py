@@ -72,5 +72,5 @@ def test_the_report_has_what_is_left(evaluated: tuple[Path, Finished]) -> None:
     root, _ = evaluated
     done_on(root, "report", "own")
     page = (root / "report" / "report.html").read_text()
-    assert "error std of model 1 on the nominal drive" in page
+    assert "on the nominal drive; of model 1" in page
     assert "lack signals of model 2, 3, 4 and 5 of Table I" in page
