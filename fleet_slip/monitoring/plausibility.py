@@ -26,15 +26,19 @@ UNBIASED_STEERING = 0.8
 """Part of the drives that must have such a ratio, of either sign, for its sign to mean anything:
 the wheels differ by some 0.04 deg in the mean, and sensors by more."""
 
+AGREEING, LONE = 0.8, 0.5
+ONE_SIDED, TURNING_BOTH_WAYS = 0.5, 0.3
+"""Mean over root mean square: a magnitude has about 0.8, a drive with bends to both sides 0.1."""
+
 
 @dataclass(frozen=True)
 class Fault:
     """What is wrong with the sensors of a drive.
 
     Attributes:
-        kind: stuck, reversed, swapped, saturated, scaled, biased, noisy, unexplained, no slip: a
-            course that is a heading, or repeated: another drive of the car was under way, so that
-            its rows count twice.
+        kind: stuck, magnitude, reversed, swapped, saturated, scaled, biased, noisy, unexplained, no
+            slip: a course that is a heading, or repeated: another drive of the car was under way,
+            so that its rows count twice.
         signals: those concerned; of an unexplained fault, the one that is furthest off.
         figure: the figure that shows it.
     """
@@ -49,7 +53,7 @@ def find_implausible(table: GramTable, min_correlation: float) -> dict[int, Faul
     faults: dict[int, Fault] = {}
     for first, moments in zip(count(0, AT_ONCE), DriveBatches.of(table)):
         turning = find_reversed_or_swapped(moments, min_correlation)
-        found = steering_swapped(moments) | turning
+        found = steering_swapped(moments) | turning | find_magnitudes(moments)
         faults |= {first + drive: fault for drive, fault in found.items()}
     return faults | find_stuck(table)
 
@@ -89,6 +93,37 @@ def find_reversed_or_swapped(moments: MeanMoments, min_correlation: float) -> di
     }
 
 
+def find_magnitudes(moments: MeanMoments) -> dict[int, Fault]:
+    """Return the drives in which a signal has lost its sign, as from buses that send it apart.
+
+    Such a witness is far from zero in the mean and hardly goes with the others, which agree with
+    one another and turn to both sides.
+    """
+    names = [name for name, parts in WITNESSES.items() if set(parts) <= set(moments.signals)]
+    if len(names) < FEWEST_WITNESSES:
+        return {}
+    weights = _weights(moments, names)
+    m = moments.matrices
+    means = m[:, 0, 1:] @ weights.T
+    squares = np.diagonal(weights @ m[:, 1:, 1:] @ weights.T, axis1=1, axis2=2)
+    away = np.divide(np.abs(means), np.sqrt(squares), out=np.zeros_like(means), where=squares > 0)
+    agreement = np.abs(_correlations(moments, names))
+    others = ~np.eye(len(names), dtype=bool)
+    found = {}
+    for i, name in enumerate(names):
+        if len(WITNESSES[name]) == 2:
+            continue
+        rest = others[i]
+        within = agreement[:, rest][:, :, rest]
+        agree = np.median(within[:, ~np.eye(rest.sum(), dtype=bool)], axis=1) > AGREEING
+        lone = agreement[:, i, rest].max(axis=1) < LONE
+        signed = np.median(away[:, rest], axis=1) < TURNING_BOTH_WAYS
+        for drive in np.flatnonzero(agree & lone & signed & (away[:, i] > ONE_SIDED)):
+            figure = f"mean {away[drive, i]:.0%} of its size, and the others turn to both sides"
+            found[int(drive)] = Fault("magnitude", tuple(WITNESSES[name]), figure)
+    return found
+
+
 def steering_swapped(moments: MeanMoments) -> dict[int, Fault]:
     """Return the drives in which the outer front wheel steers more than the inner one.
 
@@ -116,11 +151,16 @@ def steering_swapped(moments: MeanMoments) -> dict[int, Fault]:
     }
 
 
-def _correlations(moments: MeanMoments, names: Sequence[str]) -> FloatArray:
+def _weights(moments: MeanMoments, names: Sequence[str]) -> FloatArray:
     weights = np.zeros((len(names), len(moments.signals)))
     for row, name in enumerate(names):
         for signal, weight in WITNESSES[name].items():
             weights[row, moments.signals.index(signal)] = weight
+    return weights
+
+
+def _correlations(moments: MeanMoments, names: Sequence[str]) -> FloatArray:
+    weights = _weights(moments, names)
     covariances = weights @ moments.covariances() @ weights.T
     spread = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
     product = spread[:, :, None] * spread[:, None, :]
