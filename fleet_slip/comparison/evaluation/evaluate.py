@@ -16,6 +16,8 @@ from fleet_slip.comparison.evaluation.evaluated_drives import (
 )
 from fleet_slip.comparison.evaluation.filters import Bank, FilterEstimate, filter_bank
 from fleet_slip.comparison.evaluation.gps_noise import GpsSweep, sweep_gps_noise
+from fleet_slip.comparison.evaluation.identified import NAME as IDENTIFIED
+from fleet_slip.comparison.evaluation.identified import identified_estimate
 from fleet_slip.comparison.evaluation.ranking import FleetComparison, Ranking, compare_fleets, rank
 from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures, EvaluatedScenario, run_all
 from fleet_slip.comparison.evaluation.targets import (
@@ -27,6 +29,7 @@ from fleet_slip.files.documents import Document, DocumentFolder, checksum
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.predictor import Predictor
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -225,7 +228,13 @@ def train_competitors(
         estimators |= trained.estimators()
         descriptions |= trained.descriptions()
     cohort = first.selection.cohort
-    bank = filter_bank(warehouse, cohort, load_scenario("nominal").car, executor)
+    weighed = "mass_kg" in Predictor.of(one_car.manifest).plan.facts
+    nominal = load_scenario("nominal").car
+    bank = filter_bank(warehouse, cohort, nominal, executor, weighed=weighed)
+    identified = identified_estimate(warehouse, bank.drives, executor)
+    if identified is not None:
+        estimators[IDENTIFIED] = identified
+        descriptions[IDENTIFIED] = identified.description()
     learned = train_rivals(warehouse, cohort, one_car.manifest, bank) if train_rivals else ()
     return Competitors(
         one_car=first,

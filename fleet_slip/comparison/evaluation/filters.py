@@ -7,7 +7,7 @@ The tuned ones have the parameters that suit drives which the regression was tra
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import version as package_version
 from typing import Any
 
@@ -20,17 +20,16 @@ from fleet_slip.comparison.observers import ekf, kalman, luenberger, sliding_mod
 from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive, read_drive
 from fleet_slip.comparison.observers.tuning import tune
 from fleet_slip.config import Config
-from fleet_slip.errors import DataError
+from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.runs.log import LOGGER
-from fleet_slip.vehicle.parameters import VehicleParameters
+from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
+from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 
 GROUP = "filters and observers"
-TUNING_DRIVES = 4
-"""Drives of the cohort that parameters are tuned on, evenly chosen."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +50,24 @@ class Filter:
     tunable: tuple[str, ...]
     gps: bool = False
     told: bool = False
+    other_starts: tuple[Config, ...] = ()
+    """Where the search for parameters begins besides."""
 
+
+LOOSE_EKF = ekf.EkfNoise(
+    lateral_model_std_mps2=2.0, yaw_model_std_rad_s2=2.0, ay_bias_std_mps2=0.01
+)
+"""Believes in no bias and little in its model, as suits cars that are not as their class."""
 
 FILTERS = (
     Filter("kalman", "kalman", kalman.estimate, kalman.FilterNoise(), kalman.TUNABLE, gps=True),
-    Filter("ekf_class", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE),
-    Filter("ekf_told", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, told=True),
+    Filter(
+        "ekf_class", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, other_starts=(LOOSE_EKF,)
+    ),
+    Filter(
+        "ekf_told", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, told=True,
+        other_starts=(LOOSE_EKF,),
+    ),
     Filter(
         "luenberger", "luenberger", luenberger.estimate, luenberger.ObserverPoles(),
         luenberger.TUNABLE,
@@ -75,12 +86,16 @@ class FilterEstimate:
     filter: Filter
     parameters: Config
     car: VehicleParameters
+    weighed: bool = False
+    """Whether it knows a car's mass, as the model that it competes with does."""
 
     def in_drive(self, drive: EvaluatedDrive) -> "FilterEstimate":
         """Return the filter as it is told of the car, and of the road if it is told everything."""
         scenario = drive.scenario
         if not self.filter.told:
-            return replace(self, car=scenario.vehicle)
+            mass_kg = drive.facts["mass_kg"] if self.weighed else None
+            car = scenario.vehicle
+            return replace(self, car=car if mass_kg is None else car.with_sprung_mass(mass_kg))
         told = self.parameters.model_copy(update={"adhesion": scenario.adhesion})
         return replace(self, car=scenario.car, parameters=told)
 
@@ -95,51 +110,62 @@ class FilterEstimate:
             "group": GROUP,
             "gps": self.filter.gps,
             "told": "everything" if self.filter.told else "class",
+            "weighed": self.weighed,
             "parameters": self.parameters.model_dump(mode="json"),
         }
 
 
 def seen(signals: Signals) -> DriveSignals:
     """Return what filters see of a drive's signals."""
-    return DriveSignals(**{field.name: signals[field.name] for field in fields(DriveSignals)})
+    return DriveSignals(**{one.name: signals[one.name] for one in fields(DriveSignals)})
 
 
 def rebuild(name: str, about: Mapping[str, Any], car: VehicleParameters) -> FilterEstimate:
     """Return a filter from its name among the estimators and what a document says of it."""
     (one,) = (one for one in FILTERS if one.name == name.removesuffix("_tuned"))
-    return FilterEstimate(one, type(one.parameters).model_validate(about["parameters"]), car)
+    parameters = type(one.parameters).model_validate(about["parameters"])
+    return FilterEstimate(one, parameters, car, about.get("weighed", False))
 
 
 @dataclass(frozen=True)
 class Bank:
     """All filters with the parameters that they have, by name, and the drives they are tuned on."""
 
-    tuned_on: tuple[str, ...]
+    drives: "TuningDrives"
     estimators: dict[str, FilterEstimate]
     descriptions: dict[str, dict[str, Any]]
 
 
 def filter_bank(
-    warehouse: Warehouse, cohort: Cohort, car: VehicleParameters, executor: Executor
+    warehouse: Warehouse,
+    cohort: Cohort,
+    car: VehicleParameters,
+    executor: Executor,
+    *,
+    weighed: bool = False,
 ) -> Bank:
-    """Return each filter as it is and tuned on drives of a cohort that the car made.
+    """Return each filter as it is and tuned on drives of a cohort, each in the car that made it.
 
     A filter that the drives lack something for is tuned on none, and a remark says so. Tuned
     parameters are kept below `tuned/` in the data root, and sought again only for other
-    drives, another car or another program.
+    drives, another car or another program. The best that any start leads to is taken.
     """
-    chosen = tuning_drives(cohort, car)
-    drives: list[LabelledDrive] = []
-    bank = Bank(chosen, {}, {})
+    drives = TuningDrives.of(warehouse, cohort, weighed=weighed)
+    bank = Bank(drives, {}, {})
     for one in FILTERS:
-        key = _key(one, chosen, car)
+        key = _key(one, drives, car)
         kept = DocumentFolder(warehouse.root / "tuned" / one.module)
         documents = (kept.read(number).content for number in reversed(kept.numbers()))
         found = next((content for content in documents if content["key"] == key), None)
         if found is None:
-            drives = drives or read_labelled(warehouse, chosen)
             try:
-                best = tune(one.estimate, one.parameters, one.tunable, drives, car, executor)
+                best = min(
+                    (
+                        tune(one.estimate, start, one.tunable, drives.read(), car, executor)
+                        for start in (one.parameters, *one.other_starts)
+                    ),
+                    key=lambda tuned: tuned.rmse_rad,
+                )
                 found = {
                     "key": key,
                     "parameters": best.parameters.model_dump(mode="json"),
@@ -149,39 +175,82 @@ def filter_bank(
                 kept.append(found)
             except DataError as error:  # its drives have no fix, no wheel speeds, no steering
                 LOGGER.warning("%s competes as it is, for it cannot be tuned: %s", one.name, error)
-        on = list(chosen) if found else []
+        on = drives.names if found else []
         tuned = type(one.parameters).model_validate(found["parameters"]) if found else None
         both = {one.name: one.parameters, f"{one.name}_tuned": tuned or one.parameters}
         for name, parameters in both.items():
-            bank.estimators[name] = FilterEstimate(one, parameters, car)
+            bank.estimators[name] = FilterEstimate(one, parameters, car, weighed)
             bank.descriptions[name] = bank.estimators[name].description()
         bank.descriptions[f"{one.name}_tuned"]["tuned_on"] = on
     return bank
 
 
-def tuning_drives(cohort: Cohort, car: VehicleParameters) -> tuple[str, ...]:
-    """Return the drives of a cohort to tune filters on: of that car's model if there are any."""
-    drives = cohort.drives.select(["drive_id", "vehicle_model"]).to_pylist()
-    of_car = {row["drive_id"] for row in drives if row["vehicle_model"] == car.name}
-    names = sorted(of_car or {row["drive_id"] for row in drives})
-    count = min(TUNING_DRIVES, len(names))
-    places = np.linspace(0, len(names) - 1, count).round().astype(int)
-    return tuple(names[place] for place in places)
-
-
-def _key(one: Filter, drives: Sequence[str], car: VehicleParameters) -> dict[str, Any]:
+def _key(one: Filter, drives: "TuningDrives", car: VehicleParameters) -> dict[str, Any]:
     """Return what tuned parameters depend on."""
     return {
         "for_lowest": "rmse_deg",
-        "start": one.parameters.model_dump(mode="json"),
+        "starts": [start.model_dump(mode="json") for start in (one.parameters, *one.other_starts)],
         "tunable": list(one.tunable),
-        "drives": list(drives),
+        "drives": drives.key(),
         "car": car.model_dump(mode="json"),
         "package_version": package_version("fleet-slip"),
     }
 
 
-def read_labelled(warehouse: Warehouse, names: Sequence[str]) -> list[LabelledDrive]:
-    """Return drives with their labels, to train with."""
-    with connect(warehouse.root) as database:
-        return [read_drive(database, name) for name in names]
+TUNING_DRIVES = 24
+"""Drives of the cohort that parameters are tuned on, evenly chosen."""
+
+TUNING_S = 120
+"""How much of each is taken."""
+
+
+@dataclass(frozen=True)
+class TuningDrives:
+    """Drives of a cohort to tune filters on: name, vehicle model, and mass if filters know it."""
+
+    warehouse: Warehouse
+    known: tuple[tuple[str, str, float | None], ...]
+    _read: list[LabelledDrive] = field(default_factory=list, repr=False, compare=False)
+
+    @classmethod
+    def of(cls, warehouse: Warehouse, cohort: Cohort, *, weighed: bool) -> "TuningDrives":
+        """Choose drives evenly, by name."""
+        rows = cohort.drives.select(["drive_id", "vehicle_model", "mass_kg"]).to_pylist()
+        one_each = {row["drive_id"]: row for row in rows}
+        names = sorted(one_each)
+        places = np.linspace(0, len(names) - 1, min(TUNING_DRIVES, len(names))).round()
+        chosen = [one_each[names[int(place)]] for place in places]
+        return cls(
+            warehouse,
+            tuple(
+                (row["drive_id"], row["vehicle_model"], row["mass_kg"] if weighed else None)
+                for row in chosen
+            ),
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """The drives' names."""
+        return [name for name, _, _ in self.known]
+
+    def key(self) -> list[Any]:
+        """Return what tells these from others, for a JSON document."""
+        return [TUNING_S, *(list(known) for known in self.known)]
+
+    def read(self) -> Sequence[LabelledDrive]:
+        """Return the beginning of each drive, as filters meet it: they know no bias yet."""
+        if not self._read:
+            with connect(self.warehouse.root, query="SELECT 1 FROM log") as database:
+                for name, model, mass_kg in self.known:
+                    drive = read_drive(database, name).beginning(TUNING_S * SAMPLE_RATE_HZ)
+                    self._read.append(replace(drive, car=class_car(model, mass_kg)))
+        return self._read
+
+
+def class_car(model: str, mass_kg: float | None) -> VehicleParameters | None:
+    """Return what a fleet knows of a car: its class's file, and its mass; None without a file."""
+    try:
+        car = load_vehicle(model)
+    except ConfigError:
+        return None
+    return car if mass_kg is None else car.with_sprung_mass(mass_kg)

@@ -5,7 +5,7 @@ reckoning with differential wheelspeeds", Navigation 51 (2004): the axle without
 with the least slip.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import duckdb
 import numpy as np
@@ -48,6 +48,13 @@ class LabelledDrive:
     drive_id: str
     signals: DriveSignals
     sideslip_rad: FloatArray
+    car: VehicleParameters | None = None
+    """The car as filters know it; None where it is that of all drives."""
+
+    def beginning(self, rows: int) -> "LabelledDrive":
+        """Return its first rows."""
+        arrays = {name: values[:rows] for name, values in vars(self.signals).items()}
+        return replace(self, signals=DriveSignals(**arrays), sideslip_rad=self.sideslip_rad[:rows])
 
 
 def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDrive:

@@ -9,7 +9,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.estimators import TABLE_ONE
 from fleet_slip.comparison.evaluation.evaluate import Rival
-from fleet_slip.comparison.evaluation.filters import Bank, read_labelled
+from fleet_slip.comparison.evaluation.filters import Bank
 from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures, error_figures
 from fleet_slip.comparison.rivals.inputs import Inputs, LearnedEstimate, RowSample, draw_sample
 from fleet_slip.comparison.rivals.learner import Fitted, Learner, one_thread
@@ -59,7 +59,7 @@ def train_rivals(
             for suffix, inputs, learners in sets
             for learner in learners
         ]
-        drives = read_labelled(warehouse, bank.tuned_on)
+        drives = bank.drives.read()
         return (*learned, train_tree_filter(bank.estimators[BASE], drives, executor))
 
 

@@ -34,6 +34,9 @@ NAME = "ekf_tree"
 BASE = "ekf_class_tuned"
 """The filter whose noise the tree changes."""
 
+FOLDS = 4
+"""Into so many parts the drives are divided; each is judged by a tree that has not seen it."""
+
 LEAVES = 6
 LEAST_SHARE = 0.01
 """Of the rows, in each leaf."""
@@ -111,11 +114,12 @@ def fit_tree_filter(
     base: FilterEstimate, drives: Sequence[LabelledDrive], executor: Executor
 ) -> TreeFilter:
     """Fit the tree to the filter's squared errors, and the leaves' factors. Raises `ExtraError`."""
-    car = base.car
-    seen_kinds = np.concatenate([kinds(drive.signals, car) for drive in drives])
+    cars = [drive.car or base.car for drive in drives]
+    pairs = list(zip(drives, cars, strict=True))
+    seen_kinds = np.concatenate([kinds(drive.signals, car) for drive, car in pairs])
     parameters = ekf.EkfNoise.model_validate(base.parameters.model_dump())
     errors = np.concatenate(
-        [ekf.estimate(drive.signals, car, parameters) - drive.sideslip_rad for drive in drives]
+        [ekf.estimate(one.signals, car, parameters) - one.sideslip_rad for one, car in pairs]
     )
     known = np.isfinite(errors)
     tree = scikit_learn("tree").DecisionTreeRegressor(
@@ -125,7 +129,7 @@ def fit_tree_filter(
     leaves = np.flatnonzero(tree.tree_.children_left < 0)
     start = TreeFilter(base, tree, leaves, LeafNoise())
     names = [f"leaf_{number}" for number in range(len(leaves))]
-    found = tune(start.estimate, start.noise, names, drives, car, executor)
+    found = tune(start.estimate, start.noise, names, drives, base.car, executor)
     return replace(start, noise=found.parameters)
 
 
@@ -138,11 +142,12 @@ def train_tree_filter(
     training_s = time.perf_counter() - started
     started = time.perf_counter()
     for drive in drives:
-        fitted.estimate(drive.signals, base.car, fitted.noise)
+        fitted.estimate(drive.signals, drive.car or base.car, fitted.noise)
     rows = sum(len(drive.signals) for drive in drives)
     step_s = (time.perf_counter() - started) / rows
-    estimates = [_held_out(base, drives, number, executor) for number in range(len(drives))]
-    truth = np.concatenate([drive.sideslip_rad for drive in drives])
+    held_out = [drives[fold::FOLDS] for fold in range(min(FOLDS, len(drives)))]
+    estimates = [_held_out(base, drives, some, executor) for some in held_out]
+    truth = np.concatenate([drive.sideslip_rad for some in held_out for drive in some])
     figures = error_figures(np.concatenate(estimates), truth, np.isfinite(truth))
     return Rival(
         name=NAME,
@@ -160,10 +165,14 @@ def train_tree_filter(
 
 
 def _held_out(
-    base: FilterEstimate, drives: Sequence[LabelledDrive], number: int, executor: Executor
+    base: FilterEstimate,
+    drives: Sequence[LabelledDrive],
+    some: Sequence[LabelledDrive],
+    executor: Executor,
 ) -> FloatArray:
-    """Return the estimates of a drive by a filter that was fitted without it."""
-    drive = drives[number]
-    others = [*drives[:number], *drives[number + 1 :]] or drives
+    """Return the estimates of some drives by a filter that was fitted without them."""
+    others = [one for one in drives if all(one is not other for other in some)] or drives
     fitted = fit_tree_filter(base, others, executor)
-    return fitted.estimate(drive.signals, base.car, fitted.noise)
+    return np.concatenate(
+        [fitted.estimate(one.signals, one.car or base.car, fitted.noise) for one in some]
+    )

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from fleet_slip.comparison.evaluation import evaluated_drives
 from fleet_slip.comparison.evaluation.estimators import published_estimate
 from fleet_slip.comparison.evaluation.evaluate import keep
 from fleet_slip.comparison.evaluation.evaluated_drives import load_drives
-from fleet_slip.comparison.evaluation.filters import FILTERS, FilterEstimate
+from fleet_slip.comparison.evaluation.filters import FILTERS, FilterEstimate, class_car
 from fleet_slip.comparison.observers import kalman
 from fleet_slip.comparison.observers.drive_signals import read_drive
 from fleet_slip.comparison.rivals.learners import LEARNERS
@@ -29,6 +30,7 @@ from fleet_slip.models.versions import Registry
 from fleet_slip.simulation.campaign import DriveSpec
 from fleet_slip.simulation.drives import exact_motion
 from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -203,10 +205,33 @@ def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
 def test_the_filters_are_tuned_once(root: Path) -> None:
     documents = sorted(path.relative_to(root) for path in (root / "tuned").rglob("*.json"))
     assert [path.parts[1:] for path in documents] == [
-        (name, "1.json") for name in ("ekf", "kalman", "luenberger", "sliding_mode")
+        (name, "1.json") for name in ("ekf", "identified", "kalman", "luenberger", "sliding_mode")
     ]
-    tuned = json.loads((root / documents[1]).read_text())["content"]
-    assert all(name.startswith("smoke-") for name in tuned["key"]["drives"])
+    tuned = json.loads((root / documents[2]).read_text())["content"]
+    seconds, *drives = tuned["key"]["drives"]
+    assert seconds == 120
+    assert [model for _, model, _ in drives] == ["d_class_sedan"] * 8
+    assert all(name.startswith("smoke-") for name, _, _ in drives)
+    assert all(mass_kg is None for _, _, mass_kg in drives), "the model does not know it"
+
+
+def test_a_car_identified_from_the_same_drives_competes(root: Path) -> None:
+    content = evaluate(root, *SCENARIOS)
+    about = content["estimators"]["ekf_identified"]
+    assert (about["kind"], about["gps"], about["told"]) == ("filter", False, "labelled drives")
+    results = content["scenarios"][0]["results"]
+    assert results["ekf_identified"]["rmse_deg"] < 1.5 * results["ekf_class_tuned"]["rmse_deg"]
+
+
+def test_filters_know_the_mass_where_the_model_does(root: Path) -> None:
+    (drive,) = load_drives(Warehouse(LocalFolder(root)), [load_scenario("adhesion_0_4")])
+    scenario = drive.scenario.model_copy(update={"sprung_mass_kg": 1500.0})
+    heavy = replace(drive, scenario=scenario)
+    for weighed, kg in ((False, drive.scenario.vehicle.body.sprung_mass_kg), (True, 1500.0)):
+        one = FilterEstimate(FILTERS[1], FILTERS[1].parameters, scenario.vehicle, weighed)
+        assert one.in_drive(heavy).car.body.sprung_mass_kg == kg
+    assert class_car("suv", 2000.0) == load_vehicle("suv").with_sprung_mass(2000.0)
+    assert class_car("a_strangers_car", None) is None
 
 
 def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None:

@@ -68,12 +68,12 @@ def test_tuning_makes_up_for_wrong_noise_and_never_makes_worse(executor: Executo
     drives = [labelled(seed) for seed in range(3)]
     wrong = FilterNoise(ay_std_mps2=5.0)
     names = ("ay_std_mps2", "gps_vy_std_mps")
-    before = rmse_rad(lambda d: kalman.estimate(d, CAR, wrong), drives, executor)
-    right = rmse_rad(lambda d: kalman.estimate(d, CAR, FilterNoise()), drives, executor)
+    before = rmse_rad(lambda d: kalman.estimate(d.signals, CAR, wrong), drives, executor)
+    right = rmse_rad(lambda d: kalman.estimate(d.signals, CAR, FilterNoise()), drives, executor)
     found = tune(kalman.estimate, wrong, names, drives, CAR, executor)
     assert found.rmse_rad < 0.5 * before
     assert found.rmse_rad < 1.05 * right
-    again = rmse_rad(lambda d: kalman.estimate(d, CAR, found.parameters), drives, executor)
+    again = rmse_rad(lambda d: kalman.estimate(d.signals, CAR, found.parameters), drives, executor)
     assert again == found.rmse_rad
 
 
@@ -99,4 +99,4 @@ def test_drives_without_labels_are_refused(executor: Executor) -> None:
     drive = labelled(1, rows=100)
     unknown = LabelledDrive("x", drive.signals, np.full(100, np.nan))
     with pytest.raises(DataError, match="no row has both"):
-        rmse_rad(lambda d: kalman.estimate(d, CAR, FilterNoise()), [unknown], executor)
+        rmse_rad(lambda d: kalman.estimate(d.signals, CAR, FilterNoise()), [unknown], executor)

@@ -1,0 +1,186 @@
+"""Identifies a car from drives with a label: what a department does that has no tyre measured.
+
+Given are what scales and a tape measure say: mass, axles, tracks and the wheels' radius. Fitted are
+yaw inertia, the roll stiffness' share in front, the axles' cornering stiffness and the tyres'
+friction, together with the noise of the extended Kalman filter, which errs least then on the
+drives' labels. As a vehicle file the car serves every filter here.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from pydantic import Field, FiniteFloat
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.comparison.observers import ekf
+from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive
+from fleet_slip.comparison.observers.tuning import descend, rmse_rad
+from fleet_slip.config import Config
+from fleet_slip.errors import DataError
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters
+
+
+class Fitted(Config):
+    """What drives tell of a car, within what cars are, and the noise of the filter in it."""
+
+    stiffness_front: FiniteFloat = Field(default=1.0, ge=0.4, le=2.5)
+    """Of the axle, over `STIFFNESS_PER_LOAD`."""
+    stiffness_rear: FiniteFloat = Field(default=1.0, ge=0.4, le=2.5)
+    yaw_inertia: FiniteFloat = Field(default=1.0, ge=0.6, le=1.6)
+    """Over the sprung mass times both distances to the axles."""
+    front_roll_share: FiniteFloat = Field(default=0.55, ge=0.3, le=0.8)
+    friction: FiniteFloat = Field(default=1.0, ge=0.6, le=1.5)
+    noise: ekf.EkfNoise = ekf.EkfNoise()
+
+
+CAR = ("stiffness_front", "stiffness_rear", "friction", "front_roll_share", "yaw_inertia")
+NOISE = tuple(f"noise.{name}" for name in ekf.TUNABLE if not name.startswith("stiffness"))
+
+FOLDS = 4
+
+UNSPRUNG_SHARE = 0.11
+"""Of the mass: wheels, hubs and brakes of both axles."""
+
+STIFFNESS_PER_LOAD = 15.0
+"""Cornering stiffness of a tyre at its load at rest, per rad, where the search begins."""
+
+
+class Measured(Config):
+    """What scales and a tape measure say of a car."""
+
+    name: Identifier
+    mass_kg: FiniteFloat = Field(gt=0)
+    """Of the whole car, with the driver."""
+    front_axle_m: FiniteFloat = Field(gt=0)
+    """From the centre of gravity to the front axle."""
+    rear_axle_m: FiniteFloat = Field(gt=0)
+    track_m: FiniteFloat = Field(default=1.55, gt=0)
+    height_m: FiniteFloat = Field(default=0.55, gt=0)
+    """Of the centre of gravity above the road."""
+    rolling_radius_m: FiniteFloat = Field(default=0.315, gt=0)
+    front_drive_share: FiniteFloat = Field(default=1.0, ge=0, le=1)
+
+    @classmethod
+    def of(cls, car: VehicleParameters) -> Self:
+        """Return what can be measured so of a car that is known."""
+        return cls(
+            name=car.name,
+            mass_kg=car.body.mass_kg,
+            front_axle_m=car.body.front_axle_m,
+            rear_axle_m=car.body.rear_axle_m,
+            track_m=(car.body.track_front_m + car.body.track_rear_m) / 2,
+            height_m=car.body.height_m,
+            rolling_radius_m=car.tyre.rolling_radius_m,
+            front_drive_share=car.drivetrain.front_drive_share,
+        )
+
+    def car(self, fitted: Fitted) -> VehicleParameters:
+        """Return the car with what was fitted."""
+        sprung_kg = (1 - UNSPRUNG_SHARE) * self.mass_kg
+        wheel_n = self.mass_kg * GRAVITY_MPS2 / 4
+        content = {
+            "name": self.name,
+            "description": "Identified from labelled drives",
+            "body": {
+                "sprung_mass_kg": sprung_kg,
+                "unsprung_mass_front_kg": (self.mass_kg - sprung_kg) / 2,
+                "unsprung_mass_rear_kg": (self.mass_kg - sprung_kg) / 2,
+                "sprung_yaw_inertia_kgm2": (
+                    fitted.yaw_inertia * sprung_kg * self.front_axle_m * self.rear_axle_m
+                ),
+                "front_axle_m": self.front_axle_m,
+                "rear_axle_m": self.rear_axle_m,
+                "height_m": self.height_m,
+                "track_front_m": self.track_m,
+                "track_rear_m": self.track_m,
+            },
+            "suspension": {
+                "front_roll_share": fitted.front_roll_share,
+                "roll_lag_s": 0.12,
+                "pitch_lag_s": 0.12,
+                "front_stiffness_factor": fitted.stiffness_front,
+                "rear_stiffness_factor": fitted.stiffness_rear,
+            },
+            "tyre": {
+                "rolling_radius_m": self.rolling_radius_m,
+                "spin_inertia_kgm2": 1.1,
+                # A tyre is stiffest at twice its load at rest, where it has 5/4 of this stiffness.
+                "peak_stiffness_n": 1.25 * STIFFNESS_PER_LOAD * wheel_n,
+                "peak_stiffness_load_n": 2 * wheel_n,
+                "longitudinal_stiffness_ratio": 1.3,
+                "friction": fitted.friction,
+                "nominal_load_n": wheel_n,
+                "friction_load_sensitivity": 0.1,
+                "friction_decay_speed_mps": 60.0,
+                "rolling_resistance": 0.012,
+            },
+            "steering": {"ratio": 16.0, "lag_s": 0.05, "limit_rad": 8.7},
+            "drivetrain": {
+                "front_drive_share": self.front_drive_share,
+                "front_brake_share": 0.7,
+                "lag_s": 0.1,
+                "power_w": 100_000.0,
+                "slip_control": 0.05,
+            },
+            "aerodynamics": {"drag_area_m2": 0.65},
+        }
+        return VehicleParameters.model_validate(content)
+
+
+@dataclass(frozen=True)
+class Identified:
+    """A car, the noise of the filter in it, and how far it errs, in rad.
+
+    Attributes:
+        car, noise: what was found on all drives.
+        fit_rad: RMSE on them.
+        held_out_rad: RMSE on drives that were left out, in `FOLDS` parts; None for a single drive.
+    """
+
+    car: VehicleParameters
+    noise: ekf.EkfNoise
+    fit_rad: float
+    held_out_rad: float | None = None
+
+
+def identify(measured: Measured, drives: Sequence[LabelledDrive], executor: Executor) -> Identified:
+    """Fit a car and the filter's noise to drives. Raises `DataError` without rows of a label."""
+
+    def estimate(signals: DriveSignals, _: VehicleParameters, tried: Fitted) -> FloatArray:
+        return ekf.estimate(signals, measured.car(tried), tried.noise)
+
+    start = Fitted()
+    car = measured.car(start)
+    found = descend(estimate, start, (*CAR, *NOISE), drives, car, executor)
+    return Identified(measured.car(found.parameters), found.parameters.noise, found.rmse_rad)
+
+
+def identify_held_out(
+    measured: Measured, drives: Sequence[LabelledDrive], executor: Executor
+) -> Identified:
+    """Identify a car from all drives, and measure it on drives that it was not identified from."""
+    found = identify(measured, drives, executor)
+    if len(drives) < 2:
+        return found
+    squares: list[float] = []
+    rows: list[int] = []
+    for fold in range(min(FOLDS, len(drives))):
+        out = drives[fold::FOLDS]
+        others = [one for place, one in enumerate(drives) if place % FOLDS != fold]
+        other = identify(measured, others, executor)
+
+        def estimate(drive: LabelledDrive, of: Identified = other) -> FloatArray:
+            return ekf.estimate(drive.signals, of.car, of.noise)
+
+        try:
+            error_rad = rmse_rad(estimate, out, executor)
+        except DataError:  # none of these has a row with a label
+            continue
+        squares.append(error_rad**2)
+        rows.append(sum(int(np.isfinite(one.sideslip_rad).sum()) for one in out))
+    held_out = float(np.sqrt(np.average(squares, weights=rows))) if rows else None
+    return replace(found, held_out_rad=held_out)
