@@ -3,13 +3,14 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from fleet_slip.api.calls import Rooted, takes
+from fleet_slip.api.calls import Rooted, open_workers, takes
 from fleet_slip.errors import UsageError
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
     from fleet_slip.api.examined_model import ExaminedModel
+    from fleet_slip.comparison.observers.identification import Identified
     from fleet_slip.grams.cohorts.folding import Folding, FoldKey
     from fleet_slip.grams.cohorts.gram_cohort import Cohort
     from fleet_slip.models.model_version import ModelVersion
@@ -174,6 +175,25 @@ class FleetCohort(Rooted):
 
         dealt = self._dealt(signals, features, by, folds)
         return compare_shrinkage(*dealt, naive=naive, cluster=cluster)
+
+    def identify(self, name: str, *, threads: int | None = None, **measured: float) -> "Identified":
+        """Identify the tyres and the yaw inertia of the car that made the cohort's drives.
+
+        `measured` is what scales and a tape measure say, in the words of
+        `fleet_slip.comparison.observers.identification.Measured`. The extended Kalman filter in the
+        car is fitted to the labels of up to 24 drives; its error on drives that were left out
+        stands beside. Raises `CohortError` where a minimum cohort is asked for, and `DataError` if
+        the drives lack the label or what the filter needs.
+        """
+        from fleet_slip.comparison.evaluation.filters import TuningDrives
+        from fleet_slip.comparison.observers.identification import Measured, identify_held_out
+        from fleet_slip.warehouse.minimum_cohort import require_single_cars
+
+        require_single_cars("identifying a car", "Select a model instead.")
+        car = Measured.model_validate({"name": name, **measured})
+        chosen = TuningDrives.of(self.warehouse, self._load("signals"), weighed=False)
+        with open_workers(self.root, threads) as executor:
+            return identify_held_out(car, chosen.read(), executor)
 
     def _load(self, feature_set: str, condition: str | None = None) -> "Cohort":
         from fleet_slip.grams.cohorts.gram_cohort import load_cohort

@@ -55,6 +55,7 @@ GROUPS = {
     "Accuracy": {
         "score": "accuracy.evaluate_commands",
         "evaluate": "accuracy.evaluate_commands",
+        "identify": "accuracy.identify_command",
         "report": "accuracy.report_command",
         "watch": "accuracy.watch_command",
         "explore": "accuracy.explore_command",

@@ -42,6 +42,7 @@ ASK: dict[str, list[str]] = {
         f"score|smoke|--against|smoke@1|--cohort|drive_id = '{DRIVE}' AND tick = 5",
     ],
     "evaluate": ["evaluate smoke --scenario nominal"],
+    "identify": ["identify mine --mass 1480 --front-axle 1.11 --rear-axle 1.67 --output mine.toml"],
     "report": ["report smoke"],
     "watch": [f"watch {DRIVE} smoke"],
     "explore": ["explore --headless"],
@@ -160,6 +161,9 @@ OF_COHORT: dict[str, Callable[[FleetCohort], Any]] = {
     "what_if": lambda cohort: cohort.what_if("smoke", noise={"ay": 0.2}),
     "regimes": lambda cohort: cohort.regimes(),
     "shrink": lambda cohort: cohort.shrink("ay,yaw_rate"),
+    "identify": lambda cohort: cohort.identify(
+        "mine", mass_kg=1480.0, front_axle_m=1.11, rear_axle_m=1.67
+    ),
 }
 OF_NO_CAR = {
     *("models", "model", "promote", "rollback", "pin", "unpin", "diff", "sign", "import_model"),

@@ -6,10 +6,12 @@ friction, together with the noise of the extended Kalman filter, which errs leas
 drives' labels. As a vehicle file the car serves every filter here.
 """
 
+import json
+import math
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import Field, FiniteFloat
@@ -139,12 +141,40 @@ class Identified:
         car, noise: what was found on all drives.
         fit_rad: RMSE on them.
         held_out_rad: RMSE on drives that were left out, in `FOLDS` parts; None for a single drive.
+        drives: from how many.
     """
 
     car: VehicleParameters
     noise: ekf.EkfNoise
     fit_rad: float
     held_out_rad: float | None = None
+    drives: int = 0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document says: what was found, and errors in degrees."""
+        car = self.car
+        return {
+            "name": car.name,
+            "drives": self.drives,
+            "found": {
+                "front_stiffness_factor": car.suspension.front_stiffness_factor,
+                "rear_stiffness_factor": car.suspension.rear_stiffness_factor,
+                "yaw_inertia_kgm2": car.body.yaw_inertia_kgm2,
+                "front_roll_share": car.suspension.front_roll_share,
+                "friction": car.tyre.friction,
+            },
+            "noise": self.noise.model_dump(mode="json"),
+            "fit_deg": math.degrees(self.fit_rad),
+            "held_out_deg": None if self.held_out_rad is None else math.degrees(self.held_out_rad),
+        }
+
+    def as_toml(self) -> str:
+        """Return the car as a vehicle file."""
+        lines = [f"name = {json.dumps(self.car.name)}"]
+        lines.append(f"description = {json.dumps(self.car.description)}")
+        for part, values in self.car.model_dump(exclude={"name", "description"}).items():
+            lines += ["", f"[{part}]", *(f"{name} = {value!r}" for name, value in values.items())]
+        return "\n".join(lines) + "\n"
 
 
 def identify(measured: Measured, drives: Sequence[LabelledDrive], executor: Executor) -> Identified:
@@ -156,7 +186,8 @@ def identify(measured: Measured, drives: Sequence[LabelledDrive], executor: Exec
     start = Fitted()
     car = measured.car(start)
     found = descend(estimate, start, (*CAR, *NOISE), drives, car, executor)
-    return Identified(measured.car(found.parameters), found.parameters.noise, found.rmse_rad)
+    car = measured.car(found.parameters)
+    return Identified(car, found.parameters.noise, found.rmse_rad, drives=len(drives))
 
 
 def identify_held_out(

@@ -116,8 +116,13 @@ def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> FloatArra
 
 
 def measured_steer_rad(drive: DriveSignals) -> FloatArray:
-    """Return the mean angle of the front wheels. Raises `DataError` without them."""
-    return hold_last((drive.steer_fl_rad + drive.steer_fr_rad) / 2, "steer_fl and steer_fr")
+    """Return the mean angle of the front wheels, or that of the one that a car logs.
+
+    Raises `DataError` without any.
+    """
+    logged = [one for one in (drive.steer_fl_rad, drive.steer_fr_rad) if np.isfinite(one).any()]
+    mean = sum(logged, np.zeros(len(drive))) / max(len(logged), 1)
+    return hold_last(mean if logged else drive.steer_fl_rad, "steer_fl and steer_fr")
 
 
 LEAST_LOAD = 0.05

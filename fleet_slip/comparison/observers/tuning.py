@@ -158,8 +158,8 @@ def descend(
         def estimate(drive: LabelledDrive) -> FloatArray:
             return estimator(drive.signals, drive.car or car, parameters)[::EVERY]
 
-        estimates: FloatArray = np.concatenate(list(executor.map(estimate, drives)))
-        return estimates - labels
+        off: FloatArray = np.concatenate(list(executor.map(estimate, drives))) - labels
+        return off
 
     best, found = start, errors(start)
     there = np.isfinite(found)
