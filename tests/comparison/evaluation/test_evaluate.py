@@ -153,7 +153,7 @@ def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path) -> No
 
 def test_the_truth_is_the_simulators_and_not_the_logs(root: Path) -> None:
     (drive,) = load_drives(Warehouse(LocalFolder(root)), [load_scenario("nominal")])
-    with connect(root) as database:
+    with connect(root, scenarios=True) as database:
         logged = database.sql(
             "SELECT vy_mps FROM log WHERE drive_id = 'scenario-nominal' ORDER BY time_s"
         ).fetchnumpy()["vy_mps"]
