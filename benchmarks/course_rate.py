@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from threadpoolctl import threadpool_limits
+
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
@@ -30,7 +32,8 @@ def main() -> None:
     given = parser.parse_args()
     for name in features().sets:
         if features().feature_set(name).in_time:
-            print(json.dumps(measure(Warehouse(data_root(given.root)), name, given.seconds)))
+            with threadpool_limits(1, user_api="blas"):  # as where Gram rows are computed
+                print(json.dumps(measure(Warehouse(data_root(given.root)), name, given.seconds)))
 
 
 def measure(warehouse: Warehouse, name: str, seconds: float) -> dict[str, Any]:
