@@ -96,7 +96,8 @@ def log_version(version: ModelVersion, warehouse: Warehouse, uri: str) -> str:
 
     subject = _subject(version, warehouse)
     content = document_of(version, subject.program, subject.checks, subject.drives)
-    return log_to_mlflow(uri, version, subject.program, subject.checks, content)
+    aliases = Registry(warehouse.root / "models").history(version.manifest.name).aliases()
+    return log_to_mlflow(uri, version, subject.program, subject.checks, content, aliases)
 
 
 def _json(subject: Subject) -> dict[str, str]:

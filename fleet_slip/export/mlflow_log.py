@@ -3,7 +3,7 @@
 MLflow and pandas are the extra `fleet-slip[mlflow]`; they are imported when they are used.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from http.client import HTTPException
 from importlib.metadata import version as package_version
@@ -21,12 +21,15 @@ from fleet_slip.export.checks import Check
 from fleet_slip.export.files import render
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.words import number_of
 
 LOADER = "fleet_slip.export.mlflow_model"
 DOCUMENT = "estimator.json"
 EXAMPLE_ROWS = 50
 ANSWER_S = 10.0
 """So long a server may take to say that it is there."""
+LONGEST_PARAMETER = 500
+"""Characters; newer versions of MLflow take 6,000."""
 SHA256_TAG = "fleet_slip.sha256"
 
 _TEXTS = ("vehicle_id", "vehicle_model", "campaign", "track", "source")
@@ -38,10 +41,12 @@ def log_to_mlflow(
     program: Program,
     checks: Sequence[Check],
     document: dict[str, Any],
+    aliases: Mapping[str, int],
 ) -> str:
     """Register a version under its model's name; return the number that MLflow gave it.
 
-    One that is registered already, by its checksum, is not registered again. Raises `UsageError`
+    One that is registered already, by its checksum, is not registered again; `aliases` that point
+    at it here point at it there. Raises `UsageError`
     for a URI with a password, and `StorageError` if the server does not take it.
     """
     if urlsplit(uri).username is not None or urlsplit(uri).password is not None:
@@ -53,8 +58,11 @@ def log_to_mlflow(
     require_answer(uri, version.reference)
     try:
         with _tracking(mlflow, uri), TemporaryDirectory() as folder:
-            found = _registered(mlflow, version)
-            return found or _log(mlflow, version, program, checks, document, Path(folder))
+            number = _registered(mlflow, version) or _log(
+                mlflow, version, program, checks, document, Path(folder)
+            )
+            describe(mlflow.MlflowClient(), version, number, aliases)
+            return number
     except mlflow.exceptions.MlflowException as error:
         told = shorten(str(error), 300, placeholder=" …")
         raise _not_taken(version.reference, told) from None
@@ -136,6 +144,7 @@ def _log(
     (folder / DOCUMENT).write_text(render(document), "utf-8")
     tags = _tags(version)
     with mlflow.start_run(run_name=version.reference, tags=tags):
+        mlflow.log_params(parameters(version))
         mlflow.log_metrics(_metrics(version))
         logged = mlflow.pyfunc.log_model(
             name=manifest.name,
@@ -152,6 +161,34 @@ def _log(
     for key, value in tags.items():
         client.set_model_version_tag(manifest.name, number, key, value)
     return number
+
+
+def describe(client: Any, version: ModelVersion, number: str, aliases: Mapping[str, int]) -> None:
+    """Give a registered version a description, and the aliases that it has here."""
+    name, trained = version.manifest.name, version.manifest.trained_on
+    told = (
+        f"{version.reference} of fleet_slip, trained on {number_of(trained.drives, 'drive')} where "
+        f"{trained.cohort}. {version.manifest.selected_by.reason}"
+    )
+    client.update_model_version(name, number, description=told)
+    for alias in sorted(one for one, which in aliases.items() if which == version.version):
+        client.set_registered_model_alias(name, alias, number)
+
+
+def parameters(version: ModelVersion) -> dict[str, str]:
+    """Return what the version was made with, by name, as short as every MLflow takes it."""
+    trained, chosen = version.manifest.trained_on, version.manifest.selected_by
+    told = {
+        "cohort": trained.cohort,
+        "feature_set": trained.feature_set,
+        "drives": trained.drives,
+        "rows": trained.rows,
+        "model_list": chosen.model_list,
+        "model": chosen.model,
+        "signals": ",".join(version.manifest.signals),
+        **(chosen.asked or {}),
+    }
+    return {key: str(value)[:LONGEST_PARAMETER] for key, value in told.items()}
 
 
 def _tags(version: ModelVersion) -> dict[str, str]:

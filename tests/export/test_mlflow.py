@@ -18,7 +18,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import ConfigError, StorageError
-from fleet_slip.export.mlflow_log import require_answer
+from fleet_slip.export.mlflow_log import describe, parameters, require_answer
 
 START_S = 120
 
@@ -61,6 +61,31 @@ def wait_for(uri: str, process: "subprocess.Popen[bytes]") -> None:
         except (urllib.error.URLError, OSError):
             time.sleep(0.5)
     pytest.fail("the server of MLflow does not answer")
+
+
+class Registered:
+    """Notes what a client of MLflow would be asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, ...]] = []
+
+    def update_model_version(self, name: str, number: str, description: str) -> None:
+        self.asked.append((name, number, description))
+
+    def set_registered_model_alias(self, name: str, alias: str, number: str) -> None:
+        self.asked.append((name, alias, number))
+
+
+def test_a_registered_version_says_what_it_is(smoke_root: Path) -> None:
+    version = fleet_slip.open(smoke_root).model("smoke")
+    client = Registered()
+    describe(client, version, "7", {"champion": version.version, "old": version.version + 1})
+    (name, number, told), *aliases = client.asked
+    assert (name, number) == ("smoke", "7")
+    assert told.startswith("smoke@1 of fleet_slip, trained on 8 drives where ")
+    assert aliases == [("smoke", "champion", "7")]
+    assert parameters(version)["drives"] == "8"
+    assert max(map(len, parameters(version).values())) <= 500
 
 
 LOAD = """
