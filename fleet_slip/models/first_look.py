@@ -18,6 +18,7 @@ from fleet_slip.errors import RefusedError
 from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
 from fleet_slip.ingest.drives.measured_drives import SOURCE
 from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
+from fleet_slip.models.gate import thin
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.trained_drives import salt_drives
 from fleet_slip.warehouse.condition import asking, parse_condition
@@ -51,6 +52,11 @@ def require_sound_drives(
     found, looked_at = _look(warehouse, manifest, made)
     if made is not None and looked_at < FEWEST_NEW:
         return
+    if made is None and looked_at and (lacks := thin(manifest)):
+        raise RefusedError(
+            f"{manifest.name} was not published: {'; '.join(lacks)}. Ingest more drives, choose "
+            "fewer columns, or publish it with force all the same."
+        )
     used = {manifest.label.signal}
     for term in manifest.terms:
         used |= set(term.definition.signals) if term.definition else {term.signal}

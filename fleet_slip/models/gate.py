@@ -26,7 +26,7 @@ from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.models.counts_model import counts_model
-from fleet_slip.models.manifest import Manifest, TrainedOn
+from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.regression.choice.winner import Shortfall, Worth, compare_paired, compare_typical
 from fleet_slip.regression.exact.figures import error_sums
@@ -228,14 +228,15 @@ def faults(manifest: Manifest, champion: Manifest | None) -> list[str]:
         found.append(f"it was trained on {cars}, fewer than {least.min_vehicles}")
     if champion is not None:
         found += _shrunk(manifest, champion, least.min_part_of_champion)
-    elif manifest.learned_from is None:
-        found += _thin(len(manifest.terms), trained, least)
     return found
 
 
-def _thin(columns: int, trained: TrainedOn, least: Floor) -> list[str]:
-    """Return of what a first champion has too little for its columns."""
-    found = []
+def thin(manifest: Manifest) -> list[str]:
+    """Return of what a first champion of measured drives has too little for its columns."""
+    if manifest.learned_from is not None:
+        return []
+    found, least = [], floor()
+    columns, trained = len(manifest.terms), manifest.trained_on
     if columns > least.max_columns_per_drive * trained.drives:
         drives = number_of(trained.drives, "drive")
         most = f"{least.max_columns_per_drive:g}"

@@ -208,8 +208,6 @@ def test_what_was_forced_is_where_it_begins_anew(warehouse: Warehouse) -> None:
         ("min_drives = 49", "on 48 drives, fewer than 49"),
         ("min_vehicles = 9", "on 8 cars, fewer than 9"),
         ("min_correlation = 0.99999", "below 0.99999"),
-        ("max_columns_per_drive = 0.04", "2 columns on 48 drives, more than 0.04 a drive"),
-        ("min_rows_per_column = 9999", "9,600 rows, fewer than 9999 for each of its 2 columns"),
     ],
 )
 def test_a_person_sets_the_floor(

@@ -11,6 +11,7 @@ from fleet_slip import Fleet
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli import left_out
 from fleet_slip.errors import RefusedError, UnexaminedError
+from fleet_slip.models import gate
 from fleet_slip.monitoring import examined, quality
 from fleet_slip.monitoring.quality import QualityReport
 from fleet_slip.runs.nights import hash_drive, with_all_drives, without_drives
@@ -101,6 +102,22 @@ def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
     with pytest.raises(RefusedError, match=r"of 4 drives .* contradict .*delay of sideslip"):
         fleet.publish("m", fleet.cohort())
     assert fleet.publish("m", fleet.cohort(), candidate=True).candidate
+
+
+def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_columns(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = fleet.cohort("day = DATE '2026-10-05'").select(nested="ay,yaw_rate", worth="0.0001deg")
+    for name, bound, told in (
+        ("max_columns_per_drive", 0.1, r"columns? on 4 drives, more than 0\.1 a drive"),
+        ("min_rows_per_column", 10**6, r"rows, fewer than 1000000 for each of its \d columns?"),
+    ):
+        strict = gate.floor().model_copy(update={name: bound})
+        monkeypatch.setattr(gate, "floor", lambda strict=strict: strict)
+        with pytest.raises(RefusedError, match=told):
+            fleet.publish("m", asked)
+        monkeypatch.undo()
+    assert fleet.publish("m", asked).new
 
 
 def test_a_cohort_tells_what_it_was_before_drives_were_left_out() -> None:
