@@ -1,5 +1,6 @@
 """What every estimator must do alike: on the simulated car, in a mirror, at rest, with gaps."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -81,13 +82,25 @@ def test_a_gap_of_the_sensors_is_bridged(name: str) -> None:
 @OBSERVERS
 @pytest.mark.parametrize(
     ("field", "message"),
-    [("ay_mps2", "no ay"), ("wheel_rl_rad_s", "wheel speeds"), ("steer_fl_rad", "steer_fl")],
+    [("ay_mps2", "no ay"), ("wheel_rl_rad_s", "wheel speeds"), ("steer_f._rad", "steer_fl")],
 )
 def test_an_absent_sensor_is_named(name: str, field: str, message: str) -> None:
     estimate, parameters = ESTIMATORS[name]
     drive = slalom(CAR, 50)[0]
+    absent = {one: np.full(50, np.nan) for one in vars(drive) if re.fullmatch(field, one)}
     with pytest.raises(DataError, match=message):
-        estimate(replace(drive, **{field: np.full(50, np.nan)}), CAR, parameters)
+        estimate(replace(drive, **absent), CAR, parameters)
+
+
+@OBSERVERS
+def test_a_car_that_logs_one_front_wheels_angle_steers_by_it(name: str) -> None:
+    estimate, parameters = ESTIMATORS[name]
+    drive = slalom(CAR, 500)[0]
+    for field in ("steer_fl_rad", "steer_fr_rad"):
+        one = replace(drive, **{field: np.full(500, np.nan)})
+        np.testing.assert_array_equal(
+            estimate(one, CAR, parameters), estimate(drive, CAR, parameters)
+        )
 
 
 @OBSERVERS
