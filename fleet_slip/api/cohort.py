@@ -106,7 +106,7 @@ class FleetCohort(Rooted):
         what `Fleet.model` raises.
         """
         from fleet_slip.catalogue.signals import catalogue
-        from fleet_slip.models.counts_model import counts_model
+        from fleet_slip.models.estimates.counts_model import counts_model
         from fleet_slip.regression.exact.least_squares import fit
         from fleet_slip.selection.what_if import what_if
 

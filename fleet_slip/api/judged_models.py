@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fleet_slip.comparison.evaluation.evaluate import TrainRivals
     from fleet_slip.comparison.report.page import Written
     from fleet_slip.files.documents import Document
-    from fleet_slip.models.score import Score
+    from fleet_slip.models.estimates.score import Score
 
 
 class JudgedModels(PublishedModels):
@@ -30,7 +30,7 @@ class JudgedModels(PublishedModels):
         `DataError` if no row has the model's signals, `QuestionError` for an invalid condition, and
         what `model` raises.
         """
-        from fleet_slip.models.score import score
+        from fleet_slip.models.estimates.score import score
         from fleet_slip.models.seen_drives import find_seen
 
         manifest = self.resolve(model).manifest

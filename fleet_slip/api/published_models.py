@@ -78,10 +78,10 @@ class PublishedModels(Rooted):
         that contradict any car; `UsageError` for an invalid name, `ConfigError` for an unusable
         key, and what `FleetCohort.select` raises.
         """
-        from fleet_slip.models.first_look import require_sound_drives
-        from fleet_slip.models.in_time import require_in_time
+        from fleet_slip.models.acceptance.first_look import require_sound_drives
+        from fleet_slip.models.acceptance.in_time import require_in_time
+        from fleet_slip.models.acceptance.sound_course import require_sound_course
         from fleet_slip.models.publish import manifest_of, publish, with_straight_intercept
-        from fleet_slip.models.sound_course import require_sound_course
         from fleet_slip.models.trained_drives import read_trained_drives
 
         require_model_name(name)

@@ -20,8 +20,8 @@ from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.lowering import CarFact
 from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program
 from fleet_slip.grams.rows.drive_rows import counts_of
+from fleet_slip.models.estimates.predictor import Predictor
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.predictor import Predictor
 
 SMOOTH_TICKS = 300
 HOSTILE_TICKS = 200

@@ -10,7 +10,7 @@ from fleet_slip.columns.operations import size_of
 from fleet_slip.errors import DataError
 from fleet_slip.export.fixed_point import LARGEST_ANGLE, OUTPUT_COUNTS, fixed_point
 from fleet_slip.export.program import Angle, Input, Program
-from fleet_slip.models.counts_model import counts_model
+from fleet_slip.models.estimates.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 
 
@@ -20,7 +20,7 @@ def compile_program(manifest: Manifest) -> Program:
     Raises what `write_program` raises, and `QuestionError` or `DataError` for definitions that
     contradict each other.
     """
-    from fleet_slip.models.predictor import Predictor  # noqa: PLC0415 - numba, not for show
+    from fleet_slip.models.estimates.predictor import Predictor  # noqa: PLC0415 - numba, not for show
 
     _ = Predictor.of(manifest).plan.program  # raises for what the kernel could not compute
     return write_program(manifest)

@@ -23,7 +23,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.operations import GIVEN, operands_of, operation_of, plain_of, size_of
 from fleet_slip.export.onnx_nodes import Nodes
 from fleet_slip.export.program import Program
-from fleet_slip.models.counts_model import counts_model
+from fleet_slip.models.estimates.counts_model import counts_model
 from fleet_slip.models.model_version import ModelVersion
 
 OPSET, IR_VERSION = 17, 8

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy import float64
     from numpy.typing import ArrayLike, NDArray
 
-    from fleet_slip.models.predictor import Predictor
+    from fleet_slip.models.estimates.predictor import Predictor
 
 
 class ArrowStream(Protocol):
@@ -96,12 +96,12 @@ class ModelVersion:
         Raises `InputError` for a column that is missing (it says what is there), is there twice, is
         not of numbers, has infinite ones, or differs from the others in length.
         """
-        from fleet_slip.models.predict import predict  # noqa: PLC0415 - DuckDB, not for show
+        from fleet_slip.models.estimates.predict import predict  # noqa: PLC0415 - DuckDB, not for show
 
         return predict(self.manifest, frame, self._predictor if self.manifest.definitions else None)
 
     @cached_property
     def _predictor(self) -> "Predictor":
-        from fleet_slip.models.predictor import Predictor  # noqa: PLC0415 - numba, not for show
+        from fleet_slip.models.estimates.predictor import Predictor  # noqa: PLC0415 - numba, not for show
 
         return Predictor.of(self.manifest)

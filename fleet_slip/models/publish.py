@@ -11,8 +11,9 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError, RefusedError
 from fleet_slip.grams.cohorts.taught_cohort import TaughtCohort
+from fleet_slip.models.acceptance.gate import compare, faults
+from fleet_slip.models.acceptance.vouched import ODD, odd_gain
 from fleet_slip.models.aliases import CANDIDATE, CHAMPION, AliasMove
-from fleet_slip.models.gate import compare, faults
 from fleet_slip.models.manifest import (
     CrossValidated,
     LearnedFrom,
@@ -27,7 +28,6 @@ from fleet_slip.models.recipe import asked_of
 from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.models.trained_drives import checksum_of_drives, pack_drives
 from fleet_slip.models.versions import Registry
-from fleet_slip.models.vouched import ODD, odd_gain
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.select_models import RequestedSelection, Selection
 from fleet_slip.warehouse.condition import parse_cohort
@@ -165,10 +165,10 @@ def publish(
     """Make the winner the next version of its model, and its champion.
 
     It must be above the floor, and no worse than the champion and the best of the champions so far
-    (`fleet_slip.models.gate`), else it is refused (`RefusedError`) unless forced. A `candidate`
-    waits for somebody to promote it, and so does whatever is published while the champion is held
-    by `rollback` or `pin`. A challenger that is the same estimator from the same rows changes
-    nothing. If the champion changes meanwhile, all is decided again.
+    (`acceptance.gate`), else it is refused (`RefusedError`) unless forced. A `candidate` waits for
+    somebody to promote it, and so does whatever is published while the champion is held by
+    `rollback` or `pin`. A challenger that is the same estimator from the same rows changes nothing.
+    If the champion changes meanwhile, all is decided again.
     """
     history = registry.history(manifest.name)
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from fleet_slip.catalogue.sources import RECEIVED
 from fleet_slip.grams.rows.rollup import hash_numbers
+from fleet_slip.models.estimates.score import cohort_of_rows
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.score import cohort_of_rows
 from fleet_slip.models.trained_drives import read_trained_drives, salt_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.condition import Condition, asking, drive_columns

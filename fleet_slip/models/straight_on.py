@@ -24,8 +24,8 @@ from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.calibration.car_evidence import CalibratedNumber
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
+from fleet_slip.models.estimates.predictor import Predictor
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.predictor import Predictor
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel, fit
 from fleet_slip.warehouse.condition import Condition

@@ -19,7 +19,7 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.cohorts.day_sums import sum_days
-from fleet_slip.models.counts_model import counts_model
+from fleet_slip.models.estimates.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.monitoring.thresholds import MonitorThresholds, thresholds

@@ -16,7 +16,7 @@ import fleet_slip
 from fleet_slip.api.nightly import Night
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import UsageError
-from fleet_slip.models.gate import floor
+from fleet_slip.models.acceptance.gate import floor
 from fleet_slip.monitoring.night_page import render_night
 from fleet_slip.monitoring.night_report import NightReport
 from fleet_slip.regression.exact.gram import Gram

@@ -19,6 +19,7 @@ from fleet_slip import Fleet, ModelVersion
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
+from fleet_slip.models.estimates.score import score_statement
 from fleet_slip.models.manifest import (
     CrossValidated,
     Manifest,
@@ -27,7 +28,6 @@ from fleet_slip.models.manifest import (
     SelectedBy,
     TrainedOn,
 )
-from fleet_slip.models.score import score_statement
 
 Column = list[float | None]
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")

@@ -16,8 +16,8 @@ from fleet_slip.export.checks import Sample, angles_by_kernel, angles_of_columns
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.program import Car, Program
 from fleet_slip.grams.rows.drive_rows import read_drives
+from fleet_slip.models.estimates.predictor import Predictor
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.predictor import Predictor
 from tests.export.compiled import (
     DEADLINE_S,
     SANITIZED,

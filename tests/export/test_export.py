@@ -17,7 +17,7 @@ from fleet_slip.export.checks import angles_of_columns
 from fleet_slip.export.compile import compile_program
 from fleet_slip.files.documents import checksum
 from fleet_slip.grams.rows.drive_rows import read_drives
-from fleet_slip.models.predictor import Predictor
+from fleet_slip.models.estimates.predictor import Predictor
 from tests.export import plain
 from tests.export.models import export_texts
 

@@ -14,8 +14,8 @@ from fleet_slip.export.checks import drive_counts
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.files import export_files
 from fleet_slip.export.onnx_graph import FloatName, error_bound
+from fleet_slip.models.estimates.predictor import Predictor
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.predictor import Predictor
 from tests.export.models import CARS, DEFINITIONS, MODELS, hostile_drive, model_of
 from tests.export.onnx_drives import in_si, open_session, run_drives
 

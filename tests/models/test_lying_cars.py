@@ -10,7 +10,7 @@ import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.cohorts import outweighing
-from fleet_slip.models.counts_model import counts_model
+from fleet_slip.models.estimates.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.exact.figures import error_sums
 from fleet_slip.regression.exact.gram import Gram, packed_position

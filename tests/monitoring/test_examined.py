@@ -11,7 +11,7 @@ from fleet_slip import Fleet
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli import left_out
 from fleet_slip.errors import RefusedError, UnexaminedError
-from fleet_slip.models import gate
+from fleet_slip.models.acceptance import gate
 from fleet_slip.monitoring import examined, quality
 from fleet_slip.monitoring.quality import QualityReport
 from fleet_slip.runs.nights import hash_drive, with_all_drives, without_drives

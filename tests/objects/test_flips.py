@@ -14,11 +14,11 @@ from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.verify import verify
-from fleet_slip.models.score import score
+from fleet_slip.models.estimates.score import score
 from fleet_slip.models.versions import Registry
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-from tests.models.test_gate import publish_from, write
+from tests.models.acceptance.test_gate import publish_from, write
 from tests.support.s3_server import Server, forget_clients
 
 

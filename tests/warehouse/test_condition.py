@@ -14,8 +14,8 @@ from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.models.estimates.score import score_statement
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.score import score_statement
 from fleet_slip.monitoring.monitor import monitor
 from fleet_slip.monitoring.quality import examine_drives
 from fleet_slip.warehouse.condition import asking, drive_columns, parse_condition

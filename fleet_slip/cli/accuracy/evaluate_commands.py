@@ -15,7 +15,7 @@ from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Threads
 from fleet_slip.errors import UsageError
-from fleet_slip.models.score import Score, score_statement
+from fleet_slip.models.estimates.score import Score, score_statement
 from fleet_slip.words import number_of
 
 FleetModels = Annotated[

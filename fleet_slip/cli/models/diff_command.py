@@ -7,9 +7,9 @@ import typer
 from fleet_slip.cli.models.version_commands import Reference
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.models.diff import Difference
+from fleet_slip.models.estimates.score import cohort_of_rows
+from fleet_slip.models.estimates.score import score as score_rows
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.score import cohort_of_rows
-from fleet_slip.models.score import score as score_rows
 from fleet_slip.warehouse.condition import parse_condition, row_columns
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of

@@ -11,9 +11,9 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.drive_columns import DriveCounts
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
+from fleet_slip.models.estimates.predictor import Predictor
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.predictor import Predictor
 from fleet_slip.regression.exact.least_squares import LinearModel
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.select_models import Selection, select

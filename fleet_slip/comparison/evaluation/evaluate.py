@@ -27,9 +27,9 @@ from fleet_slip.comparison.evaluation.targets import (
 )
 from fleet_slip.files.documents import Document, DocumentFolder, checksum
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
+from fleet_slip.models.estimates.predictor import Predictor
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.predictor import Predictor
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 from fleet_slip.warehouse.tables import Warehouse
 

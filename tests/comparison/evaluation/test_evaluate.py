@@ -25,7 +25,7 @@ from fleet_slip.comparison.rivals.learners import LEARNERS
 from fleet_slip.errors import DataError, RefusedError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.models.score import score
+from fleet_slip.models.estimates.score import score
 from fleet_slip.models.versions import Registry
 from fleet_slip.simulation.campaign import DriveSpec
 from fleet_slip.simulation.drives import exact_motion

@@ -18,8 +18,8 @@ from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.models.predict import predict
-from fleet_slip.models.score import score, score_statement
+from fleet_slip.models.estimates.predict import predict
+from fleet_slip.models.estimates.score import score, score_statement
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.warehouse.tables import Warehouse

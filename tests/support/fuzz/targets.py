@@ -32,8 +32,8 @@ from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.ingest.mapping.mapping import Mapping, load_mapping
 from fleet_slip.maintenance.retention import load_retention
+from fleet_slip.models.estimates.score import score
 from fleet_slip.models.manifest import require_model_name
-from fleet_slip.models.score import score
 from fleet_slip.models.versions import Registry
 from fleet_slip.resources import find_config, folder
 from fleet_slip.selection.answer_request import answer_request

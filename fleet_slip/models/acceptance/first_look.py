@@ -18,7 +18,7 @@ from fleet_slip.errors import RefusedError
 from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
 from fleet_slip.ingest.drives.measured_drives import SOURCE
 from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
-from fleet_slip.models.gate import thin
+from fleet_slip.models.acceptance.gate import thin
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.trained_drives import salt_drives
 from fleet_slip.warehouse.condition import asking, parse_condition

@@ -25,7 +25,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.folding import FoldKey
-from fleet_slip.models.counts_model import counts_model
+from fleet_slip.models.estimates.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.regression.choice.winner import Shortfall, Worth, compare_paired, compare_typical

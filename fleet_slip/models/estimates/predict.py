@@ -21,9 +21,9 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.columns.row_counts import row_counts
 from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.rows.drive_rows import counts_of
-from fleet_slip.models.data_frames import Frame, open_frame
+from fleet_slip.models.estimates.data_frames import Frame, open_frame
+from fleet_slip.models.estimates.predictor import Predictor
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.predictor import Predictor
 
 
 def predict(manifest: Manifest, frame: Any, predictor: Predictor | None = None) -> Any:

@@ -15,10 +15,10 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.marked_models import models_trained_on
-from fleet_slip.models import gate
+from fleet_slip.models.acceptance import gate
 from fleet_slip.models.aliases import CANDIDATE
-from fleet_slip.models.counts_model import counts_model
 from fleet_slip.models.diff import compare_versions
+from fleet_slip.models.estimates.counts_model import counts_model
 from fleet_slip.models.publish import Publication, judge_only, manifest_of, publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.choice.stepwise import stepwise_order
@@ -217,7 +217,7 @@ def test_a_person_sets_the_floor(
     floor: str,
     problem: str,
 ) -> None:
-    usual = (Path(__file__).parents[2] / "configs" / "publish.toml").read_text()
+    usual = (Path(__file__).parents[3] / "configs" / "publish.toml").read_text()
     name = floor.partition(" ")[0]
     kept = "\n".join(line for line in usual.splitlines() if not line.startswith(name))
     (tmp_path / "publish.toml").write_text(f"{kept}\n{floor}\n")

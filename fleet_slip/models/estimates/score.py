@@ -16,8 +16,8 @@ from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.cohorts.expansion import CarCounts
 from fleet_slip.grams.rows.drive_rows import counts_of, drives_of_stream
+from fleet_slip.models.estimates.predictor import Predictor
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.predictor import Predictor
 from fleet_slip.resources import read_sql
 from fleet_slip.runs.log import log_event
 from fleet_slip.warehouse.condition import (

@@ -1,0 +1,1 @@
+"""What a model must be before it becomes champion, and what its drives and course must be."""

@@ -1,0 +1,1 @@
+"""Estimates of a published model: tick by tick, of data frames, of a cohort."""
