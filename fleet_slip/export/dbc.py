@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from itertools import islice
 
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.export.c.c_names import different
 from fleet_slip.export.program import Input, Program
 from fleet_slip.models.model_version import ModelVersion
@@ -17,6 +18,10 @@ PER_MESSAGE = 4
 
 MISSING = -(2**15)
 
+CYCLE = "GenMsgCycleTime"
+"""The attribute of a message that tools read as milliseconds from one to the next."""
+TICK_MS = round(1000 * SAMPLE_TIME_S)
+
 
 def dbc_text(version: ModelVersion, program: Program) -> str:
     """Return the file: messages of four signals each, and one with the angle.
@@ -27,6 +32,7 @@ def dbc_text(version: ModelVersion, program: Program) -> str:
     names = different([one.name for one in program.signals], LONGEST_NAME)
     signals = iter(zip(names, program.signals, strict=True))
     parts, comments = [_HEAD], [f'CM_ "{_about(version, program)}";']
+    cycles = [f'BA_DEF_ BO_ "{CYCLE}" INT 0 65535;', f'BA_DEF_DEF_ "{CYCLE}" 0;']
     number = 0
     while chosen := list(islice(signals, PER_MESSAGE)):
         parts.append(_message(FIRST_ID + number, f"inputs_{number + 1}", _inputs(chosen)))
@@ -36,7 +42,7 @@ def dbc_text(version: ModelVersion, program: Program) -> str:
         ]
         number += 1
     identifier, angle = FIRST_ID + number, program.angle
-    most = angle.limit * angle.scale
+    most = min(angle.largest, angle.limit) * angle.scale
     parts.append(
         _message(
             identifier,
@@ -52,7 +58,8 @@ def dbc_text(version: ModelVersion, program: Program) -> str:
     first = int(version.sha256[:6], 16)
     said = f"Of {version.reference} it is {first}: the first 24 bits"
     comments.append(f'CM_ SG_ {identifier} model_sha256 "{said}";')
-    return "\n".join([*parts, *comments, ""])
+    cycles += [f'BA_ "{CYCLE}" BO_ {FIRST_ID + i} {TICK_MS};' for i in range(number + 1)]
+    return "\n".join([*parts, *comments, *cycles, ""])
 
 
 _HEAD = f'VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: {NODE}\n'
@@ -64,7 +71,7 @@ def _about(version: ModelVersion, program: Program) -> str:
     drives = version.manifest.trained_on.drives_sha256 or "unknown"
     return (
         f"{version.reference}, SHA-256 {version.sha256}, trained on drives with SHA-256 {drives}. "
-        f"A message of each kind every tick. Identifiers are examples.{also}"
+        f"Identifiers are examples.{also}"
     )
 
 

@@ -62,6 +62,20 @@ def test_signals_have_the_scales_units_and_ranges_of_the_catalogue(bus: Database
         assert signal.maximum == float(one.max_count * one.scale)
 
 
+def test_messages_come_every_tick(bus: Database) -> None:
+    assert [message.cycle_time for message in bus.messages] == [10] * len(bus.messages)
+
+
+def test_the_angle_s_range_is_what_the_model_can_reach(bus: Database) -> None:
+    angle = bus.get_message_by_name("sideslip_estimate").get_signal_by_name("sideslip")
+    car = Car({"mass_kg": 1500.0, "vehicle_model": "suv"}, {})
+    found = angles_by_kernel(VERSION.manifest, PROGRAM, car, hostile_drive(PROGRAM, 100, 5))
+    largest = max(abs(one) for one in found if one is not None) * float(PROGRAM.angle.scale)
+    assert angle.maximum is not None
+    assert largest <= angle.maximum < 100 * largest
+    assert angle.minimum == -angle.maximum
+
+
 def test_the_angle_s_message_says_the_angle_and_of_which_version(bus: Database) -> None:
     message = bus.get_message_by_name("sideslip_estimate")
     data = message.encode({"sideslip": -0.12345, "valid": 1, "model_sha256": 0x12AB34})
