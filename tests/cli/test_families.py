@@ -1,6 +1,6 @@
 """How a table names the columns of a large model."""
 
-from fleet_slip.cli.begin.select_command import MANY_SIGNALS, in_families
+from fleet_slip.cli.begin.selection_tables import MANY_SIGNALS, in_families
 from fleet_slip.selection.model_list import load_model_list
 
 

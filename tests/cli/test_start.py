@@ -38,6 +38,7 @@ def imported_by(root: Path, *arguments: str) -> set[str]:
     ("arguments", "spared"),
     [
         (["--help"], TABLES | ENGINES),
+        (["select", "--help"], ENGINES),
         (["models"], ENGINES),
         (["show", "sideslip"], ENGINES),
         (["status"], ENGINES - {"duckdb"}),

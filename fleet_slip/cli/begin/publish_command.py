@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.begin.select_command import print_selection
+from fleet_slip.cli.begin.selection_tables import print_selection
 from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.left_out import examine_before_publishing
 from fleet_slip.cli.models.signing_commands import SignKey, signing_key

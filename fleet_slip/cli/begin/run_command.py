@@ -8,7 +8,7 @@ from fleet_slip.api.requests import RunRequest
 from fleet_slip.api.run_report import RunReport
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.cli.begin.publish_command import print_publication
-from fleet_slip.cli.begin.select_command import print_selection
+from fleet_slip.cli.begin.selection_tables import print_selection
 from fleet_slip.cli.models.signing_commands import signing_key
 from fleet_slip.cli.next_steps import next_steps
 from fleet_slip.cli.options import request_options
