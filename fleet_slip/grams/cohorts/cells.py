@@ -89,7 +89,7 @@ class Cells:
         return int(pc.max(sums).as_py()) > folds
 
 
-NO_CELLS = Cells(pa.table({"key": pa.array([], pa.string())}))
+NO_CELLS = Cells(pa.table({"key": pa.nulls(0, pa.string())}))  # pa.array would import pandas
 
 
 def dealt_folds(folding: Folding) -> int | None:
