@@ -159,6 +159,36 @@ def test_a_program_in_cpp_takes_the_header(smoke_root: Path, tmp_path: Path) -> 
         subprocess.run(words, cwd=tmp_path, check=True, timeout=DEADLINE_S)
 
 
+COUNTING = """
+#include <stdio.h>
+#include "sideslip_smoke.h"
+int main(void) {
+    sideslip_smoke_outside outside = {0};
+    sideslip_smoke_sample sample = {0};
+    outside.ay_count = UINT32_MAX;
+    for (int i = 0; i < 3; i++) {
+        sample.ax_count = (int16_t)(i - 30001);
+        sample.ay_count = 30001;
+        sample.yaw_rate_count = SIDESLIP_SMOKE_MISSING;
+        sample.steering_wheel_count = i == 0 ? 32001 : 32000;
+        sideslip_smoke_count_outside(&outside, &sample);
+    }
+    printf("%u %u %u %u %u", outside.ax_count, outside.ay_count, outside.yaw_rate_count,
+           outside.steering_wheel_count, outside.wheel_fl_count);
+}
+"""
+
+
+def test_inputs_beyond_their_ranges_are_counted(smoke_root: Path, tmp_path: Path) -> None:
+    """A missing one is none; a counter that is full stays so."""
+    fleet = fleet_slip.open(smoke_root)
+    for name, text in export_texts(fleet.model("smoke"), fleet.warehouse, "c").items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "main.c").write_text(COUNTING)
+    code, printed = result_of(compile_c(tmp_path, ["main.c"]))
+    assert (code, printed) == (0, f"1 {2**32 - 1} 0 1 0")
+
+
 def test_names_of_scales_differ_where_c_looks() -> None:
     manifest = model_of({"wheel_fl": SMALL, "wheel_fr": SMALL}, name="m" * 15)
     text = export_texts(ModelVersion(1, manifest, "0" * 64), None, "c")

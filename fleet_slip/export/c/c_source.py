@@ -52,6 +52,7 @@ def c_header(version: ModelVersion, program: Program) -> str:
             *parts,
             _struct("What is kept from tick to tick.", _state(program), prefix, "state"),
             _functions(prefix, program),
+            _outside(prefix, program),
             "#ifdef __cplusplus\n}\n#endif\n",
             "#endif\n",
         ]
@@ -86,6 +87,34 @@ def _functions(prefix: str, program: Program) -> str:
         f" * {angle.unit}, within {float(angle.error):.12f} counts of the exact model.\n"
         " * Returns whether there is an angle; else 0 is written. Call it at every tick: one\n"
         f" * without a message is a sample of missing counts. */\n{_step_line(prefix)};\n"
+    )
+
+
+def _outside(prefix: str, program: Program) -> str:
+    """Return what counts inputs beyond their ranges; inline: who does not call it has none."""
+    fields = field_names(program)["signals"]
+    members = [f"uint32_t {field};" for field in fields]
+    lines: list[str] = []
+    for field, one in zip(fields, program.signals, strict=True):
+        count, times = f"sample->{field}", f"outside->{field}"
+        # No comparison that a count of 16 bits cannot fail: compilers warn of it.
+        low = [f"({count} < {one.min_count})"] if one.min_count > -(2**15) + 1 else []
+        high = [f"({count} > {one.max_count})"] if one.max_count < 2**15 - 1 else []
+        if not (beyond := " || ".join(low + high)):
+            continue
+        lines += [
+            f"if (({count} != INT16_MIN) && ({beyond}) && ({times} < UINT32_MAX)) {{",
+            f"{INDENT}{times}++;",
+            "}",
+        ]
+    unused = ["(void)outside;", "(void)sample;"]
+    body = "\n".join(INDENT + line for line in lines or unused)
+    told = "How often each input was there, but beyond its range. Begin with zeros."
+    given = f"{prefix}_outside *outside, const {prefix}_sample *sample"
+    return (
+        f"{_struct(told, members, prefix, 'outside')}\n"
+        "/* Counts what a tick has beyond the ranges; no angle depends on it. */\n"
+        f"static inline void {prefix}_count_outside({given})\n{{\n{body}\n}}\n"
     )
 
 
