@@ -22,6 +22,8 @@ def label_noise_deg(warehouse: Warehouse, cohort: CohortOrigin) -> float | None:
     The step of its counts is part of it, as the standard deviation of a uniform error. None where
     no campaign states it.
     """
+    if not warehouse.logs.snapshot().rows:  # all rows are of messages: none is read for this
+        return None
     with open_grams(warehouse, cohort.feature_set, cohort.condition) as opened:
         rows = opened.label_sources(cohort.condition)
     stated = [(n, _stated_rad(source, campaign)) for source, campaign, n in rows]

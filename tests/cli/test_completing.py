@@ -29,7 +29,7 @@ def complete(root: Path, *words: str) -> list[str]:
         (["simulate", "water"], ["waterford", "waterford_course"]),
         (["run", "--campaign", "prov"], ["proving_ground", "proving_ground_course"]),
         (["select", "--models", "tab"], ["table1"]),
-        (["gram", "--features", "win"], ["windows"]),
+        (["gram", "--features", "win"], ["windows", "windows_regimes"]),
         (["evaluate", "--scenario", "mass_1"], ["mass_1000", "mass_1740"]),
         (["show", "nothing@"], []),
     ],
