@@ -1,13 +1,12 @@
 """The part of a `Fleet` that publishes models and serves them."""
 
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fleet_slip.api.calls import Rooted, record_call
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.errors import StorageError, UsageError
+from fleet_slip.errors import UsageError
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.model_version import ModelVersion
@@ -94,8 +93,7 @@ class PublishedModels(Rooted):
         if not (force or candidate):
             champion, made = registry.champion(name), None
             if champion:
-                with suppress(StorageError):
-                    made = read_trained_drives(registry.folder_of(name), champion.manifest)
+                made = read_trained_drives(registry.folder_of(name), champion.manifest)
             if champion is None or made is not None:
                 require_sound_drives(self.warehouse, manifest, made)
         return publish(registry, manifest, selection, force=force, candidate=candidate)

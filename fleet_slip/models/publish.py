@@ -9,7 +9,7 @@ from typing import Any
 
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import DataError, QuestionError, RefusedError
+from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
 from fleet_slip.grams.cohorts.taught_cohort import TaughtCohort
 from fleet_slip.models.acceptance.gate import compare, faults
 from fleet_slip.models.acceptance.vouched import ODD, odd_gain
@@ -312,8 +312,11 @@ def _judge(
                 f"it, and has {now:.4f} deg on these: most of it comes from drives unlike those "
                 f"that vouch for it. Look at them before they teach: {comparison}"
             )
-    if not problems and (odd := odd_gain(registry, selection, champion)):
-        problems.append(odd)
+    try:
+        if not problems and (odd := odd_gain(registry, selection, champion)):
+            problems.append(odd)
+    except StorageError as error:
+        problems.append(f"it cannot be judged on the drives that made the champion: {error}")
     best = next((one.version for one in incumbents if one.reference == comparison.best), None)
     return _Judgement(tuple(problems), str(comparison), best, comparison.drifts)
 

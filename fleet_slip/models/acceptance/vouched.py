@@ -5,7 +5,6 @@ many that outweighs what it loses elsewhere. So where the champion meets new dri
 much more wrong than on those that made it, both are compared on these alone.
 """
 
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import DataError, StorageError
+from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort
 from fleet_slip.grams.cohorts.folding import FOLD_KEYS, assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
@@ -26,6 +25,7 @@ from fleet_slip.models.versions import Registry
 from fleet_slip.regression.choice.winner import compare_paired
 from fleet_slip.regression.validation.crossval import CrossValidation, assemble, held_out_errors
 from fleet_slip.regression.validation.folds import CohortFolds, FoldAssignment, Folds
+from fleet_slip.runs.log import LOGGER
 from fleet_slip.selection.select_models import Selection
 from fleet_slip.warehouse.condition import parse_condition
 
@@ -42,16 +42,19 @@ def odd_gain(registry: Registry, selection: Selection[Any], champion: ModelVersi
     """Return why a person must look first: it is better on odd new drives alone; else None.
 
     Nothing is said where changes of the course taught, or all drives are as known as the others.
+    Raises `StorageError` if which drives made the champion cannot be read.
     """
-    with suppress(StorageError, DataError):
-        made = read_trained_drives(registry.folder_of(champion.manifest.name), champion.manifest)
-        if made is None or isinstance(selection.cohort, TaughtCohort):
-            return None
+    made = read_trained_drives(registry.folder_of(champion.manifest.name), champion.manifest)
+    if made is None or isinstance(selection.cohort, TaughtCohort):
+        return None
+    try:
         cohort = _some_drives(selection)
         numbers = hash_numbers(cohort.drives["drive_id"])
         known = np.isin(salt_drives(champion.manifest.name, numbers), made)
         if known.any() and not known.all():
             return _compare(selection, champion, cohort, known)
+    except DataError as error:
+        LOGGER.warning("whether it is better on odd drives alone was not judged: %s", error)
     return None
 
 

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import fleet_slip
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import ConfigError, RefusedError
+from fleet_slip.errors import ConfigError, RefusedError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.forget import forget
@@ -113,6 +114,22 @@ def test_what_is_better_on_odd_new_drives_alone_waits(champion: Warehouse) -> No
     assert not judge_only(registry_of(champion), manifest_of(answer, "beta"), answer).publishes
     waiting = publish_from(champion, candidate=True)
     assert waiting.candidate and registry_of(champion).champion("beta") != waiting.version
+
+
+def test_no_champion_falls_while_the_drives_that_made_it_cannot_be_read(
+    champion: Warehouse,
+) -> None:
+    """With a flipped bit there, what is better on odd drives alone became champion."""
+    write(champion, "odd", 8, label=1.25)
+    (kept,) = Path(str(registry_of(champion).folder_of("beta"))).glob("drives-*.bin")
+    kept.write_bytes(kept.read_bytes()[:-1] + b"x")
+    with pytest.raises(RefusedError, match=r"the drives that made the champion: .*checksum"):
+        publish_from(champion)
+    with pytest.raises(StorageError, match="checksum"):
+        fleet_slip.open(str(champion.root)).publish(
+            "beta", answer_request(champion, SelectionRequest(nested="ay,yaw_rate"))
+        )
+    assert publish_from(champion, force=True).new
 
 
 def test_few_drives_are_no_reason_to_replace_a_champion_of_many(champion: Warehouse) -> None:
