@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from fleet_slip.api.calls import Rooted, record_call
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.errors import UsageError
+from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.model_version import ModelVersion
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from fleet_slip.export.estimator import Estimator
     from fleet_slip.export.files import Target
     from fleet_slip.models.diff import Difference
+    from fleet_slip.models.manifest import Manifest
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.selection.select_models import RequestedSelection
 
@@ -77,10 +78,44 @@ class PublishedModels(Rooted):
         that contradict any car; `UsageError` for an invalid name, `ConfigError` for an unusable
         key, and what `FleetCohort.select` raises.
         """
+        from fleet_slip.models.publish import publish
+
+        registry = self.registry(sign_key)
+        manifest, selection = self._challenger(name, choice, force=force, candidate=candidate)
+        return publish(registry, manifest, selection, force=force, candidate=candidate)
+
+    def would_publish(
+        self,
+        name: str,
+        choice: "RequestedSelection | FleetCohort | None" = None,
+        *,
+        force: bool = False,
+        candidate: bool = False,
+        sign_key: Path | None = None,
+    ) -> "DryRun":
+        """Tell what `publish` of the same would come to, a refusal too; nothing is written."""
+        from fleet_slip.models.publish import DryRun, would_publish
+
+        registry = self.registry(sign_key)
+        try:
+            manifest, selection = self._challenger(name, choice, force=force, candidate=candidate)
+            return would_publish(registry, manifest, selection, force=force, candidate=candidate)
+        except RefusedError as error:
+            return DryRun(name, False, str(error), refused=True)
+
+    def _challenger(
+        self,
+        name: str,
+        choice: "RequestedSelection | FleetCohort | None",
+        *,
+        force: bool,
+        candidate: bool,
+    ) -> "tuple[Manifest, RequestedSelection]":
+        """Return a selection's winner, whose drives and course are looked at unless forced."""
         from fleet_slip.models.acceptance.first_look import require_sound_drives
         from fleet_slip.models.acceptance.in_time import require_in_time
         from fleet_slip.models.acceptance.sound_course import require_sound_course
-        from fleet_slip.models.publish import manifest_of, publish, with_straight_intercept
+        from fleet_slip.models.publish import manifest_of, with_straight_intercept
         from fleet_slip.models.trained_drives import read_trained_drives
 
         require_model_name(name)
@@ -89,25 +124,14 @@ class PublishedModels(Rooted):
         if manifest.learned_from and not force:
             delays_s = require_in_time(self.warehouse, manifest)
             require_sound_course(self.warehouse, manifest, delays_s)
-        registry = self.registry(sign_key)
         if not (force or candidate):
+            registry = self.registry()
             champion, made = registry.champion(name), None
             if champion:
                 made = read_trained_drives(registry.folder_of(name), champion.manifest)
             if champion is None or made is not None:
                 require_sound_drives(self.warehouse, manifest, made)
-        return publish(registry, manifest, selection, force=force, candidate=candidate)
-
-    def would_publish(
-        self, name: str, choice: "RequestedSelection | FleetCohort | None" = None
-    ) -> "DryRun":
-        """Tell what `publish` of the same would come to, without force; nothing is written."""
-        from fleet_slip.models.publish import judge_only, manifest_of, with_straight_intercept
-
-        require_model_name(name)
-        selection = self._chosen(name, choice)
-        manifest = with_straight_intercept(self.warehouse, manifest_of(selection, name), selection)
-        return judge_only(self.registry(), manifest, selection)
+        return manifest, selection
 
     def _chosen(
         self, name: str, choice: "RequestedSelection | FleetCohort | None"

@@ -58,6 +58,11 @@ class Registry:
         require_signature(self._versions(name).folder, version, name, loaded.sha256)
         return loaded
 
+    def require_key(self) -> None:
+        """Raise `ConfigError` if there is a private key that cannot be used."""
+        if self.signing_key is not None:
+            require_signing_key(self.signing_key)
+
     def sign(self, name: str, version: int) -> None:
         """Sign a version, if there is a key to sign with."""
         if self.signing_key is not None:
@@ -127,8 +132,7 @@ class Registry:
         If the latest is the same estimator from the same rows, it is used: another process added
         it.
         """
-        if self.signing_key is not None:
-            require_signing_key(self.signing_key)  # before anything is written
+        self.require_key()  # before anything is written
         name, versions = manifest.name, self._versions(manifest.name)
         if drives is not None:
             keep_drives(versions.folder, drives)

@@ -5,11 +5,13 @@ from datetime import date
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 import fleet_slip
 from fleet_slip import Fleet
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli import left_out
+from fleet_slip.cli.app import app
 from fleet_slip.errors import RefusedError, UnexaminedError
 from fleet_slip.models.acceptance import gate
 from fleet_slip.monitoring import examined, quality
@@ -104,9 +106,14 @@ def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
     assert fleet.publish("m", fleet.cohort(), candidate=True).candidate
 
 
+_FLOOR = gate.floor
+
+
 def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_columns(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    choice = ("--nested", "ay,yaw_rate", "--worth", "0.0001deg")
+    command = ("--root", str(tmp_path / "data"), "publish", "m", *choice, "--dry-run")
     asked = fleet.cohort("day = DATE '2026-10-05'").select(nested="ay,yaw_rate", worth="0.0001deg")
     for name, bound, told in (
         ("max_columns_per_drive", 0.1, r"columns? on 4 drives, more than 0\.1 a drive"),
@@ -114,9 +121,16 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
     ):
         strict = gate.floor().model_copy(update={name: bound})
         monkeypatch.setattr(gate, "floor", lambda strict=strict: strict)
-        with pytest.raises(RefusedError, match=told):
+        with pytest.raises(RefusedError, match=told) as refused:
             fleet.publish("m", asked)
-        monkeypatch.undo()
+        dry = fleet.would_publish("m", asked)
+        assert (dry.refused, dry.publishes, dry.reason) == (True, False, str(refused.value))
+        assert fleet.would_publish("m", asked, candidate=True).candidate
+        said = CliRunner().invoke(app, command)
+        assert "winner: " in said.stdout and isinstance(said.exception, RefusedError)
+        monkeypatch.setattr(gate, "floor", _FLOOR)
+    assert not fleet.models().num_rows
+    assert "m would be published. " in CliRunner().invoke(app, command).output
     assert fleet.publish("m", asked).new
 
 

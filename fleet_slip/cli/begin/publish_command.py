@@ -11,6 +11,7 @@ from fleet_slip.cli.models.signing_commands import SignKey, signing_key
 from fleet_slip.cli.options import RESAMPLING, Unexamined, request_options
 from fleet_slip.cli.output import All, Json, print_json, say
 from fleet_slip.cli.recorded import record_run
+from fleet_slip.errors import RefusedError
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import DryRun, Publication
 from fleet_slip.models.recipe import recipe_for
@@ -73,16 +74,22 @@ def publish(
         cohort = examine_before_publishing(context.obj, cohort)
     with step("select"):
         selection = answer_request(context.obj.warehouse, recipe.request, cohort)
+    key = signing_key(sign_key)
     if dry_run:
-        told = context.obj.would_publish(name, selection)
+        told = context.obj.would_publish(
+            name, selection, force=force, candidate=candidate, sign_key=key
+        )
         if json:
             print_json(told)
         else:
             print_selection(selection, everything)
+        if told.refused:
+            raise RefusedError(told.reason)
+        if not json:
             _print_dry_run(told)
         return
     publication = context.obj.publish(
-        name, selection, force=force, candidate=candidate, sign_key=signing_key(sign_key)
+        name, selection, force=force, candidate=candidate, sign_key=key
     )
     number = context.obj.log_to_mlflow(publication.version, mlflow) if mlflow else None
     if json:
@@ -96,6 +103,7 @@ def publish(
 
 def _print_dry_run(told: DryRun) -> None:
     would = "would be published" if told.publishes else "would not be published"
+    would += " as a candidate" if told.publishes and told.candidate else ""
     say(f"{told.model} {would}. {told.reason}")
 
 

@@ -20,7 +20,7 @@ from fleet_slip.models.acceptance import gate
 from fleet_slip.models.aliases import CANDIDATE
 from fleet_slip.models.diff import compare_versions
 from fleet_slip.models.estimates.counts_model import counts_model
-from fleet_slip.models.publish import Publication, judge_only, manifest_of, publish
+from fleet_slip.models.publish import Publication, manifest_of, publish, would_publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.choice.stepwise import stepwise_order
 from fleet_slip.regression.exact.least_squares import fit
@@ -73,10 +73,13 @@ def write(warehouse: Warehouse, name: str, drives: int, label: float = 1.0, **ab
 def publish_from(
     warehouse: Warehouse, cohort: str = "true", signals: str = "ay,yaw_rate", **options: Any
 ) -> Publication:
-    """Select on a cohort and publish the winner."""
+    """Select on a cohort and publish the winner, of which a dry run said what it comes to."""
     answer = answer_request(warehouse, SelectionRequest(nested=signals, worth="0.0001deg"), cohort)
     manifest = manifest_of(answer, "beta")
-    return publish(registry_of(warehouse), manifest, answer, **options)
+    told = would_publish(registry_of(warehouse), manifest, answer, **options)
+    done = publish(registry_of(warehouse), manifest, answer, **options)
+    assert (told.publishes, told.candidate) == (done.new, done.candidate)
+    return done
 
 
 def registry_of(warehouse: Warehouse) -> Registry:
@@ -110,8 +113,6 @@ def test_what_is_better_on_odd_new_drives_alone_waits(champion: Warehouse) -> No
     write(champion, "odd", 8, label=1.25)
     with pytest.raises(RefusedError, match=r"better on odd drives alone: .* made beta@1 it has"):
         publish_from(champion)
-    answer = answer_request(champion, SelectionRequest(nested="ay,yaw_rate"))
-    assert not judge_only(registry_of(champion), manifest_of(answer, "beta"), answer).publishes
     waiting = publish_from(champion, candidate=True)
     assert waiting.candidate and registry_of(champion).champion("beta") != waiting.version
 
