@@ -11,7 +11,9 @@ correct it. With the lateral forces F of the axles:
     ṙ  = (a Ff cos δ − b Fr)/I             z3 = (Ff cos δ + Fr)/m + b
     ḃ  = 0
 
-The gyroscope's bias is a state of the yaw rate filter (`yaw_rate`) before it.
+The gyroscope's bias is a state of the yaw rate filter (`yaw_rate`) before it. A drive may begin in
+a bend: at first the rear wheels are taken to roll without slip, vy = b r. From vy = 0 the rear
+tyres would slide there, where their force has no slope that leads back.
 """
 
 from typing import NamedTuple
@@ -199,7 +201,7 @@ def estimate(
         measured_steer_rad(drive),
         axles_of(car, ax_mps2, ay_mps2, noise),
         np.ones(len(drive)) if model_noise is None else model_noise,
-        (vx_mps[0], 0.0, turning[0], 0.0),
+        (vx_mps[0], car.body.rear_axle_m * turning[0], turning[0], 0.0),  # vy: rear wheels roll
         (*(std**2 for std in INITIAL_STD), noise.ay_bias_std_mps2**2),
         chassis(car),
         variances(noise),

@@ -65,10 +65,11 @@ def _observe(
     steer: FloatArray,
     yaw_rate: FloatArray,
     ay: FloatArray,
+    rear_m: float,
 ) -> FloatArray:
     """Return vy, by Euler's forward step. The space is a `StateSpace` as a plain tuple."""
     a11, a12, a21, a22, b1, b2, vx_mps = space
-    vy, r = 0.0, yaw_rate[0]
+    vy, r = rear_m * yaw_rate[0], yaw_rate[0]
     estimates = np.empty(len(ay))
     for k in range(len(ay)):
         force = a11[k] * vy + a12[k] * r + b1[k] * steer[k]
@@ -92,5 +93,6 @@ def estimate(drive: DriveSignals, car: VehicleParameters, poles: ObserverPoles) 
         measured_steer_rad(drive),
         yaw_rate.estimate(drive, car, poles.yaw_rate).yaw_rate_rad_s,
         hold_last(drive.ay_mps2, "ay"),
+        car.body.rear_axle_m,
     )
     return sideslip_angle(vx_mps, vy_mps)

@@ -86,10 +86,11 @@ def _observe(
     measured_vy: FloatArray,
     gains: tuple[float, float],
     layers: tuple[float, float],
+    rear_m: float,
 ) -> FloatArray:
     """Return vy, by Euler's forward step. The space is a `StateSpace` as a plain tuple."""
     a11, a12, a21, a22, b1, b2, _ = space
-    vy, r = 0.0, yaw_rate[0]
+    vy, r = rear_m * yaw_rate[0], yaw_rate[0]
     estimates = np.empty(len(steer))
     for k in range(len(steer)):
         slide_vy = gains[0] * saturate((measured_vy[k] - vy) / layers[0])
@@ -115,5 +116,6 @@ def estimate(drive: DriveSignals, car: VehicleParameters, gains: SlidingGains) -
         (ay_mps2 - space.b1 * steer - space.c2 * turning) / space.a11,
         (gains.lateral_gain_mps2, gains.yaw_gain_rad_s2),
         (gains.lateral_layer_mps, gains.yaw_layer_rad_s),
+        car.body.rear_axle_m,
     )
     return sideslip_angle(vx_mps, vy_mps)

@@ -225,3 +225,12 @@ def test_covariance_stays_positive_definite() -> None:
         ekf.predict(x, 0.0, steer, STEP_S, AT_REST, CHASSIS, NOISE)
         ekf.update(x, 20.0, turning, ay, steer, AT_REST, CHASSIS, NOISE)
     assert np.linalg.eigvalsh(x.covariance).min() > 0
+
+
+def test_a_drive_that_begins_in_a_tight_bend_is_followed_from_the_start() -> None:
+    still = np.zeros(200)
+    vx, yaw_rate = still + 5.5, still + 0.8
+    vy = CAR.body.rear_axle_m * yaw_rate - 0.1
+    drive = rolling_drive(CAR, vx, vy, yaw_rate, still + 0.4)
+    error_rad = ekf.estimate(drive, CAR, EkfNoise()) - np.arctan2(vy, vx)
+    assert np.degrees(np.abs(error_rad)).max() < 2
