@@ -19,6 +19,7 @@ from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, plain_colum
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet, Regime
 from fleet_slip.catalogue.row_features import Feature
 from fleet_slip.catalogue.signals import Identifier, Signal, catalogue
+from fleet_slip.catalogue.sources import RECEIVED
 from fleet_slip.catalogue.time_columns import (
     Calibrated,
     Factor,
@@ -60,6 +61,8 @@ class FeatureCatalogue(Config):
             raise ValueError(f"names must differ, from those of signals too: {', '.join(twice)}")
         if PLAIN in self.sets:
             raise ValueError(f"{PLAIN!r} is the set of the catalogue's own signals")
+        if RECEIVED in self.sets:
+            raise ValueError(f"files of Gram rows that cars sent are called {RECEIVED!r}")
         for name, regime in self.regimes.items():
             if regime.of not in {*self.features, *signals.feature_inputs}:
                 raise ValueError(f"regimes.{name}: {regime.of} is no input signal or feature")

@@ -89,6 +89,22 @@ class Table:
             raise StorageError(f"{self.folder}/{path}: no column {min(absent)}.")
         return rows
 
+    def read_combinations(self, path: str, columns: Sequence[str]) -> pa.Table:
+        """Return each combination of the texts of some columns in a file, once, from dictionaries.
+
+        That takes a third of the time of reading the columns. Raises `StorageError` as `read`.
+        """
+        self.folder.check(path)
+        names = list(columns)
+        with (
+            storage_errors(f"{self.folder}/{path}"),
+            self.folder.open(path) as file,
+            pq.ParquetFile(file, read_dictionary=names, pre_buffer=True) as parquet,
+        ):
+            rows = parquet.read(columns=names).unify_dictionaries()
+        found = rows.group_by(names, use_threads=False).aggregate([])
+        return found.cast(pa.schema([(name, pa.string()) for name in found.column_names]))
+
     def read_metadata(self, path: str) -> pq.FileMetaData:
         """Return the footer of one of the table's files."""
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:

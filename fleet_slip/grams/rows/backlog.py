@@ -9,6 +9,7 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import RECEIVED_FILES
 from fleet_slip.delta import Snapshot, TableFile
 from fleet_slip.errors import ConflictError
+from fleet_slip.grams.rows.gram_files import is_of_received
 
 BEING_WRITTEN_HOURS = 1.0
 """A file that no commit ever knew and that is younger may belong to a job that is running."""
@@ -38,10 +39,11 @@ def named_files(grams: Snapshot, identity: str) -> tuple[set[str], set[str]]:
     done: set[str] = set()
     named: set[str] = set()
     for file in grams.files:
-        rows = grams.table.read(file.path, ["feature_set", "file"])
-        named.update(name for name in rows["file"].unique().to_pylist() if _has_log(name))
-        mine = rows.filter(pc.equal(rows["feature_set"], identity))
-        done.update(mine["file"].unique().to_pylist())
+        if is_of_received(file):  # of no log
+            continue
+        pairs = grams.table.read_combinations(file.path, ["feature_set", "file"])
+        named.update(name for name in pairs["file"].to_pylist() if _has_log(name))
+        done.update(pairs["file"].filter(pc.equal(pairs["feature_set"], identity)).to_pylist())
     return done, named
 
 

@@ -18,6 +18,7 @@ from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.grams.rows.course_delays import recorded_cars
 from fleet_slip.grams.rows.drive_rows import rows_by_drive
+from fleet_slip.grams.rows.gram_files import is_of_received
 from fleet_slip.grams.rows.gram_job import unit_name
 from fleet_slip.grams.rows.gram_rows import is_received
 from fleet_slip.grams.rows.wide import wide_grams
@@ -142,10 +143,10 @@ def _in_one_order(grams: DriveGrams) -> DriveGrams:
 def find_gram_files(warehouse: Warehouse, grams: Iterable[TableFile]) -> dict[str, tuple[str, ...]]:
     """Return the paths of the Gram files with rows of the logged signals of each log file."""
     found: dict[str, tuple[str, ...]] = {}
-    for path in (gram_file.path for gram_file in grams):
-        rows = warehouse.grams.read(path, ["feature_set", "file"])
-        mine = pc.and_(pc.equal(rows["feature_set"], PLAIN), pc.invert(is_received(rows)))
-        for file in rows.filter(mine)["file"].unique().to_pylist():
+    for path in (gram_file.path for gram_file in grams if not is_of_received(gram_file)):
+        pairs = warehouse.grams.read_combinations(path, ["feature_set", "file"])
+        mine = pc.and_(pc.equal(pairs["feature_set"], PLAIN), pc.invert(is_received(pairs)))
+        for file in pairs.filter(mine)["file"].to_pylist():
             found[file] = (*found.get(file, ()), path)
     return found
 

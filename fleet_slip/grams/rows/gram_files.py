@@ -78,7 +78,8 @@ def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
     return [
         file
         for file in grams.files
-        if file.path in merged or (stale and not stale.isdisjoint(_log_files_of(grams, file)))
+        if file.path in merged
+        or (stale and not is_of_received(file) and not stale.isdisjoint(_log_files_of(grams, file)))
     ]
 
 
@@ -97,7 +98,7 @@ def _fullness(file: TableFile) -> float:
 
 
 def _log_files_of(grams: Snapshot, file: TableFile) -> set[str]:
-    return set(grams.table.read(file.path, ["file"])["file"].unique().to_pylist())
+    return set(grams.table.read_combinations(file.path, ["file"])["file"].to_pylist())
 
 
 def rows_to_keep(
