@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.ingest.drafting.vocabulary import vocabulary
+from fleet_slip.ingest.mapping.vocabulary import vocabulary
 
 _FAR = 2.0
 """How many times the range of the others a number lies outside of it, to be none."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.drafting.profile import Profile
-from fleet_slip.ingest.drafting.vocabulary import (
+from fleet_slip.ingest.mapping.vocabulary import (
     CORNERS,
     best_words,
     fits_any,

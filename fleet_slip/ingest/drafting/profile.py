@@ -14,7 +14,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drafting.absent_values import Absent, find_absent, without_absent
 from fleet_slip.ingest.drafting.text_layout import guess_layout
-from fleet_slip.ingest.drafting.vocabulary import vocabulary
+from fleet_slip.ingest.mapping.vocabulary import vocabulary
 from fleet_slip.ingest.formats.csv_text import CsvFormat
 from fleet_slip.ingest.formats.reading import (
     FileFormats,

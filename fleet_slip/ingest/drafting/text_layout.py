@@ -5,7 +5,7 @@ import re
 from collections import Counter
 from pathlib import Path
 
-from fleet_slip.ingest.drafting.vocabulary import unit_called
+from fleet_slip.ingest.mapping.vocabulary import unit_called
 from fleet_slip.ingest.formats.csv_text import CsvFormat, Encoding, decompressed, first_lines
 
 _SEPARATORS = (";", "\t", "|", ",", " ")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.ingest.drafting.profile import FileProfile, Profile, sample_rate_hz
-from fleet_slip.ingest.drafting.vocabulary import is_called, parts_of, split_unit, vocabulary
+from fleet_slip.ingest.mapping.vocabulary import is_called, parts_of, split_unit, vocabulary
 
 _UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
 _STEPS = ((0.5, "s"), (500.0, "ms"), (500_000.0, "us"), (np.inf, "ns"))
