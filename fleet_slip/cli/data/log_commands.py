@@ -186,7 +186,7 @@ def ingest(
 
 
 def _require_sound(reports: "list[IngestReport]") -> None:
-    """Raise `AlarmError` for much that was refused, an assumed rate, or a sign that is lost."""
+    """Raise `AlarmError` for much refused, an assumed rate, a lost sign, or several cars as one."""
     from fleet_slip.ingest.drives.suspicion import (  # noqa: PLC0415 - takes a while
         FEWEST_REFUSED,
         LARGEST_REFUSED,
@@ -201,7 +201,7 @@ def _require_sound(reports: "list[IngestReport]") -> None:
                 "with --replace."
             )
         for one in report.suspicions:
-            if one.kind in {"time", "magnitude"}:
+            if one.kind in {"time", "magnitude", "cars", "repeated"}:
                 raise AlarmError(
                     f"{report.file}: {one} Its rows are in. Give the command again with --replace "
                     "when the mapping is right."

@@ -26,10 +26,10 @@ from fleet_slip.ingest.drafting.preview import preview_log
 from fleet_slip.ingest.drafting.profile import FileProfile
 from fleet_slip.ingest.drafting.times_and_cars import TimeGuess, guess_cars, guess_time
 from fleet_slip.ingest.drafting.unit_choice import choose_units, steering_ratio
-from fleet_slip.ingest.mapping.vocabulary import parts_of
 from fleet_slip.ingest.drives.suspicion import WHEELS, Suspicion, find_suspicions
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.ingest.mapping.signal_column import COURSE, SPEED
+from fleet_slip.ingest.mapping.vocabulary import parts_of
 from fleet_slip.words import shown
 
 _STAND_IN: dict[str, Any] = {"vehicle_id": "car", "vehicle_model": "car", "day": date(2000, 1, 1)}

@@ -11,6 +11,10 @@ import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.drafting.profile import Profile
+from fleet_slip.ingest.drives.one_sided import TURNING
+from fleet_slip.ingest.drives.suspicion import RADIUS_M
+from fleet_slip.ingest.mapping.signal_column import COURSE, SPEED, Component
+from fleet_slip.ingest.mapping.units import conversion_factor
 from fleet_slip.ingest.mapping.vocabulary import (
     CORNERS,
     best_words,
@@ -21,10 +25,6 @@ from fleet_slip.ingest.mapping.vocabulary import (
     unit_called,
     vocabulary,
 )
-from fleet_slip.ingest.drives.one_sided import TURNING
-from fleet_slip.ingest.drives.suspicion import RADIUS_M
-from fleet_slip.ingest.mapping.signal_column import COURSE, SPEED, Component
-from fleet_slip.ingest.mapping.units import conversion_factor
 
 NO_UNIT = "the file has no unit"
 _WEAK = 0.5

@@ -14,7 +14,6 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drafting.absent_values import Absent, find_absent, without_absent
 from fleet_slip.ingest.drafting.text_layout import guess_layout
-from fleet_slip.ingest.mapping.vocabulary import vocabulary
 from fleet_slip.ingest.formats.csv_text import CsvFormat
 from fleet_slip.ingest.formats.reading import (
     FileFormats,
@@ -23,6 +22,7 @@ from fleet_slip.ingest.formats.reading import (
     require_unchanged_file,
 )
 from fleet_slip.ingest.formats.source import OWN_TIME, Channel, Source
+from fleet_slip.ingest.mapping.vocabulary import vocabulary
 
 MOST_ROWS = 200_000
 """Rows of each time base that are looked at."""

@@ -5,8 +5,8 @@ import re
 from collections import Counter
 from pathlib import Path
 
-from fleet_slip.ingest.mapping.vocabulary import unit_called
 from fleet_slip.ingest.formats.csv_text import CsvFormat, Encoding, decompressed, first_lines
+from fleet_slip.ingest.mapping.vocabulary import unit_called
 
 _SEPARATORS = (";", "\t", "|", ",", " ")
 _LINES = 120

@@ -39,6 +39,7 @@ from fleet_slip.ingest.drives.measured_drives import (
 )
 from fleet_slip.ingest.drives.open_drives import MAX_OPEN_ROWS, DriveRows, OpenDrives
 from fleet_slip.ingest.drives.resampling import STEP_S, TIME_EPSILON_S
+from fleet_slip.ingest.drives.several_cars import SeveralCars, unmapped_cars
 from fleet_slip.ingest.drives.suspicion import Suspicion, assumed_rate, find_refusals
 from fleet_slip.ingest.formats.parquet_batches import partition_keys
 from fleet_slip.ingest.formats.reading import log_digest, require_unchanged_log
@@ -88,6 +89,7 @@ class MeasuredStream:
         self._open = OpenDrives()
         self._stretches: Counter[int] = Counter()
         self._trips = Trips()
+        self._cars = SeveralCars()
         self.name = os.fsencode(file.name).decode("utf-8", "replace")
         self._stem = self.name.split(".", 1)[0] or self.name
         self._first_refused: dict[str, Any] | None = None
@@ -167,6 +169,7 @@ class MeasuredStream:
         except InputError as error:
             raise InputError(f"{shown(self.file)}: {error}") from None
         self.totals.add(rows, drive)
+        self._cars.add(rows, drive)
         self._require_sane_drives()
         return drive
 
@@ -264,8 +267,9 @@ class MeasuredStream:
             of_signals[reason] += count
         others = self.totals.quarantined - of_signals
         found = tuple(find_refusals(self.totals.refused, self.checker.rows, others))
-        time = self.mapping.time
-        return (*found, *assumed_rate(time.rate_hz if time.assumed else None))
+        time, drives = self.mapping.time, self.totals.drives
+        of_cars = (*self._cars.suspicions(), *unmapped_cars(self.file, self.mapping, drives))
+        return (*found, *of_cars, *assumed_rate(time.rate_hz if time.assumed else None))
 
     def look_alikes(self) -> tuple[tuple[str, ...], ...]:
         """Return names of drives or cars in the file that differ only in their Unicode form."""

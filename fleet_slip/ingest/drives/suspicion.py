@@ -48,7 +48,7 @@ class Suspicion:
     """What looks wrong.
 
     Attributes:
-        kind: sign, magnitude, swapped, unit, delay, stuck, absent, values or time.
+        kind: sign, magnitude, swapped, unit, delay, stuck, absent, values, time, cars or repeated.
         signals: those concerned.
         figure: what shows it.
         remedy: what to try in the mapping.
@@ -103,8 +103,10 @@ def find_refusals(
         reason = max(others, key=lambda one: others[one])
         figure = f"{total:,} of {rows:,} rows are refused, {others[reason]:,} as {reason}"
         if reason.startswith(_OF_TIME):
-            remedy = "Check the column of times, its unit and its format."
-            yield Suspicion("values", ("time",), figure, remedy)
+            remedy = "Check the column of times, its unit and its format"
+            if reason in {"time_duplicate", "time_backwards"}:
+                remedy += ", and map the column that tells cars or trips apart if there are several"
+            yield Suspicion("values", ("time",), figure, f"{remedy}.")
         else:
             yield Suspicion("values", ("rows",), figure, "Look at the view quarantine.")
 
