@@ -53,6 +53,8 @@ class FleetSlipError(Exception):
     """Base of all expected errors: the message says what, where, and what to do next."""
 
     exit_code = 1
+    headline = ""
+    """What a command ends with instead, where it has printed the rest before."""
 
     def __init__(self, message: str) -> None:
         super().__init__(printable(hide_passwords(message)))
@@ -80,6 +82,12 @@ class RepeatedError(InputError):
     """A recording that is in the logs already: a second time it would count twice."""
 
     exit_code = 15
+
+
+class UnclaimedError(InputError):
+    """A log in a folder that no mapping of several takes, or more than one."""
+
+    exit_code = 10
 
 
 class DataError(FleetSlipError):

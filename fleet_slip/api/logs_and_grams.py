@@ -15,6 +15,7 @@ from fleet_slip.api.calls import (
     unless_local,
     within_reach,
 )
+from fleet_slip.errors import InputError
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.log import step
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from fleet_slip.ingest.landing.same_recordings import Replace
     from fleet_slip.ingest.logs.log_files import Log
     from fleet_slip.ingest.mapping.mapping import Mapping
+    from fleet_slip.ingest.mapping.mapping_list import MappingList
     from fleet_slip.maintenance.migration import MigrationReport
     from fleet_slip.simulation.campaign import Campaign
     from fleet_slip.simulation.job import SimulationReport
@@ -101,7 +103,7 @@ class LogsAndGrams(Rooted):
     def ingest(
         self,
         files: Iterable[Path | str] | Path | str,
-        mapping: "str | Mapping",
+        mapping: "str | Mapping | MappingList",
         *,
         as_one: bool = False,
         replace: "Replace" = "no",
@@ -111,9 +113,10 @@ class LogsAndGrams(Rooted):
     ) -> "list[IngestReport]":
         """Bring measured logs in through a mapping of columns, units and axes.
 
-        `mapping` is a name, the path of a TOML file, or a `Mapping`. Rows that cannot be used go to
-        the view `quarantine`. Of folders, at any depth, and patterns, the logs are taken that have
-        not landed unchanged; with `as_one` they are parts of one log. Objects are given as URLs.
+        `mapping` is a name, the path of a TOML file, or a `Mapping`; or a list of them for files of
+        their own (`docs/mapping.md`). Rows that cannot be used go to the view `quarantine`. Of
+        folders, at any depth, and patterns, the logs are taken that have not landed unchanged; with
+        `as_one` they are parts of one log. Objects are given as URLs.
         Returns a report of each file read, in order; `each` gets it once the file is committed.
         Progress is in files for folders and patterns, else in rows where a format tells them.
         Without a cluster, threads read a folder's small files; large ones are read one by one, by
@@ -123,20 +126,21 @@ class LogsAndGrams(Rooted):
         drives give way to the new ones, in one commit; with `corrected` those of the same file and
         an older state of the same mapping do. Raises `ConfigError` for an invalid mapping;
         `InputError`, when all others are in, for files that cannot be used, or `RepeatedError`
-        where these are all in already; `StorageError` and `ClusterError`.
+        where these are all in already, or `UnclaimedError` where no mapping of a list takes them,
+        or several do; `StorageError` and `ClusterError`.
         """
-        from fleet_slip.ingest.landing.ingest_job import ingest_files
+        from fleet_slip.ingest.landing.ingest_job import ingest_files, joined
         from fleet_slip.ingest.landing.known_files import KnownFiles
         from fleet_slip.ingest.logs.log_files import find_logs, find_whole_logs, names_several
-        from fleet_slip.ingest.mapping.mapping import load_mapping
+        from fleet_slip.ingest.mapping.mapping_list import as_list
         from fleet_slip.maintenance.superseding import TakingOut
 
-        plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
+        plans = as_list(mapping)
         given = [files] if isinstance(files, Path | str) else list(files)
         paths = find_whole_logs(given) if as_one else find_logs(given)
         folders = any(map(names_several, given))
-        known = KnownFiles.of(self.warehouse, plan) if folders else None
         told = count_from_start(progress)
+        failures: list[InputError] = []
         reports = {}
         with open_workers(self.root, workers) as executor, step("ingest") as figures:
             elsewhere = unless_local(executor)
@@ -144,29 +148,35 @@ class LogsAndGrams(Rooted):
                 paths = [one.absolute() if isinstance(one, Path) else one for one in paths]
             figures.rows = 0
             warehouse = within_reach(self.warehouse, executor)
-            wanted = paths
-            if known is not None and not as_one:  # what is in a folder its own size does not tell
-                wanted = known.without_landed(paths, warehouse)
-            if landed := len(paths) - len(wanted):
-                told(landed, len(paths))
+            shares, unclaimed = plans.share_out(paths, given)
             by_file = folders and not as_one
-            rows = no_progress if by_file or progress is None else _rows_of(wanted, told)
-            try:
-                threads = executor if by_file else elsewhere
-                taking_out = TakingOut(self.warehouse)
-                for report in ingest_files(
-                    warehouse, wanted, plan, threads, known, rows, replace, taking_out
-                ):
-                    reports[report.file] = report
-                    figures.rows += report.counts.ticks if report.new else 0
-                    if each is not None:
-                        each(report)
-                    if by_file:
-                        told(1, len(paths))
-            finally:
-                if known is not None:
-                    known.save(warehouse)
-        return [reports[str(path)] for path in wanted]
+            threads = executor if by_file else elsewhere
+            taking_out = TakingOut(self.warehouse)
+            logs = [log for _, share in shares for log in share]
+            rows = no_progress if by_file or progress is None else _rows_of(logs, told)
+            for plan, share in shares:
+                known = KnownFiles.of(self.warehouse, plan) if folders else None
+                wanted = share
+                if known is not None and not as_one:  # what is in a folder its size does not tell
+                    wanted = known.without_landed(share, warehouse)
+                if landed := len(share) - len(wanted):
+                    told(landed, len(logs))
+                try:
+                    for report in ingest_files(
+                        warehouse, wanted, plan, threads, known, rows, replace, taking_out, failures
+                    ):
+                        reports[report.file] = report
+                        figures.rows += report.counts.ticks if report.new else 0
+                        if each is not None:
+                            each(report)
+                        if by_file:
+                            told(1, len(logs))
+                finally:
+                    if known is not None:
+                        known.save(warehouse)
+            if failures or unclaimed:
+                raise joined(failures, unclaimed)
+        return [reports[str(path)] for path in paths if str(path) in reports]
 
     @record_call
     def take_back(self, what: str) -> int:
@@ -184,7 +194,7 @@ class LogsAndGrams(Rooted):
     def preview(
         self,
         files: Iterable[Path | str] | Path | str,
-        mapping: "str | Mapping",
+        mapping: "str | Mapping | MappingList",
         *,
         as_one: bool = False,
     ) -> "list[Preview]":
@@ -195,12 +205,15 @@ class LogsAndGrams(Rooted):
         """
         from fleet_slip.ingest.drafting.preview import preview_log
         from fleet_slip.ingest.logs.log_files import find_logs, find_whole_logs
-        from fleet_slip.ingest.mapping.mapping import load_mapping
+        from fleet_slip.ingest.mapping.mapping_list import as_list
 
-        plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
+        plans = as_list(mapping)
         given = [files] if isinstance(files, Path | str) else list(files)
         logs = find_whole_logs(given) if as_one else find_logs(given)
-        return [preview_log(log, plan) for log in logs]
+        shares, unclaimed = plans.share_out(logs, given)
+        if unclaimed:
+            raise unclaimed
+        return [preview_log(log, plan) for plan, share in shares for log in share]
 
     @record_call
     def gram(

@@ -15,9 +15,15 @@ from fleet_slip.api.run_report import Training
 from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
-from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError
+from fleet_slip.errors import (
+    DataError,
+    FleetSlipError,
+    InputError,
+    RepeatedError,
+    UnclaimedError,
+)
 from fleet_slip.ingest.logs.log_files import find_logs, is_url
-from fleet_slip.ingest.mapping.mapping import load_mapping
+from fleet_slip.ingest.mapping.mapping_list import as_list
 from fleet_slip.models.aliases import CANDIDATE
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.monitoring.night_report import NightReport, NightStep, State
@@ -156,7 +162,7 @@ class Night:
         return f"{name}@{pointed}" if waits else None
 
     def _ingest(self) -> Told:
-        mapping = load_mapping(self.asked.mapping)
+        mapping = as_list(self.asked.mapping)
         landing = self.asked.landing
         if not is_url(landing) and not Path(landing).is_dir():
             raise InputError(
@@ -178,7 +184,7 @@ class Night:
                 each=reports.append,
                 progress=self._show("ingest"),
             )
-        except RepeatedError as error:  # what is there counts once
+        except (RepeatedError, UnclaimedError) as error:  # all others are in
             again = str(error)
         rows = self.fleet.warehouse.logs.snapshot().rows - self.before.rows
         told = f"{number_of(max(rows, 0), 'new row')}."

@@ -51,7 +51,10 @@ class NightRequest:
     landing: Annotated[
         Path | str, Doc("The folder where logs land, or s3://…; what is new in it is taken.")
     ]
-    mapping: Annotated[str, Doc("A mapping of configs/mappings, or the path of a TOML file.")]
+    mapping: Annotated[
+        str,
+        Doc("A mapping or a list of them: of configs/mappings, or a TOML file."),
+    ]
     name: Annotated[str, Doc("Name of the model.")]
     _: KW_ONLY
     cohort: Annotated[str, Doc("SQL condition on the view drives: which drives train it.")] = (

@@ -36,7 +36,8 @@ app = typer.Typer(
         "Exit codes: 0 done, 1 a bug, 2 wrong usage, 3 a config file, 4 input data, 5 the data "
         "cannot answer, 6 storage, 7 refused, 8 a conflict with another process, 9 damage "
         "found, 10 something calls for attention, 11 a cluster, 12 not all done yet, 13 a "
-        "package of an extra is missing, 130 interrupted."
+        "package of an extra is missing, 14 too few cars for an answer, 15 a recording that is in "
+        "already, 16 not examined, 130 interrupted."
     ),
 )
 
@@ -115,7 +116,7 @@ def _exit_code_of_app() -> int:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         app()
     except FleetSlipError as error:
-        say(f"error: {error}", logging.ERROR)
+        say(f"error: {error.headline or error}", logging.ERROR)
         return error.exit_code
     except (MemoryError, ImportError, OSError, RuntimeError) as error:
         if not is_lack_of_memory(error):

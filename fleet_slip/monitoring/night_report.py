@@ -100,9 +100,11 @@ class NightReport:
         """How the night went, in a few words."""
         failed = [step.name for step in self.steps if step.state == "failed"]
         calling = [step.name for step in self.steps if step.state == "attention"]
-        if failed:
-            return f"{' and '.join(failed)} failed"
-        return f"{' and '.join(calling)} call for attention" if calling else "all went well"
+        told = [f"{' and '.join(failed)} failed"] if failed else []
+        if calling:
+            calls = "calls" if len(calling) == 1 else "call"
+            told.append(f"{' and '.join(calling)} {calls} for attention")
+        return ", ".join(told) or "all went well"
 
     @property
     def gained(self) -> str:

@@ -9,6 +9,7 @@ from datetime import date, timedelta
 from pathlib import Path
 from typing import Any
 
+import duckdb
 import numpy as np
 import pytest
 
@@ -222,13 +223,40 @@ def test_a_file_that_cannot_be_used_does_not_hold_up_the_others(
     assert "torn.parquet" in str(report.problem)
 
 
+def test_a_mixed_folder_lands_through_several_mappings_and_a_stray_file_is_said_once(
+    place: Path, landing: Landing
+) -> None:
+    text = landing.mapping.read_text()
+    (place / "other.toml").write_text(text.replace('"landing"', '"other"').replace("ax_", "a_x_"))
+    (place / "mixed.toml").write_text(
+        '[[mappings]]\nfiles = "night-*"\nmapping = "landing.toml"\n'
+        '[[mappings]]\nfiles = "other"\nmapping = "other.toml"\n'
+    )
+    file = land(landing, 2)
+    (place / "landing/other").mkdir()
+    with duckdb.connect() as database:
+        database.sql(
+            f"COPY (SELECT * RENAME (ax_mps2 AS a_x_mps2) FROM '{file}') "
+            f"TO '{place}/landing/other/log.parquet'"
+        )
+    file.unlink()
+    (place / "landing/stray.csv").write_text("a,b\n1,2\n")
+    done = run_night(place, 2, "--mapping", str(place / "mixed.toml"))
+    assert done.exit_code == 10, done.stderr
+    assert (done.stdout + done.stderr).count("stray.csv") == 1
+    assert done.stderr == f"error: the night of {day_of(2)}: ingest calls for attention\n"
+    assert "new: 2 drives" in done.stdout
+    assert "champion: smoke@3, was smoke@2" in done.stdout
+
+
 def test_with_a_wrong_mapping_what_is_there_is_looked_after(place: Path, landing: Landing) -> None:
     land(landing, 2)
     wrong = place / "wrong.toml"
     wrong.write_text(landing.mapping.read_text().replace('"m/s^2"', '"furlongs"'))
     done = run_night(place, 2, "--mapping", str(wrong), "--json")
     assert done.exit_code == 3
-    assert "furlongs" in done.stderr
+    assert done.stderr == f"error: the night of {day_of(2)}: ingest failed\n"
+    assert "furlongs" in done.json["steps"][0]["told"]
     states = {step["name"]: step["state"] for step in done.json["steps"]}
     assert states["ingest"] == "failed"
     assert states["verify"] == states["quality"] == "done"

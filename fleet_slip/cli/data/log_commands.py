@@ -110,7 +110,9 @@ def ingest(
     mapping: Annotated[
         str | None,
         typer.Option(
-            help="A mapping of configs/mappings, or the path of a TOML file.", show_default=False
+            help="A mapping of configs/mappings, or the path of a TOML file: a mapping, or a list "
+            "of them, each for files of its own.",
+            show_default=False,
         ),
     ] = None,
     dry_run: Annotated[

@@ -66,4 +66,5 @@ def nightly(
     else:
         print_text(report.as_text())
     if problem := report.problem:
+        problem.headline = f"the night of {report.night}: {report.verdict}"
         raise problem

@@ -82,6 +82,7 @@ def ingest_files(
     progress: Progress = no_progress,
     replace: Replace = "no",
     superseding: Superseding | None = None,
+    failures: list[InputError] | None = None,
 ) -> Iterator[IngestReport]:
     """Ingest files, and yield a report of each as it is committed; small files land together.
 
@@ -93,27 +94,29 @@ def ingest_files(
     read.
 
     A file that is not usable does not hold up the others: when they are done `InputError` tells
-    of it, or `RepeatedError` where all such files are there already. Raises `ClusterError` at the
-    end for files that workers died of.
+    of it, or `RepeatedError` where all such files are there already, unless `failures` is given and
+    takes them. Raises `ClusterError` at the end for files that workers died of.
     """
     write = partial(write_batch, warehouse, mapping, replace=replace)
     if executor is None:
         write = partial(write, progress=progress)
     warehouse.logs.require_writable(mapping.signal_names)
-    failures: list[InputError] = []
+    failed: list[InputError] = []
     asked = (AskedFile(file, known.digest_of(file) if known else None) for file in files)
     for batch, written in _written(executor, write, _batches(asked)):
         # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
         note = {"job": "ingest", "mapping": mapping.name, "digest": written.digest}
         landed, new = land_batch(warehouse, written, partial(write, batch), note, superseding)
-        failures += landed.failures
+        failed += landed.failures
         for outcome in landed.outcomes:
             yield _report(warehouse, outcome, new)
             new -= {unit_of(outcome.digest).name}  # the same content in another file is not new
             if known is not None:
                 known.remember(outcome.file, outcome.digest)
-    if failures:
-        raise _joined(failures)
+    if failures is not None:
+        failures += failed
+    elif failed:
+        raise joined(failed)
 
 
 def _written(
@@ -188,14 +191,15 @@ def _find_vehicles_like(
     return tuple(group for group in groups if suspects.intersection(group))
 
 
-def _joined(failures: list[InputError]) -> InputError:
-    """Return one error that tells of all."""
-    if len(failures) == 1:
-        return failures[0]
+def joined(failures: list[InputError], beside: InputError | None = None) -> InputError:
+    """Return one error that tells of all, and of what is wrong beside them."""
+    if len(failures) + bool(beside) == 1:
+        return beside or failures[0]
     told = " ".join(map(str, failures[:FAILURES_SHOWN]))
     more = len(failures) - FAILURES_SHOWN
     kind = RepeatedError if all(isinstance(o, RepeatedError) for o in failures) else InputError
     return kind(
         f"{number_of(len(failures), 'file')} cannot be used; all others are in. {told}"
         + (f" And {more:,} more." if more > 0 else "")
+        + (f" {beside}" if beside else "")
     )
