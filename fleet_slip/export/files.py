@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from fleet_slip.errors import ConfigError, UsageError
+from fleet_slip.export.c.a2l import a2l_text
 from fleet_slip.export.c.c_checks import c_fuzz_target, c_self_test
 from fleet_slip.export.c.c_gram import c_gram_header, c_gram_source
 from fleet_slip.export.c.c_names import c_prefix, file_prefix
@@ -122,6 +123,7 @@ def _c(subject: Subject) -> dict[str, str]:
         f"{prefix}.c": c_source(version, program),
         f"{prefix}_test.c": c_self_test(version, program, subject.checks),
         f"{prefix}_fuzz.c": c_fuzz_target(version, program),
+        f"{prefix}.a2l": a2l_text(version, program),
         **gram,
     }
 

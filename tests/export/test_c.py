@@ -119,7 +119,7 @@ def samples_of(program: Program, drive: DriveCounts) -> list[Sample]:
 def test_the_self_test_passes_and_notices_another_angle(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     files = export_texts(fleet.model("smoke"), fleet.warehouse, "c")
-    ends = (".h", ".c", "_test.c", "_fuzz.c", "_README.md", "_manifest.json")
+    ends = (".h", ".c", "_test.c", "_fuzz.c", ".a2l", "_README.md", "_manifest.json")
     assert list(files) == [f"sideslip_smoke{end}" for end in ends]
     for name, text in files.items():
         (tmp_path / name).write_text(text)
