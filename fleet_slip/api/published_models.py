@@ -116,7 +116,6 @@ class PublishedModels(Rooted):
         from fleet_slip.models.acceptance.in_time import require_in_time
         from fleet_slip.models.acceptance.sound_course import require_sound_course
         from fleet_slip.models.publish import manifest_of, with_straight_intercept
-        from fleet_slip.models.trained_drives import read_trained_drives
 
         require_model_name(name)
         selection = self._chosen(name, choice)
@@ -128,7 +127,7 @@ class PublishedModels(Rooted):
             registry = self.registry()
             champion, made = registry.champion(name), None
             if champion:
-                made = read_trained_drives(registry.folder_of(name), champion.manifest)
+                made = registry.trained_drives(champion.manifest)
             if champion is None or made is not None:
                 require_sound_drives(self.warehouse, manifest, made)
         return manifest, selection
@@ -258,7 +257,7 @@ class PublishedModels(Rooted):
 
     def registry(self, sign_key: Path | None = None) -> Registry:
         """Return the registry of models; it signs new versions with a private key, if given one."""
-        return Registry(self.root / "models", sign_key)
+        return Registry.of(self.warehouse, sign_key)
 
     def resolve(self, model: str | ModelVersion | None) -> ModelVersion:
         """Return the version that a reference names; a version is returned as it is."""

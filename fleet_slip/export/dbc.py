@@ -68,7 +68,7 @@ _HEAD = f'VERSION ""\n\nNS_ :\n\nBS_:\n\nBU_: {NODE}\n'
 def _about(version: ModelVersion, program: Program) -> str:
     known = [one.field for one in program.facts] + [one.name for one in program.numbers]
     also = f" It needs to know of the car: {', '.join(known)}." if known else ""
-    drives = version.manifest.trained_on.drives_sha256 or "unknown"
+    drives = version.manifest.trained_on.told_by or "unknown"
     return (
         f"{version.reference}, SHA-256 {version.sha256}, trained on drives with SHA-256 {drives}. "
         f"Identifiers are examples.{also}"

@@ -17,6 +17,7 @@ from fleet_slip.export.checks import Check
 from fleet_slip.export.costs import count_costs
 from fleet_slip.export.program import Angle, Input, Program
 from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.trained_drives import checksum_of_drives
 
 FORMAT = "fleet-slip estimator"
 SCHEMA = 2
@@ -30,13 +31,16 @@ def document_of(
 
     `drives` is the content of the file about the drives that trained it.
     """
+    told_by = version.manifest.trained_on.told_by
+    if drives is not None:
+        told_by = checksum_of_drives(drives)
     content: dict[str, Any] = {
         "format": FORMAT,
         "schema": SCHEMA,
         "model": {
             "reference": version.reference,
             "sha256": version.sha256,
-            "drives_sha256": version.manifest.trained_on.drives_sha256,
+            "drives_sha256": told_by,
             "drives": None if drives is None else base64.b64encode(drives).decode("ascii"),
             "manifest": version.manifest.model_dump(mode="json"),
         },
@@ -106,7 +110,7 @@ def manifest_of(
         "to": to,
         "model": version.reference,
         "sha256": version.sha256,
-        "drives_sha256": version.manifest.trained_on.drives_sha256,
+        "drives_sha256": version.manifest.trained_on.told_by,
         "angle": {
             "column": angle.column,
             "unit": angle.unit,

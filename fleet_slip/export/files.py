@@ -21,7 +21,7 @@ from fleet_slip.export.program import Program
 from fleet_slip.export.read_me import read_me
 from fleet_slip.export.sql_source import sql_macro, sql_statement
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.trained_drives import read_drives_file
+from fleet_slip.models.trained_drives import pack_hashes
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -82,8 +82,8 @@ def _subject(
     checks = make_checks(version.manifest, program)
     drives = None
     if warehouse is not None:
-        folder = Registry(warehouse.root / "models").folder_of(version.manifest.name)
-        drives = read_drives_file(folder, version.manifest)
+        made = Registry.of(warehouse).trained_drives(version.manifest)
+        drives = pack_hashes(made.salted()) if made else None
     return Subject(version, program, checks, drives, with_gram)
 
 

@@ -16,7 +16,7 @@ from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.folder import Folder
 from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
 from fleet_slip.models.manifest import TrainedOn
-from fleet_slip.models.trained_drives import hash_drives, read_trained_drives
+from fleet_slip.models.salted_drives import hash_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.audit import Audit
 from fleet_slip.warehouse.tables import Warehouse
@@ -34,9 +34,10 @@ def marked_models(root: Folder) -> frozenset[str]:
             without[entry["subject"]] = None
         elif entry["event"] == "done":
             without[entry["subject"]] = entry.get("grams_version")
-    registry = Registry(root / "models")
+    warehouse = Warehouse(root)
+    registry = Registry.of(warehouse)
     versions = [(n, number) for n in registry.names() if judged for number in registry.versions(n)]
-    drives = _PresentDrives(Warehouse(root))
+    drives = _PresentDrives(warehouse)
     for subject, numbers in judged.items():
         found |= {
             f"{name}@{number}"
@@ -83,8 +84,8 @@ def _may_have_seen(
         here = manifest.imported_from is None
         if here and manifest.trained_on.grams_version >= without:
             return False
-        kept = read_trained_drives(registry.folder_of(name), manifest)
-        return kept is None or not bool(np.isin(kept, present.hashed_for(name)).all())
+        made = registry.trained_drives(manifest)
+        return made is None or not bool(np.isin(made.salted(), present.hashed_for(name)).all())
     except FleetSlipError:
         return True
 
@@ -95,22 +96,21 @@ def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str
     Each keeps which; for older ones the cohort is asked again of the Gram rows it could see. Those
     of which it cannot be told count as trained on them.
     """
-    registry = Registry(warehouse.root / "models")
+    registry = Registry.of(warehouse)
+    hashes = hash_numbers(pa.array(sorted(drives), pa.string()))
     versions: dict[str, TrainedOn] = {}
     known: list[str] = []
     for name in registry.names():
-        hashed = hash_drives(name, hash_numbers(pa.array(sorted(drives), pa.string())))
         for number in registry.versions(name):
             reference = f"{name}@{number}"
             try:
                 manifest = registry.load(name, number).manifest
-                kept = read_trained_drives(registry.folder_of(name), manifest)
+                made = registry.trained_drives(manifest)
+                if made is None:
+                    versions[reference] = manifest.trained_on
+                elif made.among(hashes).any():
+                    known.append(reference)
             except FleetSlipError:
-                known.append(reference)
-                continue
-            if kept is None:
-                versions[reference] = manifest.trained_on
-            elif np.isin(hashed, kept).any():
                 known.append(reference)
     return sorted([*known, *_asked_again(warehouse, versions, drives)])
 

@@ -22,7 +22,6 @@ from fleet_slip.grams.rows.backlog import named_files
 from fleet_slip.maintenance.vacuum import find_temporary_files, find_unreferenced
 from fleet_slip.maintenance.verify_files import Verification, verify_files, verify_names
 from fleet_slip.maintenance.verify_grams import SoundFiles, verify_drives, verify_grams
-from fleet_slip.models.trained_drives import read_trained_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.records import find_changed_lines, find_missing_documents
@@ -56,18 +55,18 @@ def verify_models(
     warehouse: Warehouse, snapshots: dict[str, Snapshot], report: Verification
 ) -> None:
     """Look for versions that nothing present can have made, and aliases that point at nothing."""
-    registry = Registry(warehouse.root / "models")
+    registry = Registry.of(warehouse)
     for name in registry.names():
         numbers = registry.versions(name)
         for number in numbers:
             try:
                 manifest = registry.load(name, number).manifest
-                read_trained_drives(registry.folder_of(name), manifest)
+                registry.require_drives(manifest)
             except RefusedError as error:  # its signature
                 report.note("model", f"{name}@{number}", str(error))
                 continue
             except (StorageError, DataError, QuestionError) as error:
-                if "drives-" in str(error):  # anything else is told as a document
+                if "drives" in str(error):  # anything else is told as a document
                     report.note("model", f"{name}@{number}", str(error))
                 continue
             trained = manifest.trained_on

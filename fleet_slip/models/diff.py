@@ -8,7 +8,6 @@ import numpy as np
 
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.trained_drives import read_trained_drives
 from fleet_slip.models.versions import Registry
 
 
@@ -64,8 +63,8 @@ def compare_versions(registry: Registry, one: ModelVersion, other: ModelVersion)
 def _drives(registry: Registry, one: ModelVersion, other: ModelVersion) -> CommonDrives | None:
     if one.manifest.name != other.manifest.name:  # their hashes are salted differently
         return None
-    folder = registry.folder_of(one.manifest.name)
-    a, b = (read_trained_drives(folder, version.manifest) for version in (one, other))
+    made = [registry.trained_drives(version.manifest) for version in (one, other)]
+    a, b = (drives.salted() if drives else None for drives in made)
     if a is None or b is None:
         return None
     both = len(np.intersect1d(a, b, assume_unique=True))

@@ -26,7 +26,7 @@ from fleet_slip.models.manifest import (
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.recipe import asked_of
 from fleet_slip.models.straight_on import StraightOn, straight_on
-from fleet_slip.models.trained_drives import checksum_of_drives, pack_drives
+from fleet_slip.models.trained_drives import DriveRecord
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.select_models import RequestedSelection, Selection
@@ -62,6 +62,7 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
     winner = selection.winner.model
     label = signals[signals.label]
     wanted = (*winner.signals, signals.label)
+    drives = drives_of(selection, name)
     beside = rows_beside = 0
     if isinstance(selection.cohort, TaughtCohort):
         beside, rows_beside = selection.cohort.count_others(wanted)
@@ -87,7 +88,8 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
             rows=winner.pooled.rows + rows_beside,
             logs_version=selection.cohort.logs_version,
             grams_version=selection.cohort.grams_version,
-            drives_sha256=checksum_of_drives(drives_of(selection, name)),
+            drives_sha256=drives.listed_sha256,
+            files_sha256=drives.files_sha256,
         ),
         selected_by=SelectedBy(
             model_list=selection.model_list,
@@ -301,10 +303,10 @@ def _why(name: str, held: AliasMove | None) -> str:
 _DONE = {"rollback": "rolled back to", "pin": "pinned"}
 
 
-def drives_of(selection: Selection[Any], name: str) -> bytes:
-    """Return the content of the file about the drives that a selection's winner was trained on."""
+def drives_of(selection: Selection[Any], name: str) -> DriveRecord:
+    """Return what tells the drives that a selection's winner was trained on."""
     signals = (*selection.winner.model.signals, catalogue().label)
-    return pack_drives(name, selection.cohort.members.drives_with(signals))
+    return DriveRecord.of(name, *selection.cohort.members.by_file(signals))
 
 
 @dataclass(frozen=True)

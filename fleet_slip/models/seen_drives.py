@@ -2,13 +2,10 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from fleet_slip.catalogue.sources import RECEIVED
 from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.models.estimates.score import cohort_of_rows
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.trained_drives import read_trained_drives, salt_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.condition import Condition, asking, drive_columns
 from fleet_slip.warehouse.table_views import connect_tables
@@ -34,10 +31,10 @@ def find_seen(
     query = f"SELECT DISTINCT drive_id FROM {view} WHERE {logged} ORDER BY 1"
     with connect_tables(warehouse, query) as database, asking(database, cohort):
         names = database.sql(query).to_arrow_table()["drive_id"]
-    made = read_trained_drives(registry.folder_of(manifest.name), manifest)
+    made = registry.trained_drives(manifest)
     if made is None:
         return SeenDrives(len(names), None, cohort)
-    seen = np.isin(salt_drives(manifest.name, hash_numbers(names)), made)
+    seen = made.among(hash_numbers(names))
     if not seen.any() or seen.all():
         return SeenDrives(len(names), int(seen.sum()), cohort)
     kept = [name for name, old in zip(names.to_pylist(), seen, strict=True) if not old]

@@ -8,20 +8,26 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import pyarrow as pa
 
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN
 from fleet_slip.config import parse_document
-from fleet_slip.errors import QuestionError, RefusedError, StorageError
+from fleet_slip.errors import ConflictError, QuestionError, RefusedError, StorageError
 from fleet_slip.files.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.aliases import CHAMPION, AliasHistory
+from fleet_slip.models.drives_of_files import GramDrives, read_files, tree_name
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.signing import require_signature, require_signing_key, sign_version
-from fleet_slip.models.trained_drives import keep_drives
+from fleet_slip.models.trained_drives import DriveRecord, TrainedDrives, read_listed
+
+if TYPE_CHECKING:
+    from fleet_slip.delta import Table
+    from fleet_slip.warehouse.tables import Warehouse
 
 _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
 _NONE = "none yet; publish one with: fleet-slip publish NAME"
@@ -29,10 +35,19 @@ _NONE = "none yet; publish one with: fleet-slip publish NAME"
 
 @dataclass(frozen=True)
 class Registry:
-    """All models below a folder. New versions are signed with a private key, if there is one."""
+    """All models below a folder, which are made of some Gram rows.
+
+    New versions are signed with a private key, if there is one.
+    """
 
     folder: Folder
     signing_key: Path | None = None
+    grams: "Table | None" = None
+
+    @classmethod
+    def of(cls, warehouse: "Warehouse", signing_key: Path | None = None) -> "Registry":
+        """Return the models of a data root."""
+        return cls(warehouse.root / "models", signing_key, warehouse.grams)
 
     def names(self) -> list[str]:
         """Return the names of all models, sorted."""
@@ -126,8 +141,43 @@ class Registry:
         """Return the moves of a model's aliases."""
         return AliasHistory(DocumentFolder(self.folder / name / "history"))
 
-    def add(self, manifest: Manifest, drives: bytes | None = None) -> ModelVersion:
-        """Make a manifest the next version of its model, after the content of its `drives` file.
+    def trained_drives(self, manifest: Manifest) -> TrainedDrives | None:
+        """Return the drives that made a version; None if it does not tell. Raises `StorageError`.
+
+        Those of Gram files, which the manifest names, are read when they are asked for.
+        """
+        versions, checksum = self.folder_of(manifest.name), manifest.trained_on.files_sha256
+        listed = read_listed(versions, manifest)
+        if listed is None:
+            return None
+        files = read_files(versions, tree_name(checksum)) if checksum else {}
+        return TrainedDrives(listed, files, self._drives_of_files(manifest.name))
+
+    def require_drives(self, manifest: Manifest) -> None:
+        """Raise `StorageError` if what tells a version's drives is damaged or gone."""
+        if made := self.trained_drives(manifest):
+            made.among(np.array([], dtype=np.uint64))
+
+    def _drives_of_files(self, name: str) -> GramDrives:
+        grams = self.grams.folder if self.grams else self.folder
+        return GramDrives(name, self.folder_of(name), grams)
+
+    def _keep_drives(self, name: str, record: DriveRecord) -> None:
+        """Write what tells a new version's drives, before there is the version."""
+        record.keep(self.folder_of(name))
+        if record.files and self.grams:
+            # Who deletes a Gram file of no current version looks for files that name it. One that
+            # was replaced before this record was there is looked after here.
+            active = {file.path for file in self.grams.snapshot().files}
+            try:
+                self._drives_of_files(name).keep(record.files.keys() - active)
+            except StorageError as error:
+                raise ConflictError(
+                    f"Gram rows that {name} was made of are gone: {error} Publish it again."
+                ) from None
+
+    def add(self, manifest: Manifest, drives: DriveRecord | None = None) -> ModelVersion:
+        """Make a manifest the next version of its model, after what tells its `drives`.
 
         If the latest is the same estimator from the same rows, it is used: another process added
         it.
@@ -135,7 +185,7 @@ class Registry:
         self.require_key()  # before anything is written
         name, versions = manifest.name, self._versions(manifest.name)
         if drives is not None:
-            keep_drives(versions.folder, drives)
+            self._keep_drives(name, drives)
 
         def next_version(latest: int) -> int | None:
             if latest and self._read(name, latest).manifest.same_estimator(manifest):

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from fleet_slip.models.trained_drives import hash_drives, pack_drives
+from fleet_slip.models.salted_drives import hash_drives
+from fleet_slip.models.trained_drives import DriveRecord
 
 
 def test_hashes_of_drives_are_those_of_versions_of_before() -> None:
@@ -10,6 +11,8 @@ def test_hashes_of_drives_are_those_of_versions_of_before() -> None:
     drives = np.array([1, 2], dtype=np.uint64)
     known = [10430483359262113544, 11180994063705713938]
     assert hash_drives("year", drives).tolist() == known
-    assert pack_drives("year", drives) == b"".join(one.to_bytes(8, "big") for one in known)
+    assert DriveRecord.of("year", {}, drives).listed == b"".join(
+        one.to_bytes(8, "big") for one in known
+    )
     assert not len(hash_drives("year", drives[:0]))
     assert hash_drives("other", drives).tolist() != known

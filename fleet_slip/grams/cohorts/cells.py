@@ -4,7 +4,7 @@ A rollup serves where its columns tell condition and folds of all rows, to the b
 sums; other files' rows are read.
 """
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +21,7 @@ from fleet_slip.grams.cohorts.members import Hashed
 from fleet_slip.grams.rows.rollup import (
     BUCKET_KEYS,
     BUCKETS,
+    FileDrives,
     Hashes,
     Rollup,
     hash_numbers,
@@ -62,24 +63,26 @@ class Cells:
 
     def drives(self, cells: pa.Table) -> Hashed:
         """Return the drives of some cells dealt by drive, of the same signals."""
-        return Hashed(self._parts(cells, Rollup.drives), once=pc.sum(cells["gram_rows"]).as_py())
+        some = cells.select(["rollup", "first_drive", "gram_rows"])
+        parts = tuple(
+            FileDrives(self.rollups[place], some.filter(pc.equal(some["rollup"], place)))
+            for place in some["rollup"].unique().to_pylist()
+        )
+        return Hashed(parts, once=pc.sum(cells["gram_rows"]).as_py())
 
     def vehicles(self, cells: pa.Table) -> Hashed:
         """Return the cars of some cells dealt by drive."""
-        return Hashed(self._parts(cells, Rollup.vehicles), least=pc.max(cells["cars"]).as_py())
+
+        def part(place: int) -> Hashes:
+            return self.rollups[place].vehicles(cells.filter(pc.equal(cells["rollup"], place)))
+
+        parts = tuple(partial(part, place) for place in cells["rollup"].unique().to_pylist())
+        return Hashed(parts, least=pc.max(cells["cars"]).as_py())
 
     def received(self, cells: pa.Table) -> Hashed | None:
         """Return the drives of some cells whose cars sent them; None if there are none."""
         came = cells.filter(pc.fill_null(pc.equal(cells["source"], RECEIVED), False))
         return self.drives(came) if len(came) else None
-
-    def _parts(
-        self, cells: pa.Table, read: Callable[[Rollup, pa.Table], Hashes]
-    ) -> tuple[Callable[[], Hashes], ...]:
-        def part(place: int) -> Hashes:
-            return read(self.rollups[place], cells.filter(pc.equal(cells["rollup"], place)))
-
-        return tuple(partial(part, place) for place in cells["rollup"].unique().to_pylist())
 
     def tell_more_than(self, folds: int, key: str) -> bool:
         """Whether the cells alone tell that there are more drives, or cars, than folds."""

@@ -9,7 +9,7 @@ saves little, a sum has more than 64 bits, or other files tell its trips.
 """
 
 import json
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any, ClassVar
@@ -28,6 +28,9 @@ from fleet_slip.warehouse.tables import gram_schema
 
 Hashes = NDArray[np.uint64]
 """Hashes of drives or cars: what tells one from others, in 8 bytes."""
+
+Places = Sequence[tuple[int, int]]
+"""Places among the drives of a file: where some begin, and how many these are, in order."""
 
 BUCKETS = 60
 """Drives and cars are dealt into buckets by hashes: folds in a divisor of it are whole ones."""
@@ -130,6 +133,35 @@ class Rollup:
         if size.sum() == len(every):
             return every
         return np.concatenate([every[a : a + b] for a, b in zip(begin, size, strict=True)])
+
+
+@dataclass(frozen=True)
+class FileDrives:
+    """The drives of some cells of a rollup, dealt by drive."""
+
+    rollup: Rollup
+    cells: pa.Table
+
+    def __call__(self) -> Hashes:
+        """Read their hashes."""
+        return self.rollup.drives(self.cells)
+
+    @property
+    def places(self) -> Places:
+        """Where they stand among the drives of the file."""
+        first, many = (self.cells[name].to_pylist() for name in ("first_drive", "gram_rows"))
+        return list(zip(first, many, strict=True))
+
+
+def join_places(every: Places) -> Places:
+    """Return places in order, those that border on each other as one."""
+    joined: list[tuple[int, int]] = []
+    for first, many in sorted(every):
+        if joined and sum(joined[-1]) == first:
+            joined[-1] = (joined[-1][0], joined[-1][1] + many)
+        else:
+            joined.append((first, many))
+    return joined
 
 
 def read_rollup(table: Table, path: str) -> Rollup | None:

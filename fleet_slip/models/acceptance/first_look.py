@@ -15,12 +15,12 @@ import pyarrow as pa
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
+from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.ingest.drives.measured_drives import SOURCE
 from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
 from fleet_slip.models.acceptance.gate import thin
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.trained_drives import salt_drives
+from fleet_slip.models.trained_drives import TrainedDrives
 from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
@@ -41,7 +41,7 @@ _LONGEST = """
 
 
 def require_sound_drives(
-    warehouse: Warehouse, manifest: Manifest, made: Hashes | None = None
+    warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None = None
 ) -> None:
     """Raise `RefusedError` if most of some measured drives of a cohort contradict any car.
 
@@ -73,7 +73,7 @@ def require_sound_drives(
 
 
 def _look(
-    warehouse: Warehouse, manifest: Manifest, made: Hashes | None
+    warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None
 ) -> tuple[dict[tuple[str, tuple[str, ...]], list[Suspicion]], int]:
     """Return what looks wrong in some long drives, and how many these are."""
     found: dict[tuple[str, tuple[str, ...]], list[Suspicion]] = {}
@@ -83,7 +83,7 @@ def _look(
         drives = database.execute(query, {"source": SOURCE}).fetchall()
         if made is not None:
             numbers = hash_numbers(pa.array([drive for drive, _ in drives], pa.string()))
-            seen = np.isin(salt_drives(manifest.name, numbers), made).tolist()
+            seen = made.among(numbers).tolist()
             drives = [drive for drive, known in zip(drives, seen, strict=True) if not known]
         chosen = drives[:DRIVES]
         for drive, day in chosen:

@@ -20,7 +20,6 @@ from fleet_slip.grams.cohorts.taught_cohort import TaughtCohort
 from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.models.acceptance.gate import GROUPS, Contest, as_it_is, contest, worth
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.trained_drives import read_trained_drives, salt_drives
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.choice.winner import compare_paired
 from fleet_slip.regression.validation.crossval import CrossValidation, assemble, held_out_errors
@@ -44,13 +43,12 @@ def odd_gain(registry: Registry, selection: Selection[Any], champion: ModelVersi
     Nothing is said where changes of the course taught, or all drives are as known as the others.
     Raises `StorageError` if which drives made the champion cannot be read.
     """
-    made = read_trained_drives(registry.folder_of(champion.manifest.name), champion.manifest)
+    made = registry.trained_drives(champion.manifest)
     if made is None or isinstance(selection.cohort, TaughtCohort):
         return None
     try:
         cohort = _some_drives(selection)
-        numbers = hash_numbers(cohort.drives["drive_id"])
-        known = np.isin(salt_drives(champion.manifest.name, numbers), made)
+        known = made.among(hash_numbers(cohort.drives["drive_id"]))
         if known.any() and not known.all():
             return _compare(selection, champion, cohort, known)
     except DataError as error:

@@ -313,7 +313,7 @@ def test_the_minimum_cohort_counts_each_car_once(
 def test_versions_know_the_drives_of_rollups(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    manifests = []
+    manifests, drives = [], []
     for name in ("cells", "rows"):
         fleet = fleet_slip.open(tmp_path / name)
         receive(fleet, tmp_path, range(2))
@@ -321,9 +321,18 @@ def test_versions_know_the_drives_of_rollups(
         first = fleet.cohort("day = DATE '2024-05-01'").select()
         fleet.publish("made", first, force=True)  # beside the champion
         registry = Registry(fleet.warehouse.root / "models")
-        manifests.append([registry.load("made", number).manifest for number in (1, 2)])
+        made = [registry.load("made", number).manifest for number in (1, 2)]
+        drives.append([fleet.registry().trained_drives(one) for one in made])
+        told = {"drives_sha256": None, "files_sha256": None}
+        alike = [one.trained_on.model_copy(update=told) for one in made]
+        manifests.append(
+            [one.model_copy(update={"trained_on": t}) for one, t in zip(made, alike, strict=True)]
+        )
         monkeypatch.setattr(cells, "read_rollup", lambda *_: None)
     assert manifests[0] == manifests[1]
+    for of_cells, of_rows in zip(*drives, strict=True):
+        assert len(of_cells.files) > len(of_rows.files) == 0
+        assert np.array_equal(of_cells.salted(), of_rows.salted())
     assert manifests[0][0].trained_on.vehicles == CARS
     assert manifests[0][0].trained_on.drives_without_log == 2 * CARS
 
