@@ -100,6 +100,19 @@ def write_can(file: Path, parts: Iterable[Piece]) -> None:
             )
 
 
+def write_blf(file: Path, parts: Iterable[Piece]) -> None:
+    import can  # noqa: PLC0415 - of an extra
+
+    with can.BLFWriter(file, channel=0, compression_level=1) as trace:
+        for piece in parts:
+            for time, number, payload in frames_of(piece):
+                trace.on_message_received(
+                    can.Message(
+                        START_S + time, 256 + number, is_extended_id=False, data=payload, channel=0
+                    )
+                )
+
+
 def write_bus(file: Path, parts: Iterable[Piece]) -> None:
     from asammdf import MDF, Signal  # noqa: PLC0415
     from asammdf.blocks.v4_blocks import SourceInformation  # noqa: PLC0415
@@ -190,6 +203,7 @@ WRITERS: dict[str, tuple[str, str, Callable[[Path, Iterable[Piece]], None]]] = {
     "mdf": ("log.mf4", "{signal}", write_mdf),
     "mcap": ("log.mcap", "/{base}.{signal}", write_mcap),
     "can": ("log.log", "{base}.{signal}", write_can),
+    "blf": ("log.blf", "{base}.{signal}", write_blf),
     "bus": ("bus.mf4", "{base}.{signal}", write_bus),
     "mat5": ("log5.mat", "{base}.{signal}", write_mat5),
     "mat73": ("log73.mat", "{base}.{signal}", write_mat73),
@@ -203,7 +217,7 @@ def write_mapping(folder: Path, kind: str) -> Path:
     named, of_mat = WRITERS[kind][1], kind.startswith("mat")
     lines = ['name = "speed"', "[time]"]
     lines += ['column = "Imu.t"', 'unit = "s"'] if of_mat else ["own_clock = true"]
-    if kind in {"can", "bus"}:
+    if kind in {"can", "blf", "bus"}:
         lines += ["[can]", 'database = "car.dbc"']
         text = "".join(
             f"BO_ {256 + number} {base}: 8 E\n"

@@ -355,7 +355,9 @@ def blf(*objects: bytes, compress: bool = True) -> bytes:
     packed = zlib.compress(content) if compress else content
     header = struct.pack("<4sHHII", b"LOBJ", 16, 1, 32 + len(packed), 10)
     container = header + struct.pack("<H6xI4x", 2 if compress else 0, len(content)) + packed
-    return sound[: int.from_bytes(sound[4:8], "little")] + container
+    head = bytearray(sound[: int.from_bytes(sound[4:8], "little")])
+    head[16:24] = (len(head) + len(container)).to_bytes(8, "little")
+    return bytes(head) + container
 
 
 @pytest.mark.parametrize("compress", [False, True])

@@ -22,7 +22,7 @@ from fleet_slip.ingest import load_mapping
 from fleet_slip.ingest.formats import can_frames
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database
-from fleet_slip.ingest.formats.can_frames import CanFrames, physical, raw_numbers
+from fleet_slip.ingest.formats.can_frames import CanFrames, FrameBlock, physical, raw_numbers
 from fleet_slip.ingest.formats.can_trace import open_can_trace
 from fleet_slip.ingest.logs.spool import Spool
 from tests.support.logs import without_names
@@ -321,7 +321,11 @@ def test_frames_that_are_kept_are_those_that_came(
         times, buses, payloads = zip(*came, strict=True) if came else ((), (), ())
         filled = np.array([list(data.ljust(9, b"x")) for data in payloads], dtype=np.uint8)
         sizes = np.array([len(data) for data in payloads], dtype=np.int64)
-        together.extend(np.array(times), np.array(buses), sizes, filled.reshape(-1, 9))
+        numbers = np.zeros(len(came), dtype=np.int64)
+        data = filled.reshape(-1, 9)
+        together.extend(
+            FrameBlock(numbers, numbers > 0, np.array(times), np.array(buses), sizes, data)
+        )
         require_the_frames(one_by_one, came)
         require_the_frames(together, came)
 

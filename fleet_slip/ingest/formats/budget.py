@@ -77,6 +77,13 @@ class Budget:
             f"{self.size:,} bytes. {_WAY_OUT}"
         )
 
+    def damaged(self, what: str) -> InputError:
+        """Return what to say of a file with something that no recorder writes."""
+        return InputError(
+            f"{shown(self.file)}: {what}, which no trace has: it is damaged. Record or copy it "
+            "again."
+        )
+
     def metered(self, batches: Iterator[pl.DataFrame]) -> Iterator[pl.DataFrame]:
         """Yield batches while rows and seconds last; the caller's own time does not count."""
         rows, seconds = 0, 0.0

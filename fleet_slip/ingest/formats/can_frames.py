@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.ingest.logs.spool import Spool
 
 Bytes = NDArray[np.uint8]
@@ -95,6 +95,25 @@ class Frames:
     data: Bytes
 
 
+@dataclass(frozen=True)
+class FrameBlock:
+    """Frames in the order of the file: numbers, whether they are of 29 bits, times in s, buses.
+
+    `data`, shape (frames, bytes), is filled up to the longest; `sizes` say how much of it counts.
+    """
+
+    numbers: IntArray
+    extended: Flags
+    times_s: FloatArray
+    buses: IntArray
+    sizes: IntArray
+    data: Bytes
+
+    def where(self, chosen: Any) -> "FrameBlock":
+        """Return some of them, by flags or places."""
+        return FrameBlock(*(column[chosen] for column in vars(self).values()))
+
+
 class CanFrames:
     """The frames of one message, in the order in which they came."""
 
@@ -120,18 +139,17 @@ class CanFrames:
         if len(self._times) >= PIECE_FRAMES:
             self._put_aside()
 
-    def extend(
-        self, times_s: FloatArray, buses: NDArray[np.int64], sizes: NDArray[np.int64], data: Bytes
-    ) -> None:
-        """Keep frames whose payloads, shape (frames, bytes), are as long as `sizes` say."""
-        names, places = np.unique(buses, return_inverse=True)
+    def extend(self, block: FrameBlock) -> None:
+        """Keep frames of the message."""
+        times_s, sizes, data = block.times_s, block.sizes, block.data
+        names, places = np.unique(block.buses, return_inverse=True)
         known = [self._numbers.setdefault(str(bus), len(self._numbers)) for bus in names.tolist()]
         numbers = np.array(known, dtype=np.uint16)[places]
         for start in range(0, times_s.size, PIECE_FRAMES):
             some = slice(start, start + PIECE_FRAMES)
-            found = np.unique(np.stack([numbers[some], sizes[some]]), axis=1, return_counts=True)
-            for (number, size), frames in zip(found[0].T.tolist(), found[1].tolist(), strict=True):
-                self._found[number, size] += frames
+            kinds = numbers[some].astype(np.int64) << 16 | sizes[some]
+            for kind, frames in zip(*map(np.ndarray.tolist, np.unique_counts(kinds)), strict=True):
+                self._found[divmod(kind, 1 << 16)] += frames
             self._times.frombytes(times_s[some].tobytes())
             self._buses.frombytes(numbers[some].tobytes())
             self._sizes.frombytes(sizes[some].astype(np.uint16).tobytes())

@@ -4,18 +4,14 @@ Each message is a time base, a column is `Message.Signal`. Frames of errors and 
 passed over. A value that the database gives a name, such as `SNA`, is no number: it is null, or in
 a signal that has no other values the name itself.
 
-python-can believes what a file says: it unfolds a container whatever becomes of it, reads a line
-whatever its length, and an object of no size for ever. So these are looked at before.
+python-can reads a line whatever its length; so that is looked at before.
 """
 
-import os
-import struct
-import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -23,10 +19,12 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.blf_frames import read_blf_frames
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.can_bus import CanBus, parse_database
 from fleet_slip.ingest.formats.can_frames import (
     CanFrames,
+    FrameBlock,
     is_possible,
     is_sent,
     needed_bytes,
@@ -44,82 +42,22 @@ from fleet_slip.ingest.formats.source import (
 from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.words import shown
 
-BLF_MAGIC = b"LOGG"
-_MARK, _OBJECT = b"LOBJ", struct.Struct("<4s4xII")
-"""What an object of BLF begins with: the mark, its size and its kind."""
-_CONTAINER, _CONTAINER_HEADER = 10, struct.Struct("<16xH14x")
-_COMPRESSED = 2
-_LARGEST_CONTAINER, _LARGEST_OBJECT, _LONGEST_LINE = 2**27, 2**20, 2**20
+_LONGEST_LINE = 2**20
 
-SUFFIXES = {".blf", ".asc", ".log", ".trc"}
+BLF = ".blf"
+SUFFIXES = {BLF, ".asc", ".log", ".trc"}
 
 _MOST_NUMBERS = 100_000
 
 
-def require_bounded(budget: Budget) -> None:
-    """Raise `InputError` for a trace that is more than it seems. Raises `OSError`."""
-    with budget.file.open("rb") as stream:
-        if stream.read(len(BLF_MAGIC)) == BLF_MAGIC:
-            _require_objects(stream, budget)
-        else:
-            stream.seek(0)
-            _require_lines(stream, budget)
-
-
-def _require_lines(stream: BinaryIO, budget: Budget) -> None:
+def require_lines(budget: Budget) -> None:
+    """Raise `InputError` for a text with a line longer than any trace has. Raises `OSError`."""
     is_long = False
-    while piece := stream.read(_LONGEST_LINE):
-        if is_long and b"\n" not in piece:
-            raise _damaged(budget, f"a line of more than {_LONGEST_LINE:,} bytes")
-        is_long = b"\n" not in piece
-
-
-def _require_objects(stream: BinaryIO, budget: Budget) -> None:
-    """Look at all objects; one may continue in the next container."""
-    unfolded, rest = 0, b""
-    for container in _containers(stream, budget):
-        unfolded += len(container)
-        budget.require_unfolded(unfolded)
-        content, at = rest + container, 0
-        while (begin := content.find(_MARK, at, at + 8)) >= 0:
-            if len(content) < begin + _OBJECT.size:
-                break
-            _, size, _ = _OBJECT.unpack_from(content, begin)
-            if not _OBJECT.size <= size <= _LARGEST_OBJECT:
-                raise _damaged(budget, f"an object of {size:,} bytes")
-            if begin + size > len(content):
-                break
-            at = begin + size
-        rest = content[at : at + _LARGEST_OBJECT]
-
-
-def _containers(stream: BinaryIO, budget: Budget) -> Iterator[bytes]:
-    """Yield the content of each container. What python-can finds wrong by itself ends them."""
-    stream.seek(4)
-    (at,) = struct.unpack("<I", stream.read(4).ljust(4, b"\0"))
-    while len(header := os.pread(stream.fileno(), 32, at)) == _CONTAINER_HEADER.size:
-        mark, size, kind = _OBJECT.unpack_from(header)
-        if mark != _MARK:
-            return
-        if size < len(header):
-            raise _damaged(budget, f"an object of {size:,} bytes")
-        if kind == _CONTAINER:
-            content = os.pread(stream.fileno(), size - len(header), at + len(header))
-            if _CONTAINER_HEADER.unpack(header) == (_COMPRESSED,):
-                try:
-                    content = zlib.decompressobj().decompress(content, _LARGEST_CONTAINER + 1)
-                except zlib.error:
-                    return
-            if len(content) > _LARGEST_CONTAINER:
-                raise _damaged(budget, f"a container of more than {_LARGEST_CONTAINER:,} bytes")
-            yield content
-        at += size + size % 4
-
-
-def _damaged(budget: Budget, what: str) -> InputError:
-    return InputError(
-        f"{shown(budget.file)}: {what}, which no trace has: it is damaged. Record or copy it again."
-    )
+    with budget.file.open("rb") as stream:
+        while piece := stream.read(_LONGEST_LINE):
+            if is_long and b"\n" not in piece:
+                raise budget.damaged(f"a line of more than {_LONGEST_LINE:,} bytes")
+            is_long = b"\n" not in piece
 
 
 _Key = tuple[int, bool]
@@ -246,6 +184,17 @@ class CanSource(ClockSource):
         if key in self._frames or len(self._numbers) < _MOST_NUMBERS:
             self._numbers.add(key)
 
+    def _keep(self, block: FrameBlock) -> None:
+        """Keep the frames of the wanted messages, and note the numbers of all."""
+        keys = block.numbers << 1 | block.extended
+        order = np.argsort(keys, kind="stable")
+        found, firsts = np.unique(keys[order], return_index=True)
+        for key, chosen in zip(found.tolist(), np.split(order, firsts[1:]), strict=True):
+            of = key >> 1, bool(key & 1)
+            self._note(of)
+            if of in self._frames:
+                self._frames[of].extend(block.where(chosen))
+
     def _read_trace(self) -> None:
         """Keep the frames of the wanted messages, and note the numbers of all."""
         if self._file.suffix.lower() not in SUFFIXES:
@@ -253,9 +202,17 @@ class CanSource(ClockSource):
                 f"{shown(self._file)}: the suffix tells the format of a CAN trace: "
                 f"{', '.join(sorted(SUFFIXES))}. Name it as what it is."
             )
-        require_bounded(self._budget)
+        if self._file.suffix.lower() != BLF:
+            require_lines(self._budget)
         with reading_with(self._file, "can") as can, can.LogReader(self._file) as trace:
             self._require_whole(trace)
+            if isinstance(trace, can.BLFReader):
+                frames = 0
+                for block in read_blf_frames(self._budget, trace.start_timestamp):
+                    frames += len(block.numbers)
+                    self._budget.require_rows(frames)
+                    self._keep(block)
+                return
             for number, frame in enumerate(trace):
                 self._budget.require_rows(number)
                 if frame.is_error_frame or frame.is_remote_frame:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.can_bus import CanBus, parse_database
-from fleet_slip.ingest.formats.can_frames import Bytes
+from fleet_slip.ingest.formats.can_frames import Bytes, FrameBlock
 from fleet_slip.ingest.formats.can_trace import CanSource
 from fleet_slip.ingest.formats.mdf import MdfSource, open_mdf
 from fleet_slip.ingest.logs.spool import Spool
@@ -46,15 +46,15 @@ class MdfBus(CanSource):
                     "Export it again, with payloads."
                 )
             for window in self._mdf.windows(number, there):
-                self._keep(dict(zip(there, window, strict=True)))
+                self._keep(self._block(dict(zip(there, window, strict=True))))
         if not self._numbers:
             raise InputError(
                 f"{shown(self._file)}: there is no CAN frame in it ({_FRAME}ID). Map its channels "
                 "without [can] in the mapping."
             )
 
-    def _keep(self, found: dict[str, Any]) -> None:
-        """Keep some frames of a group."""
+    def _block(self, found: dict[str, Any]) -> FrameBlock:
+        """Return some frames of a group."""
         numbers = found["ID"].samples.astype(np.int64)
         extended = numbers & _EXTENDED != 0
         if "IDE" in found:
@@ -67,13 +67,7 @@ class MdfBus(CanSource):
         if "BusChannel" in found:
             buses = found["BusChannel"].samples.astype(np.int64)
         times_s = self._mdf.times_s(found["ID"])
-        keys = (numbers & _IDENTIFIER) << 1 | extended
-        for key in np.unique(keys).tolist():
-            of = key >> 1, bool(key & 1)
-            self._note(of)
-            if of in self._frames:
-                some = keys == key
-                self._frames[of].extend(times_s[some], buses[some], sizes[some], payloads[some])
+        return FrameBlock(numbers & _IDENTIFIER, extended, times_s, buses, sizes, payloads)
 
 
 def _payloads(samples: NDArray[Any]) -> Bytes:

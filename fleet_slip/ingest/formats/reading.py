@@ -15,9 +15,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.blf_frames import MAGIC as BLF_MAGIC
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.can_bus import CanBus
-from fleet_slip.ingest.formats.can_trace import BLF_MAGIC, open_can_trace
+from fleet_slip.ingest.formats.can_trace import open_can_trace
 from fleet_slip.ingest.formats.csv_batches import PlainNumbers, open_csv
 from fleet_slip.ingest.formats.csv_text import CsvFormat
 from fleet_slip.ingest.formats.duckdb_table import MAGIC as DUCKDB_MAGIC
