@@ -227,5 +227,7 @@ def _read(
     kind = np.dtype(
         {"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": size}
     )
+    if not len(begins):  # perhaps there is not even room for one
+        return np.empty(0, dtype=kind)
     records: NDArray[Any] = sliding_window_view(data, size)[begins].view(kind)[:, 0]
     return records
