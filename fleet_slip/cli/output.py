@@ -86,16 +86,23 @@ def print_table(
 ) -> None:
     """Print a table; the first `left` columns are text, the others are numbers.
 
-    Words and numbers are never broken. Where a terminal is too narrow for that, every row becomes a
-    paragraph with a line for each column.
+    Words and numbers are never broken. Where a terminal is too narrow for that, columns move
+    closer; where that is not enough, every row becomes a paragraph with a line for each column.
     """
     shown = [[printable(cell) for cell in row] for row in rows]
     console = stdout()
-    widths = _fit_columns(header, shown, console.width)
+    fitting = ((gap, _fit_columns(header, shown, console.width, gap)) for gap in GAPS)
+    gap, widths = next((found for found in fitting if found[1]), (0, None))
     if widths is None:
         table = _paragraphs(header, shown)
     else:
-        table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(header))
+        table = Table(
+            box=None,
+            pad_edge=False,
+            padding=(0, gap, 0, 0),
+            header_style="bold",
+            show_header=any(header),
+        )
         for i, (name, width) in enumerate(zip(header, widths, strict=True)):
             table.add_column(name, justify="left" if i < left else "right", width=width)
         for row in shown:
@@ -125,18 +132,18 @@ def figures_cells(figures: "Figures") -> list[str]:
     ]
 
 
-GAP = 2
-"""Spaces between two columns."""
+GAPS = (2, 1)
+"""Spaces between two columns: usually, and where a terminal is narrow."""
 
 
 def _fit_columns(
-    header: Sequence[str], rows: Sequence[Sequence[str]], width: int
+    header: Sequence[str], rows: Sequence[Sequence[str]], width: int, gap: int
 ) -> list[int] | None:
     """Return how wide each column is, none less than its longest word; None if they do not fit."""
     columns = [[name, *(row[i] for row in rows)] for i, name in enumerate(header)]
     wished = [max(map(cell_len, cells)) for cells in columns]
     widths = [max((cell_len(w) for c in cells for w in c.split()), default=0) for cells in columns]
-    left = width - sum(widths) - GAP * (len(widths) - 1)
+    left = width - sum(widths) - gap * (len(widths) - 1)
     if left < 0:
         return None
     while left and widths != wished:

@@ -16,6 +16,7 @@ from fleet_slip.export.c.c_steps import StepWriter, state_bytes
 from fleet_slip.export.compile import write_program
 from fleet_slip.export.program import Program
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.words import number_of
 
 COEFFICIENT_BYTES = 8
 """Two words of 32 bits."""
@@ -58,9 +59,10 @@ class Costs:
     def __str__(self) -> str:
         """Return it as `show` prints it."""
         return (
-            f"{self.columns} columns: {self.coefficient_bytes:,} bytes of coefficients, "
-            f"{self.memory_bytes:,} bytes of memory; {self.multiplications} multiplications, "
-            f"{self.additions} additions, {self.divisions} divisions an estimate"
+            f"{number_of(self.columns, 'column')}: {self.coefficient_bytes:,} bytes of "
+            f"coefficients, {number_of(self.memory_bytes, 'byte')} of memory; "
+            f"{self.multiplications} multiplications, {self.additions} additions, "
+            f"{self.divisions} divisions an estimate"
         )
 
 

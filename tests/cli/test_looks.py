@@ -91,6 +91,7 @@ model  signals          drives  RMSE deg
 ours                              0.0302
 """
     )
+    assert table(34, monkeypatch, capsys).splitlines()[1] == "model signals        drives     deg"
     assert table(30, monkeypatch, capsys).splitlines()[:6] == [
         "model     2",
         "signals   ax ay yaw_rate",
@@ -99,6 +100,15 @@ ours                              0.0302
         "RMSE deg  0.0735",
         "",
     ]
+
+
+def test_texts_of_an_answer_that_is_asked_for_whole_take_several_lines(
+    smoke_root: Path, shown: Shown
+) -> None:
+    query = "SELECT 'drive' AS what, trim(repeat('many words ', 20)) AS told"
+    words = ["--root", str(smoke_root), "sql", "--all", query]
+    lines = shown(lambda: app(words, standalone_mode=False), 80)
+    assert " ".join(lines).count("many") == 20
 
 
 def test_prose_breaks_between_words_and_commands_do_not(shown: Shown) -> None:

@@ -33,6 +33,7 @@ def test_it_answers_statements_and_survives_mistakes(
     assert done.exit_code == 0
     assert "answer" in done.stdout
     assert "42" in done.stdout
+    assert "slip>" not in done.stdout
     assert "after the end" not in done.stdout
     assert "error: not valid SQL" in done.stderr
 

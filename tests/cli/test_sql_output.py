@@ -26,7 +26,9 @@ def test_a_table_has_numbers_that_people_read_and_json_those_that_are_there(
 
 def test_a_table_can_be_asked_for_whole(run_command: RunCommand, smoke_root: Path) -> None:
     query = "SELECT i, repeat('x', 300) AS long FROM range(100) r(i)"
-    cut = run_command("sql", query, root=smoke_root).stdout
+    short = run_command("sql", query, root=smoke_root)
+    assert "not all rows are shown and long texts are cut; whole: --all" in short.stderr
+    cut = short.stdout
     whole = run_command("sql", query, "--all", root=smoke_root).stdout
     assert "x" * 300 not in cut
     assert whole.count("x" * 300) == 100

@@ -134,6 +134,8 @@ def _print_models(selection: Selection[Any], everything: bool) -> None:
         ],
         left=1 + listed,
     )
+    if everything and listed and found:
+        say("+ and -: what a size of the search has, and has not, unlike the size before it.")
 
 
 def _say_label_noise(selection: RequestedSelection) -> None:

@@ -19,13 +19,15 @@ from pyarrow.csv import write_csv
 
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.session import Session
-from fleet_slip.cli.output import Json, json_text, print_json, say
+from fleet_slip.cli.output import Json, cell, json_text, print_json, print_table, say
 from fleet_slip.errors import QuestionError, StorageError, UsageError
 from fleet_slip.warehouse.database import limit_memory
 from fleet_slip.words import number_of
 
 ROWS_SHOWN = 40
 ENDLESS = 2**31 - 1
+ROWS_FOLDED = 1000
+"""Of more, --all prints lines as wide as they are: to fold them would take long."""
 FORMULA = "^[=+@\\t\\r\\n＝＋－＠-]"
 """What a text begins with that a spreadsheet executes."""
 
@@ -152,11 +154,16 @@ def _write(session: Session, text: str, file: Path, limit: int | None, exact: bo
 
 def _show(session: Session, text: str, limit: int | None, everything: bool) -> None:
     """Print what fits of an answer, and say what is left out and how to see it."""
-    width = ENDLESS if everything else shutil.get_terminal_size((160, 40)).columns
+    screen = shutil.get_terminal_size((160, 40)).columns
+    width = ENDLESS if everything else screen
     rows = limit if limit is not None else ENDLESS if everything else ROWS_SHOWN
     shown, empty = session.compute(
         text, lambda answer: _fitting(answer if limit is None else answer.limit(limit), width, rows)
     )
+    wide = shown.index("\n") > screen and shown.count("\n") <= ROWS_FOLDED
+    if everything and sys.stdout.isatty() and wide:
+        _print_folded(session, text, limit)
+        return
     typer.echo(shown)
     if found := _CUT.search(shown):
         left_out = [f"{int(found[1]) - int(found[2])} of {found[1]} columns do not fit"]
@@ -164,8 +171,24 @@ def _show(session: Session, text: str, limit: int | None, everything: bool) -> N
         say(f"{'; '.join(left_out)}. Name those to see: SELECT …; all: --all")
     elif empty:
         say(f"columns without a value in these rows are left out: {', '.join(empty)}")
+    elif left_out := [what for what, cut in _CUTS.items() if cut.search(shown)]:
+        say(f"{' and '.join(left_out)}; whole: --all")
 
 
+def _print_folded(session: Session, text: str, limit: int | None) -> None:
+    """Print an answer that is wider than the terminal, with texts of several lines."""
+    rows = session.compute(
+        text,
+        lambda answer: _readable(answer if limit is None else answer.limit(limit)).fetchall(),
+    )
+    names = session.compute(text, lambda answer: answer.columns)
+    print_table("", names, [[cell(value) for value in row] for row in rows], left=len(names))
+
+
+_CUTS = {
+    "not all rows are shown": re.compile(r"rows .*shown\)"),
+    "long texts are cut": re.compile(r"\S… │"),
+}
 _CUT = re.compile(r"(\d+) columns \((\d+) shown\)")
 _NOTHING_FITS = "┌───┐\n│ … │"
 

@@ -5,7 +5,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import Json, print_json, print_table
 from fleet_slip.config import read_named_file
-from fleet_slip.resources import config_files, own_configs
+from fleet_slip.resources import config_files, folder, own_configs
 
 
 def config(json: Json = False) -> None:
@@ -32,8 +32,8 @@ def config(json: Json = False) -> None:
         print_json({"own": str(own) if own else None, "files": found})
         return
     print_table(
-        f"own configs: {own or 'none'}",
-        ["file", "from", "path"],
-        [[one["file"], one["from"], one["path"]] for one in found],
-        left=3,
+        f"own configs: {own or 'none'}\nshipped ones: {folder('configs')}",
+        ["file", "from"],
+        [[one["file"], one["from"]] for one in found],
+        left=2,
     )

@@ -5,8 +5,9 @@ from typing import Annotated
 import typer
 
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
+from fleet_slip.catalogue.features import FeatureCatalogue
 from fleet_slip.catalogue.features import features as known_features
-from fleet_slip.cli.output import Json, print_json, print_table
+from fleet_slip.cli.output import All, Json, print_json, print_table
 from fleet_slip.columns.column_sql import column_query
 from fleet_slip.words import number_of
 
@@ -23,6 +24,7 @@ def features(
             show_default=False,
         ),
     ] = None,
+    everything: All = False,
     json: Json = False,
 ) -> None:
     """List the features and feature sets of configs/features.toml.
@@ -62,6 +64,8 @@ def features(
             ],
             left=4,
         )
+    elif not everything:
+        _print_families(known)
     else:
         print_table(
             "",
@@ -81,6 +85,29 @@ def features(
             ],
             left=5,
         )
+
+
+def _print_families(known: FeatureCatalogue) -> None:
+    """Print features, and columns over time by family: one by one they are hundreds."""
+    print_table(
+        "",
+        ["feature", "unit", "description"],
+        [[name, one.unit, one.description] for name, one in known.features.items()],
+        left=3,
+    )
+    families = {
+        name: (" ".join(map(str, window.members(name).values())), window.description)
+        for name, window in known.windows.items()
+    }
+    single = {**known.factors, **known.calibrated}
+    families |= {name: ("", known.time_columns[name].description) for name in single}
+    families |= {f"COLUMN_{name}_…": ("", gate.description) for name, gate in known.gates.items()}
+    print_table(
+        f"\n{number_of(len(known.time_columns), 'column')} over time; one by one: --all",
+        ["column", "over ticks", "description"],
+        [[name, *told] for name, told in families.items()],
+        left=3,
+    )
 
 
 def _parts(one: FeatureSet) -> str:

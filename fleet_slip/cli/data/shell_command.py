@@ -158,7 +158,8 @@ def _read_statement() -> str | None:
     lines: list[str] = []
     while True:
         try:
-            line = input("   ...> " if lines else "slip> ")
+            prompt = "   ...> " if lines else "slip> "
+            line = input(prompt if sys.stdin.isatty() else "")
         except EOFError:
             return "\n".join(lines) or None
         except KeyboardInterrupt:

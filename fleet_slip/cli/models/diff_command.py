@@ -6,7 +6,7 @@ import typer
 
 from fleet_slip.cli.models.version_commands import Reference
 from fleet_slip.cli.output import Json, print_json, print_table, say
-from fleet_slip.models.diff import Difference
+from fleet_slip.models.diff import Difference, Term
 from fleet_slip.models.estimates.score import cohort_of_rows
 from fleet_slip.models.estimates.score import score as score_rows
 from fleet_slip.models.model_version import ModelVersion
@@ -34,7 +34,7 @@ def _print_difference(found: Difference) -> None:
         return
     terms = []
     for term in found.terms:
-        here, there = ("" if value is None else repr(value) for value in (term.one, term.other))
+        here, there = _coefficients(term)
         terms.append([term.signal, term.unit, here, "the same" if term.same else there])
     print_table("", ["signal", "unit", one, other], terms, left=2)
     if found.drives is not None:
@@ -43,12 +43,31 @@ def _print_difference(found: Difference) -> None:
             f"drives: {shared.both:,} made both, {shared.only_one:,} only {one}, "
             f"{shared.only_other:,} only {other}"
         )
-    rows = [[name, _shown(a), _shown(b)] for name, (a, b) in found.facts.items()]
+    rows = [
+        [name.rpartition(".")[2].replace("_", " "), _shown(a), _shown(b)]
+        for name, (a, b) in found.facts.items()
+        if not name.endswith("sha256")  # for machines: --json
+    ]
     print_table("", ["what differs", one, other], rows, left=3)
 
 
+def _coefficients(term: Term) -> list[str]:
+    """Return the two coefficients of a term, with more digits where few would hide a difference."""
+    values = (term.one, term.other)
+    short = ["" if value is None else f"{value:.6g}" for value in values]
+    return short if term.same or short[0] != short[1] else [repr(value) for value in values]
+
+
 def _shown(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    match value:
+        case None:
+            return ""
+        case dict():
+            return ", ".join(f"{name} {inner}" for name, inner in value.items())
+        case float():
+            return f"{value:.6g}"
+        case _:
+            return str(value)
 
 
 def score_against(
@@ -71,11 +90,10 @@ def score_against(
         [
             [
                 name.replace("_deg", ", deg").replace("_", " "),
-                f"{value:.4f}",
-                f"{second[name]:.4f}",
-                f"{value - second[name]:+.4f}",
+                *(f"{number:,}" if isinstance(number, int) else f"{number:.4f}" for number in pair),
+                f"{pair[0] - pair[1]:+.4f}",
             ]
-            for name, value in first.items()
-            if name != "rows" and value is not None and second[name] is not None
+            for name, pair in ((name, (first[name], second[name])) for name in first)
+            if name != "rows" and None not in pair and any(pair)
         ],
     )

@@ -85,7 +85,7 @@ def _print_models(rows: Sequence[Mapping[str, Any]], everything: bool) -> None:
         [
             [
                 f"{row['name']}@{row['version']}",
-                row["aliases"],
+                row["aliases"].replace(",", ", "),
                 row["signals"].replace(",", " ")
                 if everything
                 else str(len(row["signals"].split(","))),
