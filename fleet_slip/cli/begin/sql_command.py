@@ -186,11 +186,14 @@ def _print_folded(session: Session, text: str, limit: int | None) -> None:
 
 
 _CUTS = {
+    "not all columns are shown": re.compile(r"│ … │"),  # a narrow table has no room to say so
     "not all rows are shown": re.compile(r"rows .*shown\)"),
     "long texts are cut": re.compile(r"\S… │"),
 }
 _CUT = re.compile(r"(\d+) columns \((\d+) shown\)")
-_NOTHING_FITS = "┌───┐\n│ … │"
+_NOTHING_FITS, _HIDDEN = "┌───┐\n│ … │", "│ … │\n"
+FEW_COLUMNS = 3
+"""So many have room side by side, whatever they hold."""
 
 
 def _fitting(answer: duckdb.DuckDBPyRelation, width: int, rows: int) -> tuple[str, list[str]]:
@@ -224,10 +227,13 @@ def _readable(answer: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
 
 
 def _drawn(answer: duckdb.DuckDBPyRelation, width: int, rows: int) -> str:
-    for longest in (width, width // 2):  # a text as wide as all leaves no column any room
+    # A text as wide as all leaves other columns no room, or has none itself.
+    for longest in (width, width // max(2, len(answer.columns)) - 3):
         with contextlib.redirect_stdout(io.StringIO()) as drawn:
             answer.show(max_rows=rows, max_width=width, max_col_width=longest)
-        if not drawn.getvalue().startswith(_NOTHING_FITS):
+        shown = drawn.getvalue()
+        few = len(answer.columns) <= FEW_COLUMNS and _HIDDEN in shown
+        if not few and not shown.startswith(_NOTHING_FITS):
             break
     return drawn.getvalue().rstrip("\n")
 
