@@ -55,7 +55,8 @@ def stepwise_order(
 def sweep(matrix: LongArray, pivot: int) -> LongArray:
     """Return a matrix swept on a pivot (Goodnight 1979), which done again undoes it."""
     row = matrix[pivot] / matrix[pivot, pivot]
-    swept = matrix - np.outer(matrix[:, pivot], row)
+    swept: LongArray = np.multiply.outer(matrix[:, pivot], row)
+    np.subtract(matrix, swept, out=swept)
     swept[pivot] = row
     swept[:, pivot] = matrix[:, pivot] / matrix[pivot, pivot]
     swept[pivot, :] = row
@@ -70,9 +71,12 @@ class _Search:
         self.exact = moments(gram)
         size = len(self.exact)
         # An integer to 64 bits or more: its float, and what that leaves.
-        high = np.array([[float(x) for x in row] for row in self.exact])
-        low = np.array([[float(x - int(float(x))) for x in row] for row in self.exact])
-        matrix = high.astype(np.longdouble) + low.astype(np.longdouble)
+        half = [x for i, row in enumerate(self.exact) for x in row[: i + 1]]
+        high = np.array([float(x) for x in half])
+        low = np.array([float(x - int(near)) for x, near in zip(half, high.tolist(), strict=True)])
+        matrix = np.empty((size, size), dtype=np.longdouble)
+        matrix[np.tril_indices(size)] = high.astype(np.longdouble) + low.astype(np.longdouble)
+        matrix.T[np.tril_indices(size)] = matrix[np.tril_indices(size)]
         length = np.sqrt(np.diag(matrix))
         length[length == 0] = 1
         self.matrix: LongArray = matrix / np.outer(length, length)
@@ -80,22 +84,42 @@ class _Search:
         self.usable = self._independent()
 
     def _independent(self) -> list[int]:
-        work, left = self.matrix.copy(), set(range(self.inputs))
-        taken: list[int] = []
-        while left:
-            best = max(left, key=lambda i: (work[i, i], -i))
+        """Return inputs that explain the others, each time the one that is explained least."""
+        if self._far_from_dependent():
+            return list(range(self.inputs))
+        work, names = self.matrix[:-1, :-1].copy(), np.arange(self.inputs)
+        buffer, taken = np.empty_like(work), list[int]()
+        left = np.ones(self.inputs, dtype=np.bool_)
+        while left.any():
+            best = int(np.argmax(np.where(left, work.diagonal(), -1)))
             if work[best, best] < DEPENDENT:
                 break
-            work = sweep(work, best)
-            taken.append(best)
-            left.remove(best)
+            np.multiply.outer(work[:, best], work[best] / work[best, best], out=buffer)
+            work -= buffer
+            taken.append(int(names[best]))
+            left[best] = False
+            if 8 * left.sum() < 7 * len(left):  # what was taken is not looked at again
+                work, names = work[np.ix_(left, left)], names[left]
+                buffer, left = np.empty_like(work), np.ones(len(work), dtype=np.bool_)
         return sorted(taken)
+
+    def _far_from_dependent(self) -> bool:
+        """Whether no combination of inputs has twice as little variance as `DEPENDENT`.
+
+        What others leave of an input is no less than the least eigenvalue of the matrix.
+        """
+        correlation = self.matrix[:-1, :-1].astype(np.float64)
+        try:
+            np.linalg.cholesky(correlation - 2 * DEPENDENT * np.eye(self.inputs))
+        except np.linalg.LinAlgError:
+            return False
+        return True
 
     def forward(self, most: int, *, exchanging: bool = False) -> list[list[int]]:
         work, chosen = self.matrix.copy(), list[int]()
         sets = []
         for _ in range(most):
-            best = self._best_entry(work, chosen)
+            best = self._best_entry(work.diagonal(), work[:, -1], chosen)
             if best is None:
                 break
             work = sweep(work, best)
@@ -126,22 +150,27 @@ class _Search:
         order = [int(name) for name in lars_path_of_moments(matrix, target, names).order]
         return [order[:size] for size in range(1, min(most, len(order)) + 1)]
 
-    def _best_entry(self, work: LongArray, chosen: Sequence[int]) -> int | None:
-        free = [i for i in self.usable if i not in chosen and work[i, i] >= DEPENDENT]
-        if not free:
+    def _best_entry(
+        self, variance: LongArray, with_label: LongArray, chosen: Sequence[int]
+    ) -> int | None:
+        """Return the input that explains most beside those chosen, from what these leave."""
+        there = np.zeros(len(variance), dtype=np.bool_)
+        there[self.usable] = True
+        there[chosen] = False
+        free = np.flatnonzero(there & (variance >= DEPENDENT))
+        if not len(free):
             return None
-        gains = {i: work[i, -1] ** 2 / work[i, i] for i in free}
-        best = max(gains.values())
-        near = [i for i in free if gains[i] >= best * (1 - ROUNDING)]
+        gains = with_label[free] ** 2 / variance[free]
+        near: list[int] = free[gains >= gains.max() * (1 - ROUNDING)].tolist()
         if len(near) == 1:
             return near[0]
         return min(near, key=lambda i: (self._rss([*chosen, i]), i))
 
     def _least_loss(self, work: LongArray, chosen: Sequence[int]) -> int:
         """Return the chosen input whose loss costs least; of equals, the later declared."""
-        losses = {i: work[i, -1] ** 2 / -work[i, i] for i in chosen}
-        least = min(losses.values())
-        near = [i for i in chosen if losses[i] <= least * (1 + ROUNDING)]
+        losses = work[chosen, -1] ** 2 / -work.diagonal()[chosen]
+        cheap = np.flatnonzero(losses <= losses.min() * (1 + ROUNDING))
+        near = [chosen[int(place)] for place in cheap]
         if len(near) == 1:
             return near[0]
         return min(near, key=lambda i: (self._rss([j for j in chosen if j != i]), -i))
@@ -152,14 +181,19 @@ class _Search:
         while improved:
             improved = False
             for position, old in enumerate(chosen):
-                without = sweep(work, old)
+                # Of the matrix swept on the old one only this is needed, until it is exchanged.
+                row = work[old] / work[old, old]
+                variance = work.diagonal() - work[:, old] * row
+                with_label = work[:, -1] - work[:, old] * row[-1]
+                variance[old], with_label[old] = -1 / work[old, old], row[-1]
                 others = [*chosen[:position], *chosen[position + 1 :]]
-                new = self._best_entry(without, others)
+                new = self._best_entry(variance, with_label, others)
                 if new is None or new == old:
                     continue
-                trial = sweep(without, new)
-                if trial[-1, -1] < work[-1, -1] * (1 - ROUNDING):
-                    work, chosen[position], improved = trial, new, True
+                gain = with_label[new] ** 2 / variance[new]
+                if variance[-1] - gain < work[-1, -1] * (1 - ROUNDING):
+                    work = sweep(sweep(work, old), new)
+                    chosen[position], improved = new, True
         return work
 
     def _rss(self, chosen: Sequence[int]) -> Fraction:

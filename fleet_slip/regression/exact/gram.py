@@ -7,13 +7,15 @@ fold is, bit for bit, training on the rest.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.arrays import ObjectArray
+from fleet_slip.arrays import IntArray, ObjectArray
 from fleet_slip.errors import DataError
+
+SomeSize = TypeVar("SomeSize", int, IntArray)
 
 BLOCK_ROWS = 2**18
 """Most rows of one matrix product. 16-bit counts would allow 2^21; this keeps the block small."""
@@ -21,7 +23,7 @@ BLOCK_ROWS = 2**18
 _SMALLEST_BLOCK = 2**10
 
 
-def packed_size(k: int) -> int:
+def packed_size(k: SomeSize) -> SomeSize:
     """Return k(k+1)/2, the number of entries of a packed lower triangle."""
     return k * (k + 1) // 2
 
@@ -207,7 +209,11 @@ def positions(signals: Sequence[str], wanted: Sequence[str]) -> list[int]:
 @cache
 def packed_positions(at: tuple[int, ...]) -> tuple[int, ...]:
     """Return where the products of some of the signals stand, in the order of a packed triangle."""
-    return tuple(packed_position(i, at[b]) for a, i in enumerate(at) for b in range(a + 1))
+    places = np.array(at, dtype=np.int64)
+    row, column = np.tril_indices(len(at))
+    larger = np.maximum(places[row], places[column])
+    found = packed_size(larger) + np.minimum(places[row], places[column])
+    return tuple(found.tolist())
 
 
 def _gram_of_block(signals: Sequence[str], counts: NDArray[Any]) -> Gram:

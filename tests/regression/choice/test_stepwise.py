@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import QuestionError
+from fleet_slip.regression.choice import stepwise
 from fleet_slip.regression.choice.signal_orders import rank, replacement_sets
 from fleet_slip.regression.choice.stepwise import METHODS, stepwise_order
 from fleet_slip.regression.exact.gram import Gram
@@ -74,6 +75,23 @@ def test_a_hundred_columns_are_searched_in_a_moment() -> None:
     for method in METHODS:
         assert len(stepwise_order(gram, names(75), "y", method, 24)) == 24
     assert time.process_time() - started < 10  # exact elimination takes minutes
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_shortens_a_search_changes_no_order(
+    method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Inputs far from dependent need no elimination; taken ones leave the work by and by."""
+    gram = correlated(5, 40)
+    found = stepwise_order(gram, names(40), "y", method, 40)
+    assert len(found) == 40
+    monkeypatch.setattr(stepwise, "DEPENDENT", 1e-13)
+    monkeypatch.setattr(np.linalg, "cholesky", _singular)
+    assert stepwise_order(gram, names(40), "y", method, 40) == found
+
+
+def _singular(_: object) -> None:
+    raise np.linalg.LinAlgError
 
 
 def test_an_unknown_search_is_refused() -> None:
