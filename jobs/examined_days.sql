@@ -9,5 +9,4 @@ WHERE signals <> '' AND (
     {condition}
 )
 GROUP BY day
-HAVING drives > 0
 ORDER BY day

@@ -31,7 +31,7 @@ from fleet_slip.runs.log import step
 from fleet_slip.runs.nights import Beginning, Nights, hash_drive, without_drives
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.warehouse.minimum_cohort import UNNAMED, tells_single_cars
-from fleet_slip.warehouse.table_views import connect_tables
+from fleet_slip.warehouse.table_views import connect_tables, gram_snapshots
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
@@ -74,6 +74,7 @@ class Night:
     steps: list[NightStep] = field(default_factory=list)
     faults: "tuple[SensorFault, ...]" = ()
     chart: "Chart | None" = None
+    counted: dict[tuple[int | None, int | None], int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         one = self.asked
@@ -150,10 +151,18 @@ class Night:
             champion = self.fleet.registry().champion(self.training.name)
         return Beginning(
             champion=champion.reference if champion else None,
-            drives=_count_drives(warehouse),
+            drives=self._count_drives(),
             rows=warehouse.logs.snapshot().rows,
             quarantined=warehouse.quarantine.snapshot().rows,
         )
+
+    def _count_drives(self) -> int:
+        """Return the number of drives, counted again only where Gram rows or logs changed."""
+        grams, logs = gram_snapshots(self.fleet.warehouse)
+        state = grams.version, logs.version
+        if state not in self.counted:
+            self.counted = {state: _count_drives(self.fleet.warehouse)}
+        return self.counted[state]
 
     def _candidate(self) -> str | None:
         registry, name = self.fleet.registry(), self.training.name

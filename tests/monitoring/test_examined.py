@@ -13,6 +13,8 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli import left_out
 from fleet_slip.cli.app import app
 from fleet_slip.errors import RefusedError, UnexaminedError
+from fleet_slip.grams.cohorts.cells import NO_CELLS, RollupReader
+from fleet_slip.grams.rows import rollup
 from fleet_slip.models.acceptance import gate
 from fleet_slip.monitoring import examined, quality
 from fleet_slip.monitoring.quality import QualityReport
@@ -20,7 +22,9 @@ from fleet_slip.runs.nights import hash_drive, with_all_drives, without_drives
 from fleet_slip.warehouse.condition import Condition
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
+from tests.support.fleet_messages import messages_of
 from tests.support.landing import Landing
+from tests.support.messages import START_S
 from tests.support.once import made_once
 
 NEGATED = {"sideslip_rad": "-sideslip_rad"}
@@ -162,6 +166,33 @@ def test_many_drives_are_examined_in_pieces_of_days_and_each_piece_once(
     found = fleet.leave_out_faulty()
     assert (found.drives, found.faults, len(asked)) == (8, {"stuck ay": 2, "stuck yaw_rate": 2}, 3)
     assert "2026-10-06" in asked[-1] and "2026-10-05" not in asked[-1]
+
+
+def test_rows_of_whole_files_are_not_read_to_tell_that_they_are_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
+    monkeypatch.setattr(rollup, "ROWS_PER_CELL", 4)
+    monkeypatch.setattr(examined, "PIECE", 150)
+    fleet, asked = fleet_slip.open(tmp_path / "data"), list[str]()
+
+    def ask(warehouse: Warehouse, condition: Condition) -> QualityReport:
+        asked.append(condition.sql)
+        return QualityReport(0, 0, ())
+
+    monkeypatch.setattr(examined, "examine_drives", ask)
+    for day in range(3):
+        path = tmp_path / f"day-{day}"
+        path.write_bytes(messages_of(150, START_S + 86_400 * day, seed=day))
+        fleet.receive(path)
+        fleet.leave_out_faulty()
+        assert len(asked) == day + 1
+        assert f"2024-05-0{day + 1}" in asked[-1]
+    # Their cells tell the days: no row of theirs is in the connection.
+    monkeypatch.setattr(RollupReader, "cells", lambda *_: NO_CELLS)
+    fleet.leave_out_faulty()
+    assert len(asked) == 6
 
 
 def test_drives_without_gram_rows_are_reduced_and_examined_before_they_train(
