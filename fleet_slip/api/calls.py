@@ -9,23 +9,33 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import fields
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar, get_args, get_origin
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Concatenate,
+    ParamSpec,
+    TypeVar,
+    get_args,
+    get_origin,
+)
 
 from typing_extensions import Doc
 
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.extras import needed
 from fleet_slip.files.folder import Folder
-from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.log import current_run_id, recording
-from fleet_slip.warehouse.tables import Warehouse
+
+if TYPE_CHECKING:
+    from fleet_slip.warehouse.tables import Warehouse
 
 
 class Rooted:
     """The warehouse of a data root. Making one touches nothing."""
 
-    def __init__(self, warehouse: Warehouse) -> None:
+    def __init__(self, warehouse: "Warehouse") -> None:
         self.warehouse = warehouse
 
     @property
@@ -166,6 +176,8 @@ def open_workers(root: Folder, workers: Workers) -> Iterator[Executor]:
 
 def absolute(root: Folder) -> Folder:
     """Return a root that means the same in other working directories, such as a worker's."""
+    from fleet_slip.files.local_folder import LocalFolder
+
     return LocalFolder(root.path.absolute()) if isinstance(root, LocalFolder) else root
 
 
@@ -174,6 +186,8 @@ def unless_local(executor: Executor) -> Executor | None:
     return None if isinstance(executor, ThreadPoolExecutor) else executor
 
 
-def within_reach(warehouse: Warehouse, executor: Executor) -> Warehouse:
+def within_reach(warehouse: "Warehouse", executor: Executor) -> "Warehouse":
     """Return the warehouse as the workers of an executor find it."""
+    from fleet_slip.warehouse.tables import Warehouse
+
     return warehouse if unless_local(executor) is None else Warehouse(absolute(warehouse.root))

@@ -4,13 +4,14 @@ import logging
 import os
 import signal
 import sys
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import fleet_slip
-from fleet_slip.cli.commands import MARKUP, CommandGroup
+from fleet_slip.cli.commands import CommandGroup
 from fleet_slip.cli.leaving import LOG_VARIABLE, leave
 from fleet_slip.cli.logs import LogFormat, configure_logs
 from fleet_slip.cli.output import say
@@ -26,11 +27,14 @@ from fleet_slip.files.data_root import ROOT_VARIABLE
 from fleet_slip.limits import memory_bytes
 from fleet_slip.resources import CONFIG_VARIABLE, own_configs
 
+if TYPE_CHECKING:
+    from fleet_slip.api.fleet import Fleet
+
 app = typer.Typer(
     cls=CommandGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode=MARKUP,
+    rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog=(
         "Exit codes: 0 done, 1 a bug, 2 wrong usage, 3 a config file, 4 input data, 5 the data "
@@ -40,6 +44,22 @@ app = typer.Typer(
         "already, 16 not examined, 130 interrupted."
     ),
 )
+
+
+class LaterOpened:
+    """The fleet of a command, opened when it is first asked for: help waits for no table."""
+
+    def __init__(self, root: str | None) -> None:
+        """Take the root that was named."""
+        self._root = root
+
+    @cached_property
+    def _fleet(self) -> "Fleet":
+        return fleet_slip.open(self._root)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the fleet."""
+        return getattr(self._fleet, name)
 
 
 def _print_version(wanted: bool) -> None:
@@ -92,7 +112,7 @@ def options(
     if config is not None:
         os.environ[CONFIG_VARIABLE] = str(Path(config).absolute())
     own_configs()
-    context.obj = fleet_slip.open(root)
+    context.obj = LaterOpened(root)
 
 
 def run_app() -> int:

@@ -2,7 +2,7 @@
 
 So `--help` and shell completion wait for none of them, and a command waits for what it needs
 itself. What the list of commands says of one is its docstring's, which Python finds in the module's
-compiled code without running it.
+compiled code without running it. Help is plain text: boxes and colours took longer than all else.
 """
 
 import inspect
@@ -12,14 +12,11 @@ from importlib import import_module
 from importlib.abc import InspectLoader
 from importlib.util import find_spec
 from types import CodeType, FunctionType
-from typing import Any, Final
+from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
-
-MARKUP: Final = "markdown"
-"""What the help texts are written in."""
 
 GROUPS = {
     "Begin with": {
@@ -85,21 +82,35 @@ each as a function."""
 COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items()}
 
 
+class Command(TyperCommand):
+    """A command whose help is plain text."""
+
+    def get_help(self, ctx: Any) -> str:
+        """Return the help without what marks examples in docstrings."""
+        return super().get_help(ctx).replace("**", "")
+
+
 class CommandGroup(TyperGroup):
     """The commands, listed from their docstrings; the one that is called is loaded."""
 
     def __init__(self, **settings: Any) -> None:
         """Add a command that has nothing but its docstring for each of `COMMANDS`."""
         super().__init__(**settings)
-        for group, commands in GROUPS.items():
-            for name, module in commands.items():
-                command = TyperCommand(
-                    name,
-                    help=docstrings(module)[_function(name)],
-                    rich_markup_mode=self.rich_markup_mode,
-                    rich_help_panel=group,
-                )
-                self.add_command(command)
+        for name, module in COMMANDS.items():
+            self.add_command(Command(name, help=docstrings(module)[_function(name)]))
+
+    def get_help(self, ctx: Any) -> str:
+        """Return the help without what marks examples in docstrings."""
+        return super().get_help(ctx).replace("**", "")
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 - of the base
+        """Write the commands, group by group."""
+        wide = max(map(len, COMMANDS))
+        left = formatter.width - wide - 6
+        for group, names in GROUPS.items():
+            with formatter.section(group):
+                rows = [(name, self.commands[name].get_short_help_str(2 * left)) for name in names]
+                formatter.write_dl([(f"{name:<{wide}}", text) for name, text in rows])
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Put the command that is called in the place of its docstring."""
@@ -111,8 +122,8 @@ class CommandGroup(TyperGroup):
 def load_command(name: str) -> Any:
     """Return a command, with its options."""
     module = import_module(f"fleet_slip.cli.{COMMANDS[name]}")
-    app = typer.Typer(rich_markup_mode=MARKUP)
-    app.command(name)(getattr(module, _function(name)))
+    app = typer.Typer(rich_markup_mode=None)
+    app.command(name, cls=Command)(getattr(module, _function(name)))
     return get_group(app).commands[name]
 
 

@@ -8,13 +8,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import Any
-
-from rich.console import Console
+from typing import TYPE_CHECKING, Any
 
 from fleet_slip.cli.leaving import for_machines
 from fleet_slip.errors import hide_passwords, printable
 from fleet_slip.runs.log import LOGGER, current_run_id
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 class LogFormat(StrEnum):
@@ -25,18 +26,20 @@ class LogFormat(StrEnum):
     JSON = "json"
 
 
-_drawn_on: list[Console] = []
+_drawn_on: "list[Console]" = []
 
 
-def stderr() -> Console:
+def stderr() -> "Console":
     """Return a console for progress and remarks: that on which a bar is drawn, if there is one."""
     if _drawn_on:
         return _drawn_on[-1]
+    from rich.console import Console  # noqa: PLC0415 - a command without a remark waits for none
+
     return Console(stderr=True, highlight=False, emoji=False, soft_wrap=True)
 
 
 @contextmanager
-def drawing_on(console: Console) -> Iterator[None]:
+def drawing_on(console: "Console") -> Iterator[None]:
     """Print remarks above what is drawn on a console, not into it."""
     _drawn_on.append(console)
     try:
@@ -64,7 +67,11 @@ class PeopleHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Print a remark."""
         if not hasattr(record, "event"):
-            text, console = printable(hide_passwords(record.getMessage())), stderr()
+            text = printable(hide_passwords(record.getMessage()))
+            if not (_drawn_on or sys.stderr.isatty()):
+                print(text, file=sys.stderr, flush=True)  # noqa: T201 - a remark
+                return
+            console = stderr()
             shown = wrapped(text, console.width) if console.is_terminal else text
             console.print(shown, markup=False)
 

@@ -10,23 +10,24 @@ from decimal import Decimal
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.cells import cell_len
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from fleet_slip.cli.logs import wrapped
 from fleet_slip.errors import printable
 from fleet_slip.runs.log import LOGGER
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
     from fleet_slip.regression.exact.figures import Figures
 
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON on stdout.")]
 
 
-def stdout() -> Console:
+def stdout() -> "Console":
     """Return a console for results. Piped, it keeps to 200 columns and never wraps in mid-word."""
+    from rich.console import Console  # noqa: PLC0415 - JSON waits for none
+
     return Console(width=None if sys.stdout.isatty() else 200, highlight=False, emoji=False)
 
 
@@ -89,6 +90,9 @@ def print_table(
     Words and numbers are never broken. Where a terminal is too narrow for that, columns move
     closer; where that is not enough, every row becomes a paragraph with a line for each column.
     """
+    from rich.table import Table  # noqa: PLC0415 - JSON waits for none
+    from rich.text import Text  # noqa: PLC0415
+
     shown = [[printable(cell) for cell in row] for row in rows]
     console = stdout()
     fitting = ((gap, _fit_columns(header, shown, console.width, gap)) for gap in GAPS)
@@ -140,6 +144,8 @@ def _fit_columns(
     header: Sequence[str], rows: Sequence[Sequence[str]], width: int, gap: int
 ) -> list[int] | None:
     """Return how wide each column is, none less than its longest word; None if they do not fit."""
+    from rich.cells import cell_len  # noqa: PLC0415
+
     columns = [[name, *(row[i] for row in rows)] for i, name in enumerate(header)]
     wished = [max(map(cell_len, cells)) for cells in columns]
     widths = [max((cell_len(w) for c in cells for w in c.split()), default=0) for cells in columns]
@@ -153,8 +159,11 @@ def _fit_columns(
     return widths
 
 
-def _paragraphs(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+def _paragraphs(header: Sequence[str], rows: Sequence[Sequence[str]]) -> "Table":
     """Return a table of two columns: what a figure is called, and the figure."""
+    from rich.table import Table  # noqa: PLC0415
+    from rich.text import Text  # noqa: PLC0415
+
     table = Table(box=None, pad_edge=False, show_header=False)
     table.add_column(justify="left", no_wrap=True)
     table.add_column(justify="left", overflow="fold")

@@ -11,14 +11,11 @@ import contextlib
 import logging
 import os
 import re
-import socket
 import time
-import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib.metadata import version
 from typing import Any
 
 from fleet_slip.errors import HIDDEN, StorageError, hide_passwords
@@ -84,7 +81,7 @@ class Run:
     def start(cls, command: str, arguments: Sequence[str]) -> "Run":
         """Begin a run now. Its name sorts by time."""
         now = datetime.now(UTC)
-        run_id = f"{now:%Y%m%dT%H%M%S.%fZ}-{uuid.uuid4().hex[:8]}"
+        run_id = f"{now:%Y%m%dT%H%M%S.%fZ}-{os.urandom(4).hex()}"
         return cls(command, tuple(arguments), now, run_id)
 
     @property
@@ -96,12 +93,14 @@ class Run:
 
     def beginning(self) -> dict[str, Any]:
         """Return the line that is written when the run starts."""
+        from importlib.metadata import version  # noqa: PLC0415 - what is not recorded needs none
+
         return {
             "run_id": self.run_id,
             "command": self.command,
             "arguments": self.shown_arguments,
             "started_at": _timestamp(self.started_at),
-            "host": socket.gethostname(),
+            "host": os.uname().nodename,
             "process": os.getpid(),
             "process_began": process_began(os.getpid()),
             "package_version": version("fleet-slip"),
