@@ -196,12 +196,49 @@ def test_a_time_zone_and_a_time_of_the_day_are_understood(tmp_path: Path) -> Non
     assert (counts.rows_kept, counts.ticks) == (100, 100)
 
 
+DATES = {
+    "Datum": ("%d.%m.%Y", "Uhrzeit", "%H:%M:%S,%f"),
+    "date": ("%d%m%y", "time", "%H%M%S.%f"),
+    "Date": ("%m/%d/%Y", "Time of day", "%H:%M:%S.%f"),
+    "day": ("%Y-%m-%d", "clock", "%H:%M:%S.%f"),
+}
+
+
+@pytest.mark.parametrize("column", DATES)
+def test_date_and_time_stand_in_columns_of_their_own(tmp_path: Path, column: str) -> None:
+    """The log goes on over midnight: of a time of the day alone that is another drive."""
+    dated, clock, written = DATES[column]
+    car, start = a_car(), datetime(2024, 3, 20, 23, 59, 40, tzinfo=UTC)
+    lines = [f"{column};{clock};ay [m/s²];yaw_rate [°/s];speed [km/h]"]
+    for i in range(ROWS):
+        moment = start + timedelta(milliseconds=10 * i)
+        told = [car["ay"][i], car["yaw_rate"][i] * TO_DEG, car["wheel_rl"][i] * RADIUS_M * 3.6]
+        values = [f"{value:.4f}" for value in told]
+        lines.append(";".join([f"{moment:{dated}}", f"{moment:{written}}"[:-3], *values]))
+    (tmp_path / "log.csv").write_text("\n".join(lines), encoding="utf-8")
+    draft = call(tmp_path, "mapping", "suggest", str(tmp_path / "log.csv"))
+    text = draft.partition("\n# A draft")[2]
+    assert "# day = " not in text
+    for fact in ("vehicle_id", "vehicle_model"):
+        text = text.replace(f'# {fact} = ""', f'{fact} = "A"')
+    (tmp_path / "m.toml").write_text(f"# {text}", encoding="utf-8")
+    mapping = load_mapping(str(tmp_path / "m.toml"))
+    (drive,), counts = read(tmp_path / "log.csv", mapping)
+    assert drive.metadata["started_at"] == start
+    assert (counts.rows_kept, counts.ticks, counts.quarantined) == (ROWS, ROWS, {})
+
+
 @pytest.mark.parametrize(
     ("time", "message"),
     [
         ('column = "t"\nunit = "s"\nzone = "Europe/Berlin"', "that do not say theirs"),
         ('column = "t"\nformat = "%H:%M"\nzone = "Nowhere"', "is no time zone"),
         ('column = "t"\nepoch = true', "give their 'unit'"),
+        ('column = "t"\nunit = "s"\ndate = { column = "d" }', "whose format has the time alone"),
+        (
+            'column = "t"\nformat = "%H:%M:%S"\ndate = { column = "d", format = "%H" }',
+            "'%H' is not a strftime format of a date",
+        ),
         ("rate_hz = 100\nassumed = true\nepoch = true", "give their 'unit'"),
         ('column = "t"\nunit = "s"\nassumed = true', "a rate_hz that nobody knows"),
     ],

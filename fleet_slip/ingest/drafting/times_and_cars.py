@@ -1,15 +1,17 @@
 """Guesses where the times of a log are, and which columns tell its cars and trips apart."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
 from typing import Any
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.ingest.drafting.profile import FileProfile, Profile, sample_rate_hz
+from fleet_slip.ingest.mapping.time_base import reads_clock
 from fleet_slip.ingest.mapping.vocabulary import is_called, parts_of, split_unit, vocabulary
 
 _UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
@@ -66,10 +68,41 @@ def guess_time(
             found.append((distinct, one, values))
     if found:
         _, one, values = max(found, key=lambda some: round(some[0], 2))
-        return _timestamps(one, values) if one.time_format is not None else _numbers(one, values)
+        is_text = one.time_format is not None
+        guess = _timestamps(one, values) if is_text else _numbers(one, values)
+        written = guess.keys.get("format")
+        if written and reads_clock(written):
+            beside = (other for other in profile.profiles if other.channel.name not in taken)
+            return _with_date(guess, beside)
+        return guess
     keys = {"rate_hz": 100, "assumed": True}
     reason = "no channel looks like a time: 100 Hz is a mere assumption. Find out, correct it"
     return TimeGuess(keys, f"{reason}, and remove assumed", 100.0)
+
+
+def _with_date(guess: TimeGuess, profiles: Iterable[Profile]) -> TimeGuess:
+    """Return a time of the day with the column of dates beside it, if there is one."""
+    words = set(vocabulary()["time"]["date_words"])
+    for one in profiles:
+        if words.isdisjoint(parts_of(one.channel.name)) or one.channel.name == guess.keys["column"]:
+            continue
+        numbers = one.values[np.isfinite(one.values)]
+        texts = one.texts or tuple(f"{number:06.0f}" for number in np.unique(numbers)[:3])
+        fits = [written for written in vocabulary()["time"]["dates"] if _are_dates(texts, written)]
+        if not fits or (one.time_format and "%d" in one.time_format):
+            continue
+        dates = {"column": one.channel.name, "format": fits[0]}
+        reason = f"{guess.reason}, and {one.channel.name} the date"
+        if len(fits) > 1:
+            reason += f"; if the month comes first, write {fits[1]}"
+        return replace(guess, keys={**guess.keys, "date": dates}, reason=reason)
+    return guess
+
+
+def _are_dates(texts: tuple[str, ...], written: str) -> bool:
+    """Whether texts are dates of this century, or of the end of the last."""
+    days = pl.Series(texts, dtype=pl.String).str.to_date(written, strict=False)
+    return bool(texts) and all(day and date(1990, 1, 1) <= day < date(2100, 1, 1) for day in days)
 
 
 def _is_named(one: Profile) -> bool:
@@ -126,7 +159,8 @@ def _is_clock(values: FloatArray) -> bool:
     """Whether numbers are a time of the day without colons: after 59.99 comes 100, not 60."""
     inside = (values >= 0) & (values < 240_000) & (values % 100 < 60) & (values // 100 % 100 < 60)
     steps = np.diff(values)
-    return bool(inside.all() and ((steps > 40) & (steps <= 41)).any() and np.median(steps) < 1)
+    rolls = ((steps > 40) & (steps <= 41)) | (steps < -235_900)  # a minute, midnight
+    return bool(inside.all() and rolls.any() and np.median(steps) < 1)
 
 
 def _unit_of_step(step: float) -> str:

@@ -19,6 +19,7 @@ from fleet_slip.ingest.drives.time_bases import DISORDER, HELD
 from fleet_slip.ingest.formats.csv_batches import EXTRA_FIELDS
 from fleet_slip.ingest.mapping.mapping import FromColumn, Mapping, is_number
 from fleet_slip.ingest.mapping.signal_column import SignalColumn, count_range
+from fleet_slip.ingest.mapping.time_base import DateColumn
 from fleet_slip.ingest.mapping.units import conversion_factor
 
 RAW = "raw "
@@ -257,11 +258,14 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
     kind = schema[RAW + column]
     if kind == pl.String and mapping.time.format is not None:
         text = _without_missing(raw, mapping)
+        if mapping.time.date is not None:
+            text = _dates(mapping.time.date, schema, mapping) + " " + text
         if not mapping.time.is_dated:  # the time of day
             clock_s = text.str.to_time(mapping.time.format, strict=False).cast(pl.Int64) / 1e9
             cases = ((text.is_null(), "missing"), (value.is_null(), "not_a_time"))
             return Field("time", "time", raw, clock_s, find_problems(*cases))
-        moment = text.str.to_datetime(mapping.time.format, time_unit="us", strict=False)
+        written = mapping.time.moment_format
+        moment = text.str.to_datetime(written, time_unit="us", strict=False)
     elif isinstance(kind, pl.Datetime):
         text = moment = raw
     else:
@@ -277,6 +281,13 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
         (text.is_null(), "missing"), (value.is_null(), "not_a_time"), (outside, "out_of_range")
     )
     return Field("time", "time", raw, moment.dt.epoch("us") / 1e6, problem)
+
+
+def _dates(date: DateColumn, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
+    """Return dates as text; of digits alone with the noughts that a number lacks."""
+    text = _as_text(held(date.column, schema), schema, mapping)
+    digits = _FIRST_DAY.strftime(date.format)
+    return text.str.zfill(len(digits)) if digits.isdigit() else text
 
 
 def _number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr, pl.Expr, pl.Expr]:

@@ -151,6 +151,7 @@ class Mapping(Config):
         metadata = (getattr(self.drive, name) for name in DriveMetadata.model_fields)
         names = [self.drive.column]
         names += [source.column for source in metadata if isinstance(source, FromColumn)]
+        names += [self.time.date.column] if self.time.date else []
         for condition in self.where:
             of = condition.signal
             names.append(condition.column if of is None else self.signals[of].column)

@@ -13,17 +13,26 @@ from fleet_slip.ingest.formats.source import OWN_TIME
 from fleet_slip.ingest.mapping.units import require_unit
 
 
+class DateColumn(Config):
+    """The column of dates beside one of times of the day, and its strftime codes."""
+
+    column: Name
+    format: Name = "%Y-%m-%d"
+
+
 class TimeBase(Config):
     """Where time is from, and which gaps are bridged or end a drive.
 
     Either `column` with a `unit` (numbers) or a `format` (timestamps as text, strftime codes; naive
-    ones are UTC, or of a `zone`; a Parquet timestamp column needs no format), or `rate_hz` for
-    equally spaced rows, or `own_clock` for a format that says itself when a sample was taken.
+    ones are UTC, or of a `zone`; a Parquet timestamp column needs no format; a `date` may stand in
+    a column of its own), or `rate_hz` for equally spaced rows, or `own_clock` for a format that
+    says itself when a sample was taken.
     """
 
     column: Name | None = None
     unit: str | None = None
     format: Name | None = None
+    date: DateColumn | None = Field(default=None, exclude_if=lambda value: value is None)
     rate_hz: Annotated[float, Field(ge=1, le=100_000)] | None = None
     epoch: bool = Field(default=False, exclude_if=lambda value: not value)
     """Numbers are counted from 1970, in UTC, so that they tell the date."""
@@ -65,6 +74,11 @@ class TimeBase(Config):
             raise ValueError("'epoch' is for numbers: give their 'unit'")
         if self.assumed and self.rate_hz is None:
             raise ValueError("'assumed' is for a rate_hz that nobody knows")
+        if self.date is not None:
+            if self.format is None or not reads_clock(self.format):
+                raise ValueError("'date' stands beside a column whose format has the time alone")
+            if not _reads_back(str(self.moment_format)):
+                raise ValueError(f"{self.date.format!r} is not a strftime format of a date")
         zoned = self.format is not None and "%z" in self.format
         if self.zone is not None and (zoned or self.unit is not None or self.column is None):
             raise ValueError("'zone' is for timestamps that do not say theirs")
@@ -82,7 +96,14 @@ class TimeBase(Config):
         """Whether times can tell the day."""
         if self.unit is not None or self.rate_hz is not None:
             return self.epoch
+        if self.date is not None:
+            return True
         return self.format is None or not reads_clock(self.format)
+
+    @property
+    def moment_format(self) -> str | None:
+        """The format of a text, the date before it if that stands in a column of its own."""
+        return self.format if self.date is None else f"{self.date.format} {self.format}"
 
     @property
     def key(self) -> str | None:
