@@ -5,7 +5,7 @@ import sys
 
 from fleet_slip.cli.leaving import leave, tell
 from fleet_slip.errors import FleetSlipError, StorageError, is_lack_of_memory
-from fleet_slip.limits import require_limits
+from fleet_slip.limits import memory_bytes, require_limits
 
 
 def main() -> None:
@@ -21,6 +21,7 @@ def main() -> None:
     except (ImportError, OSError, MemoryError) as error:
         if not is_lack_of_memory(error):
             raise
-        tell("error: out of memory before anything was done. Give it more.", "error")
+        allowed = f"this process may have {memory_bytes() // 2**20:,} MiB for data"
+        tell(f"error: out of memory before anything was done: {allowed}. Give it more.", "error")
         sys.exit(StorageError.exit_code)
     sys.exit(run_app())

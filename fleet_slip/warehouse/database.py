@@ -150,7 +150,7 @@ def database_errors(doing: str) -> Iterator[None]:
             raise KeyboardInterrupt from None
         raise
     except (duckdb.OutOfMemoryException, MemoryError) as error:
-        reason = duckdb_message(error) or "out of memory"
+        reason = duckdb_message(error) or f"out of memory ({memory_bytes() // 2**20:,} MiB)"
         raise StorageError(f"{doing} failed: {reason}. Ask for less at once.") from None
     except _OF_FILES as error:
         raise StorageError(f"{doing} failed: {duckdb_message(error)}. {_RESTORE}") from None
