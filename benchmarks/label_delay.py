@@ -74,7 +74,7 @@ def found_delay(drive: dict[str, FloatArray], delay_s: float) -> float | None:
     """Return the delay that is proposed once the label is made late; None if none is."""
     label = catalogue().label
     late = {**drive, label: np.roll(drive[label], round(100 * delay_s))}
-    return next((one.value for one in find_suspicions(late) if one.kind == "delay"), None)
+    return next((one.value for one in find_suspicions(late) if one.kind == "late"), None)
 
 
 if __name__ == "__main__":

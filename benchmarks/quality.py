@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
-from fleet_slip.monitoring.quality import QualityReport, examine
+from fleet_slip.monitoring.quality import QualityReport, examine, find_wrong_labels
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.views import connect
@@ -212,14 +212,15 @@ def main() -> None:
     chosen = sample(cohort, rng)
     ids = cohort.drives["drive_id"].to_pylist()
     counts = read_counts(root, [ids[drive] for drive in chosen])
-    clean = examine(cohort)
+    clean = examine(cohort, None, find_wrong_labels(cohort))
     false = 1000 * len(clean.findings) / clean.drives
     print(f"{clean.drives} drives without faults, {clean.compared} compared with their peers:")
     print(f"false alarms: {len(clean.findings)}, {false:.1f} per 1,000 drives\n")
     print("| fault | found | right sensor | right kind | false alarms per 1,000 |")
     print("| --- | ---: | ---: | ---: | ---: |")
     for fault in FAULTS:
-        report = examine(inject(cohort, chosen, counts, fault, rng))
+        faulty = inject(cohort, chosen, counts, fault, rng)
+        report = examine(faulty, None, find_wrong_labels(faulty))
         one = score(cohort, report, chosen.tolist(), fault)
         print(
             f"| {fault.name} | {one.found / one.faulty:.0%} | {one.right_signal / one.faulty:.0%} "

@@ -156,7 +156,7 @@ def test_a_course_that_turns_the_other_way_is_suspicious() -> None:
     course = np.where(np.arange(ROWS) % FIX == 0, np.angle(velocity(time)), np.nan)
     signals = {"yaw_rate": 0.3 + 0.2 * np.sin(time / 2), "course": course}
     assert not [s for s in find_suspicions(signals) if "course" in s.signals]
-    (turned,) = (s for s in find_suspicions({**signals, "course": -course}) if s.kind == "sign")
+    (turned,) = (s for s in find_suspicions({**signals, "course": -course}) if s.kind == "reversed")
     assert turned.signals == ("course",) and "-1.0" in turned.figure
     strange = np.where(np.isnan(course), np.nan, np.sin(17 * time))
     (other,) = (s for s in find_suspicions({**signals, "course": strange}) if s.kind == "values")
@@ -313,7 +313,7 @@ def shift(place_m: float) -> Callable[[Signals], None]:
         (
             lambda s: s.update(satellite_speed=s["satellite_speed"] / 3.6),
             1.0,
-            "unit",
+            "scaled",
             "Check both units",
         ),
         (lambda s: s.update(yaw_rate=s["yaw_rate"] * 1.04), 1.0, "scale", "gyroscope"),

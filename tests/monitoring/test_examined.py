@@ -86,7 +86,7 @@ def test_a_first_champion_of_a_label_that_is_turned_in_all_drives_is_refused(
     fleet.ingest(bad, str(landing.mapping))
     fleet.gram()
     cohort = fleet.cohort()
-    with pytest.raises(RefusedError, match=r"5 of 5 drives .* contradict .*sign of sideslip"):
+    with pytest.raises(RefusedError, match=r"5 of 5 drives .* contradict .*reversed sideslip"):
         fleet.publish("m", cohort)
     assert fleet.publish("m", cohort, candidate=True).candidate
     assert fleet.publish("m", cohort, force=True).new
@@ -105,7 +105,7 @@ def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
         fleet.gram()
         if name == "a":
             assert fleet.publish("m", fleet.cohort()).new
-    with pytest.raises(RefusedError, match=r"of 4 drives .* contradict .*delay of sideslip"):
+    with pytest.raises(RefusedError, match=r"of 4 drives .* contradict .*late sideslip"):
         fleet.publish("m", fleet.cohort())
     assert fleet.publish("m", fleet.cohort(), candidate=True).candidate
 

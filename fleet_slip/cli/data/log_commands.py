@@ -188,7 +188,7 @@ def ingest(
 
 
 def _require_sound(reports: "list[IngestReport]") -> None:
-    """Raise `AlarmError` for much refused, an assumed rate, a lost sign, or several cars as one."""
+    """Raise `AlarmError` for much that was refused, and for whatever looks wrong and does harm."""
     from fleet_slip.ingest.drives.suspicion import (  # noqa: PLC0415 - takes a while
         FEWEST_REFUSED,
         LARGEST_REFUSED,
@@ -203,7 +203,7 @@ def _require_sound(reports: "list[IngestReport]") -> None:
                 "with --replace."
             )
         for one in report.suspicions:
-            if one.kind in {"time", "magnitude", "cars", "repeated"}:
+            if one.kind != "scale":
                 raise AlarmError(
                     f"{report.file}: {one} Its rows are in. Give the command again with --replace "
                     "when the mapping is right."

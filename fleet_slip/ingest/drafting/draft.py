@@ -137,7 +137,7 @@ def _doubted(guesses: dict[str, Guess], suspicions: list[Suspicion]) -> dict[str
     """
     found = dict(guesses)
     for one in suspicions:
-        if one.kind in {"delay", "absent"}:
+        if one.kind in {"late", "absent"}:
             continue
         concerned = [name for name in one.signals if name in found]
         if one.kind == "stuck":  # a gear, a pedal and a brake may well be
@@ -224,7 +224,7 @@ def _correct(guesses: dict[str, Guess], suspicions: list[Suspicion]) -> dict[str
     """Return the guesses with signs turned and pairs swapped, each with its figure."""
     corrected = dict(guesses)
     for one in suspicions:
-        if one.kind == "sign":
+        if one.kind == "reversed":
             (name,) = one.signals
             if name not in corrected:
                 continue

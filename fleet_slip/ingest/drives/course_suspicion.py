@@ -39,7 +39,7 @@ def course_fault(
         figure = f"over a second it changes by {slope:+.2f} times what the yaw rate adds up to"
         if correlation < -LEAST_CORRELATION:
             return (
-                "sign",
+                "reversed",
                 COURSE,
                 figure,
                 "Turn clockwise_from_north, or swap north and east.",
@@ -48,7 +48,7 @@ def course_fault(
             figure = f"over a second its change hardly goes with the yaw rate ({correlation:+.2f})"
             return "values", COURSE, figure, "Is it a course over ground, and of this car?"
         if not SOUND[0] <= slope <= SOUND[1]:
-            return "unit", COURSE, figure, "Check its unit, and that of the yaw rate."
+            return "scaled", COURSE, figure, "Check its unit, and that of the yaw rate."
     return _of_fixes(signals, speed) or _of_relation(_relation(signals, turned))
 
 
@@ -72,7 +72,7 @@ def _of_fixes(signals: Mapping[str, FloatArray], speed: FloatArray | None) -> Fo
         ratio = float(np.median(told[both] / speed[both]))
         if not SOUND[0] <= ratio <= SOUND[1]:
             figure = f"it is {ratio:.2f} times the speed of the wheels"
-            return "unit", SPEED, figure, "Check both units: the antenna's place is by it."
+            return "scaled", SPEED, figure, "Check both units: the antenna's place is by it."
     return None
 
 

@@ -12,8 +12,8 @@ MOVING_MPS = 2.0
 
 MOST_TICKS = 20_000
 FEWEST_DELAY_TICKS = 1000
-MOST_LAG = 50
-"""A label is looked for this many ticks before and after its inputs."""
+MOST_LAG, FAR_LAG = 50, 150
+"""A label is looked for this many ticks before and after its inputs; from the first on roughly."""
 HALF_CHANGE = 25
 """The lateral velocity changes over twice so many ticks: the label's noise matters less."""
 EACH = 5
@@ -106,11 +106,13 @@ def is_in_time(angle_rad: FloatArray, course_rad: FloatArray, yaw_rate_rad_s: Fl
 
 def _unexplained(label: FloatArray, inputs: FloatArray, rows: BoolArray) -> dict[int, float]:
     """Return what part of a label's variance its inputs leave, by how many ticks it is late."""
-    n, m = label.size, MOST_LAG
+    n, m = label.size, FAR_LAG
     within = slice(m, n - m)
+    some = rows & (np.arange(n) % EACH == 0)
+    near = dict.fromkeys(range(-MOST_LAG, MOST_LAG + 1), rows)
     return {
-        lag: 1 - fit(label[m + lag : n - m + lag], inputs[:, within], rows[within])[1]
-        for lag in range(-m, m + 1)
+        lag: 1 - fit(label[m + lag : n - m + lag], inputs[:, within], chosen[within])[1]
+        for lag, chosen in (dict.fromkeys(range(-m, m + 1, EACH), some) | near).items()
     }
 
 
@@ -119,7 +121,7 @@ def _judged(
 ) -> tuple[float, float] | None:
     best = min(left, key=lambda lag: left[lag])
     gain = 1 - left[best] / left[0] if left[0] > 0 else 0.0
-    if not least_lag <= abs(best) < MOST_LAG or gain < least_gain:
+    if not least_lag <= abs(best) < FAR_LAG or gain < least_gain:
         return None
     return best * float(SAMPLE_TIME_S), gain
 

@@ -30,12 +30,14 @@ Signals: TypeAlias = Mapping[str, FloatArray]
 
 RADIUS_M, TRACK_M = 0.31, 1.55
 """Of a passenger car: what is looked for is a factor of 3.6, 9.8 or 57."""
+LONGEST_M, LARGE_RAD = 8.0, 0.15
+"""No car's rear axle is so far behind, and a car that slips so often slides."""
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 ROAD_WHEELS = ("steer_fl", "steer")
 LEAST_CORRELATION, SURE_CORRELATION = 0.6, 0.9
 LARGEST_REFUSED, FEWEST_REFUSED = 0.1, 10
 _REFUSED = {
-    "out_of_range": ("unit", "Check its unit."),
+    "out_of_range": ("scaled", "Check its unit."),
     "not_a_number": ("texts", "Name those that mean no value under missing."),
     "not_finite": ("values", 'Write missing = ["nan"] if they mean no value.'),
 }
@@ -48,11 +50,12 @@ class Suspicion:
     """What looks wrong.
 
     Attributes:
-        kind: sign, magnitude, swapped, unit, delay, stuck, absent, values, time, cars or repeated.
+        kind: as `quality` calls it (stuck, magnitude, reversed, swapped, scaled, repeated, no slip,
+            noisy), or late, absent, values, time, cars, or scale, which does no harm.
         signals: those concerned.
         figure: what shows it.
         remedy: what to try in the mapping.
-        value: for a delay, its seconds.
+        value: how late, in seconds.
     """
 
     kind: str
@@ -63,7 +66,7 @@ class Suspicion:
 
     def __str__(self) -> str:
         """Return it as one line."""
-        return f"{self.kind} of {', '.join(self.signals)}? {self.figure}. {self.remedy}"
+        return f"{self.kind} {', '.join(self.signals)}? {self.figure}. {self.remedy}"
 
 
 def find_suspicions(signals: Signals) -> list[Suspicion]:
@@ -179,7 +182,7 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
         if len(concerned) == 2:
             yield Suspicion("swapped", concerned, figure, "Swap their columns.")
         else:
-            yield Suspicion("sign", concerned, figure, "Write negate = true.")
+            yield Suspicion("reversed", concerned, figure, "Write negate = true.")
 
 
 def _wheels_differ(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
@@ -220,7 +223,7 @@ def _accelerates(signals: Signals, speed: FloatArray | None) -> Iterator[Suspici
     slope, correlation = slope_of(smooth, change, moving(speed))
     if correlation < -LEAST_CORRELATION:
         figure = f"its correlation with the change of speed is {correlation:+.2f}"
-        yield Suspicion("sign", ("ax",), figure, "Write negate = true.")
+        yield Suspicion("reversed", ("ax",), figure, "Write negate = true.")
     elif correlation > LEAST_CORRELATION:
         yield from _wrong_scale(slope, ("ax",), "the change of speed", (0.4, 2.5))
 
@@ -251,7 +254,7 @@ def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
     large = np.abs(angle[rows & (speed > 8) & np.isfinite(angle)])
     if large.size >= FEWEST_TICKS and np.median(large) > 0.5:
         figure = f"half of the time it is above {np.degrees(np.median(large)):.0f} deg"
-        yield Suspicion("unit", (label,), figure, "Check its unit: degrees or radians?")
+        yield Suspicion("scaled", (label,), figure, "Check its unit: degrees or radians?")
         return
     with np.errstate(divide="ignore", invalid="ignore"):
         inputs = [signals["ay"], signals["yaw_rate"] / speed, signals["yaw_rate"] * speed]
@@ -264,13 +267,14 @@ def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
             "earlier" if seconds > 0 else "later"
         )
         figure += f", with {gain:.0%} less of its variance left"
-        yield Suspicion("delay", (label,), figure, f"Try delay_s = {seconds:.2f}.", seconds)
+        yield Suspicion("late", (label,), figure, f"Try delay_s = {seconds:.2f}.", seconds)
     fitted, explained = fit(angle, np.array(inputs[:2]), rows & (speed < 20))
-    if explained > LEAST_CORRELATION and fitted[1] < -0.3:
-        figure = (
-            f"turning slowly it goes against the yaw rate ({fitted[1]:+.1f} m, should be +1 to +2)"
-        )
-        yield Suspicion("sign", (label,), figure, "Write negate = true.")
+    figure = f"turning slowly it goes with the yaw rate by {fitted[1]:+.1f} m, should be +1 to +2"
+    many = large.size >= FEWEST_TICKS and np.quantile(large, 0.9) > LARGE_RAD
+    if explained > LEAST_CORRELATION and abs(fitted[1]) > LONGEST_M and many:
+        yield Suspicion("scaled", (label,), figure, "Check its unit: degrees or radians?")
+    elif explained > LEAST_CORRELATION and fitted[1] < -0.3:
+        yield Suspicion("reversed", (label,), figure, "Write negate = true.")
 
 
 def _of_scale(
@@ -294,4 +298,4 @@ def _wrong_scale(
     large = max(slope, 1 / slope)
     factor = min(_FACTORS, key=lambda f: abs(np.log(f / large)))
     near = f" ({factor:g} is between {_FACTORS[factor]})" if 0.6 < factor / large < 1.7 else ""
-    yield Suspicion("unit", concerned, f"it is {slope:.3g} times {of}{near}", "Check the units.")
+    yield Suspicion("scaled", concerned, f"it is {slope:.3g} times {of}{near}", "Check the units.")
