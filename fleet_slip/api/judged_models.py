@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import ShowProgress, count_from_start, open_workers, record_call
 from fleet_slip.api.published_models import PublishedModels
-from fleet_slip.catalogue.sources import ALL_DRIVES
+from fleet_slip.catalogue.sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import UsageError
 from fleet_slip.extras import needed
 from fleet_slip.models.model_version import ModelVersion
@@ -61,7 +61,7 @@ class JudgedModels(PublishedModels):
         `evaluations/`. Raises `ConfigError` for an invalid scenario, `RefusedError` for one that
         changed since it was simulated, `DataError`, and what `model` raises.
         """
-        from fleet_slip.comparison.evaluation.evaluate import evaluate, keep
+        from fleet_slip.comparison.evaluation.evaluate import evaluate, evaluations_of, keep
         from fleet_slip.comparison.evaluation.scenario_runs import simulate_scenarios
         from fleet_slip.files.documents import Document
         from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
@@ -73,7 +73,39 @@ class JudgedModels(PublishedModels):
             simulate_scenarios(self.warehouse, chosen, executor, told)
             found = evaluate(self.warehouse, chosen, first, rest, executor, _rivals_if(rivals))
         content = found.as_dict()
-        kept = keep(self.warehouse, content)
+        kept = keep(evaluations_of(self.warehouse), content)
+        return Document(kept.number, content, kept.sha256)
+
+    @record_call
+    def evaluate_measured(
+        self,
+        model: str | ModelVersion | None = None,
+        cohort: str = TRAINING_DRIVES,
+        others: Sequence[str | ModelVersion] = (),
+        *,
+        vehicle: str | None = None,
+        threads: int | None = None,
+    ) -> "Document":
+        """Evaluate models on measured drives with a label, beside Table I and filters.
+
+        What is fitted or tuned never saw what it is judged by: a quarter of the drives after the
+        other, or of their time, is left out. `vehicle` names the car's file, of which mass and
+        geometry suffice for a car that is identified; without it no filter competes, unless a file
+        ships for the drives' class. Returns the document kept below `evaluations/measured/`.
+        Raises `DataError` without a label, `CohortError` where a minimum cohort holds,
+        `ConfigError` for an unknown car, and what `model` raises.
+        """
+        from fleet_slip.comparison.evaluation.evaluate import keep
+        from fleet_slip.comparison.evaluation.own_car import evaluate_own_car, own_car_evaluations
+        from fleet_slip.files.documents import Document
+        from fleet_slip.warehouse.minimum_cohort import require_single_cars
+
+        require_single_cars("evaluating on drives of the logs", "Evaluate on test drives.")
+        versions = [self.resolve(one) for one in (model, *others)]
+        with open_workers(self.root, threads) as executor:
+            found = evaluate_own_car(self.warehouse, versions, cohort, vehicle, executor)
+        content = found.as_dict()
+        kept = keep(own_car_evaluations(self.warehouse), content)
         return Document(kept.number, content, kept.sha256)
 
     def evaluate_blind(

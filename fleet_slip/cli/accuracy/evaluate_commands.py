@@ -5,7 +5,8 @@ from typing import Annotated
 import typer
 
 from fleet_slip.catalogue.sources import ALL_DRIVES
-from fleet_slip.cli.accuracy.evaluation_tables import print_blind, print_evaluation, print_summary
+from fleet_slip.cli.accuracy.evaluation_tables import print_evaluation, print_summary
+from fleet_slip.cli.accuracy.judgement_tables import print_blind, print_own_car
 from fleet_slip.cli.completing import complete_config
 from fleet_slip.cli.left_out import say_without_information
 from fleet_slip.cli.model_argument import OnlyModel
@@ -118,6 +119,23 @@ def evaluate(
             "model's version, which nobody can have seen before it was published.",
         ),
     ] = False,
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="Evaluate on measured drives with a label instead: SQL condition on the view "
+            "drives. What is fitted or tuned never saw the drives, or the part of one, that it is "
+            "judged by.",
+            show_default=False,
+        ),
+    ] = None,
+    vehicle: Annotated[
+        str | None,
+        typer.Option(
+            help="With --cohort: the car's file, for filters. Its mass and geometry suffice.",
+            autocompletion=complete_config("vehicles"),
+            show_default=False,
+        ),
+    ] = None,
     threads: Threads = None,
     everything: Annotated[
         bool, typer.Option("--all", help="Print all estimators, sections and requirements.")
@@ -134,6 +152,21 @@ def evaluate(
     Example: **fleet-slip evaluate waterford --scenario nominal**
     """
     model = model or context.obj.registry().only()
+    if cohort is not None or vehicle is not None:
+        if scenario or blind or rivals or cohort is None:
+            raise UsageError(
+                "--cohort judges measured drives, for filters in the car of --vehicle: leave out "
+                "--scenario, --blind and --rivals, and name a cohort."
+            )
+        measured = context.obj.evaluate_measured(
+            model, cohort, fleet or (), vehicle=vehicle, threads=threads
+        )
+        if json:
+            print_json({"number": measured.number, "sha256": measured.sha256, **measured.content})
+        else:
+            print_own_car(measured.content, everything)
+            say(f"kept as evaluations/measured/{measured.number}.json")
+        return
     if blind:
         if scenario:
             raise UsageError("--blind has drives of its own: leave out --scenario.")

@@ -8,8 +8,7 @@ from fleet_slip.cli.output import cell, print_line, print_table, print_text, std
 from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
-    from fleet_slip.comparison.evaluation.blind import BlindRow
-    from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures
+    pass
 
 PLACES = ("inside", "outside")
 """Of an unstable section."""
@@ -47,7 +46,7 @@ def _print_group(
         shown = names[first : first + at_once]
         print_table(
             f"\n{title}{', continued' if first else ''}",
-            ["scenario", "side-slip", *(_heading(name) for name in shown)],
+            ["scenario", "side-slip", *(heading(name) for name in shown)],
             [
                 [
                     one["name"],
@@ -63,7 +62,7 @@ NAMES_WIDTH = 33
 """Of the columns with a scenario's name and its side-slip."""
 
 
-def _heading(name: str) -> str:
+def heading(name: str) -> str:
     """Return an estimator's name in words, which a heading can wrap."""
     return name.rpartition("/")[2].replace("_", " ")
 
@@ -117,7 +116,7 @@ def _print_gps_noise(sweep: dict[str, Any] | None) -> None:
     names = list(sweep["levels"][0]["rmse_deg"])
     print_table(
         f"\n{sweep['scenario']}: RMSE in deg over the noise of GPS velocity, m/s, without outages",
-        ["GPS noise", *map(_heading, names)],
+        ["GPS noise", *map(heading, names)],
         [
             [
                 f"{level['velocity_std_mps']:.3f}",
@@ -273,48 +272,3 @@ def _extremes(scenarios: Sequence[Mapping[str, Any]], ours: str) -> list[str]:
     if partial:
         lines.append(f"A sensor fails it on part of the rows; estimated: {', '.join(partial)}.")
     return lines
-
-
-def print_blind(rows: Sequence["BlindRow"], everything: bool) -> None:
-    """Print how far estimators are off on blind drives: published models and filters, or all."""
-    errors = {name: one.rmse_deg for name, one in rows[0].figures.items()}
-    names = [
-        name
-        for name, rmse_deg in errors.items()
-        if "@" in name.rpartition("/")[2]
-        or (rmse_deg is not None and (everything or "/" not in name))
-    ]
-    names.sort(key=lambda name: ("@" not in name, errors[name] is None, errors[name]))
-    shown = names if everything else names[:BLIND_NAMES]
-    print_table(
-        "Blind drives: RMSE in deg against the exact angle",
-        ["drives", "m/s", "side-slip std", *map(_heading, shown)],
-        [
-            [
-                row.name.replace("_", " "),
-                f"{row.speed_mps[0]:.0f} to {row.speed_mps[1]:.0f}",
-                f"{row.sideslip_std_deg:.2f}",
-                *(_blind_cell(row.figures[name]) for name in shown),
-            ]
-            for row in rows
-            if everything or row.drives > 1
-        ],
-    )
-    for name in names:
-        if errors[name] is None:
-            print_text(
-                f"{name} has no estimate on any of them: it may need what a car's own drives tell, "
-                "and nobody knows these cars."
-            )
-    if not everything:
-        print_text("Every drive, and all estimators: --all; for machines --json.")
-
-
-BLIND_NAMES = 5
-"""Estimators of the table that is printed first: published models, then the best of the others."""
-
-
-def _blind_cell(one: "ErrorFigures") -> str:
-    if one.rmse_deg is None:
-        return "none"
-    return f"{one.rmse_deg:.3f}" + ("" if one.coverage == 1 else f" ({one.coverage:.0%})")

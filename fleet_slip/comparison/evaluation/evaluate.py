@@ -104,9 +104,8 @@ def evaluations_of(warehouse: Warehouse) -> DocumentFolder:
     return DocumentFolder(warehouse.root / "evaluations")
 
 
-def keep(warehouse: Warehouse, content: Mapping[str, Any]) -> Document:
+def keep(documents: DocumentFolder, content: Mapping[str, Any]) -> Document:
     """Add an evaluation, unless the latest one is the same; return its document."""
-    documents = evaluations_of(warehouse)
 
     def attempt(newest: int) -> Document | None:
         if newest and (before := documents.read(newest)).sha256 == checksum(content):

@@ -44,6 +44,9 @@ NOISE = tuple(f"noise.{name}" for name in ekf.TUNABLE if not name.startswith("st
 
 FOLDS = 4
 
+IDENTIFIED = "Identified from labelled drives"
+"""The description of such a car."""
+
 UNSPRUNG_SHARE = 0.11
 """Of the mass: wheels, hubs and brakes of both axles."""
 
@@ -86,7 +89,7 @@ class Measured(Config):
         wheel_n = self.mass_kg * GRAVITY_MPS2 / 4
         content = {
             "name": self.name,
-            "description": "Identified from labelled drives",
+            "description": IDENTIFIED,
             "body": {
                 "sprung_mass_kg": sprung_kg,
                 "unsprung_mass_front_kg": (self.mass_kg - sprung_kg) / 2,

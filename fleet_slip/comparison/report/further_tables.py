@@ -232,38 +232,6 @@ def _pair(row: Mapping[str, Any] | None) -> Cell:
     return Cell(text, "good" if row["better"] == row["fleet"] else "")
 
 
-def without_label(data: ReportData) -> Iterator[ReportTable]:
-    """Yield what a model was learned from instead of a label, or beside it."""
-    manifest = data.version.manifest
-    learned, figures = manifest.learned_from, manifest.cross_validation
-    if learned is None:
-        return
-    alone = (
-        "No reference sensor taught this model: the change of the course less the integral of the "
-        "yaw rate stood for the label. Where this page compares with a label, the model has never "
-        "seen it."
-    )
-    beside = "Cars with a reference sensor taught this model, and cars with the course alone."
-    times = learned.change_s if isinstance(learned.change_s, tuple) else (learned.change_s,)
-    yield table(
-        "without-label",
-        "Learned from the course",
-        ["what", "figure"],
-        [
-            ["seconds over which the course changes", ", ".join(f"{t:g}" for t in times)],
-            ["error of changes, held out", degrees(figures.rmse_deg)],
-            ["correlation of changes, held out", number(figures.correlation, 4)],
-            ["cars that tell the intercept", count(learned.cars)],
-            ["uncertainty of the intercept", degrees(learned.intercept_uncertainty_deg)],
-            ["difference between cars", degrees(learned.intercept_spread_deg)],
-        ],
-        note=(
-            f"{alone if learned.label == 'course' else beside} Errors of changes have the noise of "
-            "two fixes in them."
-        ),
-    )
-
-
 def storage(data: ReportData) -> ReportTable:
     """Return what the warehouse holds."""
     return table(

@@ -10,6 +10,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.evaluate import evaluations_of
+from fleet_slip.comparison.evaluation.own_car import own_car_evaluations
 from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures, EvaluatedScenario
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import Document
@@ -107,6 +108,13 @@ def latest_of(warehouse: Warehouse, version: ModelVersion) -> Evaluated:
     raise DataError(
         f"{version.reference} has not been evaluated. Run: fleet-slip evaluate {version.reference}"
     )
+
+
+def latest_on_measured(warehouse: Warehouse, version: ModelVersion) -> Mapping[str, Any] | None:
+    """Return the latest evaluation of a version on measured drives; None if there is none."""
+    kept = own_car_evaluations(warehouse)
+    documents = (kept.read(number).content for number in reversed(kept.numbers()))
+    return next((one for one in documents if one["model"] == version.reference), None)
 
 
 BLOCK_S = 5.0

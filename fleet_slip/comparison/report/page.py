@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
-from fleet_slip.comparison.report import further_tables, paper_tables
+from fleet_slip.comparison.report import further_tables, own_tables, paper_tables
 from fleet_slip.comparison.report.further_pictures import draw_pictures
 from fleet_slip.comparison.report.judging import Judged, Status, judge_claims
 from fleet_slip.comparison.report.report_data import ReportData, gather
@@ -38,7 +38,8 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         distances=paper_tables.distances(data),
         targets=list(paper_tables.targets(data)),
         further=[
-            *further_tables.without_label(data),
+            *own_tables.without_label(data),
+            *own_tables.own_car(data),
             further_tables.scenarios(data),
             further_tables.standings(data),
             *further_tables.fleets(data),

@@ -4,6 +4,7 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.feature_sets import PLAIN
@@ -27,7 +28,7 @@ from fleet_slip.comparison.report.column_worth import (
     weigh_cars,
     weigh_memory,
 )
-from fleet_slip.comparison.report.kept_evaluation import Evaluated, latest_of
+from fleet_slip.comparison.report.kept_evaluation import Evaluated, latest_of, latest_on_measured
 from fleet_slip.comparison.report.training_findings import (
     Coefficients,
     Histogram,
@@ -113,6 +114,7 @@ class ReportData:
             none.
         memory: what columns over time are worth; None if the model has none, or too many.
         cars: what a car's own numbers are worth; None without a fleet in the data root.
+        on_measured: its latest evaluation on measured drives; None if there is none.
         tables: of the warehouse.
         campaigns: of the drives that the model was trained on.
         configs: checksums of what determines the results.
@@ -130,6 +132,7 @@ class ReportData:
     distances: NestedDistances | str
     memory: Memory | None
     cars: Cars | None
+    on_measured: Mapping[str, Any] | None
     tables: tuple[TableSize, ...]
     campaigns: tuple[str, ...]
     configs: tuple[ConfigHash, ...]
@@ -193,6 +196,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
         if looks_back(manifest) and len(manifest.terms) <= MOST_TERMS
         else None,
         cars=weigh_cars(warehouse),
+        on_measured=latest_on_measured(warehouse, version),
         tables=_tables(warehouse),
         campaigns=tuple(sorted(set(cohort.drives["campaign"].to_pylist()))),
         configs=(

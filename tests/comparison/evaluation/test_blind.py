@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.cli.accuracy.evaluation_tables import print_blind
+from fleet_slip.cli.accuracy.judgement_tables import print_blind
 from fleet_slip.comparison.evaluation.blind import blind_scenarios, judge_blindly
 from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluated_drives import simulate_drives

@@ -69,19 +69,19 @@ def test_evaluating_again_changes_nothing(root: Path) -> None:
 def test_an_evaluation_that_another_process_has_just_kept_is_not_kept_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    warehouse = Warehouse(LocalFolder(tmp_path))
+    kept = DocumentFolder(LocalFolder(tmp_path))
     numbers = DocumentFolder.numbers
 
     def overtaken(folder: DocumentFolder) -> list[int]:
         before = numbers(folder)
         monkeypatch.undo()
-        keep(warehouse, {"models": 5})
+        keep(kept, {"models": 5})
         return before
 
     monkeypatch.setattr(DocumentFolder, "numbers", overtaken)
-    assert keep(warehouse, {"models": 5}).number == 1
-    assert keep(warehouse, {"models": 6}).number == 2
-    assert keep(warehouse, {"models": 6}).number == 2
+    assert keep(kept, {"models": 5}).number == 1
+    assert keep(kept, {"models": 6}).number == 2
+    assert keep(kept, {"models": 6}).number == 2
 
 
 def test_no_model_is_trained_on_scenarios(root: Path) -> None:

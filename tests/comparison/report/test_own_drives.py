@@ -70,7 +70,9 @@ def test_who_cannot_be_tuned_says_so_in_a_line_and_competes(
 
 def test_the_report_has_what_is_left(evaluated: tuple[Path, Finished]) -> None:
     root, _ = evaluated
+    done_on(root, "evaluate", "own", "--cohort", "source = 'measured'")
     done_on(root, "report", "own")
     page = (root / "report" / "report.html").read_text()
+    assert "A car of one&#39;s own: measured drives" in page
     assert "on the nominal drive; of model 1" in page
     assert "lack signals of model 2, 3, 4 and 5 of Table I" in page

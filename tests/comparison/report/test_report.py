@@ -15,14 +15,14 @@ import pytest
 from jinja2 import meta
 
 from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.comparison.evaluation.evaluate import keep
+from fleet_slip.comparison.evaluation.evaluate import evaluations_of, keep
 from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
 from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
 from fleet_slip.comparison.report import paper_tables
 from fleet_slip.comparison.report.column_worth import by_length, looks_back
 from fleet_slip.comparison.report.facts import NAMES, Facts
 from fleet_slip.comparison.report.further_pictures import draw_pictures, road_pictures
-from fleet_slip.comparison.report.further_tables import standings, without_label
+from fleet_slip.comparison.report.further_tables import standings
 from fleet_slip.comparison.report.gate_strips import gates_of, opening
 from fleet_slip.comparison.report.judging import (
     CLAIMS,
@@ -33,6 +33,7 @@ from fleet_slip.comparison.report.judging import (
     judge_claims,
 )
 from fleet_slip.comparison.report.kept_evaluation import blocks_won, difference
+from fleet_slip.comparison.report.own_tables import without_label
 from fleet_slip.comparison.report.page import render
 from fleet_slip.comparison.report.report_data import ReportData
 from fleet_slip.comparison.report.training_findings import ANGLE_DEG, held_out_coefficients
@@ -276,7 +277,7 @@ def test_an_evaluation_of_other_data_is_refused(reported: Reported, data: Report
         for key in path[:-1]:
             place = place[key]
         place[path[-1]] += 0.001
-        keep(Warehouse(LocalFolder(copy)), content)
+        keep(evaluations_of(Warehouse(LocalFolder(copy))), content)
         with pytest.raises(DataError, match=f"{told}.* has changed since evaluation 2"):
             call(copy, "report", "smoke")
 

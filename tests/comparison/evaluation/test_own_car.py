@@ -1,0 +1,136 @@
+"""`fleet-slip evaluate --cohort`: measured drives judge what was not fitted to them."""
+
+import json
+import math
+import random
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.comparison.evaluation.own_car import fit_left_out
+from fleet_slip.comparison.evaluation.own_drives import Design, OwnDrive
+from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive
+from tests.support.commands import done_on, run_on
+from tests.support.measured import csv_text
+
+ROWS = 400
+LINE = Design(ColumnPlan.of(("ay",), {}, {}), (1.0,))
+NO_SIGNALS = DriveSignals(*[np.full(ROWS, np.nan)] * 11)
+
+MAPPING = """
+name = "own"
+[time]
+column = "t"
+unit = "s"
+[drive]
+vehicle_id = { column = "car" }
+vehicle_model = "own"
+day = 2026-05-04
+[signals]
+ax = { column = "ax", unit = "m/s^2" }
+ay = { column = "ay", unit = "m/s^2" }
+yaw_rate = { column = "r", unit = "rad/s" }
+sideslip = { column = "beta", unit = "rad" }
+"""
+
+
+def a_drive(number: int, part: int, *, shifted_rad: float = 0.0) -> OwnDrive:
+    ay = np.sin(np.arange(ROWS) / (20 + number))
+    label: FloatArray = -ay / 200 + shifted_rad
+    columns = {"line": ay[:, None]}
+    drive = LabelledDrive(f"drive-{number}", NO_SIGNALS, label)
+    return OwnDrive(drive, columns, np.full(ROWS, part))
+
+
+def test_a_drive_is_estimated_by_what_never_saw_it() -> None:
+    drives = [a_drive(n, n % 4, shifted_rad=1.0 if n == 2 else 0.0) for n in range(4)]
+    estimates = fit_left_out(drives, "line", LINE)
+    assert np.abs(estimates[2] - (drives[2].drive.sideslip_rad - 1.0)).max() < 1e-9
+    assert estimates[0].mean() == pytest.approx(1 / 3, abs=0.01), "one of the three others is off"
+
+
+def test_a_part_of_a_single_drive_is_estimated_by_the_others() -> None:
+    whole = a_drive(0, 0)
+    part = np.arange(ROWS) * 4 // ROWS
+    label = np.where(part == 1, 1.0, whole.drive.sideslip_rad)
+    drive = OwnDrive(LabelledDrive("one", NO_SIGNALS, label), whole.columns, part)
+    (estimate,) = fit_left_out([drive], "line", LINE)
+    assert np.abs((estimate - whole.drive.sideslip_rad)[part == 1]).max() < 1e-9
+    assert np.isnan(drive.without(1).sideslip_rad).sum() == ROWS // 4
+
+
+def own_log(folder: Path, cars: int) -> Path:
+    rng = random.Random(5)  # noqa: S311
+    ticks = [(car, tick) for car in range(cars) for tick in range(500)]
+    ay = [3 * math.sin(tick / 30) + rng.gauss(0, 0.05) for _, tick in ticks]
+    log = folder / "log.csv"
+    log.write_text(
+        csv_text(
+            {
+                "t": [tick / 100 for _, tick in ticks],
+                "car": [f"car-{car}" for car, _ in ticks],
+                "ax": [rng.gauss(0, 0.3) for _ in ticks],
+                "ay": ay,
+                "r": [value / 20 for value in ay],
+                "beta": [-value / 200 + rng.gauss(0, 0.0003) for value in ay],
+            }
+        )
+    )
+    return log
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data root with drives that no filter can serve, and a model of some of them."""
+    folder = tmp_path_factory.mktemp("own_car")
+    (folder / "own.toml").write_text(MAPPING)
+    root = folder / "data"
+    done_on(root, "ingest", own_log(folder, cars=6), "--mapping", folder / "own.toml")
+    done_on(root, "gram")
+    done_on(root, "publish", "own", "--cohort", "vehicle_id < 'car-4'")
+    return root
+
+
+def test_drives_without_a_vehicle_are_judged_by_models_alone(own: Path) -> None:
+    found = json.loads(done_on(own, "evaluate", "own", "--cohort", "true", "--json").stdout)
+    assert found["vehicle"] is None
+    assert found["estimators"]["own@1"]["told"] == "fitted to labels of the other parts"
+    assert found["estimators"]["own@1"]["rmse_deg"] < 0.05
+    assert {name for name in found["estimators"] if "/" not in name} == {"own@1"}
+    assert len(found["drives"]) == 6
+    told = done_on(own, "evaluate", "own", "--cohort", "true")
+    assert "No filter competes" in told.stdout
+    assert f"kept as evaluations/measured/{found['number']}.json" in told.stderr, "kept once"
+
+
+def test_a_model_that_saw_none_of_the_drives_is_judged_as_it_is(own: Path) -> None:
+    done = done_on(own, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'", "--json")
+    assert json.loads(done.stdout)["estimators"]["own@1"]["told"] == "as published"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("--vehicle", "suv"), ("--cohort", "true", "--blind"), ("--cohort", "true", "--rivals")],
+)
+def test_what_does_not_go_together_is_refused(own: Path, words: tuple[str, ...]) -> None:
+    done = run_on(own, "evaluate", "own", *words)
+    assert done.exit_code == 2
+    assert "leave out" in done.stderr
+
+
+@pytest.mark.slow
+def test_filters_compete_in_the_car_of_a_file_and_in_one_that_is_identified(
+    smoke_root: Path, tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(smoke_root, tmp_path / "data"))
+    one = ("--cohort", "drive_id = 'smoke-2024-05-01-0001'")
+    found = json.loads(done_on(root, "evaluate", "smoke", *one, "--json").stdout)
+    assert (found["vehicle"], found["parts_of"]) == ("d_class_sedan", "time")
+    errors = {name: one["rmse_deg"] for name, one in found["estimators"].items()}
+    assert {"kinematic", "ekf_tuned", "ekf_identified", "kalman_identified"} <= {*errors}
+    assert max(errors["ekf_tuned"], errors["ekf_identified"]) < 0.06, "the label's noise is 0.029"
+    assert list(errors.values()) == sorted(errors.values())
