@@ -6,6 +6,7 @@ not seen. A part is a quarter of the drives, or of each drive's time where there
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version as package_version
 from typing import Any
@@ -189,11 +190,7 @@ def _filtered(
             places = np.linspace(0, len(others) - 1, min(TUNING_DRIVES, len(others))).round()
             begin = TUNING_S * SAMPLE_RATE_HZ
             others = [others[int(place)].beginning(begin) for place in places]
-        try:
-            ready = _tuned(vehicle, others, executor)
-        except DataError as error:
-            LOGGER.warning("no filter competes: %s", error)
-            return {}
+        ready = _tuned(vehicle, others, executor)
         for name, (knows, estimate) in ready.items():
             _, estimates = found.setdefault(
                 name, (knows, [np.full(len(one.part), np.nan) for one in drives])
@@ -201,7 +198,8 @@ def _filtered(
             for one, into in zip(drives, estimates, strict=True):
                 here = one.part == left
                 if here.any():
-                    into[here] = estimate(one.drive.signals)[here]
+                    with suppress(DataError):  # this drive lacks a sensor: no estimate
+                        into[here] = estimate(one.drive.signals)[here]
     return found
 
 
@@ -209,18 +207,22 @@ def _tuned(
     vehicle: VehicleParameters, others: Sequence[LabelledDrive], executor: Executor
 ) -> dict[str, Known]:
     """Return each filter by name, tuned on drives in the car of the file and in that identified."""
-    identified = identify(Measured.of(vehicle), others, executor)
     ready: dict[str, Known] = {
-        "kinematic": ("geometry", lambda signals: _rolling(signals, vehicle)),
-        "ekf_identified": (
+        "kinematic": ("geometry", lambda signals: _rolling(signals, vehicle))
+    }
+    cars = {} if vehicle.description == IDENTIFIED else {"tuned": vehicle}
+    try:
+        identified = identify(Measured.of(vehicle), others, executor)
+    except DataError as error:  # as where no ax is logged
+        LOGGER.warning("no car is identified: %s", error)
+        cars["tuned"] = vehicle
+    else:
+        cars["identified"] = identified.car
+        ready["ekf_identified"] = (
             "geometry, and a car identified from the other parts",
             lambda signals: ekf.estimate(signals, identified.car, identified.noise),
-        ),
-    }
+        )
     navigated = any(np.isfinite(one.signals.gps_vx_mps).any() for one in others)
-    cars = {"identified": identified.car}
-    if vehicle.description != IDENTIFIED:  # else from drives that are judged here
-        cars["tuned"] = vehicle
     for one in FILTERS:
         for how, car in cars.items():
             name = f"{one.module}_{how}"
