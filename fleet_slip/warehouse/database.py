@@ -48,8 +48,10 @@ def open_database(
     if threads is not None:
         config["threads"] = threads
     database = duckdb.connect(":memory:", config=config)
-    # Where no script is running, in a notebook say, DuckDB prints a bar on stdout.
-    database.execute("SET enable_progress_bar = false")
+    # Where no script is running, in a notebook say, DuckDB prints a bar on stdout. In a notebook
+    # without ipywidgets it has none, and refuses the setting.
+    with contextlib.suppress(duckdb.InvalidInputException):
+        database.execute("SET enable_progress_bar = false")
     if reading:
         reading.let_read(database)
         database.execute("CALL enable_logging('FileSystem')")  # see `reading_files`

@@ -1,8 +1,10 @@
 """What a notebook shows of answers is short, and a table where there are many."""
 
+import sys
 from pathlib import Path
 
 import fleet_slip
+from tests.support.commands import finish, start
 
 
 def test_answers_are_shown_on_a_line_or_two(smoke_root: Path) -> None:
@@ -27,3 +29,17 @@ def test_a_notebook_gets_a_table_with_bars(smoke_root: Path) -> None:
     assert page.count("<tr>") == len(fleet.model("smoke").manifest.terms) + 2
     assert page.count("<svg ") == page.count("<tr>") - 1
     assert "<script>" not in selection._repr_html_() + page
+
+
+KERNEL = """
+import sys, types
+sys.modules["IPython"] = types.ModuleType("IPython")  # what DuckDB takes for a notebook
+sys.modules["IPython"].get_ipython = lambda: types.SimpleNamespace(config={"IPKernelApp": {}})
+sys.modules["ipywidgets"] = None
+from fleet_slip.warehouse.database import open_database
+print(open_database().sql("SELECT 42").fetchall())
+"""
+
+
+def test_a_notebook_needs_no_widgets() -> None:
+    assert finish(start([sys.executable, "-c", KERNEL]))[0].stdout == "[(42,)]\n"
