@@ -12,6 +12,7 @@ from fleet_slip.cli.options import Cohort
 from fleet_slip.cli.output import Json, cell, print_json, print_table, say
 from fleet_slip.grams.calibration.calibration import Calibration
 from fleet_slip.grams.calibration.car_evidence import CalibratedNumber
+from fleet_slip.grams.calibration.road_lean import FEWEST_CARS, Roads
 from fleet_slip.words import number_of
 
 
@@ -41,8 +42,10 @@ def calibrate(
         print_json(shown)
     elif car is not None:
         _print_car(car, found.car(car))
+        _say_of_roads(found.roads)
     else:
         _print_fleet(found)
+        _say_of_roads(found.roads)
 
 
 def _print_car(car: str, numbers: Mapping[NumberName, CalibratedNumber]) -> None:
@@ -107,6 +110,20 @@ def _print_fleet(found: Calibration) -> None:
     )
     if not any(one.uncertainty for cars in found.cars.values() for one in cars.values()):
         say("no car has two drives: how sure the numbers are cannot be told")
+
+
+def _say_of_roads(roads: Roads) -> None:
+    if roads.banked and roads.lean:
+        say(
+            f"bends are banked, and the roads lean: {float(roads.lean):+.3f} m/s^2 +- "
+            f"{roads.uncertainty:.2g} of ay in all {number_of(roads.cars, 'car')}, which ay_offset "
+            "is without"
+        )
+    elif not roads.banked:
+        say(
+            "bends are not seen to be banked: a road that always leans to one side counts as "
+            f"ay_offset. {FEWEST_CARS} cars or more tell the one from the other"
+        )
 
 
 def _median(values: Sequence[float | None]) -> float | None:

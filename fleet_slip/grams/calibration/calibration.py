@@ -1,8 +1,9 @@
 """How the sensors of every car are off, from the Gram rows of its drives: no label, no log row.
 
-The numbers of a car are exact functions of the sum of its drives' Gram rows (`car_numbers`), so
-that they are the same in whatever order drives came, and a drive that is forgotten is gone from
-them. `car_evidence` tells how sure they are.
+The numbers of a car are exact functions of the sum of its drives' Gram rows (`car_numbers`) and of
+what the roads of all cars have in common (`road_lean`), so that they are the same in whatever order
+drives came, and a drive that is forgotten is gone from them. `car_evidence` tells how sure they
+are.
 """
 
 import math
@@ -17,6 +18,7 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.car_evidence import CalibratedNumber, CarEvidence, Convergence
+from fleet_slip.grams.calibration.road_lean import Roads
 from fleet_slip.grams.calibration.tell_numbers import KINDS
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
@@ -63,6 +65,11 @@ class Calibration:
             for car, numbers in self.cars.items()
         }
 
+    @property
+    def roads(self) -> Roads:
+        """What the roads of all cars have in common."""
+        return self.evidence.roads
+
     def convergence(self) -> tuple[Convergence, ...]:
         """Return how sure the numbers are after 1, 2, 5, 10 ... drives of a car."""
         return self.evidence.convergence()
@@ -76,6 +83,12 @@ class Calibration:
             "cars": {
                 car: {name: vars(one) for name, one in numbers.items()}
                 for car, numbers in self.cars.items()
+            },
+            "roads": {
+                "banked": self.roads.banked,
+                "lean_mps2": None if self.roads.lean is None else float(self.roads.lean),
+                "uncertainty": self.roads.uncertainty,
+                "cars": self.roads.cars,
             },
             "convergence": [vars(one) for one in self.convergence()],
         }

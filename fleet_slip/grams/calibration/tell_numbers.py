@@ -1,10 +1,14 @@
-"""From the sums of a car's drives to its numbers: three planes, each by least squares.
+"""From the sums of a car's drives to its numbers: three relations between its sensors.
 
-A car without side-slip of its own accord turns as fast as its velocity does, so that on the whole
-yaw_rate - b = (ay - d) / v, with the offsets b and d of the sensors. The speed v is the wheels'
-times a ratio. This is a plane in ay over the wheels' speed and in one over it. The same yaw rate
-is one of the wheels' differences, and a steering angle is one of curvature and of ay (Ackermann
-angle and understeer). Means over drives make the changes of side-slip vanish.
+A car without side-slip of its own accord turns as fast as its velocity does, and a road that is
+banked in bends takes a part of the lateral acceleration that grows with their curvature:
+ay = d + rho v (r - b) + s r/v, with the offsets d and b, and the true speed rho v. On flat roads s
+is zero, and what is left is a plane, r = b + (ay/v)/rho - (d/rho)/v. The same yaw
+rate is one of the wheels' differences; unequal radii add wheel speed times their difference, tyres
+under load ay times speed: r = b + (differences)/track + e v + f ay v. And a steering angle is one
+of curvature and of ay (Ackermann angle and understeer). Means over drives make the changes of
+side-slip vanish. The gyroscope's noise is in r and in r/v. Where both are inputs beside each other
+it is taken out of their squares.
 """
 
 from collections.abc import Mapping
@@ -12,13 +16,10 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
 
-import numpy as np
-
-from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.car_numbers import NumberName
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.plane import Plane, PlaneShape, fit_plane
+from fleet_slip.regression.exact.moments_relation import ONE, ExactSums, Relation, Terms, solve
 
 LEAST_TURNING_RAD_S = Fraction(2, 100)
 """Standard deviation of how fast the direction changes, below which a car drove too straight. The
@@ -29,8 +30,72 @@ LEAST_CHANGE_OF_SPEED = Fraction(5, 100)
 the offset of one sensor from that of the other."""
 
 LEAST_CURVATURE_1PM = Fraction(1, 1000)
-SPEED_RATIOS = (Fraction(4, 5), Fraction(5, 4))
-"""What tyres there are. A ratio beyond it says that noise, not driving, made the fit."""
+SPEED_RATIOS = {False: (Fraction(4, 5), Fraction(5, 4)), True: (Fraction(3, 4), Fraction(4, 3))}
+"""What tyres there are; on roads as they are, also what bodies that roll make of ay. A ratio beyond
+it says that noise, not driving, made the fit."""
+
+FLAT = Relation(
+    instruments=(ONE, "course_rate", "slowness"),
+    left=(
+        ((ONE, ONE), ("course_rate", ONE), ("slowness", ONE)),
+        (("course_rate", ONE), ("course_rate", "course_rate"), ("course_rate", "slowness")),
+        (("slowness", ONE), ("course_rate", "slowness"), ("slowness", "slowness")),
+    ),
+    right=(("yaw_rate", ONE), ("yaw_rate", "course_rate"), ("yaw_rate", "slowness")),
+    noise={},
+)
+"""The yaw rate by 1, ay/v and 1/v: the unknowns b, 1/rho and -d/rho. Least squares."""
+
+COURSE = Relation(
+    instruments=(ONE, "slowness", "course_rate", "curvature"),
+    left=(
+        ((ONE, ONE), ("yaw_rate", "speed"), ("speed", ONE), ("curvature", ONE)),
+        (("slowness", ONE), ("yaw_rate", ONE), (ONE, ONE), ("curvature", "slowness")),
+        (("course_rate", ONE), ("yaw_rate", "ay"), ("ay", ONE), ("curvature", "course_rate")),
+        (("curvature", ONE), ("yaw_rate", "yaw_rate"), ("yaw_rate", ONE), ("curvature",) * 2),
+    ),
+    right=(("ay", ONE), ("course_rate", ONE), ("ay", "course_rate"), ("ay", "curvature")),
+    noise={(3, 1): (ONE, ONE), (3, 3): ("slowness", "slowness")},
+)
+"""ay by 1, r v, v and r/v: the unknowns d, rho, -rho b and the bank of bends."""
+
+WHEELS = Relation(
+    instruments=COURSE.instruments,
+    left=(
+        ((ONE, ONE), ("wheels", ONE), ("speed", ONE), ("ay", "speed")),
+        (("slowness", ONE), ("wheels", "slowness"), (ONE, ONE), ("ay", ONE)),
+        (("course_rate", ONE), ("wheels", "course_rate"), ("ay", ONE), ("ay", "ay")),
+        (("curvature", ONE), ("wheels", "curvature"), ("yaw_rate", ONE), ("ay", "yaw_rate")),
+    ),
+    right=(
+        ("yaw_rate", ONE),
+        ("yaw_rate", "slowness"),
+        ("yaw_rate", "course_rate"),
+        ("yaw_rate", "curvature"),
+    ),
+    noise={(3, 4): (ONE, "slowness")},
+)
+"""The yaw rate by 1, the wheels' differences, v and ay v: the unknowns b and three of the tyres."""
+
+STEERING = Relation(
+    instruments=(ONE, "bend", "ay"),
+    left=(
+        ((ONE, ONE), ("bend", ONE), ("ay", ONE)),
+        (("bend", ONE), ("bend", "bend"), ("bend", "ay")),
+        (("ay", ONE), ("bend", "ay"), ("ay", "ay")),
+    ),
+    right=(("steer", ONE), ("steer", "bend"), ("steer", "ay")),
+    noise={(1, 1): ("slowness", "slowness")},
+)
+"""The steering by 1, curvature without the gyroscope's offset, and ay."""
+
+_WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
+_COURSE = ("yaw_rate", "ay", *_WHEELS, "curvature", "course_rate", "slowness")
+KINDS: Mapping[str, tuple[str, ...]] = {
+    "course": _COURSE,
+    "steering": (*_COURSE, "steer_fl", "steer_fr"),
+}
+"""The columns of each kind of sums."""
 
 
 def _si(**weights: int) -> dict[str, Fraction]:
@@ -39,116 +104,145 @@ def _si(**weights: int) -> dict[str, Fraction]:
 
 
 @cache
-def course_shape() -> PlaneShape:
-    """Return yaw rate as a plane in ay over speed and in one over speed."""
-    return PlaneShape(_si(yaw_rate=1), _si(course_rate=1), _si(slowness=1))
+def course_terms() -> Terms:
+    """Return the terms of the relations of course and wheels."""
+    speed = input_scales()["speed"] / 4
+    return {
+        **{name: _si(**{name: 1}) for name in ("yaw_rate", "ay", *_COURSE[-3:])},
+        "speed": dict.fromkeys(_WHEELS, speed),
+        "wheels": _si(wheel_rr=1, wheel_rl=-1, wheel_fr=1, wheel_fl=-1),
+    }
 
 
-@cache
-def wheels_shape() -> PlaneShape:
-    """Return yaw rate as a plane in the differences of the rear and of the front wheels."""
-    rear, front = _si(wheel_rr=1, wheel_rl=-1), _si(wheel_fr=1, wheel_fl=-1)
-    return PlaneShape(_si(yaw_rate=1), rear, front)
-
-
-def steering_shape(yaw_rate_offset: Fraction) -> PlaneShape:
-    """Return steering as a plane in ay and in curvature without the offset of the yaw rate."""
-    steer = {name: weight / 2 for name, weight in _si(steer_fl=1, steer_fr=1).items()}
+def steering_terms(yaw_rate_offset: Fraction) -> Terms:
+    """Return the terms of the relation of steering."""
     slowness = {name: -yaw_rate_offset * w for name, w in _si(slowness=1).items()}
-    return PlaneShape(steer, {**_si(curvature=1), **slowness}, _si(ay=1))
-
-
-KINDS: Mapping[str, tuple[str, ...]] = {
-    "course": ("yaw_rate", "course_rate", "slowness"),
-    "wheels": ("yaw_rate", "wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr"),
-    "steering": ("steer_fl", "steer_fr", "curvature", "slowness", "ay"),
-}
-"""The columns of each plane."""
+    return {
+        **course_terms(),
+        "steer": {name: weight / 2 for name, weight in _si(steer_fl=1, steer_fr=1).items()},
+        "bend": {**_si(curvature=1), **slowness},
+    }
 
 
 @dataclass(frozen=True)
 class Telling:
-    """A number of a plane, its gradient by the coefficients, and by others that it depends on."""
+    """A number of a relation, its gradient by the unknowns, and by others that it depends on.
+
+    `noise` is the variance of the gyroscope's noise that was taken out; `by_lean` is how much a
+    lean of the road adds to the number.
+    """
 
     kind: str
-    shape: PlaneShape
-    plane: Plane
+    relation: Relation
+    terms: Terms
+    noise: Fraction
     value: Fraction
-    gradient: tuple[float, float, float]
+    gradient: tuple[float, ...]
     also: Mapping[NumberName, float]
+    by_lean: Fraction = Fraction(0)
 
 
-def tell_numbers(sums: Mapping[str, Gram | None]) -> dict[NumberName, Telling]:
-    """Return the numbers that the sums of a car's drives tell, by kind of plane; exactly.
+def tell_numbers(sums: Mapping[str, Gram | None], banked: bool) -> dict[NumberName, Telling]:
+    """Return the numbers that the sums of a car's drives tell, by kind; exactly.
 
-    A number is missing where its plane's columns are, where the sums do not determine it, or where
-    the car drove too straight or too evenly to tell it from noise.
+    `banked`: whether bends are, on the fleet's roads (`road_lean`). A number is missing where its
+    columns are, where the sums do not determine it, or where the car drove too straight or too
+    evenly to tell it from noise.
     """
     found: dict[NumberName, Telling] = {}
-    _tell_course(found, sums.get("course"))
-    _tell_wheels(found, sums.get("wheels"))
-    _tell_steering(found, sums.get("steering"))
+    course, steering = sums.get("course"), sums.get("steering")
+    if course is None or course.n == 0:
+        return found
+    of_course = ExactSums(course, course_terms())
+    if of_course.variance("course_rate") < LEAST_TURNING_RAD_S**2:
+        return found
+    noise = gyroscope_noise(course, steering)
+    if noise is None:
+        return found
+    _tell_wheels(found, of_course, noise)
+    change = LEAST_CHANGE_OF_SPEED * of_course.mean("slowness")
+    if of_course.variance("slowness") >= change**2:
+        _tell_course(found, of_course, noise if banked else None)
+    if steering and "ay_offset" in found:
+        _tell_steering(found, steering, noise if banked else Fraction(0))
     return found
 
 
-def _tell_course(found: dict[NumberName, Telling], gram: Gram | None) -> None:
-    shape = course_shape()
-    plane = fit_plane(gram, shape) if gram else None
-    if plane is None or plane.first <= 0:
+def bank_of_bends(sums: Mapping[str, Gram]) -> Fraction | None:
+    """Return s, what of ay grows with curvature, m^2/s^2; None if a car's drives do not tell it."""
+    course = sums.get("course")
+    if course is None or (noise := gyroscope_noise(course, sums.get("steering"))) is None:
+        return None
+    solution = solve(COURSE.system(ExactSums(course, course_terms()), noise))
+    return solution[-1] if solution else None
+
+
+def gyroscope_noise(course: Gram, steering: Gram | None) -> Fraction | None:
+    """Return what no other sensor says of the yaw rate: the variance of the gyroscope's noise."""
+    inputs = ("wheels", "speed", "course_rate")
+    if steering is None:
+        return ExactSums(course, course_terms()).residual_variance("yaw_rate", inputs)
+    sums = ExactSums(steering, steering_terms(Fraction(0)))
+    return sums.residual_variance("yaw_rate", (*inputs, "steer"))
+
+
+def _tell_course(found: dict[NumberName, Telling], sums: ExactSums, noise: Fraction | None) -> None:
+    """Tell by the relation of flat roads, or with a noise by that of banked ones."""
+    relation, noise = (FLAT, Fraction(0)) if noise is None else (COURSE, noise)
+    solution = solve(relation.system(sums, noise))
+    if solution is None or not solution[1]:
         return
-    _, turning, change = plane.variances
-    even = change < (LEAST_CHANGE_OF_SPEED * plane.means[2]) ** 2
-    ratio = 1 / plane.first
-    if turning < LEAST_TURNING_RAD_S**2 or even or not SPEED_RATIOS[0] <= ratio <= SPEED_RATIOS[1]:
+    gradients: dict[NumberName, tuple[float, ...]]
+    if relation is FLAT:
+        yaw_rate_offset, slope, of_slowness = solution
+        ay_offset, ratio = -of_slowness / slope, 1 / slope
+        gradients = {
+            "yaw_rate_offset": (1.0, 0.0, 0.0),
+            "ay_offset": (0.0, float(of_slowness / slope**2), float(-ratio)),
+            "speed_ratio": (0.0, float(-(ratio**2)), 0.0),
+        }
+    else:
+        ay_offset, ratio, of_speed, _ = solution
+        yaw_rate_offset = -of_speed / ratio
+        gradients = {
+            "yaw_rate_offset": (0.0, float(of_speed / ratio**2), float(-1 / ratio), 0.0),
+            "ay_offset": (1.0, 0.0, 0.0, 0.0),
+            "speed_ratio": (0.0, 1.0, 0.0, 0.0),
+        }
+    least, most = SPEED_RATIOS[relation is COURSE]
+    if not least <= ratio <= most:
         return
-    first, second = float(plane.first), float(plane.second)
-
-    def tell(name: NumberName, value: Fraction, *gradient: float) -> None:
-        a, b, c = gradient
-        found[name] = Telling("course", shape, plane, value, (a, b, c), {})
-
-    tell("yaw_rate_offset", plane.intercept, 1.0, 0.0, 0.0)
-    tell("ay_offset", -plane.second / plane.first, 0.0, second / first**2, -1 / first)
-    tell("speed_ratio", ratio, 0.0, -1 / first**2, 0.0)
+    values = (yaw_rate_offset, ay_offset, ratio)
+    for (name, gradient), value in zip(gradients.items(), values, strict=True):
+        lean, terms = Fraction(name == "ay_offset"), course_terms()
+        found[name] = Telling("course", relation, terms, noise, value, gradient, {}, lean)
 
 
-def _tell_wheels(found: dict[NumberName, Telling], gram: Gram | None) -> None:
-    shape = wheels_shape()
-    plane = fit_plane(gram, shape) if gram else None
-    if plane is None or plane.variances[0] < LEAST_TURNING_RAD_S**2:
-        return
-    found["yaw_rate_offset_by_wheels"] = Telling(
-        "wheels", shape, plane, plane.intercept, (1.0, 0.0, 0.0), {}
-    )
+def _tell_wheels(found: dict[NumberName, Telling], sums: ExactSums, noise: Fraction) -> None:
+    solution = solve(WHEELS.system(sums, noise))
+    if solution is not None:
+        found["yaw_rate_offset_by_wheels"] = Telling(
+            "course", WHEELS, course_terms(), noise, solution[0], (1.0, 0.0, 0.0, 0.0), {}
+        )
 
 
-def _tell_steering(found: dict[NumberName, Telling], gram: Gram | None) -> None:
-    if gram is None or "ay_offset" not in found:
-        return
+def _tell_steering(found: dict[NumberName, Telling], gram: Gram, noise: Fraction) -> None:
     yaw_rate_offset, ay_offset = found["yaw_rate_offset"].value, found["ay_offset"].value
-    shape = steering_shape(yaw_rate_offset)
-    plane = fit_plane(gram, shape)
-    if plane is None or plane.variances[1] < LEAST_CURVATURE_1PM**2:
+    terms = steering_terms(yaw_rate_offset)
+    sums = ExactSums(gram, terms)
+    solution = solve(STEERING.system(sums, noise))
+    if solution is None or sums.variance("bend") < LEAST_CURVATURE_1PM**2:
         return
-    mean_slowness = input_scales()["slowness"] * gram.sum("slowness") / gram.n
+    straight, by_bend, understeer = solution
+
     also: dict[NumberName, float] = {
-        "yaw_rate_offset": float(plane.first * mean_slowness),
-        "ay_offset": float(plane.second),
+        "yaw_rate_offset": float(by_bend * sums.mean("slowness")),
+        "ay_offset": float(understeer),
     }
-    value = plane.intercept + plane.second * ay_offset
+    of_plane = ("steering", STEERING, terms, noise)
+    value = straight + understeer * ay_offset
     found["steering_offset"] = Telling(
-        "steering", shape, plane, value, (1.0, 0.0, float(ay_offset)), also
+        *of_plane, value, (1.0, 0.0, float(ay_offset)), also, by_lean=understeer
     )
-    found["steer_per_curvature"] = Telling(
-        "steering", shape, plane, plane.first, (0.0, 1.0, 0.0), {}
-    )
-    found["understeer"] = Telling("steering", shape, plane, plane.second, (0.0, 0.0, 1.0), {})
-
-
-def gradient_about(telling: Telling, signals: tuple[str, ...], origin: FloatArray) -> FloatArray:
-    """Return the gradient by the coefficients of a plane in counts less an origin."""
-    intercept, first, second = telling.gradient
-    at = dict(zip(signals, origin.tolist(), strict=True))
-    x1 = sum(float(w) * at[name] for name, w in telling.shape.x1.items())
-    x2 = sum(float(w) * at[name] for name, w in telling.shape.x2.items())
-    return np.array([intercept, first - intercept * x1, second - intercept * x2])
+    found["steer_per_curvature"] = Telling(*of_plane, by_bend, (0.0, 1.0, 0.0), {})
+    found["understeer"] = Telling(*of_plane, understeer, (0.0, 0.0, 1.0), {})

@@ -24,20 +24,14 @@ class DriveSums:
     table: GramTable
     cars: Mapping[str, slice]
 
-    def origin(self) -> tuple[int, ...]:
-        """Return a whole count near each column's mean."""
-        rows = max(1, int(self.table.n.sum()))
-        return tuple(round(float(s) / rows) for s in self.table.sums.sum(axis=0, dtype=float))
-
-    def moments(self, origin: Sequence[int]) -> FloatArray:
-        """Return the moments of (1, columns less an origin), shape (drives, k+1, k+1)."""
+    def moments(self) -> FloatArray:
+        """Return the moments of (1, columns) of each drive, shape (drives, k+1, k+1)."""
         k = len(self.table.signals)
-        about = self.table.about(origin)
-        found = np.empty((len(about), k + 1, k + 1))
-        found[:, 0, 0] = about.n
-        found[:, 0, 1:] = found[:, 1:, 0] = about.sums
+        found = np.empty((len(self.table), k + 1, k + 1))
+        found[:, 0, 0] = self.table.n
+        found[:, 0, 1:] = found[:, 1:, 0] = self.table.sums
         at = np.array([[packed_position(i, j) for j in range(k)] for i in range(k)])
-        found[:, 1:, 1:] = about.products[:, at]
+        found[:, 1:, 1:] = self.table.products[:, at]
         return found
 
 

@@ -14,13 +14,14 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.calibration.car_evidence import CarEvidence
-from fleet_slip.grams.calibration.tell_numbers import KINDS, course_shape, tell_numbers
+from fleet_slip.grams.calibration.road_lean import roads_of
+from fleet_slip.grams.calibration.tell_numbers import FLAT, KINDS, tell_numbers
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.exact.plane import PlaneShape, fit_plane
+from fleet_slip.regression.exact.moments_relation import ExactSums, solve
 from fleet_slip.views import connect
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
@@ -126,17 +127,17 @@ def test_the_numbers_are_the_same_in_any_order(fleet: Any) -> None:
     assert one.convergence() == other.convergence()
 
 
-def test_a_plane_is_the_exact_fit() -> None:
+def test_least_squares_is_the_exact_fit() -> None:
     rng = np.random.default_rng(1)
-    counts = rng.integers(-3000, 3000, (50, 3))
-    gram = Gram.from_counts(("x1", "x2", "y"), counts)
-    expected = fit(gram, ("x1", "x2"), "y").model
-    scales = {"y": Fraction(3, 7), "x1": Fraction(2, 1000), "x2": Fraction(5, 4)}
-    found = fit_plane(gram, PlaneShape(*({name: scales[name]} for name in ("y", "x1", "x2"))))
+    names = ("yaw_rate", "course_rate", "slowness")
+    gram = Gram.from_counts(names, rng.integers(-3000, 3000, (50, 3)))
+    expected = fit(gram, names[1:], "yaw_rate").model
+    scales = {name: input_scales()[name] for name in names}
+    found = solve(FLAT.system(ExactSums(gram, {n: {n: scales[n]} for n in names}), 0))
     assert found is not None
-    assert found.intercept == expected.intercept * scales["y"]
-    assert found.first == expected.coefficients[0] * scales["y"] / scales["x1"]
-    assert found.second == expected.coefficients[1] * scales["y"] / scales["x2"]
+    assert found[0] == expected.intercept * scales["yaw_rate"]
+    for slope, coefficient, name in zip(found[1:], expected.coefficients, names[1:], strict=True):
+        assert slope == coefficient * scales["yaw_rate"] / scales[name]
 
 
 def test_the_wheels_tell_the_radius_and_the_steering_the_wheelbase() -> None:
@@ -148,6 +149,54 @@ def test_the_wheels_tell_the_radius_and_the_steering_the_wheelbase() -> None:
     assert wheelbase == pytest.approx(cars.WHEELBASE_M, rel=0.08)  # noise flattens
     assert found["understeer"].value == pytest.approx(0.002, abs=1e-3)
     assert found["yaw_rate_offset_by_wheels"].value == pytest.approx(0.013, abs=3e-4)
+
+
+def on_real_roads(rng: np.random.Generator, offsets: dict[str, float]) -> dict[str, Any]:
+    """Return the counts of a drive where bends are banked, roads fall and wheels differ."""
+
+    def change(signals: cars.Signals) -> None:
+        speed = cars.RADIUS_M * sum(signals[f"wheel_{c}"] for c in ("fl", "fr", "rl", "rr")) / 4
+        signals["ay"] += offsets["ay_offset"] + 0.2 - 20 * signals["yaw_rate"] / speed
+        signals["yaw_rate"] += offsets["yaw_rate_offset"]
+        signals["wheel_rr"] *= 1.004
+
+    return cars.counts(cars.broken(cars.drive(rng, 2.0), change))
+
+
+def test_roads_that_lean_and_are_banked_are_taken_out() -> None:
+    rng = np.random.default_rng(11)
+    rows, true = [], {}
+    for i in range(12):
+        car = f"car-{i:02d}"
+        true[car] = {
+            "yaw_rate_offset": 0.01 * rng.standard_normal(),
+            "ay_offset": 0.05 * rng.standard_normal(),
+        }
+        rows += [gram_row(car, n, on_real_roads(rng, true[car])) for n in range(3)]
+    found = evidence(rows)
+    assert found.roads.banked
+    assert found.roads.lean is not None
+    assert float(found.roads.lean) == pytest.approx(0.2, abs=0.06)
+    for car, offsets in true.items():
+        by_wheels = {"yaw_rate_offset_by_wheels": offsets["yaw_rate_offset"]}
+        for name, offset in (offsets | by_wheels).items():
+            one = found.calibrated(car)[name]  # type: ignore[index]
+            assert one.uncertainty is not None
+            assert abs(one.value - offset) < 4 * one.uncertainty, (car, name)
+
+    alone = evidence([row for row in rows if row["vehicle_id"] < "car-08"])
+    assert not alone.roads.banked
+    assert alone.roads.lean is None
+
+
+def test_the_lean_of_roads_is_what_the_cars_do_not_explain() -> None:
+    offsets = [Fraction(i - 10, 100) for i in range(21)]
+    assert roads_of(True, offsets).lean == 0
+    leaning = roads_of(True, [offset + Fraction(1, 4) for offset in offsets])
+    assert leaning.lean is not None
+    assert 0.2 < leaning.lean < 0.25
+    assert leaning.uncertainty == pytest.approx(31**0.5 / 3 * 0.05 / 21**0.5)
+    assert roads_of(True, offsets[:9]).lean is roads_of(False, offsets).lean is None
 
 
 def test_counts_are_rounded_to_the_grain_halves_away_from_zero() -> None:
@@ -192,8 +241,9 @@ def test_one_drive_of_one_car_has_no_uncertainty() -> None:
 
 
 def test_no_gram_rows_tell_nothing() -> None:
-    assert tell_numbers({}) == {}
-    assert fit_plane(Gram.zero(("yaw_rate", "course_rate", "slowness")), course_shape()) is None
+    for banked in (False, True):
+        assert tell_numbers({}, banked) == {}
+        assert tell_numbers({kind: Gram.zero(c) for kind, c in KINDS.items()}, banked) == {}
 
 
 def filled(warehouse: Warehouse, *names: str) -> None:
