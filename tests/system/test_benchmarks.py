@@ -20,6 +20,7 @@ DEADLINE_S = 1800
 
 TINY = {
     "billion": "--root {folder} --rows 3e4",
+    "calibration": "--campaign fleet --cars 2",
     "checksums": "--campaign smoke --repeat 1",
     "cluster": "--days 1 --workers 1",
     "columns": "{root} --most 4",
