@@ -67,9 +67,9 @@ def export_files(
     }
     if to != "json":  # that says all of it itself
         prefix = c_prefix(version) if to == "c" else file_prefix(version)
-        last = f"{prefix}_manifest.json"
+        last = f"{prefix}_{to}_manifest.json"  # a folder may hold several formats
         page = read_me(version, subject.program, to, prefix, [*files, last])
-        files[f"{prefix}_README.md"] = page.encode("utf-8")
+        files[f"{prefix}_{to}_README.md"] = page.encode("utf-8")
         manifest = manifest_of(version, subject.program, to, files)
         files[last] = render(manifest).encode("utf-8")
     return files

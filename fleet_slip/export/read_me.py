@@ -17,7 +17,7 @@ _FILES = {
     ".c": "the estimator in C99, in whole numbers; also for C++",
     ".a2l": "what a calibration tool measures, by symbols (ASAP2 1.71); which, it says",
     "_macro.sql": "a table macro for DuckDB",
-    ".sql": "a statement on the view `log_counts`",
+    ".sql": "a statement on the view `log`, in SI units",
     "_checks.csv": "inputs that are made up, and the angle at every tick",
     ".dbc": "messages of a CAN bus with the inputs and the angle",
     "_float32.onnx": "ONNX graph in single precision",
@@ -32,7 +32,7 @@ _USE = {
     "c": """    cc -std=c99 {prefix}.c {prefix}_test.c -o self_test && ./self_test
 
 Call `{prefix}_start` when a drive begins, and `{prefix}_step` at every tick.""",
-    "sql": "Run the statement in `fleet-slip shell`, or in any DuckDB that has the view.",
+    "sql": "Run the statement in `fleet-slip shell`, or in any engine that has a table `log`.",
     "dbc": "Load it into the tool that plans the bus. One message tells that there is an angle.",
     "onnx": "Give it a tick, and the state that it returned at the tick before.",
     "fmu": """In Simulink: the block FMU (Import), with a fixed step of one tick. With fmpy:

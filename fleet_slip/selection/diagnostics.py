@@ -72,7 +72,7 @@ class Diagnosis:
         influential: the cars that `robust` would leave out of a selection, by name.
     """
 
-    fitted: Fit
+    fitted: Fit = field(repr=False)  # holds a Gram matrix and long fractions
     drives: int
     cluster: ClusterUnit | Literal["row"]
     naive: Inference

@@ -19,6 +19,7 @@ def test_answers_are_shown_on_a_line_or_two(smoke_root: Path) -> None:
         assert len(repr(answer)) < 500
     assert len(repr(selection.models[0].model)) < 200  # its fractions may have 10,000 digits
     assert len(repr(fleet.diff(model, model))) < 1000
+    assert "Fraction" not in repr(cohort.diagnose(model))
 
 
 def test_a_notebook_gets_a_table_with_bars(smoke_root: Path) -> None:

@@ -119,7 +119,7 @@ def samples_of(program: Program, drive: DriveCounts) -> list[Sample]:
 def test_the_self_test_passes_and_notices_another_angle(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     files = export_texts(fleet.model("smoke"), fleet.warehouse, "c")
-    ends = (".h", ".c", "_test.c", "_fuzz.c", ".a2l", "_README.md", "_manifest.json")
+    ends = (".h", ".c", "_test.c", "_fuzz.c", ".a2l", "_c_README.md", "_c_manifest.json")
     assert list(files) == [f"sideslip_smoke{end}" for end in ends]
     for name, text in files.items():
         (tmp_path / name).write_text(text)
@@ -201,10 +201,11 @@ def test_the_page_beside_them_tells_inputs_and_files(smoke_root: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     for to in ("c", "sql", "dbc"):
         files = export_texts(fleet.model("smoke"), fleet.warehouse, to)
-        page = files["sideslip_smoke_README.md"]
+        page = files[f"sideslip_smoke_{to}_README.md"]
         assert all(f"| `{name}` | " in page for name in files if not name.endswith(".md"))
         assert "| `ay` | m/s^2 | 0.001 | -30000 to 30000 |" in page
         assert "every 0.01 s" in page
+        assert ("view `log`," in page) == (to == "sql")
 
 
 def result_of(program: Path) -> tuple[int, str]:

@@ -72,7 +72,7 @@ def test_the_manifest_of_an_export_and_show_say_the_same(smoke_root: Path) -> No
     assert counted["columns"] == len(version.manifest.terms)
     assert counted["memory_bytes"] > 1000 < counted["estimated_instructions"]
     files = export_files(version, None, "c")
-    manifest = json.loads(files["sideslip_smoke_manifest.json"])
+    manifest = json.loads(files["sideslip_smoke_c_manifest.json"])
     assert manifest["costs"] == counted
     assert (manifest["model"], manifest["sha256"]) == ("smoke@1", version.sha256)
     assert [*manifest["files"]] == [name for name in files if "manifest" not in name]
