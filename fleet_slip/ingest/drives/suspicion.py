@@ -35,6 +35,8 @@ LONGEST_M, LARGE_RAD = 8.0, 0.15
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 ROAD_WHEELS = ("steer_fl", "steer")
 LEAST_CORRELATION, SURE_CORRELATION = 0.6, 0.9
+LEAST_AGAINST = -0.3
+"""A correlation above tells no sign, as in `quality`: of noise alone half are below zero."""
 LARGEST_REFUSED, FEWEST_REFUSED = 0.1, 10
 _REFUSED = {
     "out_of_range": ("scaled", "Check its unit."),
@@ -178,6 +180,8 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
         concerned = tuple(WITNESSES.get(name, (name,)))
         others = np.where(loadings > 0, correlations[names.index(name)], 0.0)
         against = int(np.argmin(others))
+        if others[against] > LEAST_AGAINST:
+            continue
         figure = f"its correlation with {names[against]} is {others[against]:+.2f}"
         if len(concerned) == 2:
             yield Suspicion("swapped", concerned, figure, "Swap their columns.")
