@@ -198,6 +198,7 @@ def test_an_object_is_looked_at_before_it_is_stored(here: Path, bucket: str) -> 
     url = f"{bucket}/landing/day 1/münchen 3.csv"
     mapping = str(here / "car.toml")
     done = command_on(here / "root", "ingest", url, "--mapping", mapping, "--dry-run", "--json")
+    assert done.stdout, done.stderr
     (seen,) = json.loads(done.stdout)
     assert (seen["file"], seen["rows_read"]) == (url, 23)
     done = command_on(here / "root", "mapping", "suggest", url)

@@ -69,9 +69,10 @@ def preview_log(log: Log, mapping: Mapping) -> Preview:
                     longest = drive
                 for name, counts in drive.counts.items():
                     found[name].add(counts)
+        of_rows = stream.suspicions()  # which may look into the file again
     signals = signals_of(longest) if longest is not None else {}
     ranges = tuple(_range(name, found[name]) for name in mapping.signal_names)
-    suspicions = (*stream.suspicions(), *find_suspicions(signals))
+    suspicions = (*of_rows, *find_suspicions(signals))
     return Preview(str(log), stream.counts(), ranges, suspicions, signals)
 
 
