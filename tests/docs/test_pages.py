@@ -1,5 +1,6 @@
 """What the pages say of the repository holds, and leads somewhere."""
 
+import inspect
 import re
 import tomllib
 from pathlib import Path
@@ -7,6 +8,8 @@ from typing import Any
 
 import pytest
 from markdown_it import MarkdownIt
+
+import fleet_slip
 
 HERE = Path(__file__).resolve().parents[2]
 DOCS = HERE / "docs"
@@ -87,9 +90,21 @@ def test_the_navigation_has_every_page_once_and_none_besides() -> None:
     assert sorted(listed) == sorted(str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md"))
 
 
-def test_the_reference_has_every_folder() -> None:
-    folders = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
-    assert folders <= {page.stem for page in (DOCS / "api").glob("*.md")}
+def test_the_reference_has_what_is_public_and_no_more() -> None:
+    """The names of the package, errors, and what the calls of a fleet and a cohort return."""
+    shown = re.findall(r"^::: (\S+)$", (DOCS / "api/index.md").read_text(), re.MULTILINE)
+    assert list((DOCS / "api").iterdir()) == [DOCS / "api/index.md"]
+    calls = [
+        call.fget if isinstance(call, property) else call
+        for of in (fleet_slip.Fleet, fleet_slip.FleetCohort)
+        for name, call in inspect.getmembers(of)
+        if not name.startswith("_")
+    ]
+    told = " ".join(str(inspect.signature(call).return_annotation) for call in calls)
+    public = set(re.findall(r"[A-Z]\w+", told)) - set(fleet_slip.__all__)
+    own = public - {"Document", "DuckDBPyRelation", "Path", "Table"}
+    assert shown[:2] == ["fleet_slip", "fleet_slip.errors"]
+    assert {name.rpartition(".")[2] for name in shown[2:]} == own
 
 
 def targets(page: Path) -> list[str]:
