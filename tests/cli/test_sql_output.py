@@ -36,6 +36,19 @@ def test_a_table_can_be_asked_for_whole(run_command: RunCommand, smoke_root: Pat
     assert two.count("x" * 300) == 2
 
 
+def test_the_dictionary_is_shown_whole_and_by_view(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    shown = run_command("sql", "FROM dictionary", root=smoke_root).stdout
+    rows = run_command("sql", "FROM dictionary", "--json", root=smoke_root).json
+    lines = {" ".join(line.split()) for line in shown.splitlines()}
+    assert len(rows) > 150
+    for row in rows:
+        assert f"{row['view']}:" in lines
+        told = f"{row['column']} {row['unit'] or ''} {row['description']}"
+        assert " ".join(told.split()) in lines
+
+
 @pytest.mark.parametrize("suffix", ["parquet", "csv", "json"])
 def test_an_answer_becomes_a_file(
     run_command: RunCommand, smoke_root: Path, tmp_path: Path, suffix: str

@@ -8,6 +8,8 @@ import shutil
 import sys
 from collections.abc import Iterator
 from enum import StrEnum
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Annotated
 
@@ -154,6 +156,9 @@ def _write(session: Session, text: str, file: Path, limit: int | None, exact: bo
 
 def _show(session: Session, text: str, limit: int | None, everything: bool) -> None:
     """Print what fits of an answer, and say what is left out and how to see it."""
+    if limit is None and not everything and _DICTIONARY.fullmatch(text):
+        _print_dictionary(session)
+        return
     screen = shutil.get_terminal_size((160, 40)).columns
     width = ENDLESS if everything else screen
     rows = limit if limit is not None else ENDLESS if everything else ROWS_SHOWN
@@ -173,6 +178,18 @@ def _show(session: Session, text: str, limit: int | None, everything: bool) -> N
         say(f"columns without a value in these rows are left out: {', '.join(empty)}")
     elif left_out := [what for what, cut in _CUTS.items() if cut.search(shown)]:
         say(f"{' and '.join(left_out)}; whole: --all")
+
+
+_DICTIONARY = re.compile(r"(?i)\s*from\s+dictionary\s*;?\s*")
+
+
+def _print_dictionary(session: Session) -> None:
+    """Print what every column is, view by view and whole."""
+    rows = session.table('SELECT view, "column", unit, description FROM dictionary').to_pylist()
+    for view, columns in groupby(rows, itemgetter("view")):
+        cells = [[cell(one[key]) for key in ("column", "unit", "description")] for one in columns]
+        print_table(f"{view}:", ["column", "unit", "description"], cells, left=3)
+    say("types, too: fleet-slip sql --all \"FROM dictionary WHERE view = 'log'\"")
 
 
 def _print_folded(session: Session, text: str, limit: int | None) -> None:
