@@ -94,7 +94,7 @@ def test_the_reference_has_what_is_public_and_no_more() -> None:
     """The names of the package, errors, and what the calls of a fleet and a cohort return."""
     shown = re.findall(r"^::: (\S+)$", (DOCS / "api/index.md").read_text(), re.MULTILINE)
     assert list((DOCS / "api").iterdir()) == [DOCS / "api/index.md"]
-    calls = [
+    calls: list[Any] = [
         call.fget if isinstance(call, property) else call
         for of in (fleet_slip.Fleet, fleet_slip.FleetCohort)
         for name, call in inspect.getmembers(of)
