@@ -9,6 +9,7 @@ import pytest
 
 from fleet_slip.errors import (
     ConfigError,
+    ExtraError,
     FleetSlipError,
     QuestionError,
     RefusedError,
@@ -63,7 +64,9 @@ def fail(warehouse: Warehouse, error: FleetSlipError, *arguments: str) -> None:
         raise error
 
 
-@pytest.mark.parametrize("mistake", [UsageError, ConfigError, QuestionError, RefusedError])
+@pytest.mark.parametrize(
+    "mistake", [UsageError, ConfigError, QuestionError, RefusedError, ExtraError]
+)
 def test_what_a_person_mistyped_or_was_refused_is_no_failure_of_the_night(
     warehouse: Warehouse, mistake: type[FleetSlipError]
 ) -> None:
