@@ -1,11 +1,27 @@
-"""Runs the benchmarks that need nothing but minutes, one after the other: python -m benchmarks.
+"""Runs the benchmarks that need nothing but minutes, one after the other, and records each.
 
-The others are run by name: billion and growth need a folder and time, peers and weka other
-programs.
+    python -m benchmarks [NAME ...] [--records FILE] [--plot FILE]
+
+Their processor times are added to FILE by commit, beside that of a yardstick, work that is always
+the same. One that takes a fifth longer than the last five records, both in yardsticks, is named at
+the end, and the exit code is 1. The others are run by name: billion and growth need a folder and
+time, peers and weka other programs.
 """
 
-import subprocess
+import argparse
 import sys
+from pathlib import Path
+
+from benchmarks.bench_record import (
+    Record,
+    add_record,
+    commit,
+    draw,
+    read_records,
+    slower_than,
+    yardstick,
+)
+from benchmarks.usage import measured
 
 COMMANDS = (
     "start",
@@ -20,7 +36,30 @@ COMMANDS = (
     "reliability",
     "crash --kills 30",
 )
+RECORDS = Path(__file__).with_name("figures") / "bench.jsonl"
 
-for command in COMMANDS:
-    print(f"\n== {command}", flush=True)
-    subprocess.run([sys.executable, "-m", *f"benchmarks.{command}".split()], check=True)
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", help="by default all")
+    parser.add_argument("--records", type=Path, default=RECORDS)
+    parser.add_argument("--plot", type=Path)
+    given = parser.parse_args()
+    chosen = [one for one in COMMANDS if not given.names or one.split()[0] in given.names]
+    slower = []
+    for command in chosen:
+        print(f"\n== {command}", flush=True)
+        took_s = yardstick()
+        usage = measured([sys.executable, "-m", *f"benchmarks.{command}".split()])
+        record = Record(commit(), command, round(usage.cpu_s, 2), (took_s + yardstick()) / 2)
+        print(f"{usage.output}{record.cpu_s} s of processors, {record.relative:.2f} yardsticks")
+        slower.append(slower_than(read_records(given.records), record))
+        add_record(given.records, record)
+    if given.plot:
+        draw(read_records(given.records), given.plot)
+    if told := list(filter(None, slower)):
+        sys.exit("\n".join(told))
+
+
+if __name__ == "__main__":
+    main()

@@ -82,7 +82,7 @@ ELSEWHERE = {
 }
 """What is not run here, and what it needs."""
 
-PARTS = {"peer_ways", "usage"}
+PARTS = {"__main__", "peer_ways", "usage"}
 """What benchmarks start as processes of their own."""
 
 
