@@ -38,7 +38,7 @@ def yardstick() -> float:
     numbers, matrix = random.random(4_000_000), random.random((600, 600))
     began = time.process_time()
     for _ in range(3):
-        hashlib.sha256(numbers).digest()
+        hashlib.sha256(numbers.tobytes()).digest()
         np.sort(numbers)
         for _ in range(10):
             matrix @ matrix
