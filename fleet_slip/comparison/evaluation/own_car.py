@@ -7,7 +7,7 @@ not seen. A part is a quarter of the drives, or of each drive's time where there
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version as package_version
 from typing import Any
 
@@ -30,9 +30,9 @@ from fleet_slip.comparison.evaluation.own_drives import (
 )
 from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures, error_figures
 from fleet_slip.comparison.observers import ekf
-from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive
+from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals, LabelledDrive
 from fleet_slip.comparison.observers.identification import FOLDS, IDENTIFIED, Measured, identify
-from fleet_slip.comparison.observers.single_track import measured_speed_mps
+from fleet_slip.comparison.observers.single_track import follow, measured_speed_mps
 from fleet_slip.comparison.observers.tuning import tune
 from fleet_slip.comparison.observers.yaw_rate import YawRateNoise
 from fleet_slip.comparison.observers.yaw_rate import estimate as estimate_yaw_rate
@@ -183,6 +183,7 @@ def _filtered(
 ) -> dict[str, tuple[str, list[FloatArray]]]:
     """Estimate each part by filters that are tuned, in cars identified, on the others."""
     found: dict[str, tuple[str, list[FloatArray]]] = {}
+    drives = [replace(one, drive=_accelerated(one.drive, vehicle)) for one in drives]
     for left in range(FOLDS):
         others = [one.without(left) for one in drives]
         others = [one for one in others if np.isfinite(one.sideslip_rad).any()]
@@ -213,7 +214,7 @@ def _tuned(
     cars = {} if vehicle.description == IDENTIFIED else {"tuned": vehicle}
     try:
         identified = identify(Measured.of(vehicle), others, executor)
-    except DataError as error:  # as where no ax is logged
+    except DataError as error:
         LOGGER.warning("no car is identified: %s", error)
         cars["tuned"] = vehicle
     else:
@@ -252,6 +253,23 @@ def _in_car(
         key=lambda tuned: tuned.rmse_rad,
     )
     return lambda signals: one.estimate(signals, car, best.parameters)
+
+
+WHEELS_LAG = 0.1
+"""Of the change of wheel speeds in a step, what an acceleration made of them follows."""
+
+
+def _accelerated(drive: LabelledDrive, vehicle: VehicleParameters) -> LabelledDrive:
+    """Return the drive with ax from its wheels where none is logged, as many a car has it."""
+    signals = drive.signals
+    if np.isfinite(signals.ax_mps2).any():
+        return drive
+    try:
+        speed = measured_speed_mps(signals, vehicle)
+    except DataError:
+        return drive
+    ax_mps2 = follow(np.diff(speed, prepend=speed[:1]) / STEP_S, WHEELS_LAG)
+    return replace(drive, signals=replace(signals, ax_mps2=ax_mps2))
 
 
 def _rolling(signals: DriveSignals, vehicle: VehicleParameters) -> FloatArray:

@@ -60,7 +60,7 @@ def designs_of(
         )
         for one in load_model_list(TABLE_ONE).model
     }
-    registry = Registry(warehouse.root / "models")
+    registry = Registry.of(warehouse)
     for version in versions:
         manifest, model = version.manifest, Predictor.of(version.manifest)
         from_course = manifest.learned_from is not None and manifest.learned_from.weight is None

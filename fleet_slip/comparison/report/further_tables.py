@@ -1,6 +1,8 @@
 """Tables of what the evaluation found beyond the paper, of coefficients and of storage."""
 
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from importlib.resources import files
 from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
@@ -143,6 +145,38 @@ def _standing(found: Sequence[ErrorFigures | None]) -> list[Cell]:
             best = error is not None and error == least
             cells.append(Cell(number(error), "good" if best else ""))
     return cells
+
+
+BOUNDS = tomllib.loads((files(__package__) / "bounds.toml").read_text(encoding="utf-8"))
+"""Of test drives that ship: by how much who knows no car, and who is told it, must err, deg."""
+
+
+def limits(data: ReportData) -> Iterator[ReportTable]:
+    """Yield how many times the bound estimators err, where the bound of a drive is known."""
+    evaluated = data.evaluated
+    names = [name for name in compared(data) if name not in evaluated.of_kind("rival")]
+    known = [one for one in evaluated.scenarios if one in BOUNDS]
+    rows: list[list[str | Cell]] = []
+    for drive in known:
+        unknown, told = BOUNDS[drive]["unknown"], BOUNDS[drive]["told"]
+        errors = [evaluated.figures(drive, name) for name in names]
+        times = [
+            number(one.rmse_deg / unknown if one and one.rmse_deg is not None else None, 1)
+            for one in errors
+        ]
+        rows.append([drive, number(unknown, 4), number(told, 4), *times])
+    if rows:
+        yield table(
+            "limits",
+            "Distance to the limit: how many times the bound the root mean square error is",
+            ["test drive", "bound, degrees", "told the car", *names],
+            rows,
+            note=(
+                "The bound of Cramér and Rao for a filter that knows the laws of the extended one, "
+                "but biases, mass, tyres and road by a prior alone. Below 1: what was learned of "
+                "this very car."
+            ),
+        )
 
 
 def won(data: ReportData) -> str:

@@ -42,6 +42,7 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
             *own_tables.own_car(data),
             further_tables.scenarios(data),
             further_tables.standings(data),
+            *further_tables.limits(data),
             *further_tables.fleets(data),
             *([learned] if learned else []),
         ],

@@ -5,15 +5,21 @@ import math
 import random
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import fleet_slip
 from fleet_slip.arrays import FloatArray
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
+from fleet_slip.comparison.evaluation import own_car
 from fleet_slip.comparison.evaluation.own_car import fit_left_out
 from fleet_slip.comparison.evaluation.own_drives import Design, OwnDrive
+from fleet_slip.comparison.observers import ekf
 from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive
+from fleet_slip.comparison.observers.identification import Fitted, Identified
+from fleet_slip.comparison.observers.tuning import Tuned
 from tests.support.commands import done_on, run_on
 from tests.support.measured import csv_text
 
@@ -122,15 +128,27 @@ def test_what_does_not_go_together_is_refused(own: Path, words: tuple[str, ...])
     assert "leave out" in done.stderr
 
 
-@pytest.mark.slow
 def test_filters_compete_in_the_car_of_a_file_and_in_one_that_is_identified(
-    smoke_root: Path, tmp_path: Path
+    smoke_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = Path(shutil.copytree(smoke_root, tmp_path / "data"))
-    one = ("--cohort", "drive_id = 'smoke-2024-05-01-0001'")
-    found = json.loads(done_on(root, "evaluate", "smoke", *one, "--json").stdout)
+    judged: list[float] = []
+
+    def untuned(_: object, start: Any, *rest: Any) -> Tuned[Any]:
+        judged.append(float(np.mean([np.isfinite(one.sideslip_rad).mean() for one in rest[1]])))
+        return Tuned(start, 0.0, 1)
+
+    monkeypatch.setattr(own_car, "tune", untuned)
+    monkeypatch.setattr(
+        own_car,
+        "identify",
+        lambda measured, *_: Identified(measured.car(Fitted()), ekf.EkfNoise(), 0.0),
+    )
+    one = "drive_id = 'smoke-2024-05-01-0001'"
+    found = fleet_slip.open(root).evaluate_measured("smoke", one).content
     assert (found["vehicle"], found["parts_of"]) == ("d_class_sedan", "time")
     errors = {name: one["rmse_deg"] for name, one in found["estimators"].items()}
     assert {"kinematic", "ekf_tuned", "ekf_identified", "kalman_identified"} <= {*errors}
-    assert max(errors["ekf_tuned"], errors["ekf_identified"]) < 0.06, "the label's noise is 0.029"
+    assert errors["ekf_tuned"] < 0.06, "the label's noise is 0.029"
     assert list(errors.values()) == sorted(errors.values())
+    assert judged == pytest.approx([0.75] * len(judged), abs=0.01), "a quarter is never seen"

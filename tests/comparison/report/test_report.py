@@ -22,7 +22,7 @@ from fleet_slip.comparison.report import paper_tables
 from fleet_slip.comparison.report.column_worth import by_length, looks_back
 from fleet_slip.comparison.report.facts import NAMES, Facts
 from fleet_slip.comparison.report.further_pictures import draw_pictures, road_pictures
-from fleet_slip.comparison.report.further_tables import standings
+from fleet_slip.comparison.report.further_tables import limits, standings
 from fleet_slip.comparison.report.gate_strips import gates_of, opening
 from fleet_slip.comparison.report.judging import (
     CLAIMS,
@@ -371,6 +371,19 @@ def test_the_standings_mark_the_smallest_error_of_each_drive(data: ReportData) -
         marked = [name for name, cell in zip(names, cells, strict=True) if cell.mark == "good"]
         least = min(errors.values())
         assert marked == [name for name in names if errors.get(name) == least]
+
+
+def test_errors_stand_beside_the_bound_of_their_drive(data: ReportData) -> None:
+    (shown,) = limits(data)
+    assert shown.head[:3] == ["test drive", "bound, degrees", "told the car"]
+    nominal = next(cells for drive, *cells in shown.rows if drive.text == "nominal")
+    bound, told, *times = (float(cell.text) for cell in nominal)
+    assert told < bound < 0.02
+    for name, found in zip(shown.head[3:], times, strict=True):
+        one = data.evaluated.figures("nominal", name)
+        assert one is not None
+        assert one.rmse_deg is not None
+        assert found == pytest.approx(one.rmse_deg / bound, abs=0.06)
 
 
 def test_every_estimator_has_a_point_on_every_test_drive(data: ReportData) -> None:

@@ -1,0 +1,59 @@
+"""What learners reach with ten times the rows, on the test drives and against the exact angle.
+
+    python -m benchmarks.learners DATA_ROOT MODEL [--rows 600000] [--learners mlp,trees]
+
+They see the signals and the columns of the published model, as in `evaluate --rivals`, and are
+fitted once. It prints the root mean square error in degrees by drive.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+import fleet_slip
+from fleet_slip.comparison.evaluation.evaluated_drives import load_drives
+from fleet_slip.comparison.evaluation.scenario_runs import evaluate_drive
+from fleet_slip.comparison.rivals.compare import all_signals
+from fleet_slip.comparison.rivals.inputs import Inputs, LearnedEstimate, draw_sample
+from fleet_slip.comparison.rivals.learner import one_thread
+from fleet_slip.comparison.rivals.learners import OF_WINDOWS
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
+from fleet_slip.simulation.scenario import load_scenario
+
+DRIVES = (
+    "nominal", "noise_doubled", "melbourne", "mass_1740", "adhesion_0_7", "adhesion_0_4",
+    "style_sporty", "style_limit", "biases_of_another_car", "car_suv", "imperfect",
+)  # fmt: skip
+
+
+def main() -> None:
+    """Fit each learner and print its errors."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("root", type=Path)
+    parser.add_argument("model")
+    parser.add_argument("--rows", type=int, default=600_000)
+    parser.add_argument("--learners", default="mlp,trees")
+    asked = parser.parse_args()
+    fleet = fleet_slip.open(asked.root)
+    manifest = fleet.model(asked.model).manifest
+    inputs = Inputs.of_model(manifest, all_signals())
+    cohort = load_cohort(fleet.warehouse, manifest.trained_on.cohort)
+    sample = draw_sample(fleet.warehouse, cohort, inputs, asked.rows)
+    values = sample.of(inputs.names)
+    drives = load_drives(fleet.warehouse, [load_scenario(name) for name in DRIVES])
+    print(f"{len(values):,} rows, {len(inputs.names)} columns", flush=True)
+    for learner in OF_WINDOWS:
+        if learner.name not in asked.learners.split(","):
+            continue
+        with one_thread():
+            fitted = learner.fit(values, sample.sideslip_rad, sample.trip)
+        for drive in drives:
+            run = evaluate_drive(drive, {learner.name: LearnedEstimate(inputs, fitted)})
+            rmse_deg = run.results[learner.name].whole.rmse_deg
+            print(f"| {learner.name} | {drive.scenario.name} | {rmse_deg or np.nan:.4f} |")
+        print(f"{learner.name}: {fitted.size_bytes:,} bytes", flush=True)
+
+
+if __name__ == "__main__":
+    main()
