@@ -1,6 +1,7 @@
 """How the sensors of cars are off: the command calibrate."""
 
 from collections.abc import Mapping, Sequence
+from datetime import date
 from statistics import median, pstdev
 from typing import Annotated
 
@@ -8,10 +9,11 @@ import typer
 
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName
 from fleet_slip.catalogue.sources import ALL_DRIVES
+from fleet_slip.cli.dates import date_of
 from fleet_slip.cli.options import Cohort
 from fleet_slip.cli.output import Json, cell, print_json, print_table, say
 from fleet_slip.grams.calibration.calibration import Calibration
-from fleet_slip.grams.calibration.car_evidence import CalibratedNumber
+from fleet_slip.grams.calibration.car_evidence import SURE_ERRORS, CalibratedNumber, ChangedNumber
 from fleet_slip.grams.calibration.road_lean import FEWEST_CARS, Roads
 from fleet_slip.words import number_of
 
@@ -23,6 +25,13 @@ def calibrate(
         typer.Option(help="Show this car's numbers, and how they go on board.", show_default=False),
     ] = None,
     cohort: Cohort = ALL_DRIVES,
+    since: Annotated[
+        str | None,
+        typer.Option(
+            help="Show instead what has changed in cars from this day on, such as 2024-06-15.",
+            show_default=False,
+        ),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Tell from each car's own drives how its sensors are off: no label, no log row is read.
@@ -33,13 +42,20 @@ def calibrate(
 
     Example: **fleet-slip calibrate**
     """
+    day = date_of(since, "--since")
     found: Calibration = context.obj.calibrate(cohort)
+    if car is not None:
+        found.car(car)  # that there is such a car
+    changed = [one for one in found.changed(day) if car in (None, one.car)] if day else []
     if json:
         shown = found.as_dict()
+        if day:
+            shown["changed"] = [vars(one) for one in changed]
         if car is not None:
-            found.car(car)  # that there is such a car
             shown["cars"] = {car: shown["cars"][car]}
         print_json(shown)
+    elif day:
+        _print_changed(changed, day)
     elif car is not None:
         _print_car(car, found.car(car))
         _say_of_roads(found.roads)
@@ -110,6 +126,27 @@ def _print_fleet(found: Calibration) -> None:
     )
     if not any(one.uncertainty for cars in found.cars.values() for one in cars.values()):
         say("no car has two drives: how sure the numbers are cannot be told")
+
+
+def _print_changed(changed: Sequence[ChangedNumber], since: date) -> None:
+    if not changed:
+        return say(f"no number of a car is another since {since}, as far as its drives tell")
+    print_table(
+        f"changed since {since}, by more than {SURE_ERRORS:g} standard errors",
+        ["car", "number", "unit", "before", "after", "+-"],
+        [
+            [
+                one.car,
+                one.number,
+                CAR_NUMBERS[one.number].unit,
+                f"{one.before:.5g}",
+                f"{one.after:.5g}",
+                f"{one.uncertainty:.2g}",
+            ]
+            for one in changed
+        ],
+        left=3,
+    )
 
 
 def _say_of_roads(roads: Roads) -> None:

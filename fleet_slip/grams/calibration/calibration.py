@@ -9,6 +9,7 @@ are.
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from datetime import date
 from typing import Any
 
 import pyarrow as pa
@@ -17,7 +18,12 @@ from fleet_slip.catalogue.car_numbers import CALIBRATION, CAR_NUMBERS, NumberNam
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.calibration.car_evidence import CalibratedNumber, CarEvidence, Convergence
+from fleet_slip.grams.calibration.car_evidence import (
+    CalibratedNumber,
+    CarEvidence,
+    ChangedNumber,
+    Convergence,
+)
 from fleet_slip.grams.calibration.road_lean import Roads
 from fleet_slip.grams.calibration.tell_numbers import KINDS
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
@@ -69,6 +75,10 @@ class Calibration:
     def roads(self) -> Roads:
         """What the roads of all cars have in common."""
         return self.evidence.roads
+
+    def changed(self, since: date) -> list[ChangedNumber]:
+        """Return the numbers of cars that are others from a day on."""
+        return self.evidence.changed(since)
 
     def convergence(self) -> tuple[Convergence, ...]:
         """Return how sure the numbers are after 1, 2, 5, 10 ... drives of a car."""

@@ -8,8 +8,9 @@ same roads again, so that there is a limit to what more of them tell.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date
 from fractions import Fraction
-from math import sqrt
+from math import hypot, sqrt
 from typing import Any
 
 import numpy as np
@@ -78,6 +79,23 @@ class Convergence:
     stated: float
     measured: float | None
 
+
+@dataclass(frozen=True)
+class ChangedNumber:
+    """A number of which a car's drives from a day on tell otherwise than those before.
+
+    `uncertainty` is the standard error of the difference; all in the number's unit.
+    """
+
+    car: str
+    number: NumberName
+    before: float
+    after: float
+    uncertainty: float
+
+
+SURE_ERRORS = 4.0
+"""Standard errors by which a number has changed: by chance in one of 16,000."""
 
 STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 """Numbers of drives that a convergence is shown for."""
@@ -171,18 +189,21 @@ class CarEvidence:
             for name, variance in own.items()
         }
 
+    def _level(self, telling: Telling) -> Fraction:
+        """Return a number as it is without the lean of the roads."""
+        return telling.value - (self.roads.lean or 0) * telling.by_lean
+
     def calibrated(self, car: str, drives: int | None = None) -> dict[NumberName, CalibratedNumber]:
         """Return the numbers of a car, by all of its drives or by the first so many."""
         slices = self._slices(car, 0, drives)
         told = self.told[car] if drives is None else self.tell(slices)
-        lean = self.roads.lean or Fraction(0)
         sure = self.uncertainties(told, slices)
         found: dict[NumberName, CalibratedNumber] = {}
         for name in CAR_NUMBERS:
             if name in told:
                 at = slices[told[name].kind]
                 rows = int(self.sums[told[name].kind].table.n[at].sum())
-                value = told[name].value - lean * told[name].by_lean
+                value = self._level(told[name])
                 count = CAR_NUMBERS[name].count(value)
                 if count is None:
                     continue
@@ -193,6 +214,25 @@ class CarEvidence:
                     drives=at.stop - at.start,
                     rows=rows,
                 )
+        return found
+
+    def changed(self, since: date) -> list[ChangedNumber]:
+        """Return the numbers that are others from a day on, surely; by car."""
+        found = []
+        for car in self.cars:
+            before, after = {}, {}
+            for kind, at in self._slices(car).items():
+                early = sum(day < since for _, day, _ in self.sums[kind].drives[at])
+                before[kind] = slice(at.start, at.start + early)
+                after[kind] = slice(at.start + early, at.stop)
+            was, now = self.tell(before), self.tell(after)
+            of_was, of_now = self.uncertainties(was, before), self.uncertainties(now, after)
+            for name in CAR_NUMBERS:
+                if name in of_was and name in of_now:
+                    error = _three_digits(hypot(of_was[name], of_now[name]))
+                    one, other = float(self._level(was[name])), float(self._level(now[name]))
+                    if abs(other - one) > SURE_ERRORS * error:
+                        found.append(ChangedNumber(car, name, one, other, error))
         return found
 
     def convergence(self) -> tuple[Convergence, ...]:

@@ -1,7 +1,7 @@
 """The numbers that a car's drives tell: found as they were made, exactly, in any order."""
 
 import random
-from datetime import date
+from datetime import date, timedelta
 from fractions import Fraction
 from typing import Any
 
@@ -187,6 +187,21 @@ def test_roads_that_lean_and_are_banked_are_taken_out() -> None:
     alone = evidence([row for row in rows if row["vehicle_id"] < "car-08"])
     assert not alone.roads.banked
     assert alone.roads.lean is None
+
+
+def test_a_number_that_changes_is_named_and_no_other() -> None:
+    rng = np.random.default_rng(12)
+    rows = []
+    for i in range(24):
+        for n in range(4):
+            repaired = i == 5 and n >= 2
+            row = gram_row(f"car-{i}", n, biased(rng, TRUE | {"ay_offset": 0.4 * repaired}))
+            rows.append(row | {"day": DAY + timedelta(days=n)})
+    found = evidence(rows)
+    changed = found.changed(DAY + timedelta(days=2))
+    assert [(one.car, one.number) for one in changed] == [("car-5", "ay_offset")]
+    assert changed[0].after - changed[0].before == pytest.approx(0.4, abs=0.06)
+    assert found.changed(DAY) == found.changed(DAY + timedelta(days=4)) == []
 
 
 def test_the_lean_of_roads_is_what_the_cars_do_not_explain() -> None:
