@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import pyarrow as pa
@@ -29,6 +30,11 @@ class Hashed:
     def of(cls, hashes: Hashes, *, once: bool = False) -> "Hashed":
         """Return hashes that are here."""
         return cls((lambda: hashes,), len(hashes) if once else None)
+
+    @cached_property
+    def number(self) -> int:
+        """How many there are."""
+        return len(_union([self])) if self.once is None else self.once
 
     def __add__(self, other: "Hashed") -> "Hashed":
         both = None if self.once is None or other.once is None else self.once + other.once
@@ -125,9 +131,7 @@ def _kinds_with(hashed: Mapping[str, Hashed], signals: Collection[str]) -> froze
 
 def _count(hashed: Mapping[str, Hashed], kinds: frozenset[str]) -> int:
     found = [hashed[names] for names in hashed if names in kinds]
-    if len(found) == 1 and found[0].once is not None:
-        return found[0].once
-    return len(_union(found))
+    return found[0].number if len(found) == 1 else len(_union(found))
 
 
 def _union(found: Sequence[Hashed]) -> Hashes:
