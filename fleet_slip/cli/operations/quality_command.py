@@ -42,7 +42,7 @@ def quality(
 def _print_quality(found: QualityReport) -> None:
     examined = (
         f"{number_of(found.drives, 'drive')} examined, {found.compared:,} of them beside their "
-        "peers"
+        f"peers{'' if found.compared else ' (too few of any car or vehicle model)'}"
     )
     if not found.findings:
         order = "all are in order" if found.drives else "none is long enough"
