@@ -1,5 +1,6 @@
 """The numbers that a car's drives tell: found as they were made, exactly, in any order."""
 
+import json
 import random
 from datetime import date, timedelta
 from fractions import Fraction
@@ -8,9 +9,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from typer.testing import CliRunner
 
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
 from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.cli.app import app
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.calibration.car_evidence import CarEvidence
@@ -283,6 +286,10 @@ def test_a_warehouse_says_what_is_missing_and_forgets(warehouse: Warehouse) -> N
             one = found.car(car)[name]  # type: ignore[index]
             assert one.uncertainty is not None
             assert abs(one.value - value) < 5 * one.uncertainty
+    printed = CliRunner().invoke(app, ["--root", str(warehouse.root), "calibrate"])
+    assert "10 cars or more tell the one from the other" in printed.output
+    asked = ["--root", str(warehouse.root), "calibrate", "--since", str(DAY), "--json"]
+    assert json.loads(CliRunner().invoke(app, asked).stdout)["changed"] == []
     with pytest.raises(QuestionError, match="delta"):
         found.car("delta")
     with pytest.raises(DataError, match="no drive of"):
