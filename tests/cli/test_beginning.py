@@ -56,6 +56,7 @@ def test_a_project_has_what_it_needs(tmp_path: Path) -> None:
     readme = (tmp_path / "mine" / "README.md").read_text()
     assert done.stdout.strip() == readme.strip()
     assert len(readme.splitlines()) <= 12
+    assert all(len(line) <= 80 for line in readme.splitlines() if line.startswith("    fleet"))
     assert [p.name for p in tmp_path.iterdir()] == ["mine"]
 
 

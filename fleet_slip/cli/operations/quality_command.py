@@ -6,7 +6,7 @@ import typer
 
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.left_out import say_revoked
-from fleet_slip.cli.output import Json, print_json, print_table
+from fleet_slip.cli.output import Json, print_json, print_table, print_text
 from fleet_slip.errors import AlarmError
 from fleet_slip.monitoring.quality import QualityReport
 from fleet_slip.warehouse.minimum_cohort import tells_single_cars
@@ -46,7 +46,7 @@ def _print_quality(found: QualityReport) -> None:
     )
     if not found.findings:
         order = "all are in order" if found.drives else "none is long enough"
-        typer.echo(f"{examined}: {order}")
+        print_text(f"{examined}: {order}")
         return
     if not tells_single_cars():
         rows = [[kind, signals, f"{many:,}"] for (kind, signals), many in found.by_fault().items()]
