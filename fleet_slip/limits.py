@@ -58,6 +58,9 @@ def require_limits() -> None:
             f"Raise the limit: ulimit -d {data_needed() // 2**10}. To limit memory itself use a "
             "control group, such as systemd's MemoryMax=."
         )
+    if data != resource.RLIM_INFINITY:
+        # Else Arrow's allocator takes a GiB of it before anybody asks, and leaves none to others.
+        os.environ.setdefault("MIMALLOC_ARENA_EAGER_COMMIT", "0")
     files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if files != resource.RLIM_INFINITY and files < OPEN_FILES:
         raise StorageError(

@@ -53,7 +53,11 @@ def test_every_command_tells_it_before_it_imports_anything(
 
 
 @pytest.mark.parametrize(
-    "limit", [f"-v {ENOUGH_KIB}", f"-d {ENOUGH_DATA_KIB}", f"-n {limits.OPEN_FILES}"]
+    "limit",
+    [
+        *(f"-v {ENOUGH_KIB}", f"-d {ENOUGH_DATA_KIB}", f"-n {limits.OPEN_FILES}"),
+        f"-d {ENOUGH_DATA_KIB + 150_000}",  # what Arrow would take for itself, and too little more
+    ],
 )
 def test_what_is_said_to_be_enough_is_enough(tmp_path: Path, limit: str) -> None:
     done = run_limited(tmp_path / "data", limit)
