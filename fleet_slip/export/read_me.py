@@ -15,7 +15,7 @@ _FILES = {
     "_gram.c": "counts Gram rows in the car",
     ".h": "header: what is given, what is kept, `start` and `step`",
     ".c": "the estimator in C99, in whole numbers; also for C++",
-    ".a2l": "what a calibration tool measures, by symbols (ASAP2 1.71); which, it says",
+    ".a2l": "for calibration tools (ASAP2 1.71); its first lines say what to declare",
     "_macro.sql": "a table macro for DuckDB",
     ".sql": "a statement on the view `log`, in SI units",
     "_checks.csv": "inputs that are made up, and the angle at every tick",
