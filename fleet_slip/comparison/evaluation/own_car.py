@@ -183,7 +183,7 @@ def _filtered(
 ) -> dict[str, tuple[str, list[FloatArray]]]:
     """Estimate each part by filters that are tuned, in cars identified, on the others."""
     found: dict[str, tuple[str, list[FloatArray]]] = {}
-    drives = [replace(one, drive=_accelerated(one.drive, vehicle)) for one in drives]
+    drives = [replace(one, drive=accelerated(one.drive, vehicle)) for one in drives]
     for left in range(FOLDS):
         others = [one.without(left) for one in drives]
         others = [one for one in others if np.isfinite(one.sideslip_rad).any()]
@@ -259,7 +259,7 @@ WHEELS_LAG = 0.1
 """Of the change of wheel speeds in a step, what an acceleration made of them follows."""
 
 
-def _accelerated(drive: LabelledDrive, vehicle: VehicleParameters) -> LabelledDrive:
+def accelerated(drive: LabelledDrive, vehicle: VehicleParameters) -> LabelledDrive:
     """Return the drive with ax from its wheels where none is logged, as many a car has it."""
     signals = drive.signals
     if np.isfinite(signals.ax_mps2).any():

@@ -4,6 +4,7 @@ import json
 import math
 import random
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,15 @@ import fleet_slip
 from fleet_slip.arrays import FloatArray
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
 from fleet_slip.comparison.evaluation import own_car
-from fleet_slip.comparison.evaluation.own_car import fit_left_out
+from fleet_slip.comparison.evaluation.own_car import accelerated, fit_left_out
 from fleet_slip.comparison.evaluation.own_drives import Design, OwnDrive
 from fleet_slip.comparison.observers import ekf
 from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive
 from fleet_slip.comparison.observers.identification import Fitted, Identified
 from fleet_slip.comparison.observers.tuning import Tuned
+from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.commands import done_on, run_on
+from tests.support.drives import rolling_drive
 from tests.support.measured import csv_text
 
 ROWS = 400
@@ -67,6 +70,18 @@ def test_a_part_of_a_single_drive_is_estimated_by_the_others() -> None:
     (estimate,) = fit_left_out([drive], "line", LINE)
     assert np.abs((estimate - whole.drive.sideslip_rad)[part == 1]).max() < 1e-9
     assert np.isnan(drive.without(1).sideslip_rad).sum() == ROWS // 4
+
+
+def test_an_acceleration_that_is_not_logged_is_made_of_the_wheels() -> None:
+    car, still = load_vehicle("d_class_sedan"), np.zeros(ROWS)
+    speed = still + np.linspace(10.0, 18.0, ROWS)  # 2 m/s²
+    signals = rolling_drive(car, speed, still, still, still)
+    logged = LabelledDrive("logged", signals, still)
+    assert accelerated(logged, car) is logged
+    missing = replace(logged, signals=replace(signals, ax_mps2=np.full(ROWS, np.nan)))
+    assert accelerated(missing, car).signals.ax_mps2[100:] == pytest.approx(2.0, abs=0.01)
+    blind = replace(logged, signals=NO_SIGNALS)
+    assert accelerated(blind, car) is blind
 
 
 def own_log(folder: Path, cars: int) -> Path:
