@@ -132,7 +132,7 @@ def _token(version: ModelVersion) -> str:
 
 
 def _about(version: ModelVersion) -> str:
-    drives = version.manifest.trained_on.drives_sha256 or "unknown"
+    drives = version.manifest.trained_on.told_by or "unknown"
     return quoteattr(
         f"{version.reference}, SHA-256 {version.sha256}, trained on drives with SHA-256 {drives}"
     )

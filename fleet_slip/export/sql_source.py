@@ -46,7 +46,7 @@ def _comment(version: ModelVersion, program: Program) -> str:
     return (
         f"-- {version.reference}: {angle.column}, exported by fleet-slip. Do not edit.\n"
         f"-- SHA-256 of the version: {version.sha256}\n"
-        f"-- Trained on {trained.drives} drives, SHA-256 {trained.drives_sha256 or 'unknown'}\n"
+        f"-- Trained on {trained.drives} drives, SHA-256 {trained.told_by or 'unknown'}\n"
         f"-- angle: counts of {angle.scale:f} {angle.unit}, "
         f"within {float(angle.error):.12f} counts of the exact model"
     )

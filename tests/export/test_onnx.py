@@ -79,7 +79,13 @@ def test_the_files_say_what_they_are_of(smoke_root: Path) -> None:
     files = export_files(version, fleet.warehouse, "onnx")
     assert [*files] == [
         f"sideslip_smoke_{end}"
-        for end in ("float32.onnx", "float64.onnx", "checks.csv", "README.md", "manifest.json")
+        for end in (
+            "float32.onnx",
+            "float64.onnx",
+            "checks.csv",
+            "onnx_README.md",
+            "onnx_manifest.json",
+        )
     ]
     model = onnx.load_from_string(files["sideslip_smoke_float32.onnx"])
     said = {one.key: one.value for one in model.metadata_props}

@@ -34,7 +34,7 @@ def c_header(version: ModelVersion, program: Program) -> str:
         '#ifdef __cplusplus\nextern "C" {\n#endif\n',
         f'#define {upper}_MODEL "{version.reference}"\n'
         f'#define {upper}_SHA256 "{version.sha256}"\n'
-        f'#define {upper}_DRIVES_SHA256 "{version.manifest.trained_on.drives_sha256 or ""}"\n',
+        f'#define {upper}_DRIVES_SHA256 "{version.manifest.trained_on.told_by or ""}"\n',
         f"/* Axes: {AXES}. */\n" + "\n".join(_scales(upper, program)),
         "/* A count that is missing; one beyond its range is, too. */\n"
         f"#define {upper}_MISSING INT16_MIN\n",
@@ -185,7 +185,7 @@ def _preamble(version: ModelVersion, program: Program) -> str:
     return (
         f"/* {version.reference}: {angle.column}, exported by fleet-slip. Do not edit.\n"
         f" * SHA-256 of the version: {version.sha256}\n"
-        f" * Trained on {trained.drives} drives, SHA-256 {trained.drives_sha256 or 'unknown'}\n"
+        f" * Trained on {trained.drives} drives, SHA-256 {trained.told_by or 'unknown'}\n"
         " */"
     )
 
