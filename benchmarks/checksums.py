@@ -23,8 +23,8 @@ from fleet_slip.files import checksums
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.rows.aggregation import compute_grams
 from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.models.describe_winner import manifest_of
 from fleet_slip.models.estimates.score import score
-from fleet_slip.models.publish import manifest_of
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import load_campaign

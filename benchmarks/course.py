@@ -27,9 +27,9 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.grams.cohorts.folding import Folding, FoldKey
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
 from fleet_slip.grams.cohorts.taught_cohort import taught_by
+from fleet_slip.models.describe_winner import manifest_of, with_straight_intercept
 from fleet_slip.models.estimates.counts_model import counts_model
 from fleet_slip.models.estimates.score import score
-from fleet_slip.models.publish import manifest_of, with_straight_intercept
 from fleet_slip.models.straight_on import COLUMNS as OFFSETS
 from fleet_slip.regression.exact.figures import error_sums
 from fleet_slip.regression.exact.least_squares import fit

@@ -18,7 +18,8 @@ from typing import Any
 
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.models.publish import manifest_of, publish
+from fleet_slip.models.describe_winner import manifest_of
+from fleet_slip.models.publish import publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.control_chart import save_chart
 from fleet_slip.monitoring.monitor import Chart, monitor

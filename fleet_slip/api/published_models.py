@@ -115,7 +115,7 @@ class PublishedModels(Rooted):
         from fleet_slip.models.acceptance.first_look import require_sound_drives
         from fleet_slip.models.acceptance.in_time import require_in_time
         from fleet_slip.models.acceptance.sound_course import require_sound_course
-        from fleet_slip.models.publish import manifest_of, with_straight_intercept
+        from fleet_slip.models.describe_winner import manifest_of, with_straight_intercept
 
         require_model_name(name)
         selection = self._chosen(name, choice)

@@ -25,7 +25,8 @@ from fleet_slip.maintenance.marked_models import marked_models
 from fleet_slip.maintenance.repair import repair
 from fleet_slip.maintenance.vacuum import find_expired
 from fleet_slip.maintenance.verify import verify
-from fleet_slip.models.publish import manifest_of, publish
+from fleet_slip.models.describe_winner import manifest_of
+from fleet_slip.models.publish import publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.runs.log import recording
 from fleet_slip.selection.answer_request import answer_request

@@ -16,7 +16,8 @@ from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.marked_models import models_trained_on
 from fleet_slip.maintenance.vacuum import vacuum
-from fleet_slip.models.publish import manifest_of, publish
+from fleet_slip.models.describe_winner import manifest_of
+from fleet_slip.models.publish import publish
 from fleet_slip.warehouse.audit import Forgettable
 from tests.support.fleet_messages import messages_of
 from tests.support.messages import START_S

@@ -12,7 +12,8 @@ import pytest
 from fleet_slip.errors import RefusedError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.models.publish import Publication, manifest_of, publish
+from fleet_slip.models.describe_winner import manifest_of
+from fleet_slip.models.publish import Publication, publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.resources import find_config
 from fleet_slip.selection.answer_request import answer_request

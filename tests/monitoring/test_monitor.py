@@ -12,8 +12,9 @@ from scipy import stats
 
 from fleet_slip.errors import DataError
 from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.models.describe_winner import manifest_of
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.publish import manifest_of, publish
+from fleet_slip.models.publish import publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.monitor import Chart, Limits, monitor
 from fleet_slip.regression.exact.special import student_t_quantile

@@ -10,7 +10,7 @@ import pytest
 from fleet_slip import open as open_fleet
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.models.publish import manifest_of
+from fleet_slip.models.describe_winner import manifest_of
 from fleet_slip.selection import label_noise
 from fleet_slip.selection.label_noise import label_noise_deg
 from fleet_slip.views import connect

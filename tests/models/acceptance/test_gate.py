@@ -18,9 +18,10 @@ from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.marked_models import models_trained_on
 from fleet_slip.models.acceptance import gate
 from fleet_slip.models.aliases import CANDIDATE
+from fleet_slip.models.describe_winner import manifest_of
 from fleet_slip.models.diff import compare_versions
 from fleet_slip.models.estimates.counts_model import counts_model
-from fleet_slip.models.publish import Publication, manifest_of, publish, would_publish
+from fleet_slip.models.publish import Publication, publish, would_publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.choice.stepwise import stepwise_order
 from fleet_slip.regression.exact.least_squares import fit
