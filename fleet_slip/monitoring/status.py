@@ -71,6 +71,10 @@ class WarehouseStatus:
     champions: tuple[ChampionStatus, ...]
     problems: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        found = "; ".join(self.problems) or "nothing calls for attention"
+        return f"<{type(self).__name__}: {self.root}, newest day {self.newest_day}; {found}>"
+
 
 def status_of(
     warehouse: Warehouse, max_age_hours: float | None = None, now: datetime | None = None

@@ -220,8 +220,8 @@ def _take_back(fleet: Fleet, what: str, json: bool, *, alone: bool) -> None:
         print_json({"drives_taken_out": drives})
         return
     say(
-        f"{number_of(drives, 'drive')} taken out, with their Gram rows; they land again when their "
-        "files are given again"
+        f"{number_of(drives, 'drive')} taken out, Gram rows and all; to land again, their files "
+        "must be given again"
     )
 
 
