@@ -17,6 +17,7 @@ from fleet_slip.api.calls import (
 from fleet_slip.api.judged_models import JudgedModels
 from fleet_slip.api.requests import ForgetRequest
 from fleet_slip.catalogue.sources import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.dates import date_of
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.runs.log import step
 
@@ -100,17 +101,17 @@ class HealthAndUpkeep(JudgedModels):
         model: "str | ModelVersion | None" = None,
         cohort: str | None = None,
         *,
-        since: date | None = None,
+        since: date | str | None = None,
     ) -> "Chart":
         """Chart a model's error on each day since it was trained, with control limits, in degrees.
 
         `cohort` is by default that of its training, `since` the day after its data. `alarms` are
-        the new days beyond the limits. Raises `DataError` for too few training days, and as
-        `Fleet.model`.
+        the new days beyond the limits. Raises `DataError` for too few training days, `UsageError`
+        for another text than a date such as 2024-05-01, and as `Fleet.model`.
         """
         from fleet_slip.monitoring.monitor import monitor
 
-        return monitor(self.warehouse, self.resolve(model), cohort, since)
+        return monitor(self.warehouse, self.resolve(model), cohort, date_of(since, "since"))
 
     def verify(
         self, *, full: bool = False, workers: Workers = None, progress: ShowProgress | None = None

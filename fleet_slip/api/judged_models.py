@@ -176,6 +176,9 @@ class JudgedModels(PublishedModels):
             )
             from fleet_slip.comparison.watch.playing import write_film, write_page
 
+            if output.suffix == ".mp4":  # said at once: to estimate a drive takes seconds
+                import imageio_ffmpeg  # noqa: F401
+
         writers = {".html": write_page, ".mp4": write_film, ".gif": write_film}
         if output.suffix not in writers:
             raise UsageError(f"{output}: the suffix says the format: {', '.join(writers)}.")

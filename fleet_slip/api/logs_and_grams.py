@@ -15,6 +15,7 @@ from fleet_slip.api.calls import (
     unless_local,
     within_reach,
 )
+from fleet_slip.dates import last_day
 from fleet_slip.errors import InputError
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.log import step
@@ -43,7 +44,7 @@ class LogsAndGrams(Rooted):
         campaign: "str | Campaign",
         *,
         days: int | None = None,
-        through: date | None = None,
+        through: date | str | None = None,
         workers: Workers = None,
         progress: ShowProgress | None = None,
     ) -> "SimulationReport":
@@ -58,7 +59,7 @@ class LogsAndGrams(Rooted):
         from fleet_slip.simulation.job import simulate_campaign
 
         chosen = load_campaign(campaign) if isinstance(campaign, str) else campaign
-        wanted = chosen.chosen_days(days, through)
+        wanted = chosen.chosen_days(days, last_day(through, "through"))
         with open_workers(self.root, workers) as executor, step("simulate") as figures:
             report = simulate_campaign(
                 within_reach(self.warehouse, executor),

@@ -15,6 +15,7 @@ from fleet_slip.api.run_report import Training
 from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
+from fleet_slip.dates import date_of
 from fleet_slip.errors import (
     DataError,
     FleetSlipError,
@@ -79,7 +80,7 @@ class Night:
     def __post_init__(self) -> None:
         one = self.asked
         self.training = Training(one.name, one.cohort, one.models, one.worth, one.sign_key)
-        self.night = one.night or date.today()
+        self.night = date_of(one.night, "night") or date.today()
 
     def run(self) -> NightReport:
         """Do the night and record it."""

@@ -33,7 +33,7 @@ class RunRequest:
     _: KW_ONLY
     days: Annotated[int | None, Doc("Simulate the first N days only. Default: all.")] = None
     through: Annotated[
-        date | None, Doc("Last day to simulate, YYYY-MM-DD or today. Default: all days.")
+        date | str | None, Doc("Last day to simulate, YYYY-MM-DD or today. Default: all days.")
     ] = None
     name: Annotated[str | None, Doc("Name of the model. Default: the campaign's.")] = None
     models: Annotated[str, MODELS] = DEFAULT_MODELS
@@ -66,7 +66,9 @@ class NightRequest:
     retention: Annotated[
         str | None, Doc("A retention file. Default: retention.toml of the configs.")
     ] = None
-    night: Annotated[date | None, Doc("Date of the night, YYYY-MM-DD. Default: today.")] = None
+    night: Annotated[date | str | None, Doc("Date of the night, YYYY-MM-DD. Default: today.")] = (
+        None
+    )
     sign_key: Path | None = None
     workers: Workers = None
     progress: ShowStep | None = None

@@ -11,7 +11,7 @@ import typer
 
 from fleet_slip.api.calls import documented, type_of
 from fleet_slip.cli.completing import complete_config, complete_feature_set, complete_model
-from fleet_slip.cli.dates import date_of, last_day
+from fleet_slip.dates import date_of, last_day
 from fleet_slip.errors import UsageError
 from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.regression.inference.drive_moments import ClusterUnit

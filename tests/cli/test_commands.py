@@ -256,6 +256,8 @@ def test_commands_on_an_empty_warehouse_say_how_to_begin(
     assert run_command("sql", "FROM drives", "--json").json == []
     assert run_command("models", "--json").json == []
     assert run_command("gram", "--json").json["files_read"] == 0
+    done = run_command("gram")
+    assert (done.exit_code, "there are no logs yet" in done.stderr) == (0, True)
 
 
 def test_a_changed_campaign_is_refused_and_changes_nothing(

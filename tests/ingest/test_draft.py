@@ -174,6 +174,18 @@ def test_names_from_strangers_stay_names(tmp_path: Path) -> None:
     assert suggest(tmp_path, tmp_path / "log.parquet")["signals"]["ay"]["column"] == odd
 
 
+def test_a_long_comment_is_wrapped_and_a_key_in_a_comment_is_not(tmp_path: Path) -> None:
+    names = {name: f"{name} of the second measuring box in the boot of the car" for name in a_car()}
+    as_logged(a_car(), names, {}).with_columns(t=pl.Series(np.arange(6000) / 100)).write_parquet(
+        tmp_path / "log.parquet"
+    )
+    suggest(tmp_path, tmp_path / "log.parquet")
+    lines = (tmp_path / "draft.toml").read_text().splitlines()
+    comments = [line for line in lines if line.startswith("#") and " = " not in line]
+    assert max(map(len, comments)) <= 100
+    assert any(line.startswith("#   ") for line in comments)
+
+
 def test_what_cannot_be_drafted_says_so(tmp_path: Path) -> None:
     file = tmp_path / "log.csv"
     file.write_text("t,price\n0,1\n1,2\n")

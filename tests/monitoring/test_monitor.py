@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from fleet_slip.errors import DataError
+import fleet_slip
+from fleet_slip.errors import DataError, UsageError
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.describe_winner import manifest_of
 from fleet_slip.models.model_version import ModelVersion
@@ -114,6 +115,10 @@ def test_days_to_learn_from_may_be_chosen_and_must_be_enough(
     assert [day.training for day in chart.days] == [True] * 5 + [False]
     with pytest.raises(DataError, match="trained on 2 days"):
         monitor(warehouse, version, since=DAY + timedelta(days=2))
+    fleet = fleet_slip.open(warehouse.root)
+    assert fleet.monitor("m", since=str(DAY + timedelta(days=5))) == chart
+    with pytest.raises(UsageError, match="since tomorrow: not a date; write it as 2024-05-01"):
+        fleet.monitor("m", since="tomorrow")
 
 
 def test_limits_are_the_prediction_interval_of_one_more_day() -> None:

@@ -70,7 +70,7 @@ def _print_diagnosis(result: Diagnosis) -> None:
     print_table(
         f"{number_of(result.drives, 'drive')}, {number_of(result.fitted.gram.n, 'row')}, worth "
         f"{result.evidence.rows:,.0f} independent ones; R squared {result.fitted.r_squared:.4f}, "
-        f"condition {result.condition_number:.3g}",
+        f"condition number {result.condition_number:.3g} (1: no signal tells what another tells)",
         list(coefficients[0]),
         [list(row.values()) for row in coefficients],
         left=2,

@@ -33,6 +33,7 @@ def explore(
     with needed("explore", "the notebook"):
         import altair  # noqa: F401, PLC0415 - an extra
         import marimo  # noqa: F401, PLC0415
+        import numba  # noqa: F401, PLC0415
     context.obj.warehouse.require()
     words = ["edit" if edit else "run", str(folder("jobs") / "explore.py")]
     words += [*(["--port", str(port)] if port else []), *(["--headless"] if headless else [])]

@@ -71,6 +71,8 @@ def gram(
         return
     for report in reports:
         _say_gram(report)
+    if not (any(one.gram_rows for one in reports) or fleet.warehouse.logs.snapshot().files):
+        say(f"{fleet.root}: there are no logs yet. They come with: fleet-slip run, or ingest")
 
 
 def _run_gram(

@@ -11,12 +11,12 @@ from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.requests import RunRequest
 from fleet_slip.cli.completing import complete_config
-from fleet_slip.cli.dates import last_day
 from fleet_slip.cli.options import option
 from fleet_slip.cli.output import Json, print_json, print_table, print_text, say
 from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.recorded import record_run
 from fleet_slip.cli.workers import Cluster, Threads
+from fleet_slip.dates import last_day
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.runs.log import recording
 from fleet_slip.words import number_of

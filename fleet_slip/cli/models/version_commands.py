@@ -180,6 +180,7 @@ def _print_version(version: ModelVersion, everything: bool) -> None:
     print_table("", header[:shown], [row[:shown] for row in terms], left=2)
     if not everything:
         return
+    print_text("per count: coefficient times scale, for an ECU that works on raw counts")
     if manifest.features:
         print_table(
             "\nfeatures: SQL over the counts of log_counts, clipped to +-32767, times the scale",

@@ -9,9 +9,9 @@ import typer
 
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName
 from fleet_slip.catalogue.sources import ALL_DRIVES
-from fleet_slip.cli.dates import date_of
 from fleet_slip.cli.options import Cohort
 from fleet_slip.cli.output import Json, cell, print_json, print_table, say
+from fleet_slip.dates import date_of
 from fleet_slip.grams.calibration.calibration import Calibration
 from fleet_slip.grams.calibration.car_evidence import SURE_ERRORS, CalibratedNumber, ChangedNumber
 from fleet_slip.grams.calibration.road_lean import FEWEST_CARS, Roads
@@ -110,6 +110,8 @@ def _print_fleet(found: Calibration) -> None:
         ],
         left=2,
     )
+    if not any(one.uncertainty for cars in found.cars.values() for one in cars.values()):
+        return say("no car has two drives: how sure the numbers are cannot be told")
     print_table(
         "\nhow sure after so many drives of a car; measured: by the next so many drives",
         ["number", "drives", "cars", "known to +-", "measured"],
@@ -124,8 +126,6 @@ def _print_fleet(found: Calibration) -> None:
             for row in found.convergence()
         ],
     )
-    if not any(one.uncertainty for cars in found.cars.values() for one in cars.values()):
-        say("no car has two drives: how sure the numbers are cannot be told")
 
 
 def _print_changed(changed: Sequence[ChangedNumber], since: date) -> None:

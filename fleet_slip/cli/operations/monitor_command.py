@@ -5,10 +5,10 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.dates import date_of
 from fleet_slip.cli.left_out import say_revoked, say_untold, say_without_log
 from fleet_slip.cli.model_argument import OnlyModel
 from fleet_slip.cli.output import Json, print_json, print_table
+from fleet_slip.dates import date_of
 from fleet_slip.errors import AlarmError
 from fleet_slip.extras import needed
 from fleet_slip.monitoring.monitor import Chart

@@ -42,7 +42,7 @@ def quality(
 def _print_quality(found: QualityReport) -> None:
     examined = (
         f"{number_of(found.drives, 'drive')} examined, {found.compared:,} of them beside their "
-        f"peers{'' if found.compared else ' (too few of any car or vehicle model)'}"
+        f"peers ({'other' if found.compared else 'too few'} drives of a car or vehicle model)"
     )
     if not found.findings:
         order = "all are in order" if found.drives else "none is long enough"

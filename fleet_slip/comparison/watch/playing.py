@@ -14,7 +14,6 @@ from matplotlib.patches import Polygon
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.watch.drive_frames import FRAMES_PER_S, WHEELS, DriveFrames
-from fleet_slip.extras import needed
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.pages.drawing import STYLE, colour
@@ -29,14 +28,14 @@ ARROWS = (("truth", 9.0), ("model_4", 8.0))
 
 
 def write_film(frames: DriveFrames, file: Path) -> None:
-    """Write the film of a drive; the suffix says how. Raises `ExtraError` and `StorageError`."""
+    """Write the film of a drive; the suffix says how. Raises `StorageError`."""
     every = GIF_EVERY if file.suffix == ".gif" else 1
     rate = FRAMES_PER_S / every
     if file.suffix == ".gif":
         writer: Any = PillowWriter(fps=round(rate))
     else:
-        with needed("watch", "an MP4"):
-            from imageio_ffmpeg import get_ffmpeg_exe  # noqa: PLC0415 - an extra
+        from imageio_ffmpeg import get_ffmpeg_exe  # noqa: PLC0415 - an extra
+
         mpl.rcParams["animation.ffmpeg_path"] = str(get_ffmpeg_exe())
         writer = FFMpegWriter(fps=round(rate), codec="libx264", extra_args=["-pix_fmt", "yuv420p"])
     with mpl.rc_context(STYLE), storage_errors(file):

@@ -17,6 +17,7 @@ import pyarrow as pa
 from fleet_slip.catalogue.car_numbers import CALIBRATION, CAR_NUMBERS, NumberName
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.catalogue.sources import ALL_DRIVES
+from fleet_slip.dates import date_of
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.car_evidence import (
     CalibratedNumber,
@@ -76,9 +77,9 @@ class Calibration:
         """What the roads of all cars have in common."""
         return self.evidence.roads
 
-    def changed(self, since: date) -> list[ChangedNumber]:
+    def changed(self, since: date | str) -> list[ChangedNumber]:
         """Return the numbers of cars that are others from a day on."""
-        return self.evidence.changed(since)
+        return self.evidence.changed(date_of(since, "since"))
 
     def convergence(self) -> tuple[Convergence, ...]:
         """Return how sure the numbers are after 1, 2, 5, 10 ... drives of a car."""

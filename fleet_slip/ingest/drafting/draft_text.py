@@ -1,6 +1,8 @@
 """Writes a draft of a mapping as TOML, each guess with its reasons as a comment."""
 
 import json
+import re
+import textwrap
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -14,6 +16,9 @@ from fleet_slip.ingest.mapping.signal_column import COURSE, SPEED
 from fleet_slip.ingest.mapping.time_base import TimeBase
 from fleet_slip.words import shown
 
+WIDTH = 100
+"""Of a comment."""
+_COMMENTED_KEY = re.compile(r"# [a-z_0-9]+ = ")
 _HEAD = """\
 # A draft for {file}. Every line is a guess: check it, with
 # fleet-slip ingest {file} --mapping THIS_FILE --dry-run
@@ -38,7 +43,16 @@ def write_draft(draft: Draft, name: str) -> str:
     parts.append(_signals(draft))
     if draft.open_questions:
         parts.append("".join(f"# Look at this: {text}\n" for text in draft.open_questions))
-    return "\n".join(parts)
+    return "\n".join(_wrapped(line) for line in "\n".join(parts).split("\n"))
+
+
+def _wrapped(line: str) -> str:
+    """Return a line; a long comment as several lines, unless it is a key to be uncommented."""
+    if len(line) <= WIDTH or not line.startswith("# ") or _COMMENTED_KEY.match(line):
+        return line
+    return textwrap.fill(
+        line, WIDTH, subsequent_indent="#   ", break_long_words=False, break_on_hyphens=False
+    )
 
 
 def _csv_keys(csv: CsvFormat) -> dict[str, Any]:

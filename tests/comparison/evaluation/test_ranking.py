@@ -106,6 +106,7 @@ def test_the_table_keeps_its_numbers_whole(
     ranking: Ranking = rank([run(ours=0.3, ekf_class_tuned=0.2)], "ours", gps=())
     print_ranking(ranking.as_dict())
     printed = Text.from_ansi(capsys.readouterr().out).plain
+    assert "ours/3 is model 3 of Table I" in " ".join(printed.split())
     table = printed[printed.index("scenario") :]
     assert max(map(len, table.splitlines())) <= columns
     for figure in ("ekf_class_tuned", "0.300", "0.200", "1.50"):

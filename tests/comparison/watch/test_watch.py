@@ -109,6 +109,8 @@ def test_an_mp4_needs_an_extra_that_is_named(
     fleet = fleet_slip.open(root_to_fail_in)
     with pytest.raises(ExtraError, match=r"fleet-slip\[watch\]"):
         fleet.watch(DRIVE, "smoke", tmp_path / "film.mp4", from_s=5.0, until_s=5.1)
+    with pytest.raises(ExtraError):  # before a drive is looked for, which may take long
+        fleet.watch("nobody's", "smoke", tmp_path / "film.mp4")
     assert list(tmp_path.iterdir()) == []
 
 
