@@ -63,8 +63,8 @@ def _(across, alt, mo, training, up):
         alt.Chart(training)
         .mark_circle(size=70, opacity=0.6)
         .encode(
-            x=alt.X(across.value, scale=alt.Scale(zero=False)),
-            y=alt.Y(up.value, scale=alt.Scale(zero=False)),
+            x=alt.X(across.value, scale=alt.Scale(zero=False, padding=12)),
+            y=alt.Y(up.value, scale=alt.Scale(zero=False, padding=12)),
             color="vehicle_model",
             tooltip=["drive_id", "vehicle_id", across.value, up.value],
         )

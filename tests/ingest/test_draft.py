@@ -174,6 +174,14 @@ def test_names_from_strangers_stay_names(tmp_path: Path) -> None:
     assert suggest(tmp_path, tmp_path / "log.parquet")["signals"]["ay"]["column"] == odd
 
 
+@pytest.mark.parametrize("stem", ["2024-05-30_car", "Fahrt über Köln", "_", "x" * 90])
+def test_a_draft_loads_whatever_the_file_is_called(tmp_path: Path, stem: str) -> None:
+    names = {name: name for name in a_car()}
+    rows = as_logged(a_car(), names, {}).with_columns(t=pl.Series(np.arange(6000) / 100))
+    rows.write_parquet(tmp_path / f"{stem}.parquet")
+    suggest(tmp_path, tmp_path / f"{stem}.parquet")
+
+
 def test_a_long_comment_is_wrapped_and_a_key_in_a_comment_is_not(tmp_path: Path) -> None:
     names = {name: f"{name} of the second measuring box in the boot of the car" for name in a_car()}
     as_logged(a_car(), names, {}).with_columns(t=pl.Series(np.arange(6000) / 100)).write_parquet(

@@ -42,7 +42,7 @@ def mapping(
     Example: **fleet-slip mapping suggest drive.mf4**
     """
     from fleet_slip.ingest.drafting.draft import draft_mapping  # noqa: PLC0415
-    from fleet_slip.ingest.drafting.draft_text import write_draft  # noqa: PLC0415
+    from fleet_slip.ingest.drafting.draft_text import name_of, write_draft  # noqa: PLC0415
     from fleet_slip.ingest.drafting.profile import profile_file  # noqa: PLC0415
     from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database  # noqa: PLC0415 - takes a while
     from fleet_slip.ingest.formats.duckdb_table import DuckdbRows  # noqa: PLC0415
@@ -58,7 +58,7 @@ def mapping(
         raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
     with local_copy(logs[0]) as copy:
         draft = draft_mapping(copy, profile_file(copy, formats))
-        text = write_draft(draft, "".join(c if c.isalnum() else "_" for c in copy.stem.lower()))
+        text = write_draft(draft, name_of(copy.stem))
     if json:
         print_json({"channels": _channels(draft), "mapping": text})
     else:

@@ -26,6 +26,12 @@ _HEAD = """\
 """
 
 
+def name_of(stem: str) -> str:
+    """Return the name of a mapping for a file, whatever that is called, such as 2024-05-30."""
+    plain = re.sub("[^a-z0-9]", "_", stem.lower())
+    return (plain if plain[:1].isalpha() else f"log_{plain}")[:41]
+
+
 def write_draft(draft: Draft, name: str) -> str:
     """Return a mapping in TOML. It lacks what the file does not tell: the day, the car."""
     parts = [_HEAD.format(file=shown(draft.file.name)), f"name = {_value(name)}\n"]
