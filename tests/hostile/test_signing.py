@@ -157,6 +157,7 @@ def test_the_command_line_makes_keys_signs_and_refuses(
 ) -> None:
     made = run_command("keygen", "mine")
     assert made.exit_code == 0
+    assert "\\n" not in made.stderr
     assert (tmp_path / "mine").read_text().splitlines()[1] not in made.stderr
     publish(Registry(LocalFolder(tmp_path / "data" / "models")), manifest())
     asking = {**os.environ, VERIFY_VARIABLE: "mine.pub"}

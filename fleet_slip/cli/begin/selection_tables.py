@@ -43,6 +43,7 @@ ERROR = ("correlation", "RMSE deg", "error mean deg", "error std deg")
 
 BEST = 10
 """So many models are shown unless all are asked for."""
+CONDITION_WIDTH = 120
 
 
 def print_selection(selection: Selection[Any], everything: bool = False) -> None:
@@ -94,6 +95,12 @@ def _print_winner(selection: Selection[Any]) -> None:
         print_text(f"its columns: {in_families(winner.model.signals)}")
 
 
+def _shortened(condition: str, everything: bool) -> str:
+    """Return a condition; of a long one, such as one that names drives left out, its beginning."""
+    long = not everything and len(condition) > CONDITION_WIDTH
+    return f"{condition[:CONDITION_WIDTH].rstrip()} … (--all)" if long else condition
+
+
 def _print_models(selection: Selection[Any], everything: bool) -> None:
     """Print a table of the models, of many the best; without signals where a table above has them.
 
@@ -113,7 +120,7 @@ def _print_models(selection: Selection[Any], everything: bool) -> None:
     print_table(
         f"{number_of(selection.cohort.drive_count, 'drive')}, "
         f"{number_of(selection.cohort.rows, 'row')}"
-        + ("" if where.text == TRAINING_DRIVES else f" where {where}")
+        + ("" if where.text == TRAINING_DRIVES else f" where {_shortened(where.text, everything)}")
         + f"; {number_of(len(models[0].folds), 'fold')} by {selection.folds.by}"
         + ("" if selection.intercept else "; no intercept")
         + ("" if len(shown) == len(models) else f"; the {BEST} best of {len(models)} (--all)"),

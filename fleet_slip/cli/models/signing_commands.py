@@ -34,8 +34,8 @@ def keygen(
     Example: **fleet-slip keygen release**
     """
     public = make_keys(file)
-    say(f"{file}: the private key. To sign:\n  export {SIGNING_VARIABLE}={file}")
-    say(f"{public}: the public key. To demand signatures:\n  export {VERIFY_VARIABLE}={public}")
+    say(f"{file}: the private key. To sign: export {SIGNING_VARIABLE}={file}")
+    say(f"{public}: the public key. To demand signatures: export {VERIFY_VARIABLE}={public}")
 
 
 def sign(

@@ -184,8 +184,6 @@ def calibrate(
     with open_grams(source, CALIBRATION, condition) as opened:
         found = calibration_of(opened, condition)
     if not found.cars:
-        raise DataError(
-            f"no drive of {condition.text!r} has yaw rate, ay and wheel speeds. Choose another "
-            "cohort."
-        )
+        of = "" if condition.text == ALL_DRIVES else f" of {condition.text!r}"
+        raise DataError(f"no drive{of} has yaw rate, ay and wheel speeds. Choose another cohort.")
     return found
