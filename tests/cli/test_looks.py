@@ -91,7 +91,7 @@ model  signals          drives  RMSE deg
 ours                              0.0302
 """
     )
-    assert table(34, monkeypatch, capsys).splitlines()[1] == "model signals        drives     deg"
+    assert table(34, monkeypatch, capsys).splitlines()[1] == "model signals        drives    deg"
     assert table(30, monkeypatch, capsys).splitlines()[:6] == [
         "model     2",
         "signals   ax ay yaw_rate",
