@@ -15,6 +15,7 @@ from typing import Any
 from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.folder import TEMPORARY_PREFIX, Folder
 from fleet_slip.limits import OPEN_FILES, memory_bytes
+from fleet_slip.words import number_of
 
 MEMORY_BYTES = 2**30
 """The largest command that was measured, `verify` of files of a million rows, takes 828 MiB."""
@@ -150,7 +151,9 @@ def _cluster(count_workers: Callable[[], int]) -> Examined:
     except FleetSlipError as error:
         return Examined("cluster", "not usable", str(error))
     none = "start workers: docs/cluster.md"
-    return Examined("cluster", f"{workers} workers, of this version", "" if workers else none)
+    return Examined(
+        "cluster", f"{number_of(workers, 'worker')}, of this version", "" if workers else none
+    )
 
 
 def _extras() -> Iterator[Examined]:
