@@ -12,7 +12,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from benchmarks.bench_record import (
+from benchmarks.usage import measured
+from tests.support.bench_record import (
     Record,
     add_record,
     commit,
@@ -21,7 +22,6 @@ from benchmarks.bench_record import (
     slower_than,
     yardstick,
 )
-from benchmarks.usage import measured
 
 COMMANDS = (
     "start",

@@ -1,6 +1,6 @@
 """What learners reach with ten times the rows, on the test drives and against the exact angle.
 
-    python -m benchmarks.learners DATA_ROOT MODEL [--rows 600000] [--learners mlp,trees]
+    python -m benchmarks.learners DATA_ROOT MODEL [--rows 600000] [--learners mlp,trees] [--drives …]
 
 They see the signals and the columns of the published model, as in `evaluate --rivals`, and are
 fitted once. It prints the root mean square error in degrees by drive.
@@ -34,6 +34,7 @@ def main() -> None:
     parser.add_argument("model")
     parser.add_argument("--rows", type=int, default=600_000)
     parser.add_argument("--learners", default="mlp,trees")
+    parser.add_argument("--drives", default=",".join(DRIVES))
     asked = parser.parse_args()
     fleet = fleet_slip.open(asked.root)
     manifest = fleet.model(asked.model).manifest
@@ -41,7 +42,7 @@ def main() -> None:
     cohort = load_cohort(fleet.warehouse, manifest.trained_on.cohort)
     sample = draw_sample(fleet.warehouse, cohort, inputs, asked.rows)
     values = sample.of(inputs.names)
-    drives = load_drives(fleet.warehouse, [load_scenario(name) for name in DRIVES])
+    drives = load_drives(fleet.warehouse, [load_scenario(name) for name in asked.drives.split(",")])
     print(f"{len(values):,} rows, {len(inputs.names)} columns", flush=True)
     for learner in OF_WINDOWS:
         if learner.name not in asked.learners.split(","):

@@ -78,7 +78,7 @@ main()
 """
 
 
-@pytest.mark.parametrize("module", ["typer", "rich.console", "fleet_slip.cli.app", "numpy"])
+@pytest.mark.parametrize("module", ["typer", "pyarrow", "fleet_slip.cli.app", "numpy"])
 def test_an_interrupt_while_modules_are_imported_is_one_line(module: str, tmp_path: Path) -> None:
     program = INTERRUPTED_AT_IMPORT.replace("MODULE", repr(module))
     done = run([sys.executable, "-c", program, "--root", str(tmp_path / "data"), "status"])

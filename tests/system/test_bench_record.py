@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from benchmarks.bench_record import Record, add_record, read_records, slower_than
+from tests.support.bench_record import Record, add_record, read_records, slower_than
 
 
 def test_what_takes_longer_in_yardsticks_is_named(tmp_path: Path) -> None:

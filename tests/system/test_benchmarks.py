@@ -20,6 +20,7 @@ DEADLINE_S = 1800
 
 TINY = {
     "billion": "--root {folder} --rows 3e4",
+    "bound": "{root}",
     "calibration": "--campaign fleet --cars 2",
     "checksums": "--campaign smoke --repeat 1",
     "cluster": "--days 1 --workers 1",
@@ -43,6 +44,7 @@ TINY = {
     "ingest_folder": "--files 3 --rows 100",
     "interleave": "--schedules 2 --first gram --second simulate",
     "label_delay": "{root} --drives 1",
+    "learners": "{root} smoke --rows 2000 --learners trees --drives nominal",
     "mutants": "--show --each 1 --folder delta",
     "nights": "{root} --nights 2 --output {folder}",
     "observers": "--rows 500 --drives 2",
@@ -96,6 +98,7 @@ def tiny_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
         done_on(root, "simulate", "waterford_course", "--days", "1")
         for feature_set in ("signals", "delay", "calibration", "fleet", "windows", "course"):
             done_on(root, "gram", "--features", feature_set)
+        done_on(root, "evaluate", "smoke", "--scenario", "nominal")
 
     return made_once(tmp_path_factory, "benchmarks", make)
 
