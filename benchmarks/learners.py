@@ -1,6 +1,6 @@
 """What learners reach with ten times the rows, on the test drives and against the exact angle.
 
-    python -m benchmarks.learners DATA_ROOT MODEL [--rows 600000] [--learners mlp,trees] [--drives …]
+    python -m benchmarks.learners ROOT MODEL [--rows 600000] [--learners mlp,trees] [--drives A,B]
 
 They see the signals and the columns of the published model, as in `evaluate --rivals`, and are
 fitted once. It prints the root mean square error in degrees by drive.

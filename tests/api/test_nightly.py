@@ -175,6 +175,7 @@ class Killed(BaseException):
     """The end of a process, as far as it can be told from within."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", ["_retain", "_publish", "_candidate"])
 def test_a_night_that_is_killed_and_given_again_ends_at_the_same_place(
     place: Path, landing: Landing, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, step: str
@@ -195,6 +196,7 @@ def test_a_night_that_is_killed_and_given_again_ends_at_the_same_place(
     assert not fleet_slip.open(place / "data").verify().damage
 
 
+@pytest.mark.long
 def test_a_process_that_is_killed_leaves_a_night_that_can_be_given_again(
     place: Path, landing: Landing
 ) -> None:

@@ -11,7 +11,6 @@ from tests.support.commands import run_on
 CAR = ("--mass", "1480", "--front-axle", "1.11", "--rear-axle", "1.67", "--radius", "0.325")
 
 
-@pytest.mark.slow
 def test_a_car_is_identified_and_its_file_is_a_vehicle(smoke_root: Path, tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
     some = ("--cohort", "drive_id < 'smoke-2024-05-01-0003'")

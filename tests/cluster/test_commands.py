@@ -22,6 +22,8 @@ from tests.support.measured import csv_text, good_columns
 from tests.support.orders import Order, obey
 from tests.support.waiting import until
 
+pytestmark = pytest.mark.long
+
 UNTIL_ALL_HAD_ONE = 1000
 """So many tasks that every worker gets one, however late it comes and busy the machine is."""
 
@@ -56,7 +58,6 @@ def orders(folder: Path, number: int, seconds: float) -> Iterator[Order]:
     return (Order(f"task-{i}", folder, seconds) for i in range(number))
 
 
-@pytest.mark.slow
 def test_every_command_gives_the_same_bits_as_on_one_machine(
     dask: DaskProcesses, run_command: RunCommand, tmp_path: Path
 ) -> None:
@@ -93,7 +94,6 @@ def test_every_command_gives_the_same_bits_as_on_one_machine(
     assert damaged.name in found.stdout + found.stderr
 
 
-@pytest.mark.long
 def test_a_killed_command_is_finished_by_the_next(
     dask: DaskProcesses, run_command: RunCommand, tmp_path: Path
 ) -> None:
@@ -113,7 +113,6 @@ def test_a_killed_command_is_finished_by_the_next(
     assert run_command(*rows, root=there).json == run_command(*rows, root=local).json
 
 
-@pytest.mark.slow
 def test_a_worker_of_other_versions_is_refused_early_and_late(
     dask: DaskProcesses, tmp_path: Path
 ) -> None:
@@ -133,7 +132,6 @@ def test_a_worker_of_other_versions_is_refused_early_and_late(
             dask.kill(worker)
 
 
-@pytest.mark.slow
 def test_a_worker_that_does_not_see_the_data_root_writes_nothing(
     dask: DaskProcesses, tmp_path: Path
 ) -> None:
@@ -151,7 +149,6 @@ def test_a_worker_that_does_not_see_the_data_root_writes_nothing(
     assert run_orders(dask, tmp_path, 4, 0) == 4
 
 
-@pytest.mark.slow
 def test_a_scheduler_that_tells_other_news_at_once_is_asked_again(
     dask: DaskProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

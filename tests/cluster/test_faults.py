@@ -18,7 +18,7 @@ from tests.support.dask_processes import DaskProcesses, dask_processes
 from tests.support.orders import Order, obey
 from tests.support.waiting import until
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 
 @pytest.fixture

@@ -22,6 +22,8 @@ from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows, path_of, random_counts
 
+pytestmark = pytest.mark.long
+
 FLIPS = 30
 
 Answer = Callable[[Warehouse], Any]

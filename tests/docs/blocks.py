@@ -4,8 +4,7 @@
   `…` stands for any text, and a command without such lines may print anything.
 - `bash`, `python` and `sql` run as they are.
 - A block with a title, such as ```` ```toml title="mapping.toml" ````, becomes a file of that name.
-- A block below `<!-- not run: reason -->` is not run; one below `<!-- long: reason -->` is run by
-  `make test-all`.
+- A block below `<!-- not run: reason -->` is not run.
 - Blocks in the languages of `SHOWN` are for reading.
 """
 
@@ -31,7 +30,7 @@ RUN = frozenset({"console", "bash", "python", "sql"})
 SHOWN = frozenset({"text", "json", "toml", "yaml", "csv", "diff"})
 _FENCES = RawFencedCodeBlockLexer(re.compile(r"(?P<language>\S*)(?P<options>[^\n]*)$\n", re.M))
 _TITLE = re.compile(r'\s*title="(?P<title>[\w.-]+)"\s*')
-_MARK = re.compile(r"<!-- (not run|long): \S.* -->\n\Z")
+_MARK = re.compile(r"<!-- (not run): \S.* -->\n\Z")
 _run_python = PythonEvaluator()
 
 
@@ -88,15 +87,15 @@ def _block(example: Example) -> Block:
     )
 
 
-def run(block: Block, known: dict[str, str], *, long: bool = False) -> None:
-    """Run a block in the working directory, a long one if it is asked for.
+def run(block: Block, known: dict[str, str]) -> None:
+    """Run a block in the working directory.
 
     `known` are the outputs of commands that were run before the page was opened.
     """
     assert block.fault is None, block.fault
     if block.title:
         Path(block.title).write_text(block.source, encoding="utf-8")
-    elif block.language in SHOWN or (block.mark and not (long and block.mark == "long")):
+    elif block.language in SHOWN or block.mark:
         return
     elif block.language == "python":
         block.example.evaluate()

@@ -10,6 +10,8 @@ import pytest
 from tests.docs.blocks import blocks, matches, printed_by, run
 from tests.support.once import made_once
 
+pytestmark = pytest.mark.long
+
 HERE = Path(__file__).resolve().parents[2]
 PAGES = [HERE / "README.md", HERE / "CONTRIBUTING.md", *sorted((HERE / "docs").rglob("*.md"))]
 CODE = {str(page.relative_to(HERE)): found for page in PAGES if (found := blocks(page))}
@@ -42,25 +44,11 @@ def as_typed(patch: pytest.MonkeyPatch, folder: Path) -> None:
 def test_the_code_of_a_page_runs(
     page: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run_page(page, made, tmp_path, monkeypatch, long=False)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "page", [page for page, found in CODE.items() if any(one.mark == "long" for one in found)]
-)
-def test_all_code_of_a_page_runs(
-    page: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run_page(page, made, tmp_path, monkeypatch, long=True)
-
-
-def run_page(page: str, made: Path, folder: Path, patch: pytest.MonkeyPatch, *, long: bool) -> None:
     # Nothing changes a file of a table in place, so that 30 MB need not be copied for each page.
-    shutil.copytree(made / "data", folder / "data", copy_function=link_tables)
-    as_typed(patch, folder)
+    shutil.copytree(made / "data", tmp_path / "data", copy_function=link_tables)
+    as_typed(monkeypatch, tmp_path)
     for block in CODE[page]:
-        run(block, {"make run": (made / "printed").read_text(encoding="utf-8")}, long=long)
+        run(block, {"make run": (made / "printed").read_text(encoding="utf-8")})
 
 
 def link_tables(file: str, copy: str) -> None:
@@ -97,19 +85,14 @@ def test_what_fails_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     page.write_text(
         "```console\n$ exit 3\n```\n\n```console\n$ echo 1\n2\n```\n\n"
         "```console\n$ fleet-slip show nothing\n```\n\n```python\nassert False\n```\n\n"
-        "```bash\nfalse\ntrue\n```\n\n<!-- not run: fails -->\n```bash\nfalse\n```\n\n"
-        "<!-- long: fails late -->\n```bash\nfalse\n```\n"
+        "```bash\nfalse\ntrue\n```\n\n<!-- not run: fails -->\n```bash\nfalse\n```\n"
     )
-    *failing, marked, long = blocks(page)
+    *failing, marked = blocks(page)
     assert len(failing) == 5
     for block in failing:
         with pytest.raises(AssertionError):
             run(block, {})
-    for block in (marked, long):
-        run(block, {})
-    run(marked, {}, long=True)
-    with pytest.raises(AssertionError):
-        run(long, {}, long=True)
+    run(marked, {})
 
 
 @pytest.mark.parametrize(

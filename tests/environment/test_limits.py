@@ -10,6 +10,8 @@ from fleet_slip import limits
 from fleet_slip.errors import StorageError
 from tests.support.commands import COMMAND, Finished, run
 
+pytestmark = pytest.mark.long
+
 ENOUGH_KIB = (limits.LIBRARIES_BYTES + limits.THREAD_BYTES * len(os.sched_getaffinity(0))) // 2**10
 
 

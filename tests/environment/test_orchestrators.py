@@ -13,8 +13,6 @@ from tests.support.landing import Landing
 
 SCHEDULE = Path(__file__).parents[2] / "jobs/schedule"
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture
 def landing(tmp_path: Path, smoke_root: Path) -> Landing:

@@ -39,9 +39,12 @@ def can_confine() -> bool:
     return made.exit_code == 0
 
 
-pytestmark = pytest.mark.skipif(
-    not can_confine(), reason="a service is confined by root, with unshare and setpriv"
-)
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(
+        not can_confine(), reason="a service is confined by root, with unshare and setpriv"
+    ),
+]
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ SCHEDULE = Path(__file__).parents[2] / "jobs/schedule"
 EXPOSURE_TENTHS = 10
 """1.0 of 10: systemd calls that safe. Without the settings it is 8.7."""
 
-pytestmark = [pytest.mark.slow, pytest.mark.tools("systemd-analyze")]
+pytestmark = pytest.mark.tools("systemd-analyze")
 
 
 def security(unit: Path) -> int:

@@ -9,6 +9,8 @@ import pytest
 from fleet_slip.errors import StorageError
 from tests.support.commands import COMMAND, Finished, run
 
+pytestmark = pytest.mark.long
+
 FULL = Path("/dev/full")
 STORAGE = StorageError.exit_code
 

@@ -114,7 +114,6 @@ def trailing_mean(values: np.ndarray, ticks: int = 16) -> np.ndarray:
     return np.array([values[max(0, i + 1 - ticks) : i + 1].mean() for i in range(len(values))])
 
 
-@pytest.mark.slow
 def test_what_a_log_remembers_is_found_and_carries_to_speeds_it_was_not_fitted_at(
     tmp_path: Path,
 ) -> None:

@@ -227,7 +227,6 @@ def test_retention_forgets_by_age_and_refuses_to_leave_nothing(tmp_path: Path) -
     assert days == [(date(2024, 2, 1),), (date(2024, 3, 1),)]
 
 
-@pytest.mark.slow
 def test_models_are_marked_and_run_trains_again_without_bringing_the_drive_back(
     run_command: RunCommand, smoke_root: Path, tmp_path: Path
 ) -> None:

@@ -227,7 +227,6 @@ def test_rescaling_rounds_as_python_does(counts: list[int], old: int, new: int) 
     assert found == [round(count * ratio) for count in counts]
 
 
-@pytest.mark.slow
 def test_the_nightly_job_goes_on_after_a_signal_was_added(
     run_command: RunCommand, use: Use
 ) -> None:

@@ -205,7 +205,6 @@ def test_leftovers_and_a_backlog_are_remarks(filled: Warehouse) -> None:
     assert [finding.kind for finding in report.findings] == ["backlog", "unreferenced"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("compacted", [False, True])
 def test_simulated_logs_are_rebuilt_to_the_bit(
     warehouse: Warehouse, tmp_path: Path, compacted: bool

@@ -93,7 +93,7 @@ def test_score_finds_the_error_that_the_gram_rows_say(root: Path) -> None:
     assert scored["rmse_deg"] == pytest.approx(figures.rmse_deg, rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_evaluate_ranks_it_among_the_filters(root: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(root, tmp_path / "data")
     found = call(copy, "evaluate", "roads", "--scenario", "nominal")

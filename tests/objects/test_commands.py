@@ -13,6 +13,8 @@ from tests.support.commands import finish, start_on
 from tests.support.dask_processes import dask_processes
 from tests.support.s3_server import ACCESS_KEY, SECRET_KEY, Server, command_on
 
+pytestmark = pytest.mark.long
+
 DAMAGE, STORAGE = 9, 6
 
 
@@ -68,7 +70,6 @@ def test_a_run_gives_the_same_bits_and_a_second_does_nothing(filled: Folder, loc
         assert SECRET_KEY.encode() not in filled.read(history)
 
 
-@pytest.mark.slow
 def test_questions_are_answered_as_in_a_folder(filled: Folder, local: Folder) -> None:
     for question in (
         ["sql", "--json", "SELECT * FROM log ORDER BY drive_id, time_s LIMIT 3"],
@@ -84,7 +85,6 @@ def test_questions_are_answered_as_in_a_folder(filled: Folder, local: Folder) ->
     assert [table["rows"] for table in status["tables"].values()] == [55957, 16, 0]
 
 
-@pytest.mark.slow
 def test_what_is_damaged_is_found_and_made_again(copied: Folder) -> None:
     root = copied
     victim = next(file for file in root.files() if file.path.startswith("logs/day="))
@@ -97,7 +97,6 @@ def test_what_is_damaged_is_found_and_made_again(copied: Folder) -> None:
     assert root.read(victim.path) == whole
 
 
-@pytest.mark.slow
 def test_a_car_is_forgotten_and_its_files_are_gone(copied: Folder) -> None:
     root = copied
     before = stored(root)
@@ -112,7 +111,6 @@ def test_a_car_is_forgotten_and_its_files_are_gone(copied: Folder) -> None:
     assert command_on(root, "verify", "--full").exit_code == 0
 
 
-@pytest.mark.long
 def test_processes_at_once_lose_and_double_nothing(
     server: Server, by_module: None, local: Folder
 ) -> None:
@@ -131,7 +129,6 @@ def test_processes_at_once_lose_and_double_nothing(
     assert command_on(root, "verify", "--full").exit_code == 0
 
 
-@pytest.mark.slow
 def test_workers_of_a_cluster_write_to_it(
     server: Server, by_module: None, local: Folder, tmp_path: Path
 ) -> None:

@@ -21,6 +21,8 @@ from fleet_slip.warehouse.tables import Warehouse
 from tests.models.acceptance.test_gate import publish_from, write
 from tests.support.s3_server import Server, forget_clients
 
+pytestmark = pytest.mark.long
+
 
 def query(warehouse: Warehouse, statement: str) -> Any:
     """Ask as `fleet-slip sql` does."""

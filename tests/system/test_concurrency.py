@@ -11,6 +11,8 @@ from tests.support.measured import csv_text, good_columns
 from tests.support.state import state
 from tests.support.writers import concurrency
 
+pytestmark = pytest.mark.long
+
 MAPPING = """
 name = "test"
 time = { column = "t", unit = "s" }
@@ -20,7 +22,6 @@ signals.sideslip = { column = "beta", unit = "deg" }
 """
 
 
-@pytest.mark.long
 def test_writers_lose_nothing_and_readers_see_whole_commits_in_order() -> None:
     said = concurrency(writers=3, commits=5, patience_s=PATIENCE_S)
     assert "nothing lost or doubled" in said
@@ -42,7 +43,6 @@ def contents(run_command: RunCommand, root: Path) -> list[Any]:
     return [run_command("sql", query, "--json", root=root).json for query in queries]
 
 
-@pytest.mark.long
 def test_commands_at_once_leave_what_they_leave_one_after_the_other(
     run_command: RunCommand, tmp_path: Path
 ) -> None:
@@ -71,7 +71,6 @@ def test_commands_at_once_leave_what_they_leave_one_after_the_other(
     assert run_command("verify", "--full", root=parallel).exit_code == 0
 
 
-@pytest.mark.slow
 def test_the_second_run_of_a_campaign_waits_and_has_nothing_to_do(
     tmp_path: Path, smoke_root: Path
 ) -> None:

@@ -14,12 +14,13 @@ from fleet_slip.files.folder import TEMPORARY_PREFIX
 from tests.support.commands import RunCommand, run
 from tests.support.state import state
 
+pytestmark = pytest.mark.long
+
 JOB = ["run", "--campaign", "smoke", "--threads", "1"]
 KILLS = 40
 """Ten of each command."""
 
 
-@pytest.mark.long
 @pytest.mark.timeout(7200)
 def test_commands_that_are_killed_and_repeated_end_in_the_same_bits() -> None:
     """What `python -m benchmarks.crash` does; a new process, because it forks."""
@@ -141,7 +142,6 @@ def digest(root: Path) -> Any:
         return database.execute(query).fetchone()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("failing", ["smoke-0000", "signals-", "00000000000000000001.json"])
 def test_a_read_error_is_told_and_loses_nothing(
     run_command: RunCommand,

@@ -267,7 +267,6 @@ def test_impossible_adhesion_is_refused() -> None:
         simulate_drives([dataclasses.replace(usable, adhesion=0.0)])
 
 
-@pytest.mark.slow
 def test_the_inner_loop_is_vector_instructions_without_fused_operations() -> None:
     """On x86-64 with AVX: the physics divides in whole vectors, and no operation is fused."""
     fresh = numba.njit(nogil=True, error_model="numpy")(lane_kernel.build_kernel("not kept"))

@@ -36,8 +36,6 @@ from fleet_slip.warehouse.tables import Warehouse
 
 SCENARIOS = ("nominal", "adhesion_0_4", "wheel_missing")
 
-pytestmark = pytest.mark.slow
-
 
 def call(root: Path, *words: str) -> Any:
     result = CliRunner().invoke(app, ["--root", str(root), *words, "--json"])

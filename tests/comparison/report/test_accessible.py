@@ -30,7 +30,7 @@ NARROW_PX = 400
 LEAST_FULL = 0.6
 """Share of a printed page down to its last mark, of all pages but the last."""
 
-pytestmark = [pytest.mark.slow, pytest.mark.tools("chromium")]
+pytestmark = pytest.mark.tools("chromium")
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ DESK_PX = 1200
 LONG_PX = 16000
 DARK = "--blink-settings=preferredColorScheme=0"
 
-pytestmark = [pytest.mark.slow, pytest.mark.tools("chromium")]
+pytestmark = pytest.mark.tools("chromium")
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from tests.support.commands import run
 
 NOTEBOOK = Path(__file__).parents[3] / "jobs/explore.py"
 
-pytestmark = [pytest.mark.slow, pytest.mark.tools("marimo")]
+pytestmark = pytest.mark.tools("marimo")
 
 
 def executed(root: Path, folder: Path) -> tuple[int, str, str]:

@@ -55,8 +55,6 @@ from tests.support.reported import Reported, call
 
 MINUS = "\N{MINUS SIGN}"
 
-pytestmark = pytest.mark.slow
-
 
 class Page(HTMLParser):
     """The names, links and sources of a page, and how often each element stands in it."""

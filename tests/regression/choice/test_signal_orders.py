@@ -175,7 +175,6 @@ def test_all_subsets_equal_brute_force(seed: int, k: int) -> None:
         assert result.best.size == size
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("k", [1, 4, 12])
 def test_leaps_and_bounds_finds_what_doubling_finds(k: int) -> None:
     gram = gram_of(np.concatenate(random_drives(k, inputs=k, noise=2000)))
