@@ -1,6 +1,7 @@
 """Frames of BLF files are those that python-can reads, one after the other."""
 
 import struct
+import zlib
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -130,5 +131,9 @@ def test_what_no_recorder_writes_is_refused(tmp_path: Path) -> None:
     content = write_objects(file, one).read_bytes()
     file.write_bytes(content[:160] + b"\7" + content[161:])
     assert "compressed by an unknown method, 7" in damaged(file)
+    packed = zlib.compress(one * 9)[:-6]  # its last frames are not there
+    header = struct.pack("<4sHHII", b"LOBJ", 16, 1, 32 + len(packed), 10)
+    file.write_bytes(content[:144] + header + struct.pack("<H6xI4x", 2, 9 * len(one)) + packed)
+    assert "a container that ends too early" in damaged(file)
     file.write_bytes(content + b"rest")
     assert "no object at byte" in damaged(file)

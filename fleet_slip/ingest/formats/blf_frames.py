@@ -119,10 +119,13 @@ def _containers(stream: BinaryIO, budget: Budget) -> Iterator[bytes]:
 
 def _unfolded(content: bytes, method: int, budget: Budget) -> bytes:
     if method == _COMPRESSED:
+        unfolding = zlib.decompressobj()
         try:
-            content = zlib.decompressobj().decompress(content, _LARGEST_CONTAINER + 1)
+            content = unfolding.decompress(content, _LARGEST_CONTAINER + 1)
         except zlib.error as error:
             raise budget.damaged(f"a container that zlib cannot unfold ({error})") from None
+        if not unfolding.eof and len(content) <= _LARGEST_CONTAINER:
+            raise budget.damaged("a container that ends too early")
     elif method != _PLAIN:
         raise budget.damaged(f"a container compressed by an unknown method, {method}")
     if len(content) > _LARGEST_CONTAINER:
