@@ -26,8 +26,8 @@ from fleet_slip.words import shown
 
 _OpenIt = Callable[[Path], AbstractContextManager[tuple[list[Base], set[str]]]]
 
-_CLOCK = "this format says when each sample was taken: write own_clock = true under [time]"
-_NO_CLOCK = "this format has no clock of its own: write column or rate_hz under [time]"
+_CLOCK = "this file says when each sample was taken: write own_clock = true under [time]"
+_NO_CLOCK = "this file has no clock of its own: write column or rate_hz under [time]"
 
 
 @dataclass

@@ -62,12 +62,13 @@ class MatSource:
             rows, columns = _rows_columns(matrix.shape)
             names = [path] if columns == 1 else [f"{path}(:,{i + 1})" for i in range(columns)]
             if rows > 1 and columns <= _MOST_COLUMNS:
-                found += [Channel(name, "", f"{rows} rows") for name in names]
+                unit = getattr(matrix, "unit", "")  # MATLAB knows none
+                found += [Channel(name, unit, f"{rows} rows") for name in names]
         return found
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield all rows, some at once. Raises `InputError` if columns differ in length."""
-        found = {name: self._find(name) for name in columns}
+        found = {name: self.find(name) for name in columns}
         lengths = {name: _rows_columns(matrix.shape)[0] for name, (matrix, _) in found.items()}
         first, rows = next(iter(lengths.items()))
         for name, length in lengths.items():
@@ -84,8 +85,8 @@ class MatSource:
                 for name, (matrix, column) in found.items()
             )
 
-    def _find(self, name: str) -> tuple[_Matrix, int]:
-        """Return a matrix, and which of its columns is meant."""
+    def find(self, name: str) -> tuple[_Matrix, int]:
+        """Return a matrix, and which of its columns is meant. Raises `InputError`."""
         whole = self._matrices.get(name)
         if whole is not None:
             if _rows_columns(whole.shape)[1] != 1:

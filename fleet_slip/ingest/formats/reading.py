@@ -32,6 +32,8 @@ from fleet_slip.ingest.formats.mdf import open_mdf
 from fleet_slip.ingest.formats.mdf_bus import open_mdf_bus
 from fleet_slip.ingest.formats.parquet_batches import PARQUET_MAGIC, open_parquet
 from fleet_slip.ingest.formats.source import Source
+from fleet_slip.ingest.formats.tdms import MAGIC as TDMS_MAGIC
+from fleet_slip.ingest.formats.tdms import open_tdms
 from fleet_slip.ingest.logs.log_files import Log, parts_of
 from fleet_slip.words import shown
 
@@ -43,6 +45,7 @@ _BINARY = {
     (".mat", ".h5", ".hdf5"): "a MATLAB file of version 5 or 7.3",
     (".duckdb", ".ddb"): "a DuckDB file",
     (".mcap",): "an MCAP file",
+    (".tdms", ".tdms_index"): "a TDMS file",
 }
 
 Told = TypeVar("Told")
@@ -166,6 +169,7 @@ _FORMATS: tuple[
     (lambda start: start.startswith(PARQUET_MAGIC), open_parquet),
     (lambda start: start.startswith(MDF_MAGICS), open_mdf),
     (lambda start: start.startswith(MCAP_MAGIC), open_mcap),
+    (lambda start: start.startswith(TDMS_MAGIC), open_tdms),
     (lambda start: start.startswith(MAT5_MAGIC), open_mat),
     (lambda start: HDF5_MAGIC in (start[: len(HDF5_MAGIC)], start[HDF5_AT:]), open_mat73),
 )

@@ -120,7 +120,7 @@ def reading_with(file: Path, package: str) -> Iterator[Any]:
 
 
 def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
-    """Return an array as text or 64-bit floats. Raises `InputError` if it is neither."""
+    """Return an array as text, timestamps or 64-bit floats. Raises `InputError` for others."""
     if values.ndim != 1:
         raise InputError(
             f"{shown(file)}: channel {name!r} has {' x '.join(map(str, values.shape))} values, "
@@ -130,6 +130,8 @@ def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
         return pl.Series(name, [text.decode("utf-8", "replace").strip("\0") for text in values])
     if values.dtype.kind in "UO":
         return pl.Series(name, [str(text) for text in values], pl.String)
+    if values.dtype.kind == "M":
+        return pl.Series(name, values.astype("M8[us]"))
     if values.dtype.kind not in "iufb":
         raise InputError(
             f"{shown(file)}: channel {name!r} is of the type {values.dtype}, neither a number nor "

@@ -25,7 +25,7 @@ from fleet_slip.words import shown
 
 SUFFIXES = (
     ".csv", ".csv.gz", ".csv.zst", ".parquet", ".pq", ".mf4", ".mdf", ".mat", ".h5", ".hdf5",
-    ".blf", ".asc", ".log", ".trc", ".duckdb", ".ddb", ".mcap",
+    ".blf", ".asc", ".log", ".trc", ".duckdb", ".ddb", ".mcap", ".tdms",
 )  # fmt: skip
 
 _HIDDEN = re.compile(r"/\.(?!\.?(/|$))")

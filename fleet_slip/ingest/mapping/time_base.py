@@ -64,7 +64,7 @@ class TimeBase(Config):
     def _consistent(self) -> "TimeBase":
         if [self.column is None, self.rate_hz is None, not self.own_clock].count(False) != 1:
             raise ValueError(
-                "needs either 'column' or 'rate_hz', or 'own_clock' for MDF files and CAN traces"
+                "needs either 'column' or 'rate_hz', or 'own_clock' for files with clocks, as MDF"
             )
         if self.column is None and (self.unit is not None or self.format is not None):
             raise ValueError("'unit' and 'format' describe a column, and there is none")

@@ -15,6 +15,7 @@ import can
 import duckdb
 import h5py
 import mcap_ros2.writer
+import nptdms
 import numpy as np
 import polars as pl
 import pyarrow as pa
@@ -124,6 +125,15 @@ def _mat73(file: Path) -> None:
         stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\0\x02IM")
 
 
+def _tdms(file: Path) -> None:
+    wave = {"wf_start_time": START.replace(tzinfo=None), "wf_increment": 0.01, "unit_string": "g"}
+    with nptdms.TdmsWriter(file) as writer:
+        for rows in (slice(40), slice(40, ROWS)):
+            ax = nptdms.ChannelObject("car", "ax", AX[rows], wave)
+            note = nptdms.ChannelObject("car", "note", ["text"] * len(AX[rows]), wave)
+            writer.write_segment([ax, nptdms.ChannelObject("gps", "beta", BETA[rows], wave), note])
+
+
 def _duckdb(file: Path) -> None:
     table = pa.table({"t": TIME_S, "ax": AX, "beta": BETA})
     with duckdb.connect(str(file)) as database:
@@ -156,6 +166,7 @@ FORMATS: dict[str, Format] = {
     "candump": Format(
         ".log", _trace(can.CanutilsLogWriter), _mapping("Motion.ax", "Motion.beta", **_CAN)
     ),
+    "tdms": Format(".tdms", _tdms, _mapping("ax", "beta", **_OWN)),
     "mat5": Format(
         ".mat",
         lambda file: scipy.io.savemat(file, {"t": TIME_S, "ax": AX, "Data": {"beta": BETA}}),

@@ -1,0 +1,112 @@
+"""Reads TDMS files of LabVIEW through npTDMS, some values at once.
+
+Times are from the properties of waveforms. Of a file without any, time is one of its channels. A
+channel of several groups is named `CHANNEL@GROUP`.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from logging import CRITICAL
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.matlab import MatSource
+from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, ClockSource, reading_with
+from fleet_slip.words import shown
+
+MAGIC = b"TDSm"
+READ_AHEAD = 2**17
+"""Values that are read at once: for each time npTDMS reads all that a segment has of a channel."""
+_EARLIEST_S = 10**8
+"""A waveform that was given no start begins in 1904: before 1973 it is not a date."""
+
+
+class _Vector:
+    """The values of a channel; `base` says their times, and is empty where nothing tells them."""
+
+    def __init__(self, told: Any) -> None:
+        self._told, self._first, self._ahead = told, 0, np.zeros(0)
+        of, self.shape = told.properties, (len(told),)
+        self.unit, self.step_s = str(of.get("unit_string", "")), float(of.get("wf_increment", 0))
+        began_s = np.datetime64(of.get("wf_start_time", 0), "us").astype(np.int64) / 1e6
+        offset_s = float(of.get("wf_start_offset", 0))
+        self.start_s = offset_s + (began_s if began_s > _EARLIEST_S else 0.0)
+        told_s = f"{self.start_s!r} s and each {self.step_s!r} s, {len(told)} times"
+        self.base = told_s if self.step_s > 0 else ""
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def read(self, _column: int, start: int, end: int) -> np.ndarray[Any, Any]:
+        """Return some values, scaled."""
+        if not self._first <= start <= end <= self._first + len(self._ahead):
+            until = max(start + READ_AHEAD, end)
+            self._first, self._ahead = start, np.asarray(self._told[start:until])
+        return self._ahead[start - self._first : end - self._first]
+
+
+class TdmsSource(ClockSource):
+    """The waveforms of a file."""
+
+    def __init__(self, waves: dict[str, _Vector], budget: Budget) -> None:
+        """Take the waveforms by name, and what may become of the file."""
+        self._waves, self._table = waves, MatSource(waves, budget)
+
+    def channels(self) -> list[Channel]:
+        """Return the waveforms, with their units."""
+        return [Channel(name, one.unit, one.base) for name, one in self._waves.items()]
+
+    def bases(self, columns: Sequence[str]) -> list[Base]:
+        """Return what has the same times. Raises `InputError`."""
+        alike: dict[str, list[str]] = {}
+        for name in columns:
+            self._table.find(name)
+            alike.setdefault(self._waves[name].base, []).append(name)
+        return [
+            Base(base, partial(len, self._waves[names[0]]), partial(self._read, names))
+            for base, names in alike.items()
+        ]
+
+    def _read(self, names: list[str]) -> Iterator[pl.DataFrame]:
+        wave, row = self._waves[names[0]], 0
+        for rows in self._table.batches(names):
+            times_s = wave.start_s + wave.step_s * np.arange(row, row + rows.height)
+            row += rows.height
+            yield rows.with_columns(pl.Series(OWN_TIME, times_s, dtype=pl.Float64))
+
+
+@contextmanager
+def open_tdms(budget: Budget) -> Iterator[TdmsSource | MatSource]:
+    """Open a TDMS file; an index beside it may be that of another one, and is not read.
+
+    Raises `InputError`, also for a file that ends too early, or has counts of a converter.
+    """
+    file = budget.file
+    with reading_with(file, "nptdms") as nptdms, file.open("rb") as stream:
+        nptdms.log.log_manager.set_level(CRITICAL)  # each of its modules has a level of its own
+        tdms = nptdms.TdmsFile.open(stream)
+        last = tdms._reader._segments[-1:]
+        if [one.next_segment_pos for one in last] != [budget.size] or any(
+            one.segment_incomplete or one.final_chunk_lengths_override is not None for one in last
+        ):
+            raise InputError(
+                f"{shown(file)}: its last segment ends too early: it was cut off, or is still "
+                "written. Copy it again."
+            )
+        channels = [one for group in tdms.groups() for one in group.channels() if len(one)]
+        if not channels or any(one.scaler_data_types for one in channels):
+            what = "has raw data of DAQmx, counts of a converter" if channels else "has no values"
+            raise InputError(f"{shown(file)}: it {what}. Save it from LabVIEW or DIAdem, scaled.")
+        several = Counter(one.name for one in channels)
+        vectors = {
+            one.name if several[one.name] < 2 else f"{one.name}@{one.group_name}": _Vector(one)
+            for one in channels
+        }
+        waves = {name: one for name, one in vectors.items() if one.base}
+        yield TdmsSource(waves, budget) if waves else MatSource(vectors, budget)
