@@ -4,7 +4,7 @@ A drive depends on the campaign's seed and its own name, never on days, other dr
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, timedelta
 from functools import cached_property
@@ -121,7 +121,10 @@ _BATCH = TypeAdapter(Batch)
 
 
 class Campaign(Config):
-    """A plan of drives over days, or what differs from its `base`; more days change no drive."""
+    """A plan of drives over days, or what differs from its `base`; more days change no drive.
+
+    A plan without a `kind` says what differs from that of the base, table by table.
+    """
 
     name: Identifier
     description: str = Field(min_length=1)
@@ -148,7 +151,10 @@ class Campaign(Config):
             raise ValueError(str(error)) from None
         if "base" in base:
             raise ValueError(f"the base {content['base']!r} has a base itself: take that one")
-        return {**base, **content}
+        plan = content.get("plan", {})
+        if isinstance(plan, dict) and "kind" not in plan:
+            plan = merged(base.get("plan", {}), plan)
+        return {**base, **content, "plan": plan}
 
     @model_validator(mode="after")
     def _open_tracks_have_no_laps(self) -> Self:
@@ -228,6 +234,15 @@ class Campaign(Config):
             receiver=receiver,
             drawn_as=self.base or "",
         )
+
+
+def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the base with changes; tables are merged key by key, all else is replaced."""
+    both = dict(base)
+    for key, value in changes.items():
+        tables = isinstance(value, dict) and isinstance(both.get(key), dict)
+        both[key] = merged(both[key], value) if tables else value
+    return both
 
 
 def pack(drives: Sequence[DriveSpec], rows_per_file: int) -> list[tuple[DriveSpec, ...]]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, FiniteFloat
+from pydantic import BeforeValidator, Field
 
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError
@@ -15,7 +15,8 @@ from fleet_slip.simulation.imperfections import (
     ImperfectionRanges,
     Imperfections,
     NotNegative,
-    Range,
+    Positive,
+    Uniform,
 )
 from fleet_slip.simulation.manoeuvres import Manoeuvre
 from fleet_slip.simulation.roads import load_track
@@ -42,15 +43,7 @@ def load_by_name(load: Callable[[str], object]) -> BeforeValidator:
 
 NamedTrack = Annotated[Track, load_by_name(load_track)]
 NamedVehicle = Annotated[VehicleParameters, load_by_name(load_vehicle)]
-Positive = Annotated[FiniteFloat, Field(gt=0)]
 NotEmpty = Field(min_length=1)
-
-
-class Uniform(Range):
-    """A uniform distribution over positive numbers."""
-
-    min: Positive
-    max: Positive
 
 
 @dataclass(frozen=True)
@@ -156,7 +149,18 @@ class SensorBiases(Config):
         )
 
 
-class FleetPlan(Plan):
+class DrawnPlan(Plan):
+    """A plan whose cars and drives are drawn, with what is imperfect about both."""
+
+    sensor_bias_std: SensorBiases
+    """Of cars; in trials of the other ones."""
+    imperfections: ImperfectionRanges | None = Field(
+        default=None, exclude_if=lambda ranges: ranges is None
+    )
+    """None: cars, sensors and roads are those of the textbook."""
+
+
+class FleetPlan(DrawnPlan):
     """Many different cars that take turns, each on roads and at speeds drawn for every drive.
 
     Model, load, tyres and biases are a car's own. The driver plans lateral acceleration over μ g by
@@ -171,14 +175,9 @@ class FleetPlan(Plan):
     """Cornering stiffness over that of the vehicle's file."""
     tyre_radius: Uniform
     """Rolling radius over that of the vehicle's file."""
-    sensor_bias_std: SensorBiases
     adhesion: Uniform
     friction_use: Uniform
     speed_factor: Uniform
-    imperfections: ImperfectionRanges | None = Field(
-        default=None, exclude_if=lambda ranges: ranges is None
-    )
-    """None: cars, sensors and roads are those of the textbook."""
 
     def car(self, number: int) -> int:
         """Return the car that drives the drive of this number."""
@@ -201,8 +200,7 @@ class FleetPlan(Plan):
         lateral_mps2 = self.friction_use.draw(of_drive) * adhesion * GRAVITY_MPS2
         speed_factor = self.speed_factor.draw(of_drive)
         ranges = self.imperfections or ImperfectionRanges()
-        place = ranges.load_position_m
-        vehicle = vehicle.with_sprung_mass(mass_kg, place.draw(of_car) if place else None)
+        vehicle = ranges.loaded(vehicle, mass_kg, of_car)
         flaws = ranges.draw(of_car, of_drive)
         stiffer, smaller = ranges.wear(of_car, days)
         return CarOnRoad(

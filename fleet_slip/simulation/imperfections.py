@@ -7,7 +7,9 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from fleet_slip.config import Config
 from fleet_slip.vehicle.car_imperfections import CarImperfections
+from fleet_slip.vehicle.parameters import VehicleParameters
 
+Positive = Annotated[FiniteFloat, Field(gt=0)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 Latency = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Bandwidth = Annotated[FiniteFloat, Field(ge=0, le=30)]
@@ -104,6 +106,13 @@ class Range(Config):
         return float(generator.uniform(self.min, self.max))
 
 
+class Uniform(Range):
+    """A uniform distribution over positive numbers."""
+
+    min: Positive
+    max: Positive
+
+
 WORN_STIFFNESS, WORN_RADIUS = 1.1, 0.98
 """Cornering stiffness and rolling radius of a tyre without tread, over those of a new one: 8 mm
 less on 325 mm, and shorter blocks, which give way less (the scenario `tyres_worn`)."""
@@ -142,6 +151,13 @@ class ImperfectionRanges(Config):
         if self.tread_wear_per_100_days and self.tread_wear_per_100_days.min < 0:
             raise ValueError("tread_wear_per_100_days: a tread does not grow")
         return self
+
+    def loaded(
+        self, vehicle: VehicleParameters, mass_kg: float, generator: np.random.Generator
+    ) -> VehicleParameters:
+        """Return the car loaded to a sprung mass. Raises `ConfigError` if it cannot be."""
+        place = self.load_position_m
+        return vehicle.with_sprung_mass(mass_kg, place.draw(generator) if place else None)
 
     def wear(self, of_car: np.random.Generator, days: int) -> tuple[float, float]:
         """Return what so many days have made of a car's stiffness and rolling radius: factors."""

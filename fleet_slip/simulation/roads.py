@@ -53,6 +53,12 @@ def load_track(name_or_path: str) -> Track:
     return load_config(find_config("tracks", name_or_path), Track)
 
 
+def road_class(track: Track) -> str | None:
+    """Return the class of a road that was drawn; None for any other track."""
+    drawn = _NAME.fullmatch(track.name)
+    return drawn[1] if drawn else None
+
+
 def draw_road(kind: str, seed: int) -> Track:
     """Draw a road of a class of `CLASSES`. It is open, and its ends are straight."""
     road, generator = CLASSES[kind], random_generator(seed, "road", kind)

@@ -19,9 +19,9 @@ from fleet_slip.catalogue.sources import SCENARIO
 from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import config_names, find_config
-from fleet_slip.simulation.campaign import Batch, DriveSpec
-from fleet_slip.simulation.drive_plan import NamedTrack, NamedVehicle, Positive
-from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative
+from fleet_slip.simulation.campaign import Batch, DriveSpec, merged
+from fleet_slip.simulation.drive_plan import NamedTrack, NamedVehicle
+from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative, Positive
 from fleet_slip.simulation.sensing.sensors import GPS_SIGNALS, Sensors
 from fleet_slip.simulation.track import SpeedLimits, SpeedProfile
 from fleet_slip.vehicle.parameters import VehicleParameters
@@ -206,16 +206,7 @@ def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str,
         )
     drive = inherited["drive"] if "failures" in content else name
     kept = {key: value for key, value in inherited.items() if key not in NOT_INHERITED}
-    return {**_merged(kept, content), "drive": drive}
-
-
-def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the base with changes; tables are merged key by key, all else is replaced."""
-    merged = dict(base)
-    for key, value in changes.items():
-        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = _merged(merged[key], value) if both else value
-    return merged
+    return {**merged(kept, content), "drive": drive}
 
 
 def load_scenario(name_or_path: str) -> Scenario:

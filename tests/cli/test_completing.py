@@ -27,7 +27,7 @@ def complete(root: Path, *words: str) -> list[str]:
         (["show", "sm"], ["smoke"]),
         (["show", "smoke@"], ["smoke@champion", "smoke@1"]),
         (["simulate", "water"], ["waterford", "waterford_course"]),
-        (["run", "--campaign", "prov"], ["proving_ground", "proving_ground_course"]),
+        (["run", "--campaign", "proving_g"], ["proving_ground", "proving_ground_course"]),
         (["select", "--models", "tab"], ["table1"]),
         (["gram", "--features", "win"], ["windows", "windows_regimes"]),
         (["evaluate", "--scenario", "mass_1"], ["mass_1000", "mass_1740"]),

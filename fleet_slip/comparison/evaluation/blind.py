@@ -24,13 +24,12 @@ from fleet_slip.comparison.evaluation.scenario_runs import (
 from fleet_slip.config import Config, load_config
 from fleet_slip.resources import config_file
 from fleet_slip.simulation.campaign import Campaign, load_campaign
-from fleet_slip.simulation.drive_plan import FleetPlan, Uniform, load_by_name
-from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Range
+from fleet_slip.simulation.drive_plan import FleetPlan, load_by_name
+from fleet_slip.simulation.drivers import Drivers
+from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Range, Uniform
 from fleet_slip.simulation.random_numbers import random_generator
-from fleet_slip.simulation.roads import CLASSES, WANDER_S, draw_road, driven_line
+from fleet_slip.simulation.roads import CLASSES, draw_road
 from fleet_slip.simulation.scenario import Scenario
-from fleet_slip.simulation.track import SpeedLimits, Track
-from fleet_slip.vehicle.parameters import GRAVITY_MPS2
 
 ALL = "all"
 """What the figures over all drives are called, beside those of a class of road or a weather."""
@@ -42,36 +41,6 @@ class Weather(Config):
     adhesion: Uniform
     friction_use: Uniform
     """Planned lateral acceleration over μ g."""
-
-
-class Drivers(Config):
-    """How drivers differ: the line, how they wander about it, and their temper."""
-
-    cut: Range
-    """How far ahead and behind a bend is rounded off, over the smallest radius of the class."""
-    wander_m: Range
-    acceleration_mps2: Uniform
-    """On a road with μ = 1; less on others."""
-    braking_mps2: Uniform
-    top_speed: Uniform
-    """Over that of the road's class."""
-
-    def line(self, road: Track, kind: str, of_drive: np.random.Generator) -> Track:
-        """Draw the line that a driver takes along a road of a class."""
-        cut_m = self.cut.draw(of_drive) * CLASSES[kind].radius_m[0]
-        every_m = WANDER_S * CLASSES[kind].top_speed_mps
-        return driven_line(road, cut_m, self.wander_m.draw(of_drive), every_m, of_drive)
-
-    def limits(
-        self, kind: str, adhesion: float, friction_use: float, of_drive: np.random.Generator
-    ) -> SpeedLimits:
-        """Draw how fast a driver goes who sees the adhesion."""
-        return SpeedLimits(
-            lateral_mps2=friction_use * adhesion * GRAVITY_MPS2,
-            acceleration_mps2=self.acceleration_mps2.draw(of_drive) * adhesion,
-            braking_mps2=self.braking_mps2.draw(of_drive) * adhesion,
-            top_speed_mps=self.top_speed.draw(of_drive) * CLASSES[kind].top_speed_mps,
-        )
 
 
 class BlindSet(Config):

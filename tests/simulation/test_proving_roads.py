@@ -1,0 +1,124 @@
+"""Trials on roads of every class: what is drawn, and that load and banks are in the signals."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.comparison.evaluation.blind import blind_scenarios
+from fleet_slip.errors import ConfigError
+from fleet_slip.resources import find_config
+from fleet_slip.simulation.campaign import DriveSpec, load_campaign
+from fleet_slip.simulation.drives import simulate_logs
+from fleet_slip.simulation.imperfections import Imperfections, RoadImperfections
+from fleet_slip.simulation.roads import CLASSES, load_track
+from fleet_slip.simulation.sensing.sensors import Sensors
+from fleet_slip.simulation.track import SpeedLimits
+from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
+
+TEXT = find_config("campaigns", "proving_roads").read_text(encoding="utf-8")
+SEDAN = load_vehicle("d_class_sedan")
+
+
+@pytest.fixture(scope="module")
+def drives() -> tuple[DriveSpec, ...]:
+    campaign = load_campaign("proving_roads")
+    return campaign.drives(campaign.first_day)
+
+
+def steady(
+    vehicle: VehicleParameters, track: str, speed_mps: float, laps: float, fall_percent: float = 0.0
+) -> dict[str, np.ndarray]:
+    """Return the counts of the last fifth of a drive of exact sensors at a steady speed."""
+    exact = dict.fromkeys((n for n in Sensors.model_fields if n != "gps"), 0.0)
+    campaign = load_campaign("smoke")
+    spec = replace(
+        campaign.drives(campaign.first_day)[0],
+        vehicle=vehicle,
+        sensors=Sensors.model_validate({**exact, "gps": campaign.sensors.gps}),
+        track=load_track(track),
+        adhesion=1.0,
+        limits=SpeedLimits(
+            lateral_mps2=9.0, acceleration_mps2=2.5, braking_mps2=4.0, top_speed_mps=speed_mps
+        ),
+        laps=laps,
+        script=(),
+        flaws=Imperfections(road=RoadImperfections(cross_slope_percent=fall_percent)),
+    )
+    (log,) = simulate_logs([spec])
+    assert log.lost_control_s is None
+    return {name: one[-log.rows // 5 :] for name, one in log.measurement.counts.items()}
+
+
+def test_every_class_of_road_is_driven_at_its_speeds(drives: tuple[DriveSpec, ...]) -> None:
+    by_class = {
+        name: [d for d in drives if d.track.name.startswith(f"{name}_")] for name in CLASSES
+    }
+    for name, some in by_class.items():
+        top_mps = CLASSES[name].top_speed_mps
+        assert 0.6 * top_mps < max(d.limits.top_speed_mps for d in some) <= top_mps
+        lines = {d.track.segments for d in some if d.track.name == some[0].track.name}
+        assert len(lines) > 1, "each driver takes a line of his own"
+    assert max(d.limits.top_speed_mps for d in by_class["motorway"]) > 42
+    assert min(d.adhesion for d in drives) < 0.2
+    assert all(d.flaws.road.superelevation_percent > 0 for d in drives)
+
+
+def test_load_and_wear_are_of_the_drive_and_all_else_of_the_car(
+    drives: tuple[DriveSpec, ...],
+) -> None:
+    tested = [d for d in drives if d.vehicle_id == "proving_roads-0000"]
+    rear_m = [d.vehicle.body.rear_axle_m for d in tested]
+    assert min(rear_m) < SEDAN.body.rear_axle_m - 0.2
+    assert len({d.vehicle.tyre.rolling_radius_m for d in tested}) > len(tested) / 2
+    assert {d.flaws.car for d in tested} == {tested[0].flaws.car}
+
+
+def test_no_road_of_the_plan_is_a_blind_one() -> None:
+    """Names reach to nine digits; a version's seeds are below that once in 10⁹ versions."""
+    with pytest.raises(ConfigError):
+        load_track("country_1000000000")
+    assert min(one.seed for one in blind_scenarios("ab" * 32)) > 1e9
+    assert load_campaign("proving_roads").seed != load_campaign("proving_ground").seed
+
+
+def test_load_behind_the_rear_axle_takes_understeer_away() -> None:
+    """K = (Wf/Cf − Wr/Cr) / g: on the skid pad the loaded car needs less steering."""
+    loaded = SEDAN.with_sprung_mass(1620.0, -1.9)
+    slow, fast = (
+        {car.body.sprung_mass_kg: steady(car, "skid_pad", v, 1.0) for car in (SEDAN, loaded)}
+        for v in (6.0, 17.0)
+    )
+    more = {
+        mass: fast[mass]["steering_wheel"].mean() - slow[mass]["steering_wheel"].mean()
+        for mass in fast
+    }
+    assert more[1620.0] < 0.7 * more[1320.0]
+    assert fast[1620.0]["sideslip"].mean() < fast[1320.0]["sideslip"].mean()
+
+
+def test_a_bank_is_in_ay() -> None:
+    """A car going straight on a road that falls by 4 % feels the weight that it holds."""
+    flat, banked = (steady(SEDAN, "straight", 20.0, 1.0, fall)["ay"] for fall in (0.0, 4.0))
+    assert flat.mean() == pytest.approx(0.0, abs=2)
+    assert banked.mean() * float(catalogue()["ay"].scale) == pytest.approx(9.81 * 0.04, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("load_position_m", "# load_position_m", "need each other"),
+        ("tread_wear_per", "# tread_wear_per", "needs imperfections.tread_wear_per_100_days"),
+        ('"city_1"', '"waterford_hills"', "roads of a class, such as country_17, not waterford"),
+    ],
+)
+def test_a_plan_that_would_ignore_a_key_is_refused(
+    tmp_path: Path, old: str, new: str, reason: str
+) -> None:
+    file = tmp_path / "campaign.toml"
+    head, _, tail = TEXT.rpartition(old)
+    file.write_text(head + new + tail)
+    with pytest.raises(ConfigError, match=reason):
+        load_campaign(str(file))
