@@ -50,9 +50,10 @@ def evaluate(root: Path, *scenarios: str) -> Any:
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
+def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, tuned: Path) -> Path:
     folder = tmp_path_factory.mktemp("evaluated") / "data"
     shutil.copytree(smoke_root, folder)
+    shutil.copytree(tuned, folder / "tuned")
     evaluate(folder, *SCENARIOS)
     return folder
 

@@ -24,9 +24,10 @@ SCENARIOS = (
 
 
 @pytest.fixture(scope="session")
-def reported(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Reported:
+def reported(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, tuned: Path) -> Reported:
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
+        shutil.copytree(tuned, root / "tuned")
         options = [word for name in SCENARIOS for word in ("--scenario", name)]
         call(root, "evaluate", "smoke", *options)
         call(root, "report", "smoke")
