@@ -130,7 +130,7 @@ WAYS = {
 
 def write_log(file: Path, rows: int, *, course: bool = False) -> None:
     """Write a log in the format of the file's suffix, a million rows at a time."""
-    tables = (_rows(start, min(start + CHUNK, rows)) for start in range(0, rows, CHUNK))
+    tables = (log_rows(start, min(start + CHUNK, rows)) for start in range(0, rows, CHUNK))
     if course:
         tables = (table.with_columns(**_VELOCITY) for table in tables)
     if file.suffix == ".mf4":
@@ -161,7 +161,7 @@ def require_space(folder: Path, kind: str, rows: int, programs: int) -> None:
         )
 
 
-def _rows(start: int, end: int) -> pl.DataFrame:
+def log_rows(start: int, end: int) -> pl.DataFrame:
     """Return waves with noise, a drive of half an hour and then a pause."""
     tick = np.arange(start, end)
     rng = np.random.default_rng(start)

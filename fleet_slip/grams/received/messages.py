@@ -23,7 +23,13 @@ A message of another feature set has the layout 3, signed 4. It differs from byt
 
 and says by its definition which set it is of (`counted_sets`).
 
-A signed message has its signature, 64 bytes, before the checksum (`signatures`).
+A signed message has its signature, 64 bytes, before the checksum (`signatures`). One that is signed
+with all others of its car and day has the layout 16, of a feature set 64, and more by the levels of
+their tree (`day_tree`). Before the signature it has
+
+    0   2   place in the tree, from 0       2   2   number of messages in it
+    4   ..  32 bytes of each level: the node beside its own, from the leaves up
+
 Messages of one length that stand one behind the other are read at once, as an array.
 """
 
@@ -45,6 +51,13 @@ LAYOUT = 1
 SET_LAYOUT = 3
 SIGNED_LAYOUTS = {LAYOUT: 2, SET_LAYOUT: 4}
 """The layout of a signed message, by that of one which is not."""
+DAY_LAYOUTS = {LAYOUT: 16, SET_LAYOUT: 64}
+"""That of one whose day is signed, in a tree without levels."""
+MOST_LEVELS = 10
+"""Of a tree: 1,024 messages."""
+NODE_BYTES = 32
+PLACE_BYTES = 4
+"""Of a message in its tree, and of how many there are."""
 SIGNATURE_BYTES = 64
 HEADER_BYTES = 56
 CHECKSUM_BYTES = 4
@@ -78,20 +91,10 @@ WRONG_CHECKSUM = "has a wrong checksum"
 TOO_MANY = f"and all that follows is beyond the {MOST_MESSAGES:,} messages of a file: cut it"
 NO_FILE = f"and all that follows is not read, after {MOST_REFUSED:,} places that are no message"
 
+_OF_SIGNATURES = {"leaf", "leaves", "path", "signature"}
+
 Messages = NDArray[Any]
 """Messages of the same length: an array with the fields of `message_type`."""
-
-
-KEPT = np.dtype(
-    [
-        ("signature", "V64"),
-        ("definition", "<u8"),
-        ("mask", "<u4"),
-        ("place", "<u2"),
-        ("parts", "<u2"),
-    ]
-)
-"""What the column holds; a message that was not signed has no parts here."""
 
 
 @dataclass
@@ -115,11 +118,13 @@ def message_size(signals: int, *, of_set: bool = False) -> int:
 
 
 @cache
-def message_type(signals: int, *, signed: bool = False, of_set: bool = False) -> np.dtype[Any]:
+def message_type(
+    signals: int, *, signed: bool = False, of_set: bool = False, levels: int | None = None
+) -> np.dtype[Any]:
     """Return the fields of a message of so many signals, or columns of a set.
 
     `rows` are n, `lost` rows of the drive that none of its messages has; `numbers` are sums, then
-    products.
+    products. With `levels` it is signed with its day, in a tree of so many.
     """
     which = [("part", "<u2"), ("late", "<i2")] if of_set else [("mask", "<u4")]
     return np.dtype(
@@ -137,8 +142,31 @@ def message_type(signals: int, *, signed: bool = False, of_set: bool = False) ->
             ("lost", "<u4"),
             *([("columns", "<u8", (MOST_COLUMNS // 64,))] if of_set else []),
             ("numbers", "<i8", (signals + packed_size(signals),)),
-            *([("signature", "V64")] if signed else []),
+            *_fields_of_tree(levels),
+            *([("signature", f"V{SIGNATURE_BYTES}")] if signed or levels is not None else []),
             ("checksum", "<u4"),
+        ]
+    )
+
+
+def _fields_of_tree(levels: int | None) -> list[tuple[str, str]]:
+    """Return what says where a message stands in the tree of its day, if it does."""
+    if levels is None:
+        return []
+    return [("leaf", "<u2"), ("leaves", "<u2"), *[("path", f"V{NODE_BYTES * levels}")][:levels]]
+
+
+@cache
+def kept_type(levels: int | None) -> np.dtype[Any]:
+    """Return the fields of what is kept of a signature: what else rebuilds the message."""
+    return np.dtype(
+        [
+            ("signature", f"V{SIGNATURE_BYTES}"),
+            ("definition", "<u8"),
+            ("mask", "<u4"),
+            ("place", "<u2"),
+            ("parts", "<u2"),
+            *_fields_of_tree(levels),
         ]
     )
 
@@ -215,12 +243,17 @@ def _continued(
 @cache
 def _types() -> dict[tuple[int, int], tuple[int, np.dtype[Any]]]:
     """Return the number of signals and the fields of a message, by its layout and its length."""
+    kinds: dict[int, dict[str, Any]] = {}
+    for plain, signed in SIGNED_LAYOUTS.items():
+        of_set = plain == SET_LAYOUT
+        kinds |= {plain: {"of_set": of_set}, signed: {"of_set": of_set, "signed": True}}
+        for levels in range(MOST_LEVELS + 1):
+            kinds[DAY_LAYOUTS[plain] + levels] = {"of_set": of_set, "levels": levels}
     return {
         (layout, kind.itemsize): (signals, kind)
-        for plain, signed in SIGNED_LAYOUTS.items()
-        for layout in (plain, signed)
+        for layout, words in kinds.items()
         for signals in range(MOST_SIGNALS + 1)
-        for kind in [message_type(signals, signed=layout == signed, of_set=plain == SET_LAYOUT)]
+        for kind in [message_type(signals, **words)]
     }
 
 
@@ -272,20 +305,35 @@ def _why_none(content: bytes, at: int) -> str:
 
 def without_signatures(messages: Messages) -> Messages:
     """Return messages as they were before they were signed, but for their checksums."""
-    names = messages.dtype.names or ()
-    if "signature" not in names:
+    if not is_signed(messages):
         return messages
-    kept = [name for name in names if name != "signature"]
+    kept = [name for name in messages.dtype.names or () if name not in _OF_SIGNATURES]
     plain = np.empty(len(messages), [(name, messages.dtype[name]) for name in kept])
     for name in kept:
         plain[name] = messages[name]
     return plain
 
 
+def is_signed(messages: Messages) -> bool:
+    """Whether messages have signatures."""
+    return "signature" in (messages.dtype.names or ())
+
+
+def levels_of(messages: Messages) -> int | None:
+    """Return the levels of the trees of days that messages stand in, None if they do not."""
+    names = messages.dtype.names or ()
+    if "leaf" not in names:
+        return None
+    return messages.dtype["path"].itemsize // NODE_BYTES if "path" in names else 0
+
+
 def keep_signatures(messages: Messages) -> Messages:
-    """Return what is kept of some messages: an array of `KEPT`."""
-    kept = np.zeros(len(messages), KEPT)
-    if "signature" in (messages.dtype.names or ()):
-        for name in set(KEPT.names or ()).intersection(messages.dtype.names or ()):
+    """Return what is kept of each message, the bytes of `kept_type`; None if it is not signed."""
+    found = np.full(len(messages), None, dtype=np.object_)
+    if is_signed(messages):
+        kept = np.zeros(len(messages), kept_type(levels_of(messages)))
+        for name in set(kept.dtype.names or ()).intersection(messages.dtype.names or ()):
             kept[name] = messages[name]
-    return kept
+        content, size = kept.tobytes(), kept.itemsize
+        found[:] = [content[at : at + size] for at in range(0, len(content), size)]
+    return found

@@ -64,7 +64,7 @@ class ReceivedRows:
         file: which of some files each is from, shape (m,).
         number: which message of its file, from 1.
         messages: what they say, without signatures.
-        kept: what is kept of their signatures.
+        kept: what is kept of their signatures, None of messages that are not signed.
     """
 
     file: IntArray
@@ -208,7 +208,7 @@ def sort_out(
     runs: dict[tuple[int, ...], list[ReceivedRows]] = {}
     for file, one in found:
         refused += [Refused(file, number, reason) for number, reason in one.refused]
-        for run in _by_layout(file, one):
+        for run in by_layout(file, one):
             told, nameless = _without_name(run)
             refused += nameless
             if judge is not None and len(told):
@@ -230,12 +230,11 @@ def sort_out(
     return kept, refused
 
 
-def _by_layout(file: int, found: Found) -> Iterator[ReceivedRows]:
+def by_layout(file: int, found: Found) -> Iterator[ReceivedRows]:
     """Yield the messages of a file, those of one layout and length together."""
     alike: dict[Any, list[tuple[int, Messages]]] = {}
     for first, messages in found.runs:
-        kind = messages.dtype.itemsize, messages.dtype.names
-        alike.setdefault(kind, []).append((first, messages))
+        alike.setdefault(messages.dtype, []).append((first, messages))
     for runs in alike.values():
         numbers = np.concatenate([np.arange(at, at + len(some)) for at, some in runs])
         messages = runs[0][1]

@@ -2,7 +2,8 @@
 
 A received row has n, sums and products of its message, and its drive's name tells the car and the
 moment. The column `signed` has the rest, 80 bytes: the signature, what the signals meant, which
-they were, and the place among the drive's messages. So the signature can be checked again. It is
+they were, and the place among the drive's messages; and of a message whose day is signed, where it
+stands in the tree. So the signature can be checked again. It is
 null of rows that were not signed, and a file without any has no such column. Of a row of a feature
 set, its columns, its part and the delay of its course stand in the table.
 """
@@ -15,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.arrays import BoolArray
+from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.course_change import COURSE_LATE
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
@@ -23,12 +24,14 @@ from fleet_slip.catalogue.sources import RECEIVED, RECEIVED_FILES
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.received.counted_sets import CountedSet, counted_by_identity
 from fleet_slip.grams.received.messages import (
-    KEPT,
+    DAY_LAYOUTS,
     LAYOUT,
     MAGIC,
+    MOST_LEVELS,
     SET_LAYOUT,
     SIGNED_LAYOUTS,
     Messages,
+    kept_type,
     message_type,
 )
 from fleet_slip.grams.received.plausible import find_impossible
@@ -59,7 +62,7 @@ def received_table(rows: ReceivedRows, schema: pa.Schema, digests: Sequence[str]
         "clipped": pa.repeat(0, many),
         "sums": list_array(rows.sums),
         "products": list_array(rows.products),
-        SIGNED: _signed_column(rows.kept),
+        SIGNED: pa.array(rows.kept, pa.binary()),
         **({} if part is None else {"part": pa.repeat(part, many)}),
         **({COURSE_LATE: pa.array(rows.late)} if rows.of.in_time else {}),
     }
@@ -68,18 +71,6 @@ def received_table(rows: ReceivedRows, schema: pa.Schema, digests: Sequence[str]
         for one in schema
     ]
     return pa.table(columns, schema=schema)
-
-
-def _signed_column(kept: Messages) -> pa.Array:
-    """Return the column of the table."""
-    signed = kept["parts"] > 0
-    if not signed.any():
-        return pa.nulls(len(kept), pa.binary())
-    content = pa.py_buffer(np.ascontiguousarray(kept).tobytes())
-    whole = pa.FixedSizeBinaryArray.from_buffers(
-        pa.binary(KEPT.itemsize), len(kept), [None, content]
-    )
-    return pc.if_else(pa.array(signed), whole.cast(pa.binary()), None)
 
 
 def _part_names(one: CountedSet) -> dict[int, str]:
@@ -96,34 +87,45 @@ def of_part(rows: pa.RecordBatch, like: ReceivedRows) -> pa.RecordBatch:
 
 def messages_again(
     one: CountedSet, signals: str, rows: pa.RecordBatch
-) -> tuple[Messages, BoolArray]:
-    """Rebuild signed messages of rows, without checksums; and tell whose signature fits."""
+) -> Iterator[tuple[IntArray, Messages]]:
+    """Rebuild signed messages of rows, without checksums: those of one layout, and which they are.
+
+    Rows whose signature does not fit them are in none.
+    """
     names = signals.split(",") if signals else []
     of_set = one.name != PLAIN
     content = rows[SIGNED].to_pylist()
-    fits = np.array([len(said) == KEPT.itemsize for said in content], dtype=np.bool_)
-    blank = bytes(KEPT.itemsize)
-    sized = (said if fit else blank for said, fit in zip(content, fits, strict=True))
-    kept = np.frombuffer(b"".join(sized), KEPT)
     moments = pc.utf8_slice_codeunits(rows["drive_id"].cast(pa.string()), -16)
     started = pc.strptime(moments, "%Y%m%dT%H%M%SZ", "s", error_is_null=True)
-    fits &= np.asarray(started.is_valid().to_numpy(zero_copy_only=False), dtype=np.bool_)
-    fits &= np.bitwise_count(kept["mask"]) == (0 if of_set else len(names))
-    messages: Any = np.zeros(len(rows), message_type(len(names), signed=True, of_set=of_set))
-    messages["magic"] = MAGIC
-    messages["layout"] = SIGNED_LAYOUTS[SET_LAYOUT if of_set else LAYOUT]
-    messages["length"] = messages.dtype.itemsize
-    messages["vehicle"] = np.array(rows["vehicle_id"].cast(pa.string()).to_pylist(), "S16")
-    messages["start_s"] = started.fill_null(0).cast(pa.int64()).to_numpy().astype(np.uint64)
-    messages["rows"] = rows["n"].to_numpy().astype(np.uint32)
-    for name in set(KEPT.names or ()).intersection(messages.dtype.names or ()):
-        messages[name] = kept[name]
-    if of_set:
-        _name_set(messages, one, names, rows)
-    if names:
-        table = gram_table(signals, rows)
-        messages["numbers"] = np.hstack([table.sums, table.products])
-    return messages, fits
+    dated = np.asarray(started.is_valid().to_numpy(zero_copy_only=False), dtype=np.bool_)
+    for levels in (None, *range(MOST_LEVELS + 1)):
+        kind = kept_type(levels)
+        sized = np.array([len(said) == kind.itemsize for said in content], dtype=np.bool_)
+        at = np.flatnonzero(sized & dated)
+        kept = np.frombuffer(b"".join(content[place] for place in at), kind)
+        fits = np.bitwise_count(kept["mask"]) == (0 if of_set else len(names))
+        at, kept = at[fits], kept[fits]
+        if not len(at):
+            continue
+        some = rows.take(pa.array(at))
+        messages: Any = np.zeros(
+            len(at), message_type(len(names), signed=True, of_set=of_set, levels=levels)
+        )
+        layout = SET_LAYOUT if of_set else LAYOUT
+        signed = SIGNED_LAYOUTS[layout] if levels is None else DAY_LAYOUTS[layout] + levels
+        messages["magic"], messages["layout"] = MAGIC, signed
+        messages["length"] = messages.dtype.itemsize
+        messages["vehicle"] = np.array(some["vehicle_id"].cast(pa.string()).to_pylist(), "S16")
+        messages["start_s"] = started.take(pa.array(at)).cast(pa.int64()).to_numpy()
+        messages["rows"] = some["n"].to_numpy().astype(np.uint32)
+        for name in set(kind.names or ()).intersection(messages.dtype.names or ()):
+            messages[name] = kept[name]
+        if of_set:
+            _name_set(messages, one, names, some)
+        if names:
+            table = gram_table(signals, some)
+            messages["numbers"] = np.hstack([table.sums, table.products])
+        yield at, messages
 
 
 def _name_set(
@@ -241,12 +243,14 @@ def _check(
 ) -> int:
     """Check rows of the same signals; return how many cars have no key on their day."""
     drives, cars = (rows[name].cast(pa.string()).to_pylist() for name in ("drive_id", "vehicle_id"))
-    messages, fits = messages_again(one, signals, rows)
     known = [keys.of(car, day) for car, day in zip(cars, rows["day"].to_pylist(), strict=True)]
-    asked = [at for at, key in enumerate(known) if key is not None and fits[at]]
-    right = check_signatures(messages[asked], [key.bytes for at in asked if (key := known[at])])
-    found.checked += len(asked)
-    forged = np.array(asked, dtype=np.int64)[~right]
-    found.forged += [(drives[at], FORGED) for at in forged.tolist()]
-    found.forged += [(drives[at], OTHER_ROW) for at in np.flatnonzero(~fits).tolist()]
+    others = set(range(len(rows)))
+    for at, messages in messages_again(one, signals, rows):
+        others.difference_update(at.tolist())
+        asked = np.array([known[place] is not None for place in at], dtype=np.bool_)
+        public = [key.bytes for place in at if (key := known[place])]
+        right = check_signatures(messages[asked], public)
+        found.checked += len(right)
+        found.forged += [(drives[place], FORGED) for place in at[asked][~right]]
+    found.forged += [(drives[place], OTHER_ROW) for place in sorted(others)]
     return sum(key is None for key in known)

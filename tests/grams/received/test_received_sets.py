@@ -1,5 +1,6 @@
 """Messages of feature sets: changes of the course that cars counted, beside their signals."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import fleet_slip
 from fleet_slip.catalogue.course_change import BESIDE
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.received.signatures import KEYS_VARIABLE, sign_messages
+from fleet_slip.grams.received.signatures import KEYS_VARIABLE, sign_days, sign_messages
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.ed25519 import generate
 from fleet_slip.regression.exact.gram import Gram
@@ -104,8 +105,13 @@ def test_what_cannot_be_goes_to_the_quarantine(
     assert (report.received, dict(report.refused)) == (1, {reason: 1})
 
 
+@pytest.mark.parametrize(("sign", "layout"), [(sign_messages, b"\x04\0"), (sign_days, b"\x41\0")])
 def test_signatures_of_messages_of_changes_are_checked_again(
-    fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fleet: fleet_slip.Fleet,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    sign: Callable[[bytes, bytes], bytes],
+    layout: bytes,
 ) -> None:
     private, public = generate()
     messages = b"".join((set_message_of(changes(1), late=9), message_of(gram_of(1))))
@@ -114,8 +120,8 @@ def test_signatures_of_messages_of_changes_are_checked_again(
     keys.write_text(f"vehicle_id,public_key\nVIN1,{public.decode().splitlines()[1]}\n")
     monkeypatch.setenv(KEYS_VARIABLE, str(keys))
     assert not receive(fleet, tmp_path, messages, b" ").received, "they are not signed"
-    signed = sign_messages(messages, private)
-    assert signed[4:6] == b"\x04\0"
+    signed = sign(messages, private)
+    assert signed[4:6] == layout
     forged = bytearray(signed)
     forged[130] ^= 1
     assert receive(fleet, tmp_path, signed).received == 2
