@@ -270,10 +270,11 @@ def test_threads_read_small_files_and_large_ones_come_alone(
     assert set().union(*read_by.values()) == {f"{i}.csv" for i in range(5)}
 
 
-def test_a_data_root_is_no_folder_of_logs(folder: Path) -> None:
+@pytest.mark.parametrize("inside", ["", "logs", "logs/day=2024-05-31"])
+def test_a_data_root_is_no_folder_of_logs(folder: Path, inside: str) -> None:
     ingest(folder)
-    with pytest.raises(InputError, match="it is or has a data root"):
-        ingest(folder, folder.parent / "root")
+    with pytest.raises(InputError, match="it is, has or is in a data root"):
+        ingest(folder, folder.parent / "root" / inside)
 
 
 @pytest.mark.parametrize("url", ["s3://bucket/ok/../ok/f.csv", "gs://bucket/./f.csv"])

@@ -236,6 +236,17 @@ def test_timestamps_give_time_and_day(tmp_path: Path, kind: str) -> None:
     assert ticks(log) == [i for i in range(20) if i != 7 or kind == "parquet"]
 
 
+def test_polars_does_not_warn_of_a_format_in_its_own_words(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    columns = good_columns()
+    columns["t"] = [f"31.05.2024 12:00:00.{10 * i:03}" for i in range(len(columns["t"]))]
+    mapping = a_mapping(time={"unit": None, "format": "%d.%m.%Y %H:%M:%S.%f"}, drive={"day": None})
+    with pytest.raises(InputError, match="19 time_duplicate"):
+        read_columns(tmp_path, columns, mapping)
+    assert [one for one in recwarn if "%f" in str(one.message)] == []
+
+
 def test_a_rate_replaces_the_column_of_time(tmp_path: Path) -> None:
     columns = good_columns()
     del columns["t"]

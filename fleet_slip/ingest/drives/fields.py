@@ -19,7 +19,7 @@ from fleet_slip.ingest.drives.time_bases import DISORDER, HELD
 from fleet_slip.ingest.formats.csv_batches import EXTRA_FIELDS
 from fleet_slip.ingest.mapping.mapping import FromColumn, Mapping, is_number
 from fleet_slip.ingest.mapping.signal_column import SignalColumn, count_range
-from fleet_slip.ingest.mapping.time_base import DateColumn
+from fleet_slip.ingest.mapping.time_base import DateColumn, as_moments
 from fleet_slip.ingest.mapping.units import conversion_factor
 
 RAW = "raw "
@@ -264,8 +264,7 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
             clock_s = text.str.to_time(mapping.time.format, strict=False).cast(pl.Int64) / 1e9
             cases = ((text.is_null(), "missing"), (value.is_null(), "not_a_time"))
             return Field("time", "time", raw, clock_s, find_problems(*cases))
-        written = mapping.time.moment_format
-        moment = text.str.to_datetime(written, time_unit="us", strict=False)
+        moment = as_moments(text, str(mapping.time.moment_format))
     elif isinstance(kind, pl.Datetime):
         text = moment = raw
     else:

@@ -89,7 +89,9 @@ def find_files(path: Path) -> list[Path]:
         return _matching(path)
     if not path.is_dir():
         return [path]
-    _require_no_root(path, (path / "logs" / "_delta_log").is_dir())
+    real = path.resolve()
+    tables = [path / "logs", *(one for one in (real, *real.parents) if one.name == "logs")]
+    _require_no_root(path, any((table / "_delta_log").is_dir() for table in tables))
     inside = sorted(_logs_below(path))
     if not inside:
         raise InputError(f"{shown(path)}: {_NO_LOG}")
@@ -100,8 +102,8 @@ def _require_no_root(place: Place, is_root: bool) -> None:
     """Raise `InputError` for a data root: what is in it is in it."""
     if is_root:
         raise InputError(
-            f"{shown(place)}: it is or has a data root, whose logs were ingested before. Name the "
-            "folder where logs land."
+            f"{shown(place)}: it is, has or is in a data root, whose logs were ingested before. "
+            "Name the folder where logs land."
         )
 
 
