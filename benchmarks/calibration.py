@@ -19,16 +19,12 @@ from pathlib import Path
 import numpy as np
 
 import fleet_slip
-from fleet_slip.catalogue.car_numbers import CALIBRATION, CAR_NUMBERS
+from fleet_slip.catalogue.car_numbers import BY_COURSE, BY_SATELLITE, CALIBRATION, CAR_NUMBERS
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.grams.calibration.car_evidence import CarEvidence
-from fleet_slip.grams.calibration.tell_numbers import KINDS
-from fleet_slip.grams.cohorts.drive_sums import collect_sums
-from fleet_slip.grams.cohorts.reader import open_grams
 from fleet_slip.simulation.campaign import Campaign, DriveSpec, load_campaign
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2
-from fleet_slip.warehouse.condition import parse_condition
 
 STEPS = (1, 5, 30)
 ROADS = 8
@@ -63,10 +59,10 @@ def evidence_of(root: Path, campaign: Campaign) -> CarEvidence:
     """Simulate what is missing, and return what the drives are evidence of."""
     fleet = fleet_slip.open(root)
     fleet.simulate(campaign)
-    fleet.gram(CALIBRATION)
-    every = parse_condition(ALL_DRIVES)
-    with open_grams(fleet.warehouse, CALIBRATION, every) as opened:
-        return CarEvidence(collect_sums(opened.batches(every), KINDS))
+    sets = (CALIBRATION, BY_SATELLITE, BY_COURSE) if campaign.receivers else (CALIBRATION,)
+    for name in sets:
+        fleet.gram(name)
+    return fleet.calibrate(ALL_DRIVES).evidence
 
 
 def truth(campaign: Campaign) -> dict[str, dict[str, float]]:

@@ -15,6 +15,12 @@ from fleet_slip.config import Config
 CALIBRATION = "calibration"
 """The feature set whose Gram rows tell the numbers."""
 
+BY_SATELLITE = "calibration_satellite"
+"""The feature set that tells the speed ratio of cars whose receivers log the speed."""
+
+BY_COURSE = "calibration_course"
+"""The feature set that tells how cars slip whose receivers log the course."""
+
 DELAY = "delay"
 """The feature set whose Gram rows tell how late a satellite receiver is."""
 
@@ -26,6 +32,8 @@ NumberName = Literal[
     "speed_ratio",
     "steer_per_curvature",
     "understeer",
+    "slip_lever",
+    "slip_compliance",
 ]
 
 
@@ -89,6 +97,16 @@ CAR_NUMBERS: dict[NumberName, CarNumber] = {
         grain=Decimal("0.00002"),
         description="Steering angle that each lateral acceleration takes beyond: the tyres and the "
         "load",
+    ),
+    "slip_lever": CarNumber(
+        unit="m",
+        grain=Decimal("0.002"),
+        description="Slip for each curvature by wheels of 0.31 m: how far the rear axle is behind",
+    ),
+    "slip_compliance": CarNumber(
+        unit="rad*s^2/m",
+        grain=Decimal("0.000002"),
+        description="Slip that each lateral acceleration adds: the rear tyres and the load",
     ),
 }
 """The numbers, in the order in which they are shown."""

@@ -8,13 +8,14 @@ are.
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from typing import Any
 
 import pyarrow as pa
 
 from fleet_slip.catalogue.car_numbers import CALIBRATION, CAR_NUMBERS, NumberName
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.dates import date_of
@@ -26,6 +27,7 @@ from fleet_slip.grams.calibration.car_evidence import (
     Convergence,
 )
 from fleet_slip.grams.calibration.road_lean import Roads
+from fleet_slip.grams.calibration.tell_by_satellite import kinds_by_set
 from fleet_slip.grams.calibration.tell_numbers import KINDS
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
 from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
@@ -124,8 +126,17 @@ TABLE = pa.schema(
 
 
 def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
-    """Return the numbers that Gram rows of `calibration` tell of every car of a cohort."""
-    evidence = CarEvidence(collect_sums(opened.batches(condition), KINDS))
+    """Return the numbers that Gram rows of `calibration` tell of every car of a cohort.
+
+    With those of the sets that satellites tell more by, as far as there are any.
+    """
+    sums = collect_sums(opened.batches(condition), KINDS)
+    known = features()
+    for name, kinds in kinds_by_set().items():
+        if name in known.sets:
+            beside = replace(opened, identity=known.identity(name))
+            sums |= collect_sums(beside.batches(condition), kinds)
+    evidence = CarEvidence(sums)
     cars = {car: evidence.calibrated(car) for car in evidence.cars}
     return Calibration(cars, opened.logs_version, opened.grams_version, evidence)
 

@@ -18,6 +18,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName
 from fleet_slip.grams.calibration.road_lean import are_banked, roads_of
+from fleet_slip.grams.calibration.tell_by_satellite import LASTING_BY_SATELLITE, tell_by_satellite
 from fleet_slip.grams.calibration.tell_numbers import Telling, bank_of_bends, tell_numbers
 from fleet_slip.grams.cohorts.drive_sums import DriveSums
 from fleet_slip.regression.exact.gram import Gram
@@ -134,7 +135,8 @@ class CarEvidence:
 
     def tell(self, slices: Mapping[str, slice]) -> dict[NumberName, Telling]:
         """Return the numbers that some drives tell, with the lean of their roads."""
-        return tell_numbers(self._totals(slices), self._banked)
+        totals = self._totals(slices)
+        return tell_numbers(totals, self._banked) | tell_by_satellite(totals)
 
     def influence(self, telling: Telling, at: slice) -> Influence | None:
         """Return how drives move a number."""
@@ -176,9 +178,9 @@ class CarEvidence:
             if found is not None and name in self.variances:
                 again = 1 + len(found.shares) / ROADS
                 own[name] = self.variances[name] * float(found.shares.sum()) * again
-        for name, error in LASTING[self._banked].items():
-            if name in own:
-                own[name] += error**2
+        for name in own:
+            by_satellite = LASTING_BY_SATELLITE.get(told[name].kind, {})
+            own[name] += {**LASTING[self._banked], **by_satellite}.get(name, 0.0) ** 2
         common = self.roads.uncertainty
         return {
             name: sqrt(

@@ -89,8 +89,8 @@ STEERING = Relation(
 )
 """The steering by 1, curvature without the gyroscope's offset, and ay."""
 
-_WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
-_COURSE = ("yaw_rate", "ay", *_WHEELS, "curvature", "course_rate", "slowness")
+WHEEL_SPEEDS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
+_COURSE = ("yaw_rate", "ay", *WHEEL_SPEEDS, "curvature", "course_rate", "slowness")
 KINDS: Mapping[str, tuple[str, ...]] = {
     "course": _COURSE,
     "steering": (*_COURSE, "steer_fl", "steer_fr"),
@@ -109,7 +109,7 @@ def course_terms() -> Terms:
     speed = input_scales()["speed"] / 4
     return {
         **{name: _si(**{name: 1}) for name in ("yaw_rate", "ay", *_COURSE[-3:])},
-        "speed": dict.fromkeys(_WHEELS, speed),
+        "speed": dict.fromkeys(WHEEL_SPEEDS, speed),
         "wheels": _si(wheel_rr=1, wheel_rl=-1, wheel_fr=1, wheel_fl=-1),
     }
 
