@@ -71,6 +71,11 @@ def _printable(text: str) -> str:
     return text
 
 
+def added(default: float, **bounds: float) -> Any:
+    """Return a field that came later: at its default it is in no dump, and changes no digest."""
+    return Field(default=default, exclude_if=lambda value: value == default, **bounds)
+
+
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200), AfterValidator(_printable)]
 """Text that names a column, a car or a file."""
 

@@ -5,11 +5,17 @@ from typing import Annotated, NamedTuple
 
 from pydantic import Field, FiniteFloat
 
-from fleet_slip.config import Config
-from fleet_slip.vehicle.parameters import AIR_DENSITY_KGPM3, VehicleParameters
+from fleet_slip.config import Config, added
+from fleet_slip.vehicle.parameters import AIR_DENSITY_KGPM3, GRAVITY_MPS2, VehicleParameters
 
 Angle = Annotated[FiniteFloat, Field(ge=-5, le=5)]
 RadiusError = Annotated[FiniteFloat, Field(ge=-0.1, le=0.1)]
+
+PNEUMATIC_TRAIL_M = 0.03
+"""Of a tyre that does not slide: a third of half a contact patch of 0.18 m (Pacejka 2012, 3.2)."""
+
+CAMBER_PER_SLIP = 0.1
+"""Side force of a tyre per camber angle over that per slip angle (Gillespie 1992, ch. 6)."""
 
 
 class CarImperfections(Config):
@@ -45,6 +51,14 @@ class CarImperfections(Config):
     """Frontal area times the slope of the side force coefficient, per rad of air flow angle."""
     yawing_moment_volume_m3: FiniteFloat = Field(default=0.0, ge=0)
     """Frontal area times wheelbase times the slope of the yawing moment coefficient, per rad."""
+    aligning_compliance_deg_per_knm: FiniteFloat = added(0.0, ge=0, le=5)
+    """How far the front wheels give way to an aligning torque of each of their tyres."""
+    camber_per_roll: FiniteFloat = added(0.0, ge=-1, le=1)
+    """Angle by which wheels lean out of the bend over the body's roll."""
+    esc_brake_n: FiniteFloat = added(0.0, ge=0, le=10_000)
+    """Force of the brake with which stability control holds one wheel; 0: there is none."""
+    esc_threshold_deg_s: FiniteFloat = added(4.0, gt=0, le=45)
+    """How far the yaw rate departs from what steering asks for until it brakes."""
 
 
 PERFECT = CarImperfections()
@@ -77,6 +91,14 @@ class Traits(NamedTuple):
     """Lateral acceleration per speed and cross-wind, in 1/m."""
     wind_moment: float
     """Yaw acceleration per speed and cross-wind, in 1/m²."""
+    aligning: float
+    """Tangent of the road wheels' angle lost per aligning torque of both front tyres."""
+    lean: float
+    """Slip angle as which the wheels' camber acts, per lateral acceleration."""
+    brake: float
+    """Force of the brake of stability control, in N."""
+    threshold: float
+    """Departure of the yaw rate from which on it brakes, in rad/s."""
 
 
 def traits(vehicle: VehicleParameters, flaws: CarImperfections, sample_s: float) -> Traits:
@@ -84,6 +106,7 @@ def traits(vehicle: VehicleParameters, flaws: CarImperfections, sample_s: float)
     radius, body = vehicle.tyre.rolling_radius_m, vehicle.body
     toe_rear, thrust = math.radians(flaws.toe_rear_deg), math.radians(flaws.thrust_angle_deg)
     length_m = flaws.relaxation_length_m
+    roll = math.radians(flaws.roll_gradient_deg_per_g) / GRAVITY_MPS2
     pressure = 0.5 * AIR_DENSITY_KGPM3
     return Traits(
         half_lash=math.radians(flaws.steering_lash_deg) / 2,
@@ -102,4 +125,8 @@ def traits(vehicle: VehicleParameters, flaws: CarImperfections, sample_s: float)
         cooling=1 - sample_s / flaws.warm_up_s,
         wind_force=pressure * flaws.side_force_area_m2 / body.mass_kg,
         wind_moment=pressure * flaws.yawing_moment_volume_m3 / body.yaw_inertia_kgm2,
+        aligning=math.radians(flaws.aligning_compliance_deg_per_knm) / 2000,
+        lean=CAMBER_PER_SLIP * flaws.camber_per_roll * roll,
+        brake=flaws.esc_brake_n,
+        threshold=math.radians(flaws.esc_threshold_deg_s),
     )

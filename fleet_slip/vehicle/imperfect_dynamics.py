@@ -7,7 +7,7 @@ Sources: `docs/imperfections.md`.
 from typing import NamedTuple
 
 from fleet_slip.compiling import equation
-from fleet_slip.vehicle.car_imperfections import Traits
+from fleet_slip.vehicle.car_imperfections import PNEUMATIC_TRAIL_M, Traits
 from fleet_slip.vehicle.dynamics import Derivative, driven_body, rates_of
 from fleet_slip.vehicle.integration import extrapolate
 from fleet_slip.vehicle.parameters import Constants
@@ -19,8 +19,9 @@ from fleet_slip.vehicle.wheels import (
     Loads,
     WheelForce,
     WheelForces,
+    braked_spins,
     direction_of,
-    driven_spins,
+    driver_brakes,
     in_car_frame,
     transferred_loads,
 )
@@ -40,6 +41,11 @@ class Around(NamedTuple):
     """Speed of the air across the car to the left, in m/s."""
     stiffness: float
     """Cornering stiffness over that of warm tyres."""
+    brake_fl: float = 0.0
+    """Force of stability control at a wheel, in N."""
+    brake_fr: float = 0.0
+    brake_rl: float = 0.0
+    brake_rr: float = 0.0
 
 
 class Give(NamedTuple):
@@ -54,6 +60,8 @@ class Give(NamedTuple):
     side_fr: float
     side_rl: float
     side_rr: float
+    rack_torque: float = 0.0
+    """Aligning torque of the front tyres as the steering has given way to it, in Nm."""
 
 
 class GiveRates(NamedTuple):
@@ -64,11 +72,13 @@ class GiveRates(NamedTuple):
     side_fr: float
     side_rl: float
     side_rr: float
+    rack_torque: float = 0.0
 
 
 class _Wheel(NamedTuple):
     force: WheelForce
     side_rate: float
+    torque: float
 
 
 @equation
@@ -80,7 +90,8 @@ def wheel_tangent(tangent: float, far: float, toe: float) -> tuple[float, float]
 @equation
 def rack_tangent(give: Give, c: Constants, t: Traits) -> float:
     """Return the tangent of the mean front wheel's angle: less where the steering gives way."""
-    return c.steer_per_wheel * give.rack - t.compliance * give.rack_force
+    given = t.compliance * give.rack_force + t.aligning * give.rack_torque
+    return c.steer_per_wheel * give.rack - given
 
 
 @equation
@@ -103,7 +114,11 @@ def _imperfect_wheel(
     felt = across + t.relaxes * (followed_side - across)
     force = brush_force(along, felt, rolling, load, peak, c, grip)
     speed = max(abs(rolling), CREEP_SPEED_MPS)
-    return _Wheel(in_car_frame(force, to), speed * t.inverse_relaxation * (across - followed_side))
+    return _Wheel(
+        in_car_frame(force, to),
+        speed * t.inverse_relaxation * (across - followed_side),
+        PNEUMATIC_TRAIL_M * force.trail * force.y,
+    )
 
 
 @equation
@@ -112,9 +127,11 @@ def _wheels(
 ) -> tuple[WheelForces, GiveRates]:
     tangent = rack_tangent(give, c, t)
     bend = c.ackermann * tangent
-    left = direction_of(*wheel_tangent(tangent, 1.0 - bend, -t.toe))
-    right = direction_of(*wheel_tangent(tangent, 1.0 + bend, t.toe))
-    rear_left, rear_right = direction_of(1.0, t.rear_left), direction_of(1.0, t.rear_right)
+    lean = t.lean * x.ay_lag
+    left = direction_of(*wheel_tangent(tangent - lean, 1.0 - bend, -t.toe))
+    right = direction_of(*wheel_tangent(tangent - lean, 1.0 + bend, t.toe))
+    rear_left = direction_of(1.0, t.rear_left - lean)
+    rear_right = direction_of(1.0, t.rear_right - lean)
     front, rear = x.vy + c.front * x.yaw_rate, x.vy - c.rear * x.yaw_rate
     turn_f, turn_r = c.half_track_front * x.yaw_rate, c.half_track_rear * x.yaw_rate
     peak_f, peak_r = around.stiffness * c.stiffness_front, around.stiffness * c.stiffness_rear
@@ -136,7 +153,8 @@ def _wheels(
         x.vx + turn_r, rear, give.side_rr, rear_right, roll_rr, load.rr, peak_r, grip_r, c, t
     )
     yielding = (fl.force.y + fr.force.y - give.rack_force) * c.inverse_steering_lag
-    rates = GiveRates(yielding, fl.side_rate, fr.side_rate, rl.side_rate, rr.side_rate)
+    turning = (fl.torque + fr.torque - give.rack_torque) * c.inverse_steering_lag
+    rates = GiveRates(yielding, fl.side_rate, fr.side_rate, rl.side_rate, rr.side_rate, turning)
     return WheelForces(fl.force, fr.force, rl.force, rr.force), rates
 
 
@@ -156,7 +174,14 @@ def imperfect_derivative(
         still.vy + t.wind_force * push + around.gravity_y,
         still.yaw_rate + t.wind_moment * push,
     )
-    return rates_of(x, u, motion, driven_spins(x, force, load, motion, c), c), give_rates
+    front, rear = driver_brakes(x, c)
+    each = (
+        front + around.brake_fl,
+        front + around.brake_fr,
+        rear + around.brake_rl,
+        rear + around.brake_rr,
+    )
+    return rates_of(x, u, motion, braked_spins(x, force, load, each, c), c), give_rates
 
 
 @equation
@@ -177,4 +202,5 @@ def advance_give(
         give.side_fr + step * extrapolate(d.side_fr, before.side_fr, extrapolation),
         give.side_rl + step * extrapolate(d.side_rl, before.side_rl, extrapolation),
         give.side_rr + step * extrapolate(d.side_rr, before.side_rr, extrapolation),
+        give.rack_torque + step * extrapolate(d.rack_torque, before.rack_torque, extrapolation),
     )

@@ -32,6 +32,8 @@ class TyreForce(NamedTuple):
     """Longitudinal slip σx, positive when driven."""
     slip_per_speed: float
     """∂σx/∂(rolling speed), in s/m."""
+    trail: float
+    """Pneumatic trail over that of a tyre that does not slide: λ², within 0.04 of the brush's."""
 
 
 @equation
@@ -90,6 +92,7 @@ def brush_force(
         stuck2 * bristle_x + drag * direction_y * direction_y,
         slide_x * per_speed,
         per_speed,
+        stuck2,
     )
 
 
@@ -102,4 +105,5 @@ def linear_force(
     per_speed = 1.0 / max(abs(rolling), CREEP_SPEED_MPS)
     bristle = c.stiffness_ratio * stiffness * per_speed
     slip = (rolling - along) * per_speed
-    return TyreForce(bristle * (rolling - along), stiffness * slip_angle, bristle, slip, per_speed)
+    along_force, lateral = bristle * (rolling - along), stiffness * slip_angle
+    return TyreForce(along_force, lateral, bristle, slip, per_speed, 1.0)

@@ -191,7 +191,7 @@ def build_wheel_forces(brush: bool, spinning: bool) -> Callable[..., WheelForces
         slip_angle = math.atan2(to.sine, to.cosine) - math.atan2(vy, vx)
         rolling = c.radius * spin if spinning else vx
         force = linear_force(slip_angle, vx, rolling, load, peak, c)
-        x, y, damping, slip, per_speed = force
+        x, y, damping, slip, per_speed, _ = force
         return WheelForce(x, y, x, damping, slip, per_speed, 1.0, 0.0)
 
     @equation

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from fleet_slip.vehicle.car_imperfections import PERFECT, CarImperfections, traits
+from fleet_slip.vehicle.car_imperfections import (
+    CAMBER_PER_SLIP,
+    PERFECT,
+    PNEUMATIC_TRAIL_M,
+    CarImperfections,
+    traits,
+)
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
 from fleet_slip.vehicle.dynamics import derivative
 from fleet_slip.vehicle.imperfect_dynamics import (
@@ -17,6 +23,7 @@ from fleet_slip.vehicle.integration import SECOND_ORDER
 from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
 from fleet_slip.vehicle.lanes.road import Road, Surface
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, constants, load_vehicle
+from fleet_slip.vehicle.stability_control import controlled_brakes
 from fleet_slip.vehicle.state import Controls, State
 from tests.support.whole_drives import Truth, simulate_drives
 
@@ -292,3 +299,61 @@ def test_the_body_s_motion_is_recorded_for_its_sensors() -> None:
     found = channels["yaw_acceleration_rad_s2"]
     assert np.sqrt(np.mean((found - rate)[20:] ** 2)) < 0.1 * np.std(rate) + 0.01
     assert end(channels["leaning_ay_mps2"]) == pytest.approx(end(channels["ay_mps2"]), abs=0.01)
+
+
+def test_aligning_torque_takes_as_much_steering_as_its_compliance_says() -> None:
+    """Mz = F t of each front tyre; at a gentle lateral acceleration t is nearly whole."""
+    road, mass = circle(60.0, 10.0), SEDAN.body.mass_kg
+    plain = drive(road)
+    given = drive(road, CarImperfections(aligning_compliance_deg_per_knm=5.0))
+    front_n = mass * end(plain.ay_mps2) * SEDAN.body.rear_axle_m / SEDAN.body.wheelbase_m
+    expected_deg = 5.0 * PNEUMATIC_TRAIL_M * front_n / 2 / 1000
+    more_deg = np.degrees(end(given.steering_wheel_rad) - end(plain.steering_wheel_rad))
+    assert 0.6 * expected_deg < more_deg / SEDAN.steering.ratio < 1.05 * expected_deg
+
+
+def test_wheels_that_lean_outwards_slip_more_at_both_axles() -> None:
+    """Camber acts as slip: both axles need more of it, so that the car turns further inwards."""
+    road = circle(60.0, 14.0)
+    flaws = {"roll_gradient_deg_per_g": 5.0}
+    plain = drive(road, CarImperfections(**flaws))
+    leaning = drive(road, CarImperfections(**flaws, camber_per_roll=0.8))
+    expected_deg = CAMBER_PER_SLIP * 0.8 * 5.0 * end(plain.ay_mps2) / GRAVITY_MPS2
+    turned_deg = np.degrees(end(plain.sideslip_rad) - end(leaning.sideslip_rad))
+    assert turned_deg == pytest.approx(expected_deg, rel=0.1)
+
+
+def control(steering: float, yaw_rate: float) -> tuple[float, ...]:
+    flaws = CarImperfections(esc_brake_n=2000.0, esc_threshold_deg_s=4.0)
+    state = State(20.0, 0.0, yaw_rate, steering, *7 * (0.0,))
+    c = constants(SEDAN, 1.0)
+    return controlled_brakes(state, FINE, handling(SEDAN), c, traits(SEDAN, flaws, SAMPLE_S))
+
+
+def test_stability_control_brakes_the_outer_front_wheel_and_the_inner_rear_one() -> None:
+    """To the left: a car that turns too fast is held at fr, one that turns too slowly at rl."""
+    assert control(0.0, 0.0) == (0.0, 0.0, 0.0, 0.0)
+    assert control(0.0, np.radians(3.0)) == (0.0, 0.0, 0.0, 0.0)
+    assert np.flatnonzero(control(0.0, 0.3)).tolist() == [1]
+    assert np.flatnonzero(control(1.0, 0.05)).tolist() == [2]
+    assert np.flatnonzero(control(0.0, -0.3)).tolist() == [0]
+    assert np.flatnonzero(control(-1.0, -0.05)).tolist() == [3]
+
+
+def test_stability_control_holds_a_car_that_would_spin() -> None:
+    """300 kg behind the rear axle, braked in a bend on a wet road."""
+    car = SEDAN.with_sprung_mass(1620.0, -1.9)
+    road = circle(60.0, 1.0)
+    speed_mps = np.linspace(19.0, 22.0, len(road.speed_mps))
+    faster = road._replace(speed_mps=speed_mps, closed=False, length_m=road.length_m)
+    faster = faster._replace(
+        curvature_1pm=np.append(road.curvature_1pm, road.curvature_1pm[0]),
+        speed_mps=np.append(speed_mps, 22.0),
+    )
+    plain, held = simulate_drives(
+        [
+            LaneDrive(car, faster, 0.75, 1.0, flaws, felt=True)
+            for flaws in (PERFECT, CarImperfections(esc_brake_n=3000.0, esc_threshold_deg_s=3.0))
+        ]
+    )
+    assert np.abs(held.sideslip_rad).max() < 0.8 * np.abs(plain.sideslip_rad).max()

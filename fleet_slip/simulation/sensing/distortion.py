@@ -10,6 +10,8 @@ from fleet_slip.compiling import equation, kernel
 from fleet_slip.simulation.imperfections import Imperfections
 from fleet_slip.simulation.sensing.lags import Delay, LowPass, Wander
 from fleet_slip.simulation.sensing.pulses import Pulses
+from fleet_slip.simulation.sensing.vibration import AX, AY, FIRST_WHEEL, Vibration
+from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2
 
 WHEELS = ("wheel_fl_rad_s", "wheel_fr_rad_s", "wheel_rl_rad_s", "wheel_rr_rad_s")
@@ -17,6 +19,9 @@ INERTIAL = ("ax_mps2", "ay_mps2", "yaw_rate_rad_s")
 STEERING = ("steering_wheel_rad", "steer_fl_rad", "steer_fr_rad")
 GPS = ("gps_vx_mps", "gps_vy_mps")
 LABEL = "sideslip_rad"
+
+SLOWEST_LABEL_MPS = 1.0
+"""The reference sensor's errors are those at this speed where the car is slower."""
 
 
 class Distortion:
@@ -43,11 +48,28 @@ class Distortion:
             if pulses
         }
         self._gps: Wander | None = None
+        self._drift: Wander | None = None
+        roughness_cm3 = flaws.road.roughness_cm3
+        self._vibration = Vibration(roughness_cm3, of_drive) if roughness_cm3 else None
+        self._latest: dict[str, float] = {}
+
+    @property
+    def held_ticks(self) -> dict[str, int]:
+        """For how many ticks a value stands in the log, by column; those of every tick are not."""
+        sensors = self._flaws.sensors
+        groups = {
+            INERTIAL: sensors.inertial_held_ticks,
+            STEERING: sensors.steering_held_ticks,
+            WHEELS: sensors.wheel_held_ticks,
+        }
+        return {name: ticks for names, ticks in groups.items() for name in names if ticks > 1}
 
     def apply(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Return the next block as the sensors see it, with satellite velocity besides."""
+        truth = self._shaken(truth)
         seen = dict(truth)
         seen |= self._accelerations(truth)
+        self._let_drift(seen)
         seen |= self._angles(truth)
         for name, pulses in self._pulses.items():
             seen[name] = pulses.apply(truth[name])
@@ -56,7 +78,56 @@ class Distortion:
             seen[name] = low_pass.apply(seen[name])
         for name, delay in self._delays.items():
             seen[name] = delay.apply(seen[name])
+        if self._flaws.sensors.clock_jitter_s:
+            for names in (INERTIAL, STEERING, WHEELS):
+                self._jitter(seen, names)
         return seen
+
+    def _shaken(self, truth: Mapping[str, FloatArray]) -> Mapping[str, FloatArray]:
+        """Return what an uneven road makes of accelerations and wheel speeds."""
+        if self._vibration is None:
+            return truth
+        shaken = self._vibration.next(truth["vx_mps"])
+        wheels = {
+            name: truth[name] * (1 + one)
+            for name, one in zip(WHEELS, shaken[FIRST_WHEEL:], strict=True)
+        }
+        ax, ay = truth["ax_mps2"] + shaken[AX], truth["ay_mps2"] + shaken[AY]
+        return {**truth, **wheels, "ax_mps2": ax, "ay_mps2": ay}
+
+    def _let_drift(self, seen: dict[str, FloatArray]) -> None:
+        """Let the biases of the inertial unit change within the drive."""
+        sensors = self._flaws.sensors
+        acceleration, rate = sensors.acceleration_drift_mps2, sensors.yaw_rate_drift_rad_s
+        if acceleration or rate:
+            self._drift = self._drift or Wander(3, sensors.drift_s, self._generator)
+            errors = self._drift.next(len(seen[LABEL]))
+            for name, std, error in zip(
+                INERTIAL, (acceleration, acceleration, rate), errors, strict=True
+            ):
+                seen[name] = seen[name] + std * error
+
+    def _jitter(self, seen: dict[str, FloatArray], names: tuple[str, ...]) -> None:
+        """Make the values of one message older, up to the jitter, each by another time."""
+        most = self._flaws.sensors.clock_jitter_s / SAMPLE_S
+        late = most * self._generator.random(len(seen[LABEL]))
+        for name in names:
+            now = seen[name]
+            before = np.concatenate([[self._latest.get(name, now[0])], now[:-1]])
+            self._latest[name] = float(now[-1])
+            seen[name] = now - late * (now - before)
+
+    def _reference(self, truth: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the label's angle at its sensor: of the velocities there, by small angles."""
+        sensors = self._flaws.sensors
+        angle = truth[LABEL] + math.radians(sensors.label_offset_deg)
+        if not (sensors.label_x_m or sensors.label_velocity_std_mps):
+            return angle
+        across = sensors.label_x_m * truth["yaw_rate_rad_s"]
+        if sensors.label_velocity_std_mps:
+            noise = self._generator.standard_normal(len(angle))
+            across = across + sensors.label_velocity_std_mps * noise
+        return angle + across / np.maximum(truth["vx_mps"], SLOWEST_LABEL_MPS)
 
     def _accelerations(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Return what the inertial unit feels at its place on a leaning body.
@@ -89,7 +160,7 @@ class Distortion:
             + math.radians(sensors.steering_offset_deg),
             "steer_fl_rad": scale * truth["steer_fl_rad"] + math.radians(left),
             "steer_fr_rad": scale * truth["steer_fr_rad"] + math.radians(right),
-            LABEL: truth[LABEL] + math.radians(sensors.label_offset_deg),
+            LABEL: self._reference(truth),
         }
 
     def _satellite(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:

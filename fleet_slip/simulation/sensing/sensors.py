@@ -106,6 +106,7 @@ class Recorder:
         self._counts: dict[str, list[NDArray[np.int16]]] = {}
         self._gps_fix: list[BoolArray] = []
         self._saturated = 0
+        self._held = {} if distortion is None else distortion.held_ticks
 
     def record(self, truth: Mapping[str, FloatArray]) -> None:
         """Measure the next block, float64 by SI column but GPS; a missing one is not measured."""
@@ -145,6 +146,9 @@ class Recorder:
         bias_and_std: tuple[float, float],
     ) -> None:
         counts, clipped = noisy_counts(physical, noise, bias_and_std, catalogue()[name])
+        if ticks := self._held.get(catalogue()[name].column):
+            earlier = self._counts.get(name)
+            counts = held(counts, ticks, self._ticks, earlier[-1][-1] if earlier else counts[0])
         self._counts.setdefault(name, []).append(counts)
         self._saturated += clipped
 
@@ -163,6 +167,13 @@ class Recorder:
 
 def _joined(parts: list[NDArray[Scalar]]) -> NDArray[Scalar]:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def held(counts: NDArray[np.int16], ticks: int, first: int, before: np.int16) -> NDArray[np.int16]:
+    """Return counts as a log has them that takes a value every so many ticks from tick 0 on."""
+    places = np.arange(len(counts))
+    taken = places - (places + first) % ticks
+    return np.where(taken < 0, before, counts[np.maximum(taken, 0)])
 
 
 def noisy_counts(

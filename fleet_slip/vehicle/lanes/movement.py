@@ -5,6 +5,7 @@ from typing import Any
 
 from fleet_slip.compiling import equation
 from fleet_slip.vehicle.car_imperfections import Traits
+from fleet_slip.vehicle.driver import Handling
 from fleet_slip.vehicle.dynamics import derivative
 from fleet_slip.vehicle.imperfect_dynamics import (
     Around,
@@ -34,6 +35,7 @@ from fleet_slip.vehicle.lanes.lane_memory import (
     FORCE,
     GIVE,
     GIVE_SLOPES,
+    HANDLING,
     LANES,
     NOBODY,
     ORDER,
@@ -51,6 +53,7 @@ from fleet_slip.vehicle.lanes.lane_memory import (
     write,
 )
 from fleet_slip.vehicle.parameters import Constants
+from fleet_slip.vehicle.stability_control import controlled_brakes
 from fleet_slip.vehicle.state import Controls, State
 
 
@@ -72,13 +75,16 @@ def look_around(memory: Any, book: Any, routes: Any, surfaces: Any, truth: Any) 
             x = read(memory, STATE, lane, State)
             pose = read(memory, POSE, lane, Pose)
             t = read(memory, TRAITS, lane, Traits)
-            warm = read(memory, AROUND, lane, Around).stiffness
+            near = read(memory, AROUND, lane, Around)
             here, share = place(routes[drive], pose.station)
             for column in range(5):
                 before, after = surfaces[here, column], surfaces[here + 1, column]
                 memory[(AROUND + column) * LANES + lane] = before + share * (after - before)
-            memory[(AROUND + 5) * LANES + lane] = 1.0 + (warm - 1.0) * t.cooling
+            memory[(AROUND + 5) * LANES + lane] = 1.0 + (near.stiffness - 1.0) * t.cooling
             c = read(memory, CAR, lane, Constants)
+            if t.brake > 0.0:
+                h = read(memory, HANDLING, lane, Handling)
+                write(memory, AROUND + 6, lane, controlled_brakes(x, near, h, c, t))
             give = read(memory, GIVE, lane, Give)
             left, right = _wheel_tangents(give, c, t)
             sample = book[TICK, lane] - book[FIRST, lane]
