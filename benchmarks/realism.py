@@ -1,9 +1,10 @@
 """What each imperfection of car, sensors and road costs an estimator, alone and all together.
 
-    python -m benchmarks.realism [--root ROOT] [--tune] [--document docs/imperfections.md]
+    python -m benchmarks.realism [--root ROOT] [--tune] [--document docs/imperfections.md] [--rough]
 
 Errors on the nominal test drive against its label as logged, each with one group of the figures of
-the scenario `imperfect`. Models 4 and 5 of Table I are fitted to one day of `waterford` without any
+the scenario `imperfect`; with --rough with one of what `fleet_rough` adds, of the middle of its
+ranges. Models 4 and 5 of Table I are fitted to one day of `waterford` without any
 imperfection; once more with the same imperfections in the training drives. The published model is
 the champion of the ROOT given (fleet-slip --root ROOT run), and so are the columns that are fitted
 once more. The EKF and the Kalman filter with GPS
@@ -11,6 +12,7 @@ know the car's parameters; with --tune their noises suit two of the training dri
 """
 
 import argparse
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
@@ -38,6 +40,7 @@ from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
+from fleet_slip.simulation.drive_plan import FleetPlan
 from fleet_slip.simulation.drives import DriveLog, simulate_logs
 from fleet_slip.simulation.imperfections import NONE, WORN_RADIUS, WORN_STIFFNESS, Imperfections
 from fleet_slip.simulation.scenario import load_scenario
@@ -95,6 +98,23 @@ GROUPS: dict[str, tuple[str, ...]] = {
 for tyres without tread, as after the life of a set."""
 
 
+ROUGH_GROUPS: dict[str, tuple[str, ...]] = {
+    "none": (),
+    "aligning torque": ("aligning_compliance_deg_per_knm",),
+    "roll of the body alone": ("roll_gradient_deg_per_g",),
+    "... and camber by roll": ("roll_gradient_deg_per_g", "camber_per_roll"),
+    "stability control": ("esc_brake_n", "esc_threshold_deg_s"),
+    "biases that drift": ("acceleration_drift_mps2", "yaw_rate_drift_rad_s", "drift_s"),
+    "lever of the label": ("label_x_m",),
+    "noise of the label by 1 / v": ("label_velocity_std_mps",),
+    "clock jitter": ("clock_jitter_s",),
+    "inertial and steering at 50 Hz": ("inertial_held_ticks", "steering_held_ticks"),
+    "wheels at 33 Hz": ("wheel_held_ticks",),
+    "road of class B": ("roughness_cm3",),
+}
+"""What `fleet_rough` adds."""
+
+
 @dataclass(frozen=True)
 class Case:
     """One group of imperfections, in all drives alike."""
@@ -118,12 +138,33 @@ class Case:
         return replace(drive, flaws=self.flaws, vehicle=vehicle)
 
 
-def cases() -> list[Case]:
+def rough() -> Imperfections:
+    """Return the scenario's figures, with the middle of the ranges that `fleet_rough` adds.
+
+    Of a range about zero it is the end.
+    """
+    figures = load_scenario("imperfect").imperfections.model_dump()
+    plan = load_campaign("fleet_rough").plan
+    assert isinstance(plan, FleetPlan) and plan.imperfections
+    added = {name for names in ROUGH_GROUPS.values() for name in names}
+    for kind, ranges in (
+        ("car", plan.imperfections.car),
+        ("sensors", plan.imperfections.sensors),
+        ("road", plan.imperfections.road),
+    ):
+        for name, bounds in ranges.items():
+            if name in added and name not in figures[kind]:
+                middle = bounds.max if bounds.min < 0 else (bounds.min + bounds.max) / 2
+                figures[kind][name] = math.ceil(middle) if name.endswith("_ticks") else middle
+    return Imperfections.model_validate(figures)
+
+
+def cases(of_rough: bool = False) -> list[Case]:
     """Return each group alone, and all at once."""
-    whole = load_scenario("imperfect").imperfections
+    whole = rough() if of_rough else load_scenario("imperfect").imperfections
     found = [
         Case(name, part_of(whole, names), "load" in names, "wear" in names)
-        for name, names in GROUPS.items()
+        for name, names in (ROUGH_GROUPS if of_rough else GROUPS).items()
     ]
     return [*found, Case("everything", whole, loaded=True, worn=True)]
 
@@ -265,6 +306,7 @@ def main() -> None:
     parser.add_argument("--root", help="data root with a published model waterford")
     parser.add_argument("--tune", action="store_true", help="tune the filters; takes minutes")
     parser.add_argument("--document", type=Path, help="page to put the table into")
+    parser.add_argument("--rough", action="store_true", help="what fleet_rough adds")
     arguments = parser.parse_args()
     campaign = load_campaign("waterford")
     training = campaign.drives(campaign.days()[0])
@@ -274,14 +316,14 @@ def main() -> None:
         published = published_estimate(fleet_slip.open(arguments.root).model("waterford").manifest)
     fixed = fixed_estimators(simulate_logs(training), arguments.tune, published)
     rows = {}
-    for case in cases():
+    for case in cases(arguments.rough):
         rows[case.name] = row(case, training, test, fixed, published)
         if len(rows) == 1:
             print(", ".join(rows[case.name]), flush=True)
         values = "".join(f"{value:9.3f}" for value in rows[case.name].values())
         print(f"{case.name:36}{values}", flush=True)
     if arguments.document:
-        insert(arguments.document, "realism", table(rows))
+        insert(arguments.document, "rough" if arguments.rough else "realism", table(rows))
 
 
 if __name__ == "__main__":

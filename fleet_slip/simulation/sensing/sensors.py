@@ -171,9 +171,9 @@ def _joined(parts: list[NDArray[Scalar]]) -> NDArray[Scalar]:
 
 def held(counts: NDArray[np.int16], ticks: int, first: int, before: np.int16) -> NDArray[np.int16]:
     """Return counts as a log has them that takes a value every so many ticks from tick 0 on."""
-    places = np.arange(len(counts))
-    taken = places - (places + first) % ticks
-    return np.where(taken < 0, before, counts[np.maximum(taken, 0)])
+    begun = -first % ticks
+    values = np.repeat(counts[begun::ticks], ticks)
+    return np.concatenate([np.full(begun, before), values])[: len(counts)]
 
 
 def noisy_counts(
