@@ -19,8 +19,8 @@ TICKS = 60_000
 
 
 def truth(speed_mps: float, yaw_rate_rad_s: float = 0.0) -> dict[str, np.ndarray]:
-    names = (*INERTIAL, *WHEELS, LABEL, "steering_wheel_rad", "steer_fl_rad", "steer_fr_rad")
-    names += ("yaw_acceleration_rad_s2", "leaning_ax_mps2", "leaning_ay_mps2", "vx_mps", "vy_mps")
+    names = [*INERTIAL, *WHEELS, LABEL, "steering_wheel_rad", "steer_fl_rad", "steer_fr_rad"]
+    names += ["yaw_acceleration_rad_s2", "leaning_ax_mps2", "leaning_ay_mps2", "vx_mps", "vy_mps"]
     values = {name: np.zeros(TICKS) for name in names}
     values["vx_mps"] += speed_mps
     values["yaw_rate_rad_s"] += yaw_rate_rad_s
