@@ -129,7 +129,8 @@ class PublishedModels(Rooted):
             if champion:
                 made = registry.trained_drives(champion.manifest)
             if champion is None or made is not None:
-                require_sound_drives(self.warehouse, manifest, made)
+                settled = len(champion.manifest.terms) if champion else 0
+                require_sound_drives(self.warehouse, manifest, made, settled)
         return manifest, selection
 
     def _chosen(

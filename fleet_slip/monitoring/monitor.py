@@ -182,12 +182,15 @@ def _judged(day: Day, mean: Limits, std: Limits) -> Day:
     return replace(day, alarms=tuple(name for name, yes in beyond.items() if yes))
 
 
+_SINCE = "fleet-slip monitor {name} --since DAY"
+
+
 def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | None:
     """Return the newest day of the logs as they were when the model was trained."""
     if version.manifest.imported_from is not None:
         raise DataError(
             f"{version.reference} was trained in another data root. Say which day is the first new "
-            "one."
+            f"one: {_SINCE.format(name=version.manifest.name)}"
         )
     logs = warehouse.logs
     number = version.manifest.trained_on.logs_version
@@ -196,6 +199,7 @@ def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | No
     except StorageError:
         raise StorageError(
             f"{logs.folder}: version {number}, which {version.reference} was trained on, is no "
-            "longer in the Delta log. Say which day is the first new one."
+            "longer in the Delta log. Say which day is the first new one: "
+            f"{_SINCE.format(name=version.manifest.name)}"
         ) from None
     return max((file.day for file in then.files if file.day), default=None)

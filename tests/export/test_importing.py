@@ -72,7 +72,7 @@ def test_the_tables_here_are_not_those_that_made_it(
     arguments = (home.warehouse, trained.cohort, "estimator", None)
     assert is_up_to_date(made.manifest, *arguments)
     assert not is_up_to_date(brought.manifest, *arguments)
-    with pytest.raises(DataError, match="another data root"):
+    with pytest.raises(DataError, match="monitor smoke --since DAY"):
         monitor(home.warehouse, brought)
     report = Verification()
     verify_models(away.warehouse, {}, report)

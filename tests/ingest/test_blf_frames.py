@@ -128,7 +128,10 @@ def test_what_no_recorder_writes_is_refused(tmp_path: Path) -> None:
     assert "no object where the next should begin" in damaged(write_objects(file, one, bytes(40)))
     short = one[:8] + struct.pack("<I", 40) + one[12:40]
     assert "a frame of 40 bytes" in damaged(write_objects(file, short, one))
+    assert "a last object that ends too early" in damaged(write_objects(file, one, one[:-4]))
     content = write_objects(file, one).read_bytes()
+    file.write_bytes(write_objects(file, one, one).read_bytes()[: -len(one)])
+    assert "a container that ends too early" in damaged(file)
     file.write_bytes(content[:160] + b"\7" + content[161:])
     assert "compressed by an unknown method, 7" in damaged(file)
     packed = zlib.compress(one * 9)[:-6]  # its last frames are not there

@@ -138,6 +138,18 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
     assert fleet.publish("m", asked).new
 
 
+def test_a_champion_of_more_columns_needs_drives_for_them_too(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cohort = fleet.cohort("day = DATE '2026-10-05'")
+    assert fleet.publish("m", cohort.select(model="ay, yaw_rate")).new
+    strict = gate.floor().model_copy(update={"max_columns_per_drive": 0.6})
+    monkeypatch.setattr(gate, "floor", lambda: strict)
+    with pytest.raises(RefusedError, match=r"3 columns on 4 drives, more than 0\.6 a drive"):
+        fleet.publish("m", cohort.select(model="ay, yaw_rate, steering_wheel"))
+    assert not fleet.would_publish("m", cohort.select(model="ay, steering_wheel")).refused
+
+
 def test_a_cohort_tells_what_it_was_before_drives_were_left_out() -> None:
     asked = "day > '2026-01-01' AND (mass_kg < 1500)"
     once = without_drives(asked, "drive", [hash_drive("drive", "a")])

@@ -39,4 +39,6 @@ def watch(
     Example: **fleet-slip watch adhesion_0_4 --output slippery.html**
     """
     file = context.obj.watch(what, model, output, from_s=begin, until_s=until, threads=threads)
-    say(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
+    from fleet_slip.pages.page_parts import size  # noqa: PLC0415 - of the extra, which is there now
+
+    say(f"{file}: {size(file.stat().st_size)}")

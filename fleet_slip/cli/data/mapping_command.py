@@ -58,7 +58,7 @@ def mapping(
         raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
     with local_copy(logs[0]) as copy:
         draft = draft_mapping(copy, profile_file(copy, formats))
-        text = write_draft(draft, name_of(copy.stem))
+        text = write_draft(draft, name_of(copy.stem), file)
     if json:
         print_json({"channels": _channels(draft), "mapping": text})
     else:

@@ -62,7 +62,10 @@ def check_grams(
 def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> CheckReport:
     logs = warehouse.logs.snapshot()
     if not logs.files:
-        raise DataError(f"{warehouse.root}: no logs yet. Run: fleet-slip simulate CAMPAIGN")
+        raise DataError(
+            f"{warehouse.root}: there are no logs, of which Gram rows are computed again. They "
+            "come with: fleet-slip run, or ingest. What cars sent is checked by: fleet-slip verify"
+        )
     chosen = _evenly(logs.files, count, begin)
     where = find_gram_files(warehouse, warehouse.grams.snapshot().files)
     drives = by_integers = rows = wide_drives = 0

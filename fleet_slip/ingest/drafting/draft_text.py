@@ -2,9 +2,11 @@
 
 import json
 import re
+import shlex
 import textwrap
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
@@ -18,7 +20,7 @@ from fleet_slip.words import shown
 
 WIDTH = 100
 """Of a comment."""
-_COMMENTED_KEY = re.compile(r"# [a-z_0-9]+ = ")
+_COPIED = re.compile(r"# ([a-z_0-9]+ = |fleet-slip )")
 _HEAD = """\
 # A draft for {file}. Every line is a guess: check it, with
 # fleet-slip ingest {file} --mapping THIS_FILE --dry-run
@@ -32,9 +34,13 @@ def name_of(stem: str) -> str:
     return (plain if plain[:1].isalpha() else f"log_{plain}")[:41]
 
 
-def write_draft(draft: Draft, name: str) -> str:
-    """Return a mapping in TOML. It lacks what the file does not tell: the day, the car."""
-    parts = [_HEAD.format(file=shown(draft.file.name)), f"name = {_value(name)}\n"]
+def write_draft(draft: Draft, name: str, place: Path | str | None = None) -> str:
+    """Return a mapping in TOML. It lacks what the file does not tell: the day, the car.
+
+    `place` is what a person calls the file, if that is not where it was read.
+    """
+    called = shlex.quote(shown(str(place or draft.file)))
+    parts = [_HEAD.format(file=called), f"name = {_value(name)}\n"]
     formats = draft.profile.formats
     if draft.profile.absent.texts:
         parts.append(f"missing = {_value(draft.profile.absent.texts)}\n")
@@ -53,8 +59,8 @@ def write_draft(draft: Draft, name: str) -> str:
 
 
 def _wrapped(line: str) -> str:
-    """Return a line; a long comment as several lines, unless it is a key to be uncommented."""
-    if len(line) <= WIDTH or not line.startswith("# ") or _COMMENTED_KEY.match(line):
+    """Return a line; a long comment as several lines, unless it has a key or a command."""
+    if len(line) <= WIDTH or not line.startswith("# ") or _COPIED.match(line):
         return line
     return textwrap.fill(
         line, WIDTH, subsequent_indent="#   ", break_long_words=False, break_on_hyphens=False

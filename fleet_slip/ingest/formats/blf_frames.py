@@ -88,6 +88,8 @@ def read_blf_frames(budget: Budget, start_s: float) -> Iterator[FrameBlock]:
             rest = content[end:]
             if len(begins):
                 yield _frames(content, begins, start_s, budget)
+    if _MARK in rest:
+        raise budget.damaged("a last object that ends too early")
 
 
 def _together(containers: Iterator[bytes]) -> Iterator[bytes]:
@@ -113,6 +115,8 @@ def _containers(stream: BinaryIO, budget: Budget) -> Iterator[bytes]:
             raise budget.damaged(f"an object of {size:,} bytes")
         if kind == _CONTAINER:
             content = os.pread(stream.fileno(), size - len(header), at + len(header))
+            if len(content) < size - len(header):
+                raise budget.damaged("a container that ends too early")
             yield _unfolded(content, _CONTAINER_HEADER.unpack(header)[0], budget)
         at += size + size % _PADDING
 

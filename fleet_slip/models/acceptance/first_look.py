@@ -41,22 +41,23 @@ _LONGEST = """
 
 
 def require_sound_drives(
-    warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None = None
+    warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None = None, settled: int = 0
 ) -> None:
     """Raise `RefusedError` if most of some measured drives of a cohort contradict any car.
 
-    `made` are the drives that made the champion. What is looked at is the label, and the signals
+    `made` are the drives that made the champion, of `settled` columns: one of more columns needs as
+    much data for them as a first champion does. What is looked at is the label, and the signals
     that a model has columns of. Simulated drives, and those of cars that sent no log, are passed
     over.
     """
-    found, looked_at = _look(warehouse, manifest, made)
-    if made is not None and looked_at < FEWEST_NEW:
-        return
-    if made is None and looked_at and (lacks := thin(manifest)):
+    found, looked_at, measured = _look(warehouse, manifest, made)
+    if measured and len(manifest.terms) > settled and (lacks := thin(manifest)):
         raise RefusedError(
             f"{manifest.name} was not published: {'; '.join(lacks)}. Ingest more drives, choose "
             "fewer columns, or publish it with force all the same."
         )
+    if made is not None and looked_at < FEWEST_NEW:
+        return
     used = {manifest.label.signal}
     for term in manifest.terms:
         used |= set(term.definition.signals) if term.definition else {term.signal}
@@ -74,13 +75,14 @@ def require_sound_drives(
 
 def _look(
     warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None
-) -> tuple[dict[tuple[str, tuple[str, ...]], list[Suspicion]], int]:
-    """Return what looks wrong in some long drives, and how many these are."""
+) -> tuple[dict[tuple[str, tuple[str, ...]], list[Suspicion]], int, int]:
+    """Return what looks wrong in some long drives, how many these are, and of how many."""
     found: dict[tuple[str, tuple[str, ...]], list[Suspicion]] = {}
     condition = parse_condition(manifest.trained_on.cohort)
     query = _LONGEST.format(condition=condition.sql)
     with connect_tables(warehouse, query + "log_counts") as database, asking(database, condition):
         drives = database.execute(query, {"source": SOURCE}).fetchall()
+        measured = len(drives)
         if made is not None:
             numbers = hash_numbers(pa.array([drive for drive, _ in drives], pa.string()))
             seen = made.among(numbers).tolist()
@@ -94,7 +96,7 @@ def _look(
             ).fetchnumpy()
             for suspicion in find_suspicions(_signals(columns)):
                 found.setdefault((suspicion.kind, suspicion.signals), []).append(suspicion)
-    return found, len(chosen)
+    return found, len(chosen), measured
 
 
 def _signals(columns: Mapping[str, Any]) -> dict[str, FloatArray]:

@@ -149,9 +149,8 @@ def _reason(winner: Shortfall, best: CrossValidation, near: int, total: int, wor
             "one standard error of the difference."
         )
     real = "real, but less than" if winner.real else "not real; worth having would be"
-    lacking = (
-        "" if worth.relative else f", which is {math.degrees(winner.lacks):.2g} deg of its own"
-    )
+    lacks_deg = math.degrees(winner.lacks)
+    lacking = "" if worth.relative else f", what an independent error of {lacks_deg:.2g} deg adds"
     return (
         f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of the "
         f"{near} models whose error is negligibly larger than that of model {best.name}, the best "

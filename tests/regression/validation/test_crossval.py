@@ -163,7 +163,7 @@ def test_a_gain_that_is_real_and_worth_nothing_buys_no_signal() -> None:
     assert choose([small, best], Worth(0.03, relative=True)).model is best
     reason = choose([small, best], Worth(0.5)).reason
     assert "fewest signals (3) of the 2 models whose error is negligibly larger" in reason
-    assert "is real, but less than" in reason
+    assert "what an independent error of 24 deg adds, is real, but less than" in reason
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5, 2.0])
