@@ -16,9 +16,9 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
-from fleet_slip.comparison.observers import ekf, kalman, luenberger, sliding_mode
+from fleet_slip.comparison.observers import ekf, ekf_bank, kalman, luenberger, sliding_mode
 from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive, read_drive
-from fleet_slip.comparison.observers.tuning import tune
+from fleet_slip.comparison.observers.tuning import Estimator, Tuned, tune
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.files.documents import DocumentFolder
@@ -52,6 +52,34 @@ class Filter:
     told: bool = False
     other_starts: tuple[Config, ...] = ()
     """Where the search for parameters begins besides."""
+    filters: str | None = None
+    """The module whose tuned parameters are its own; it tunes what it has besides."""
+
+    def starts(self, tuned: Mapping[str, Config]) -> tuple[Config, ...]:
+        """Return where the search begins, from what other modules were tuned to."""
+        if self.filters is None or self.filters not in tuned:
+            return (self.parameters, *self.other_starts)
+        own = self.parameters.model_copy(update=dict(tuned[self.filters]))
+        return (own,)
+
+    def tune(
+        self,
+        drives: Sequence[LabelledDrive],
+        car: VehicleParameters,
+        executor: Executor,
+        tuned: dict[str, Config],
+    ) -> Tuned[Config]:
+        """Return the best that any start leads to, and add its parameters to what was tuned."""
+        estimate: Estimator[Config] = (
+            ekf_bank.remembering() if self.module == "ekf_bank" else self.estimate
+        )
+        found = [
+            tune(estimate, start, self.tunable, drives, car, executor)
+            for start in self.starts(tuned)
+        ]
+        best = min(found, key=lambda one: one.rmse_rad)
+        tuned[self.module] = best.parameters
+        return best
 
 
 LOOSE_EKF = ekf.EkfNoise(
@@ -67,6 +95,10 @@ FILTERS = (
     Filter(
         "ekf_told", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, told=True,
         other_starts=(LOOSE_EKF,),
+    ),
+    Filter(
+        "ekf_bank", "ekf_bank", ekf_bank.estimate, ekf_bank.BankNoise(), ekf_bank.TUNABLE,
+        filters="ekf",
     ),
     Filter(
         "luenberger", "luenberger", luenberger.estimate, luenberger.ObserverPoles(),
@@ -152,20 +184,15 @@ def filter_bank(
     """
     drives = TuningDrives.of(warehouse, cohort, weighed=weighed)
     bank = Bank(drives, {}, {})
+    before: dict[str, Config] = {}
     for one in FILTERS:
-        key = _key(one, drives, car)
+        key = _key(one, one.starts(before), drives, car)
         kept = DocumentFolder(warehouse.root / "tuned" / one.module)
         documents = (kept.read(number).content for number in reversed(kept.numbers()))
         found = next((content for content in documents if content["key"] == key), None)
         if found is None:
             try:
-                best = min(
-                    (
-                        tune(one.estimate, start, one.tunable, drives.read(), car, executor)
-                        for start in (one.parameters, *one.other_starts)
-                    ),
-                    key=lambda tuned: tuned.rmse_rad,
-                )
+                best = one.tune(drives.read(), car, executor, before)
                 found = {
                     "key": key,
                     "parameters": best.parameters.model_dump(mode="json"),
@@ -176,8 +203,10 @@ def filter_bank(
             except DataError as error:  # its drives have no fix, no wheel speeds, no steering
                 LOGGER.warning("%s competes as it is, for it cannot be tuned: %s", one.name, error)
         on = drives.names if found else []
-        tuned = type(one.parameters).model_validate(found["parameters"]) if found else None
-        both = {one.name: one.parameters, f"{one.name}_tuned": tuned or one.parameters}
+        if found:
+            before[one.module] = type(one.parameters).model_validate(found["parameters"])
+        tuned = before.get(one.module, one.parameters)
+        both = {one.name: one.parameters, f"{one.name}_tuned": tuned}
         for name, parameters in both.items():
             bank.estimators[name] = FilterEstimate(one, parameters, car, weighed)
             bank.descriptions[name] = bank.estimators[name].description()
@@ -185,11 +214,13 @@ def filter_bank(
     return bank
 
 
-def _key(one: Filter, drives: "TuningDrives", car: VehicleParameters) -> dict[str, Any]:
+def _key(
+    one: Filter, starts: Sequence[Config], drives: "TuningDrives", car: VehicleParameters
+) -> dict[str, Any]:
     """Return what tuned parameters depend on."""
     return {
         "for_lowest": "rmse_deg",
-        "starts": [start.model_dump(mode="json") for start in (one.parameters, *one.other_starts)],
+        "starts": [start.model_dump(mode="json") for start in starts],
         "tunable": list(one.tunable),
         "drives": drives.key(),
         "car": car.model_dump(mode="json"),

@@ -33,9 +33,9 @@ from fleet_slip.comparison.observers import ekf
 from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals, LabelledDrive
 from fleet_slip.comparison.observers.identification import FOLDS, IDENTIFIED, Measured, identify
 from fleet_slip.comparison.observers.single_track import follow, measured_speed_mps
-from fleet_slip.comparison.observers.tuning import tune
 from fleet_slip.comparison.observers.yaw_rate import YawRateNoise
 from fleet_slip.comparison.observers.yaw_rate import estimate as estimate_yaw_rate
+from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
@@ -212,6 +212,7 @@ def _tuned(
         "kinematic": ("geometry", lambda signals: _rolling(signals, vehicle))
     }
     cars = {} if vehicle.description == IDENTIFIED else {"tuned": vehicle}
+    before: dict[str, dict[str, Config]] = {"tuned": {}}
     try:
         identified = identify(Measured.of(vehicle), others, executor)
     except DataError as error:
@@ -219,6 +220,7 @@ def _tuned(
         cars["tuned"] = vehicle
     else:
         cars["identified"] = identified.car
+        before["identified"] = {"ekf": identified.noise}
         ready["ekf_identified"] = (
             "geometry, and a car identified from the other parts",
             lambda signals: ekf.estimate(signals, identified.car, identified.noise),
@@ -230,7 +232,7 @@ def _tuned(
             if one.told or name in ready or (one.gps and not navigated):
                 continue
             try:
-                ready[name] = (_knows(how), _in_car(one, car, others, executor))
+                ready[name] = (_knows(how), _in_car(one, car, others, executor, before[how]))
             except DataError as error:
                 LOGGER.warning("%s does not compete: %s", name, error)
     return ready
@@ -243,16 +245,14 @@ def _knows(how: str) -> str:
 
 
 def _in_car(
-    one: Filter, car: VehicleParameters, others: Sequence[LabelledDrive], executor: Executor
+    one: Filter,
+    car: VehicleParameters,
+    others: Sequence[LabelledDrive],
+    executor: Executor,
+    tuned: dict[str, Config],
 ) -> Callable[[DriveSignals], FloatArray]:
-    best = min(
-        (
-            tune(one.estimate, start, one.tunable, others, car, executor)
-            for start in (one.parameters, *one.other_starts)
-        ),
-        key=lambda tuned: tuned.rmse_rad,
-    )
-    return lambda signals: one.estimate(signals, car, best.parameters)
+    parameters = one.tune(others, car, executor, tuned).parameters
+    return lambda signals: one.estimate(signals, car, parameters)
 
 
 WHEELS_LAG = 0.1

@@ -55,8 +55,8 @@ def spread(belief: Belief, f: tuple[Row, ...], q: Row) -> None:
 
 
 @equation
-def condition(belief: Belief, h: Row, innovation: float, variance: float) -> None:
-    """Take in one measurement with the row H, in Joseph's form.
+def condition(belief: Belief, h: Row, innovation: float, variance: float) -> float:
+    """Take in one measurement with the row H, in Joseph's form; return the innovation's variance.
 
         K = P Hᵀ / (H P Hᵀ + R)
         x ← x + K (z − H x)
@@ -82,3 +82,4 @@ def condition(belief: Belief, h: Row, innovation: float, variance: float) -> Non
         for j in range(i, n):
             p[i, j] = p[i, j] - gain * u[j] + rest * (u[j] / (known + variance))
             p[j, i] = p[i, j]
+    return known + variance

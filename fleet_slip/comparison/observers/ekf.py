@@ -16,6 +16,7 @@ a bend: at first the rear wheels are taken to roll without slip, vy = b r. From 
 tyres would slide there, where their force has no slope that leads back.
 """
 
+from math import log
 from typing import NamedTuple
 
 import numpy as np
@@ -120,12 +121,21 @@ def update(
     axles: Axles,
     c: Chassis,
     v: Variances,
-) -> None:
-    """Take in wheel speed, yaw rate and lateral acceleration, whose noises are independent."""
+) -> float:
+    """Take in wheel speed, yaw rate and lateral acceleration, whose noises are independent.
+
+    Returns the logarithm of the likelihood of yaw rate and lateral acceleration before they were
+    taken in, but for a constant. That of the wheels' speed is of the bias of ax.
+    """
     condition(x, (1.0, 0.0, 0.0, 0.0), vx - x.mean[0], v.r_vx)
-    condition(x, (0.0, 0.0, 1.0, 0.0), yaw_rate - x.mean[2], v.r_r)
+    off_r = yaw_rate - x.mean[2]
+    var_r = condition(x, (0.0, 0.0, 1.0, 0.0), off_r, v.r_r)
     d = rates(x.mean[0], x.mean[1], x.mean[2], steer, axles, c)
-    condition(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), ay - d.ay - x.mean[3], v.r_ay)
+    off_ay = ay - d.ay - x.mean[3]
+    var_ay = condition(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), off_ay, v.r_ay)
+    squares = off_r**2 / var_r + off_ay**2 / var_ay
+    likelihood: float = -0.5 * (squares + log(var_r * var_ay))
+    return likelihood
 
 
 @kernel
@@ -142,7 +152,7 @@ def _filter(
     c: Chassis,
     v: Variances,
 ) -> FloatArray:
-    means = np.empty((2, len(ax)))
+    found = np.empty((3, len(ax)))
     x = belief_of(first_mean, first_variances)
     for k in range(len(ax)):
         axles = Axles(loaded[0, k], loaded[1, k], loaded[2, k], loaded[3, k])
@@ -150,9 +160,9 @@ def _filter(
             noise = model_noise[k]
             w = Variances(v.q_vx, noise * v.q_vy, noise * v.q_r, v.r_vx, v.r_r, v.r_ay)
             predict(x, ax[k], steer[k], STEP_S, axles, c, w)
-        update(x, vx[k], yaw_rate[k], ay[k], steer[k], axles, c, v)
-        means[:, k] = x.mean[:2]
-    return means
+        found[2, k] = update(x, vx[k], yaw_rate[k], ay[k], steer[k], axles, c, v)
+        found[:2, k] = x.mean[:2]
+    return found
 
 
 def variances(noise: EkfNoise) -> Variances:
@@ -190,10 +200,21 @@ def estimate(
     model_noise: FloatArray | None = None,
 ) -> FloatArray:
     """Estimate side-slip in rad by row; `model_noise`, (rows,), scales the model's variances."""
+    vx_mps, vy_mps, _ = velocity(drive, car, noise, model_noise)
+    return sideslip_angle(vx_mps, vy_mps)
+
+
+def velocity(
+    drive: DriveSignals,
+    car: VehicleParameters,
+    noise: EkfNoise,
+    model_noise: FloatArray | None = None,
+) -> FloatArray:
+    """Return vx, vy and the log likelihood of what was measured, (3, rows)."""
     turning = yaw_rate.estimate(drive, car, noise.yaw_rate).yaw_rate_rad_s
     vx_mps = measured_speed_mps(drive, car)
     ax_mps2, ay_mps2 = hold_last(drive.ax_mps2, "ax"), hold_last(drive.ay_mps2, "ay")
-    means = _filter(
+    return _filter(
         ax_mps2,
         ay_mps2,
         turning,
@@ -206,4 +227,3 @@ def estimate(
         chassis(car),
         variances(noise),
     )
-    return sideslip_angle(means[0], means[1])

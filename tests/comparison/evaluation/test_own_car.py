@@ -14,7 +14,7 @@ import pytest
 import fleet_slip
 from fleet_slip.arrays import FloatArray
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
-from fleet_slip.comparison.evaluation import own_car
+from fleet_slip.comparison.evaluation import filters, own_car
 from fleet_slip.comparison.evaluation.own_car import accelerated, fit_left_out
 from fleet_slip.comparison.evaluation.own_drives import Design, OwnDrive
 from fleet_slip.comparison.observers import ekf
@@ -153,7 +153,7 @@ def test_filters_compete_in_the_car_of_a_file_and_in_one_that_is_identified(
         judged.append(float(np.mean([np.isfinite(one.sideslip_rad).mean() for one in rest[1]])))
         return Tuned(start, 0.0, 1)
 
-    monkeypatch.setattr(own_car, "tune", untuned)
+    monkeypatch.setattr(filters, "tune", untuned)
     monkeypatch.setattr(
         own_car,
         "identify",
