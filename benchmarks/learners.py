@@ -1,9 +1,11 @@
 """What learners reach with ten times the rows, on the test drives and against the exact angle.
 
     python -m benchmarks.learners ROOT MODEL [--rows 600000] [--learners mlp,trees] [--drives A,B]
+        [--signals]
 
-They see the signals and the columns of the published model, as in `evaluate --rivals`, and are
-fitted once. It prints the root mean square error in degrees by drive.
+They see the signals and the columns of the published model, as in `evaluate --rivals`, or signals
+alone, and are fitted once. It prints the root mean square error and the standard deviation of the
+error in degrees by drive, and the standard deviation inside of its sections and outside.
 """
 
 import argparse
@@ -35,10 +37,13 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=600_000)
     parser.add_argument("--learners", default="mlp,trees")
     parser.add_argument("--drives", default=",".join(DRIVES))
+    parser.add_argument("--signals", action="store_true", help="show them no other columns")
     asked = parser.parse_args()
     fleet = fleet_slip.open(asked.root)
     manifest = fleet.model(asked.model).manifest
     inputs = Inputs.of_model(manifest, all_signals())
+    if asked.signals:
+        inputs = Inputs.of_signals(all_signals())
     cohort = load_cohort(fleet.warehouse, manifest.trained_on.cohort)
     sample = draw_sample(fleet.warehouse, cohort, inputs, asked.rows)
     values = sample.of(inputs.names)
@@ -51,8 +56,12 @@ def main() -> None:
             fitted = learner.fit(values, sample.sideslip_rad, sample.trip)
         for drive in drives:
             run = evaluate_drive(drive, {learner.name: LearnedEstimate(inputs, fitted)})
-            rmse_deg = run.results[learner.name].whole.rmse_deg
-            print(f"| {learner.name} | {drive.scenario.name} | {rmse_deg or np.nan:.4f} |")
+            found = run.results[learner.name]
+            parts = [("rmse", found.whole.rmse_deg), ("std", found.whole.error_std_deg)]
+            parts += [(f"in {part}", one.error_std_deg) for part, one in found.inside.items()]
+            parts += [(f"not {part}", one.error_std_deg) for part, one in found.outside.items()]
+            words = [f"{part} {value or np.nan:.4f}" for part, value in parts]
+            print(f"| {learner.name} | {drive.scenario.name} | {' | '.join(words)} |", flush=True)
         print(f"{learner.name}: {fitted.size_bytes:,} bytes", flush=True)
 
 
