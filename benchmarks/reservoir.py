@@ -47,7 +47,9 @@ class Reservoir:
         inner *= RADIUS / np.abs(np.linalg.eigvals(inner)).max()
         outer = random.uniform(-strength, strength, (neurons, inputs + 1))
         self.weights = np.hstack([inner, outer]).T.astype(np.float32)
-        self.leak = np.exp(random.uniform(*np.log(LEAKS), neurons)).astype(np.float32)
+        self.leak = np.exp(random.uniform(np.log(LEAKS[0]), np.log(LEAKS[1]), neurons)).astype(
+            np.float32
+        )
 
     def rows(
         self, drives: Sequence[FloatArray], every: int
@@ -119,7 +121,7 @@ def _choose(
         size = neurons + drives[0].shape[1] + 2
         moments = np.zeros((2, size, size))
         for tick, going, rows in reservoir.rows(drives, every):
-            label = np.array([labels[one][tick] for one in np.flatnonzero(going)])
+            label = np.array([one[tick] for one, goes in zip(labels, going, strict=True) if goes])
             both = np.column_stack([rows, label])
             for part in (0, 1):
                 some = both[held[going] == part]
