@@ -54,6 +54,7 @@ def find_implausible(table: GramTable, min_correlation: float) -> dict[int, Faul
     for first, moments in zip(count(0, AT_ONCE), DriveBatches.of(table)):
         turning = find_reversed_or_swapped(moments, min_correlation)
         found = steering_swapped(moments) | turning | find_magnitudes(moments)
+        found |= axes_swapped(moments)
         faults |= {first + drive: fault for drive, fault in found.items()}
     return faults | find_stuck(table)
 
@@ -122,6 +123,28 @@ def find_magnitudes(moments: MeanMoments) -> dict[int, Fault]:
             figure = f"mean {away[drive, i]:.0%} of its size, and the others turn to both sides"
             found[int(drive)] = Fault("magnitude", tuple(WITNESSES[name]), figure)
     return found
+
+
+def axes_swapped(moments: MeanMoments) -> dict[int, Fault]:
+    """Return the drives in which `ax` tells the turns, and `ay` does not."""
+    rest = [name for name in ("yaw_rate", "steering_wheel") if name in moments.signals]
+    if not {"ax", "ay"} <= set(moments.signals) or not rest:
+        return {}
+    at = [moments.signals.index(name) for name in ("ax", "ay", *rest)]
+    covariances = moments.covariances()[:, at][:, :, at]
+    spread = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
+    product = spread[:, :2, None] * spread[:, None, 2:]
+    shared = np.abs(covariances[:, :2, 2:])
+    agreement = np.divide(shared, product, out=np.zeros_like(shared), where=product > 0)
+    ax, ay = agreement[:, 0].min(axis=1), agreement[:, 1].max(axis=1)
+    return {
+        int(drive): Fault(
+            "swapped",
+            ("ax", "ay"),
+            f"ax goes with the turns by {ax[drive]:.2f}, ay {ay[drive]:.2f}",
+        )
+        for drive in np.flatnonzero((ax > AGREEING) & (ay < LONE))
+    }
 
 
 def steering_swapped(moments: MeanMoments) -> dict[int, Fault]:

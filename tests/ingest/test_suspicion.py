@@ -48,6 +48,12 @@ def test_all_axes_reversed_are_told_by_the_wheels() -> None:
     assert kinds(reversed_axes) >= {("reversed", (name,)) for name in names}
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_axes_of_acceleration_swapped(sign: int) -> None:
+    car = a_car()
+    assert ("swapped", ("ax", "ay")) in kinds({**car, "ax": sign * car["ay"], "ay": car["ax"]})
+
+
 @pytest.mark.parametrize("axle", ["f", "r"])
 def test_left_and_right_wheels_swapped(axle: str) -> None:
     car, left, right = a_car(), f"wheel_{axle}l", f"wheel_{axle}r"

@@ -64,6 +64,7 @@ FAULTS = [
     (multiply("ay", -1), "reversed", ("ay",)),
     (multiply("yaw_rate", -1), "reversed", ("yaw_rate",)),
     (multiply("steering_wheel", -1), "reversed", ("steering_wheel",)),
+    (swap("ax", "ay"), "swapped", ("ax", "ay")),
     (swap("wheel_fl", "wheel_fr"), "swapped", ("wheel_fl", "wheel_fr")),
     (swap("wheel_rl", "wheel_rr"), "swapped", ("wheel_rl", "wheel_rr")),
     (swap("steer_fl", "steer_fr"), "swapped", ("steer_fl", "steer_fr")),

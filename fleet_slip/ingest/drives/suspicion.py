@@ -44,6 +44,8 @@ _REFUSED = {
     "not_finite": ("values", 'Write missing = ["nan"] if they mean no value.'),
 }
 _OF_TIME = ("time", "isolated", "too_short", "not_a_time")
+_GOES_WITH, _GOES_NOT = 0.8, 0.5
+"""Correlations of an acceleration with the turns, across the car and along it."""
 _FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
 
 
@@ -81,7 +83,7 @@ def find_suspicions(signals: Signals) -> list[Suspicion]:
     magnitudes = [Suspicion("magnitude", (name,), figure, remedy) for name, figure in one_sided]
     usual = {name: v for name, v in usual.items() if name not in {m.signals[0] for m in magnitudes}}
     found = [*still, *magnitudes, *_turning(usual, speed)]
-    for check in (_wheels_differ, _rates_differ, _accelerates, _axles_swapped):
+    for check in (_axes_swapped, _wheels_differ, _rates_differ, _accelerates, _axles_swapped):
         found += check(usual, speed)
     if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
         found += _label(usual, speed)  # which is judged by them
@@ -187,6 +189,17 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
             yield Suspicion("swapped", concerned, figure, "Swap their columns.")
         else:
             yield Suspicion("reversed", concerned, figure, "Write negate = true.")
+
+
+def _axes_swapped(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    """Compare both accelerations with the turns."""
+    if speed is None or not {"ax", "ay", "yaw_rate"} <= set(signals):
+        return
+    expected, rows = signals["yaw_rate"] * speed, moving(speed)
+    ax, ay = (abs(slope_of(signals[name], expected, rows)[1]) for name in ("ax", "ay"))
+    if ax > _GOES_WITH and ay < _GOES_NOT:
+        figure = f"yaw rate times speed goes with ax by {ax:.2f}, with ay by {ay:.2f}"
+        yield Suspicion("swapped", ("ax", "ay"), figure, "Swap their columns.")
 
 
 def _wheels_differ(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
