@@ -1,7 +1,7 @@
 """A night with real cars: what is new comes in, is examined, and trains the model again."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -9,20 +9,14 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fleet_slip.api.calls import ShowProgress, of_step
+from fleet_slip.api.calls import of_step
 from fleet_slip.api.requests import NightRequest
 from fleet_slip.api.run_report import Training
 from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.dates import date_of
-from fleet_slip.errors import (
-    DataError,
-    FleetSlipError,
-    InputError,
-    RepeatedError,
-    UnclaimedError,
-)
+from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError, UnclaimedError
 from fleet_slip.ingest.logs.log_files import find_logs, is_url
 from fleet_slip.ingest.mapping.mapping_list import as_list
 from fleet_slip.models.aliases import CANDIDATE
@@ -33,12 +27,10 @@ from fleet_slip.runs.nights import Beginning, Nights, hash_drive, without_drives
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.warehouse.minimum_cohort import UNNAMED, tells_single_cars
 from fleet_slip.warehouse.table_views import connect_tables, gram_snapshots
-from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
-    from fleet_slip.grams.cohorts.outweighing import Outweighing
     from fleet_slip.ingest.landing.ingest_job import IngestReport
     from fleet_slip.monitoring.monitor import Chart
     from fleet_slip.monitoring.quality import SensorFault
@@ -131,9 +123,6 @@ class Night:
         seconds = round(time.monotonic() - began, 3)
         self.steps.append(NightStep(name, state, told, seconds, error))
 
-    def _show(self, name: str) -> ShowProgress | None:
-        return of_step(self.asked.progress, name)
-
     def _hindrance(self, name: str) -> str:
         """Return why a step cannot be done."""
         warehouse = self.fleet.warehouse
@@ -160,9 +149,12 @@ class Night:
     def _count_drives(self) -> int:
         """Return the number of drives, counted again only where Gram rows or logs changed."""
         grams, logs = gram_snapshots(self.fleet.warehouse)
-        state = grams.version, logs.version
+        state, query = (grams.version, logs.version), "SELECT count(DISTINCT drive_id) FROM grams"
+        if not grams.rows:
+            return 0
         if state not in self.counted:
-            self.counted = {state: _count_drives(self.fleet.warehouse)}
+            with connect_tables(self.fleet.warehouse, query) as database:
+                self.counted = {state: int(database.sql(query).fetchall()[0][0])}
         return self.counted[state]
 
     def _candidate(self) -> str | None:
@@ -192,7 +184,7 @@ class Night:
                 replace="corrected",
                 workers=self.asked.workers,
                 each=reports.append,
-                progress=self._show("ingest"),
+                progress=of_step(self.asked.progress, "ingest"),
             )
         except (RepeatedError, UnclaimedError) as error:  # all others are in
             again = str(error)
@@ -221,7 +213,7 @@ class Night:
                 name,
                 cohort=None if name == PLAIN else self.training.cohort,
                 workers=self.asked.workers,
-                progress=self._show(f"gram {name}"),
+                progress=of_step(self.asked.progress, f"gram {name}"),
             )
         return "done", f"Of {number_of(self._now().drives, 'drive')}."
 
@@ -271,23 +263,23 @@ class Night:
             )
         if publication is None:
             publication = self.fleet.publish(name, selection, candidate=True, sign_key=key)
-        left_out = _outweighing(selection.cohort.outweighing)
+        cars = selection.cohort.outweighing
+        why, which = "they would outweigh the others", number_of(len(cars), "car")
+        left_out = _left_out((one.drives for one in cars), which, why)
         told = f"{publication.version.reference}: {publication.reason}{left_out}"
         return "attention" if refusal else "done", told
 
     def _verify(self) -> Told:
-        checked = self.fleet.check(
-            SAMPLE_FILES,
-            begin=self.night.toordinal(),
-            progress=self._show("verify"),
-        )
+        told = of_step(self.asked.progress, "verify")
+        checked = self.fleet.check(SAMPLE_FILES, begin=self.night.toordinal(), progress=told)
         return "done", (
             f"{number_of(checked.rows, 'row')} of {number_of(checked.files, 'file')} are what was "
             "written, and their Gram rows what they must be."
         )
 
     def _retain(self) -> Told:
-        report = self.fleet.retain(self.asked.retention, progress=self._show("retain"))
+        told = of_step(self.asked.progress, "retain")
+        report = self.fleet.retain(self.asked.retention, progress=told)
         forgotten, removed = report.forgotten.drives, len(report.vacuumed.files)
         return "done", (
             f"{number_of(forgotten, 'drive')} before {report.before} forgotten, "
@@ -295,26 +287,12 @@ class Night:
         )
 
 
-def _count_drives(warehouse: Warehouse) -> int:
-    if not warehouse.grams.snapshot().rows:
-        return 0
-    query = "SELECT count(DISTINCT drive_id) FROM grams"
-    with connect_tables(warehouse, query) as database:
-        return int(database.sql(query).fetchall()[0][0])
-
-
-def _outweighing(cars: "Sequence[Outweighing]") -> str:
-    """Return the sentence on drives that did not train, since their car would outweigh others."""
-    if not cars:
-        return ""
-    drives = number_of(sum(one.drives for one in cars), "drive")
-    return f" {drives} of {number_of(len(cars), 'car')} left out: they would outweigh the others."
-
-
 def _revoked(drives: Mapping[str, int]) -> str:
     """Return the sentence on drives that do not count, since a revoked key signed them."""
-    if not drives:
-        return ""
-    many = number_of(sum(drives.values()), "drive")
     cars = number_of(len(drives), "car") if tells_single_cars() else UNNAMED
-    return f" {many} of {cars} left out: a key of theirs was revoked."
+    return _left_out(drives.values(), cars, "a key of theirs was revoked")
+
+
+def _left_out(drives: Iterable[int], cars: str, why: str) -> str:
+    many = sum(drives)
+    return f" {number_of(many, 'drive')} of {cars} left out: {why}." if many else ""

@@ -14,12 +14,7 @@ from fleet_slip.delta.checkpoints import (
     require_kept_checksum,
     version_of,
 )
-from fleet_slip.delta.commits import (
-    CHECKSUM_KEY,
-    Commit,
-    problem_of_commit,
-    read_commit,
-)
+from fleet_slip.delta.commits import CHECKSUM_KEY, Commit, problem_of_commit, read_commit
 from fleet_slip.delta.snapshot import Snapshot
 from fleet_slip.errors import StorageError
 from fleet_slip.files.folder import Folder, StoredFile

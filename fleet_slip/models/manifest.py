@@ -9,12 +9,7 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Annotated, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    FiniteFloat,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, FiniteFloat, model_validator
 
 from fleet_slip.catalogue.definitions import Definition, integer_arithmetic, plain_column
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue

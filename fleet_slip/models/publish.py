@@ -7,9 +7,7 @@ from typing import Any
 from fleet_slip.models.acceptance.judgement import judge
 from fleet_slip.models.aliases import CANDIDATE, CHAMPION, AliasMove
 from fleet_slip.models.describe_winner import drives_of
-from fleet_slip.models.manifest import (
-    Manifest,
-)
+from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
 from fleet_slip.selection.select_models import Selection

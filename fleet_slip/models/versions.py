@@ -5,7 +5,7 @@ models/<name>/history/1.json, 2.json, ...      every move of an alias, with its 
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -82,20 +82,20 @@ class Registry:
         """Sign a version, if there is a key to sign with."""
         if self.signing_key is not None:
             loaded = self._read(name, version)
-            folder = self._versions(name).folder
-            sign_version(folder, version, name, loaded.sha256, self.signing_key)
+            sign_version(self.folder_of(name), version, name, loaded.sha256, self.signing_key)
 
     def _read(self, name: str, version: int) -> ModelVersion:
         if not _IDENTIFIER.fullmatch(name):
-            raise QuestionError(_unknown(name, str(version), self.names(), []))
+            self.require(name)
         try:
             document = self._versions(name).read(version)
         except StorageError:
             # Looked up only now: a model may have very many versions.
-            numbers = self.versions(name) if name in self.names() else []
+            self.require(name)
+            numbers = self.versions(name)
             if version in numbers:
                 raise
-            raise QuestionError(_unknown(name, str(version), self.names(), numbers)) from None
+            raise _unknown(name, str(version), numbers) from None
         manifest = parse_document(document.content, Manifest, f"{name}@{version}", "its manifest")
         if manifest.name != name:
             raise StorageError(
@@ -122,10 +122,7 @@ class Registry:
         history = self.history(name)
         version = history.pointed_at(which)
         if version is None:
-            known_aliases = history.aliases()
-            raise QuestionError(
-                _unknown(name, which, self.names(), self.versions(name), known_aliases)
-            )
+            raise _unknown(name, which, [*self.versions(name), *sorted(history.aliases())])
         return self.load(name, version)
 
     def folder_of(self, name: str) -> Folder:
@@ -227,8 +224,7 @@ class Registry:
 
         def move(newest: int) -> int | None:
             there = bool(history.held_by(alias)) == (command == "pin")
-            moved = there or history.move(alias, version, command, after=newest)
-            return version if moved else None
+            return version if there or history.move(alias, version, command, after=newest) else None
 
         return history.decide(move)
 
@@ -298,14 +294,6 @@ _TABLE_SCHEMA = pa.schema(
 )
 
 
-def _unknown(
-    name: str,
-    which: str,
-    names: list[str],
-    versions: list[int],
-    aliases: Mapping[str, int] | None = None,
-) -> str:
-    if name not in names:
-        return f"no model is called {name!r}. Models: {', '.join(names) or _NONE}."
-    known = [str(number) for number in versions] + sorted(aliases or {})
-    return f"{name} has no version or alias {which!r}. It has: {', '.join(known)}."
+def _unknown(name: str, which: str, known: Sequence[int | str]) -> QuestionError:
+    there = ", ".join(map(str, known))
+    return QuestionError(f"{name} has no version or alias {which!r}. It has: {there}.")

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import date
 from math import ceil
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,9 @@ class SensorFault:
         """Return the finding for a JSON document."""
         named = {"drive_id": self.drive_id, "vehicle_id": self.vehicle_id, "day": self.day}
         return named | asdict(self.fault)
+
+
+BY_DAY = attrgetter("day", "drive_id")
 
 
 @dataclass(frozen=True)
@@ -114,22 +118,18 @@ def examine_drives(
     return QualityReport(
         sum(report.drives for report in reports),
         sum(report.compared for report in reports),
-        tuple(sorted(findings, key=_day_and_drive)),
+        tuple(sorted(findings, key=BY_DAY)),
         revoked,
     )
 
 
 def _faulty_courses(reader: GramReader, condition: Condition) -> dict[str, Fault]:
     """Return the drives whose course is not one, if Gram rows of its changes are there."""
-    related = {
-        drive: relate(moments)
-        for drives in course_moments(reader, condition).values()
-        for drive, moments in drives.items()
-    }
     return {
         drive: Fault(fault.kind, fault.signals, fault.figure)
-        for drive, relation in related.items()
-        if relation and (fault := relation.fault)
+        for drives in course_moments(reader, condition).values()
+        for drive, moments in drives.items()
+        if (relation := relate(moments)) and (fault := relation.fault)
     }
 
 
@@ -175,10 +175,6 @@ def _literal(text: str | None) -> str:
     return "NULL" if text is None else "'" + text.replace("'", "''") + "'"
 
 
-def _day_and_drive(finding: SensorFault) -> tuple[date, str]:
-    return finding.day, finding.drive_id
-
-
 def find_wrong_labels(cohort: Cohort, limits: QualityThresholds | None = None) -> dict[str, Fault]:
     """Return the drives whose label contradicts that of the others, of whatever vehicle model.
 
@@ -187,12 +183,7 @@ def find_wrong_labels(cohort: Cohort, limits: QualityThresholds | None = None) -
     """
     limits = limits or thresholds().quality
     found: dict[str, Fault] = {}
-    start = 0
-    for whole in cohort.tables:
-        long = whole.n >= limits.min_rows
-        table = whole.take(long)
-        metadata = cohort.drives.slice(start, len(whole)).filter(pa.array(long))
-        start += len(whole)
+    for table, metadata in _long_drives(cohort, limits.min_rows):
         in_order = np.ones(len(table), dtype=np.bool_)
         in_order[list(find_implausible(table, limits.min_correlation))] = False
         if in_order.sum() >= limits.min_drives:
@@ -222,8 +213,7 @@ def examine(
         names = metadata["drive_id"].to_pylist()
         faults = find_implausible(table, limits.min_correlation)
         faults |= _saturated(table, metadata, limits)
-        before = {drive: known[name] for drive, name in enumerate(names) if name in known}
-        faults = before | faults
+        faults = {drive: known[name] for drive, name in enumerate(names) if name in known} | faults
         in_order = np.array([drive not in faults for drive in range(len(table))])
         beside_peers = np.zeros(len(table), dtype=np.bool_)
         for group in _peer_groups(metadata, limits.min_drives):
@@ -233,8 +223,9 @@ def examine(
                 faults |= {drive: fault for drive, fault in found.items() if drive not in faults}
         drives += len(table)
         compared += int(beside_peers.sum())
-        findings += _findings(metadata, faults)
-    findings.sort(key=_day_and_drive)
+        named = enumerate(metadata.select(["drive_id", "vehicle_id", "day"]).to_pylist())
+        findings += [SensorFault(**row, fault=faults[i]) for i, row in named if i in faults]
+    findings.sort(key=BY_DAY)
     return QualityReport(drives, compared, tuple(findings))
 
 
@@ -270,17 +261,21 @@ def _peer_groups(metadata: pa.Table, enough: int) -> Iterator[BoolArray]:
         yield (counts[of_car] < enough) | (number < most)
 
 
-def _groups(cohort: Cohort, min_rows: int) -> Iterator[tuple[GramTable, pa.Table]]:
-    """Yield the drives of each vehicle model and set of signals that are long enough."""
+def _long_drives(cohort: Cohort, min_rows: int) -> Iterator[tuple[GramTable, pa.Table]]:
+    """Yield the drives of each set of signals that are long enough, with their metadata."""
     start = 0
     for table in cohort.tables:
-        metadata = cohort.drives.slice(start, len(table))
-        start += len(table)
-        models = np.array(metadata["vehicle_model"].to_pylist(), dtype=object)
         long = table.n >= min_rows
-        for model in sorted({str(name) for name in models[long]}):
-            mask = long & (models.astype(str) == model)
-            yield table.take(mask), metadata.filter(pa.array(mask))
+        yield table.take(long), cohort.drives.slice(start, len(table)).filter(pa.array(long))
+        start += len(table)
+
+
+def _groups(cohort: Cohort, min_rows: int) -> Iterator[tuple[GramTable, pa.Table]]:
+    """Yield the same, each vehicle model by itself."""
+    for table, metadata in _long_drives(cohort, min_rows):
+        models = np.array([str(name) for name in metadata["vehicle_model"].to_pylist()])
+        for model in sorted(set(models)):
+            yield table.take(models == model), metadata.filter(pa.array(models == model))
 
 
 def _saturated(table: GramTable, metadata: pa.Table, limits: QualityThresholds) -> dict[int, Fault]:
@@ -302,11 +297,3 @@ def _unlike_peers(
         return {}
     faults = peers.explain(DriveBatches.of(members, suspects))
     return dict(zip(np.flatnonzero(group)[suspects].tolist(), faults, strict=True))
-
-
-def _findings(metadata: pa.Table, faults: dict[int, Fault]) -> list[SensorFault]:
-    return [
-        SensorFault(row["drive_id"], row["vehicle_id"], row["day"], faults[drive])
-        for drive, row in enumerate(metadata.select(["drive_id", "vehicle_id", "day"]).to_pylist())
-        if drive in faults
-    ]

@@ -13,14 +13,7 @@ from fleet_slip.cli.left_out import (
     say_without_information,
     say_without_log,
 )
-from fleet_slip.cli.output import (
-    cell,
-    figures_cells,
-    print_line,
-    print_table,
-    print_text,
-    say,
-)
+from fleet_slip.cli.output import cell, figures_cells, print_line, print_table, print_text, say
 from fleet_slip.grams.cohorts.folding import BANDS, PARTS, ROW_FOLDS
 from fleet_slip.grams.cohorts.outweighing import drives_by_car
 from fleet_slip.grams.cohorts.taught_cohort import TaughtCohort
@@ -48,19 +41,16 @@ CONDITION_WIDTH = 120
 
 def print_selection(selection: Selection[Any], everything: bool = False) -> None:
     """Print the winner and why, the best models or all, and how sure that is."""
-    _print_winner(selection)
+    winner = selection.winner
+    print_text(f"winner: {winner.model.name}. {winner.reason}")
+    if selection.searched is not None and winner.model in selection.searched.models:
+        print_text(f"its columns: {in_families(winner.model.signals)}")
     if selection.choice is not None:
         _print_choice(selection.choice)
     if isinstance(selection.distances, NestedDistances):
         _print_distances(selection.distances)
     _print_models(selection, everything)
     _say_left_out(selection)
-    if isinstance(selection, RequestedSelection) and selection.remark:
-        say(selection.remark)
-    if isinstance(selection, RequestedSelection) and selection.without_label is not None:
-        _say_without_label(selection.without_label)
-    if isinstance(selection, RequestedSelection):
-        _say_label_noise(selection)
     if isinstance(selection.cohort, TaughtCohort):
         say(
             f"a change of the course has {selection.cohort.weight} times the weight of a row with "
@@ -86,13 +76,6 @@ def print_selection(selection: Selection[Any], everything: bool = False) -> None
         )
     if selection.uncertainty is not None:
         _print_uncertainty(selection.uncertainty)
-
-
-def _print_winner(selection: Selection[Any]) -> None:
-    winner = selection.winner
-    print_text(f"winner: {winner.model.name}. {winner.reason}")
-    if selection.searched is not None and winner.model in selection.searched.models:
-        print_text(f"its columns: {in_families(winner.model.signals)}")
 
 
 def _shortened(condition: str, everything: bool) -> str:
@@ -187,7 +170,7 @@ def _say_without_label(told: WithoutLabel) -> None:
 
 
 def _say_left_out(selection: Selection[Any]) -> None:
-    """Say which drives of the cohort the models were not made of, and which have no log."""
+    """Say which drives of the cohort the models were not made of, and what the label is worth."""
     if not isinstance(selection.cohort, TaughtCohort):
         say_without_information(selection.rows_without, selection.cohort.rows)
     if without_log := selection.cohort.members.count_received:
@@ -196,9 +179,13 @@ def _say_left_out(selection: Selection[Any]) -> None:
     say_revoked(selection.cohort.revoked)
     say_outweighing(drives_by_car(selection.cohort.outweighing))
     say_untold(selection.cohort.untold, "signal set")
-    if not isinstance(selection, RequestedSelection):
-        return
-    say_influential(selection.left_out, "left out")
+    if isinstance(selection, RequestedSelection):
+        say_influential(selection.left_out, "left out")
+        if selection.remark:
+            say(selection.remark)
+        if selection.without_label is not None:
+            _say_without_label(selection.without_label)
+        _say_label_noise(selection)
 
 
 def _print_folds(model: CrossValidation) -> None:

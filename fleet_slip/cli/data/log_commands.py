@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,25 +25,20 @@ from fleet_slip.words import number_of
 if TYPE_CHECKING:
     from fleet_slip.ingest.drafting.preview import Preview
     from fleet_slip.ingest.landing.ingest_job import IngestReport
-    from fleet_slip.simulation.job import SimulationReport
-
-CampaignName = Annotated[
-    str,
-    typer.Argument(
-        help="A campaign of configs/campaigns, or the path of a TOML file.",
-        autocompletion=complete_config("campaigns"),
-    ),
-]
-Through = Annotated[str | None, option(RunRequest, "through")]
-Days = Annotated[int | None, option(RunRequest, "days")]
 
 
 @record_run
 def simulate(
     context: typer.Context,
-    campaign: CampaignName,
-    days: Days = None,
-    through: Through = None,
+    campaign: Annotated[
+        str,
+        typer.Argument(
+            help="A campaign of configs/campaigns, or the path of a TOML file.",
+            autocompletion=complete_config("campaigns"),
+        ),
+    ],
+    days: Annotated[int | None, option(RunRequest, "days")] = None,
+    through: Annotated[str | None, option(RunRequest, "through")] = None,
     threads: Threads = None,
     cluster: Cluster = None,
     json: Json = False,
@@ -63,38 +59,35 @@ def simulate(
     if json:
         print_json(report)
     elif report.changed:
-        say(
+        written = (
             f"{plan.name}: {number_of(report.drives, 'drive')}, {number_of(report.rows, 'row')} in "
             f"{number_of(report.batches_written, 'file')}, "
-            f"{report.size_bytes / max(report.rows, 1):.1f} bytes "
-            f"a row{_left_out(report.drives_forgotten)}"
+            f"{report.size_bytes / max(report.rows, 1):.1f} bytes a row"
         )
-        say(_where_the_time_went(report))
+        say(_joined(written, forgotten=report.drives_forgotten))
+        seconds = report.seconds
+        shares = ", ".join(
+            f"{name} {getattr(seconds, name) / seconds.tasks:.0%}"
+            for name in ("simulate", "encode", "write")
+        )
+        say(
+            f"{seconds.elapsed:.1f} s, {report.rows / seconds.elapsed:,.0f} rows/s: "
+            f"{seconds.tasks / seconds.elapsed:.1f} workers busy ({shares}), commits "
+            f"{seconds.commit:.1f} s"
+        )
     else:
         chosen = plan.chosen_days(days, last)
         say(f"{plan.name}: nothing to do, {number_of(len(chosen), 'day')} done before")
 
 
-def _left_out(drives: int) -> str:
-    if not drives:
-        return ""
-    return (
-        f"; {number_of(drives, 'drive')} left out, forgotten (fleet-slip forget --allow lets them "
-        "come back)"
+def _joined(*parts: str, replaced: int = 0, forgotten: int = 0) -> str:
+    """Return one sentence of what there is to say, and of drives that gave way or did not come."""
+    allow = "fleet-slip forget --allow lets them come back"
+    parts += (
+        f"in place of {number_of(replaced, 'drive')}" if replaced else "",
+        f"{number_of(forgotten, 'drive')} left out, forgotten ({allow})" if forgotten else "",
     )
-
-
-def _where_the_time_went(report: "SimulationReport") -> str:
-    seconds = report.seconds
-    shares = ", ".join(
-        f"{name} {getattr(seconds, name) / seconds.tasks:.0%}"
-        for name in ("simulate", "encode", "write")
-    )
-    return (
-        f"{seconds.elapsed:.1f} s, {report.rows / seconds.elapsed:,.0f} rows/s: "
-        f"{seconds.tasks / seconds.elapsed:.1f} workers busy ({shares}), commits "
-        f"{seconds.commit:.1f} s"
-    )
+    return "; ".join(filter(None, parts))
 
 
 def ingest(
@@ -166,7 +159,7 @@ def ingest(
         _show_previews(fleet.preview(files, mapping, as_one=as_one), plot, json)
         return
     folders = any(map(names_several, files)) and not as_one
-    each = Remarks(quiet=json or folders)
+    each = remarks(quiet=json or folders)
     with (
         recording(fleet.root, "ingest", sys.argv[1:]),
         progress(*(("ingest", "files") if folders else ("read", "rows"))) as show,
@@ -189,14 +182,12 @@ def ingest(
 
 def _require_sound(reports: "list[IngestReport]") -> None:
     """Raise `AlarmError` for much that was refused, and for whatever looks wrong and does harm."""
-    from fleet_slip.ingest.drives.suspicion import (  # noqa: PLC0415 - takes a while
-        FEWEST_REFUSED,
-        LARGEST_REFUSED,
-    )
+    from fleet_slip.ingest.drives import suspicion  # noqa: PLC0415 - takes a while
 
     for report in reports:
         refused, read = sum(report.counts.quarantined.values()), report.counts.rows_read
-        if report.new and refused > max(read * LARGEST_REFUSED, FEWEST_REFUSED):
+        many = max(read * suspicion.LARGEST_REFUSED, suspicion.FEWEST_REFUSED)
+        if report.new and refused > many:
             raise AlarmError(
                 f"{report.file}: {refused:,} of {number_of(read, 'row')} were refused. See: "
                 'fleet-slip sql "FROM quarantine". Correct the mapping and give the command again '
@@ -230,26 +221,21 @@ def _summed_up(reports: "list[IngestReport]") -> str:
     if not new:
         return "nothing new"
     held = sum(sum(report.counts.quarantined.values()) for report in new)
-    return (
+    return _joined(
         f"{number_of(len(new), 'new file')}: {number_of(sum(r.counts.ticks for r in new), 'row')} "
-        f"in {number_of(sum(r.counts.drives for r in new), 'drive')}"
-        + (f"; in quarantine: {number_of(held, 'row')}" if held else "")
-        + _in_place_of(sum(report.drives_replaced for report in new))
-        + _left_out(sum(report.drives_forgotten for report in new))
+        f"in {number_of(sum(r.counts.drives for r in new), 'drive')}",
+        f"in quarantine: {number_of(held, 'row')}" if held else "",
+        replaced=sum(report.drives_replaced for report in new),
+        forgotten=sum(report.drives_forgotten for report in new),
     )
 
 
-class Remarks:
-    """Says what became of each file, and once what looks wrong in several."""
+def remarks(*, quiet: bool) -> "Callable[[IngestReport], None]":
+    """Return what says what became of a file, unless `quiet`, and once what looks wrong in some."""
+    told: set[tuple[str, tuple[str, ...]]] = set()
 
-    def __init__(self, *, quiet: bool) -> None:
-        """Say of what became of files nothing, if it is said elsewhere."""
-        self._quiet = quiet
-        self._told: set[tuple[str, tuple[str, ...]]] = set()
-
-    def __call__(self, report: "IngestReport") -> None:
-        """Say what is to be said of a file."""
-        if not self._quiet:
+    def tell(report: "IngestReport") -> None:
+        if not quiet:
             say(_ingested(report.as_dict()))
         for names in report.look_alikes:
             say(
@@ -259,9 +245,11 @@ class Remarks:
                 logging.WARNING,
             )
         for one in report.suspicions:
-            if (one.kind, one.signals) not in self._told:
-                self._told.add((one.kind, one.signals))
+            if (one.kind, one.signals) not in told:
+                told.add((one.kind, one.signals))
                 say(f"{report.file}: looks wrong: {one}", logging.WARNING)
+
+    return tell
 
 
 def _ingested(report: dict[str, Any]) -> str:
@@ -269,22 +257,14 @@ def _ingested(report: dict[str, Any]) -> str:
         return f"{report['file']}: nothing to do, it was ingested before"
     reasons = ", ".join(f"{n:,} {reason}" for reason, n in report["quarantined"].items())
     left_out, held = report["rows_left_out"], report["rows_quarantined"]
-    return (
+    return _joined(
         f"{report['file']}: {number_of(report['ticks'], 'row')} in "
-        f"{number_of(report['drives'], 'drive')}"
-        + (
-            f"; not as the mapping's conditions ask: {number_of(left_out, 'row')}"
-            if left_out
-            else ""
-        )
-        + (f"; in quarantine: {number_of(held, 'row')} ({reasons})" if reasons else "")
-        + _in_place_of(report["drives_replaced"])
-        + _left_out(report["drives_forgotten"])
+        f"{number_of(report['drives'], 'drive')}",
+        f"not as the mapping's conditions ask: {number_of(left_out, 'row')}" if left_out else "",
+        f"in quarantine: {number_of(held, 'row')} ({reasons})" if reasons else "",
+        replaced=report["drives_replaced"],
+        forgotten=report["drives_forgotten"],
     )
-
-
-def _in_place_of(drives: int) -> str:
-    return f"; in place of {number_of(drives, 'drive')}" if drives else ""
 
 
 def _show_previews(previews: "list[Preview]", plot: Path | None, json: bool) -> None:
@@ -296,30 +276,24 @@ def _show_previews(previews: "list[Preview]", plot: Path | None, json: bool) -> 
         say(f"drawn to {plot}")
     if json:
         print_json(previews)
-    else:
-        for preview in previews:
-            _show_preview(preview)
-    suspicions = sum(len(preview.suspicions) for preview in previews)
-    if suspicions:
+    for preview in () if json else previews:
+        counts = preview.counts
+        rejected = ", ".join(f"{n:,} {reason}" for reason, n in counts.quarantined.items())
+        print_table(
+            f"{preview.file}: {number_of(counts.rows_read, 'row')}; left out by conditions "
+            f"{counts.rows_left_out:,}; rejected {sum(counts.quarantined.values()):,}"
+            f"{f' ({rejected})' if rejected else ''}; {number_of(counts.drives, 'drive')} of "
+            f"{number_of(counts.ticks, 'tick')}",
+            ["signal", "unit", "least", "most", "missing"],
+            [
+                [one.signal, one.unit, f"{one.low:.4g}", f"{one.high:.4g}", f"{one.missing:.1%}"]
+                for one in preview.ranges
+            ],
+            left=2,
+        )
+        for suspicion in preview.suspicions:
+            print_text(f"looks wrong: {suspicion}")
+    if suspicions := sum(len(preview.suspicions) for preview in previews):
         raise AlarmError(
             f"{number_of(suspicions, 'thing')} to look at before ingesting. Nothing was stored."
         )
-
-
-def _show_preview(preview: "Preview") -> None:
-    counts = preview.counts
-    rejected = ", ".join(f"{n:,} {reason}" for reason, n in counts.quarantined.items())
-    print_table(
-        f"{preview.file}: {number_of(counts.rows_read, 'row')}; left out by conditions "
-        f"{counts.rows_left_out:,}; rejected {sum(counts.quarantined.values()):,}"
-        f"{f' ({rejected})' if rejected else ''}; {number_of(counts.drives, 'drive')} of "
-        f"{number_of(counts.ticks, 'tick')}",
-        ["signal", "unit", "least", "most", "missing"],
-        [
-            [one.signal, one.unit, f"{one.low:.4g}", f"{one.high:.4g}", f"{one.missing:.1%}"]
-            for one in preview.ranges
-        ],
-        left=2,
-    )
-    for suspicion in preview.suspicions:
-        print_text(f"looks wrong: {suspicion}")

@@ -134,7 +134,7 @@ def _standings(data: ReportData) -> Picture:
 
 
 def _over_gps_noise(data: ReportData, sweep: Mapping[str, Any]) -> Picture:
-    levels = sweep["levels"]
+    levels, choice = sweep["levels"], choice_line(data).label
     noise = np.array([level["velocity_std_mps"] for level in levels])
     lines = [
         Series(FILTER_LABELS[name], name, np.array([level["rmse_deg"][name] for level in levels]))
@@ -142,17 +142,13 @@ def _over_gps_noise(data: ReportData, sweep: Mapping[str, Any]) -> Picture:
         if name in levels[0]["rmse_deg"]
     ]
     for label, colour, name in (
-        (choice_line(data).label, "model_4", data.choice),
+        (choice, "model_4", data.choice),
         (data.version.reference, "model_3", data.version.reference),
     ):
         if name in sweep["regressions"]:
             lines.append(Series(label, colour, np.full(len(noise), sweep["regressions"][name])))
     equal = sweep["equal_at_mps"].get("kalman_tuned", {}).get(data.choice)
-    told = (
-        f"With the tuned filter {choice_line(data).label} is level at {equal:.3f} m/s. "
-        if equal is not None
-        else ""
-    )
+    told = "" if equal is None else f"With the tuned filter {choice} is level at {equal:.3f} m/s. "
     return Picture(
         "gps-noise",
         "The Kalman filter over the noise of GPS",
@@ -233,17 +229,13 @@ def _by_columns(data: ReportData, memory: Memory) -> Picture:
         mark = filter_deg if name == "nominal" else None
         lines.append(Series(*LINES[name], errors, mark))
     found = memory.searched
-    caption = (
-        f"Models of 1 to {len(found.models)} columns that a search by {found.search.method} finds "
-        f"among {len(found.inputs)} inputs on the training drives alone; "
-        "the test drives only judge. "
-        f"{_smallest(memory, filter_deg)} Cross-validated errors have the noise of the training "
-        "drives' labels in them, test drives have none."
-    )
     return Picture(
         "memory-columns",
         "Error by number of columns",
-        caption,
+        f"Models of 1 to {len(found.models)} columns that a search by {found.search.method} finds "
+        f"among {len(found.inputs)} inputs on the training drives alone; the test drives only "
+        f"judge. {_smallest(memory, filter_deg)} Cross-validated errors have the noise of the "
+        "training drives' labels in them, test drives have none.",
         f"A falling line for each of {listed([line.label for line in lines])}.",
         lambda size: error_by_columns(lines, size),
     )
@@ -272,17 +264,14 @@ def _left_out(data: ReportData, memory: Memory) -> Picture:
     of_lengths = (
         f"Of the lengths it is {window.name}: {degrees(window.rmse_deg, 4)}. " if window else ""
     )
-    caption = (
-        f"Cross-validated RMSE of the columns of {data.version.reference} as they stand, "
-        f"{degrees(memory.rmse_deg, 4)}, and what it rises to when a column, or all windows of one "
-        f"length, is left out and the rest is fitted again. The dearest column is {dearest.name}: "
-        f"{degrees(dearest.rmse_deg, 4)} without it. {of_lengths}A column "
-        "that costs little may still be the best of several that say nearly the same."
-    )
     return Picture(
         "memory-left-out",
         "What each column and each window buys",
-        caption,
+        f"Cross-validated RMSE of the columns of {data.version.reference} as they stand, "
+        f"{degrees(memory.rmse_deg, 4)}, and what it rises to when a column, or all windows of one "
+        f"length, is left out and the rest is fitted again. The dearest column is {dearest.name}: "
+        f"{degrees(dearest.rmse_deg, 4)} without it. {of_lengths}A column that costs little may "
+        "still be the best of several that say nearly the same.",
         "Bars.",
         lambda size: left_out(memory, size),
     )
@@ -290,21 +279,17 @@ def _left_out(data: ReportData, memory: Memory) -> Picture:
 
 def _on_the_track(data: ReportData) -> Picture:
     run, published = data.runs["nominal"], data.version.reference
-    label = data.choice_number
     maps = [
-        Map(f"Model {label}, one instant", run, data.choice),
+        Map(f"Model {data.choice_number}, one instant", run, data.choice),
         Map(f"{published}, with memory", run, published),
     ]
     before, after = (run.results[one.estimator].whole.rmse_deg for one in maps)
-    caption = (
-        "The nominal drive, by the model of one instant and by the published one. Blue: the "
-        "estimate is too far to the right; orange: too far to the left. Root mean square error "
-        f"{degrees(before)} and {degrees(after)}."
-    )
     return Picture(
         "memory-map",
         "Where on the track memory helps",
-        caption,
+        "The nominal drive, by the model of one instant and by the published one. Blue: the "
+        "estimate is too far to the right; orange: too far to the left. Root mean square error "
+        f"{degrees(before)} and {degrees(after)}.",
         "Two maps of the track, coloured by the error.",
         lambda size: error_map(maps, size, FINE_EDGES_DEG),
     )

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.comparison.evaluation.estimators import TrainedModels
 from fleet_slip.comparison.evaluation.evaluate import evaluations_of
 from fleet_slip.comparison.evaluation.own_car import own_car_evaluations
 from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures, EvaluatedScenario
@@ -86,11 +87,43 @@ class Evaluated:
             for stretch in found["stretches"]
         ]
 
+    def require_models(self, trained: TrainedModels) -> None:
+        """Raise `DataError` if today's data make others of the models of Table I."""
+        now = {name: model.as_dict() for name, model in trained.estimators().items()}
+        for name in self.models.values():
+            kept = self.estimators[name]
+            if name not in now or now[name] != {key: kept.get(key) for key in now[name]}:
+                raise self._changed(f"the cohort of {self.group}")
+
+    def require_figures(self, runs: Mapping[str, EvaluatedScenario]) -> None:
+        """Raise `DataError` if an estimator is off by more or less on a drive of today."""
+        for scenario, run in runs.items():
+            for name, result in run.results.items():
+                kept = self.figures(scenario, name)
+                if kept is None or not _same(kept.rmse_deg, result.whole.rmse_deg):
+                    raise self._changed(f"the drive of {scenario}, or {name},")
+
+    def _changed(self, what: str) -> DataError:
+        return DataError(
+            f"{what} has changed since evaluation {self.document.number}. Run: fleet-slip "
+            f"evaluate {self.group}"
+        )
+
     def _result(self, scenario: str, estimator: str) -> Mapping[str, Any] | None:
         if scenario not in self.scenarios:
             return None
         result: Mapping[str, Any] | None = self.scenarios[scenario]["results"].get(estimator)
         return result
+
+
+SAME = 1e-6
+"""Relative difference below which two figures of the same estimates are the same."""
+
+
+def _same(first: float | None, second: float | None) -> bool:
+    if first is None or second is None:
+        return first is second
+    return math.isclose(first, second, rel_tol=SAME)
 
 
 def _figures(found: Mapping[str, Any]) -> ErrorFigures:

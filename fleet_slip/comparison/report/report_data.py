@@ -1,7 +1,6 @@
 """Everything that a report shows, gathered from warehouse, registry and evaluation."""
 
 import hashlib
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -71,9 +70,6 @@ DRAWN_SCENARIOS = (
 MOST_TERMS = 60
 """Of a larger model, neither standard errors nor what each column buys are shown: hundreds of rows
 tell nothing, and take an hour to compute."""
-
-SAME = 1e-6
-"""Relative difference below which two figures of the same estimates are the same."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +163,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     """
     evaluated = latest_of(warehouse, version)
     trained = train_models(warehouse, version)
-    _same_models(evaluated, trained)
+    evaluated.require_models(trained)
     shipped = shipped_scenarios()
     scenarios = [one for one in shipped if one.name in evaluated.scenarios]
     drawn = [one for one in scenarios if one.name in DRAWN_SCENARIOS]
@@ -175,7 +171,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
         run.scenario.name: run
         for run in run_all(warehouse, drawn, drawn_estimators(evaluated, version))
     }
-    _same_figures(evaluated, runs)
+    evaluated.require_figures(runs)
     cohort, models = trained.selection.cohort, trained.selection.models
     own = _own_cohort(warehouse, trained)
     manifest = version.manifest
@@ -219,36 +215,6 @@ def drawn_estimators(evaluated: Evaluated, version: ModelVersion) -> dict[str, E
         if name in evaluated.estimators:
             estimators[name] = rebuild(name, evaluated.estimators[name], car)
     return estimators | {version.reference: published_estimate(version.manifest)}
-
-
-def _same_models(evaluated: Evaluated, trained: TrainedModels) -> None:
-    now = {name: model.as_dict() for name, model in trained.estimators().items()}
-    for name in evaluated.models.values():
-        kept = evaluated.estimators[name]
-        if name not in now or now[name] != {key: kept.get(key) for key in now[name]}:
-            raise DataError(_changed(evaluated, f"the cohort of {evaluated.group}"))
-
-
-def _same_figures(evaluated: Evaluated, runs: Mapping[str, EvaluatedScenario]) -> None:
-    for scenario, run in runs.items():
-        for name, result in run.results.items():
-            kept = evaluated.figures(scenario, name)
-            found = result.whole.rmse_deg
-            if kept is None or not _same(kept.rmse_deg, found):
-                raise DataError(_changed(evaluated, f"the drive of {scenario}, or {name},"))
-
-
-def _same(first: float | None, second: float | None) -> bool:
-    if first is None or second is None:
-        return first is second
-    return math.isclose(first, second, rel_tol=SAME)
-
-
-def _changed(evaluated: Evaluated, what: str) -> str:
-    return (
-        f"{what} has changed since evaluation {evaluated.document.number}. Run: fleet-slip "
-        f"evaluate {evaluated.group}"
-    )
 
 
 def _by_speed(selection: Selection) -> dict[str, CrossValidation]:

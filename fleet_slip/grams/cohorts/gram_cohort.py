@@ -28,9 +28,7 @@ from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.inference.drive_moments import serving_drives
-from fleet_slip.regression.validation.folds import (
-    CohortFolds,
-)
+from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.warehouse.condition import Condition, asking, parse_cohort
 from fleet_slip.warehouse.minimum_cohort import has_enough, require_vehicles
 from fleet_slip.warehouse.tables import Warehouse

@@ -7,9 +7,7 @@ from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageErr
 from fleet_slip.models.acceptance.gate import compare, faults
 from fleet_slip.models.acceptance.vouched import ODD, odd_gain
 from fleet_slip.models.aliases import CHAMPION
-from fleet_slip.models.manifest import (
-    Manifest,
-)
+from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
 from fleet_slip.selection.select_models import Selection
