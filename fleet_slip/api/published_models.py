@@ -113,8 +113,7 @@ class PublishedModels(Rooted):
     ) -> "tuple[Manifest, RequestedSelection]":
         """Return a selection's winner, whose drives and course are looked at unless forced."""
         from fleet_slip.models.acceptance.first_look import require_sound_drives
-        from fleet_slip.models.acceptance.in_time import require_in_time
-        from fleet_slip.models.acceptance.sound_course import require_sound_course
+        from fleet_slip.models.acceptance.sound_course import require_in_time, require_sound_course
         from fleet_slip.models.describe_winner import manifest_of, with_straight_intercept
 
         require_model_name(name)
