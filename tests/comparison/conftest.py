@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.commands import done_on
 from tests.support.once import made_once
+from tests.support.reported import call
 
 
 @pytest.fixture(scope="session")
@@ -15,6 +15,6 @@ def tuned(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
 
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
-        done_on(root, "evaluate", "smoke", "--scenario", "nominal")
+        call(root, "evaluate", "smoke", "--scenario", "nominal")
 
     return made_once(tmp_path_factory, "tuned", make) / "tuned"

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pytest
 from typer.testing import CliRunner
 
 from fleet_slip.cli.app import app
@@ -25,8 +26,14 @@ class Reported:
         return self.root / "report" / "figures"
 
 
+LITTLE_S = 30
+"""So much of each drive filters are tuned on: to tune them takes most of an evaluation."""
+
+
 def call(root: Path, *words: str) -> Any:
-    result = CliRunner().invoke(app, ["--root", str(root), *words])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fleet_slip.comparison.evaluation.filters.TUNING_S", LITTLE_S)
+        result = CliRunner().invoke(app, ["--root", str(root), *words])
     require_no_failed_run(root)
     if result.exception is not None:
         raise result.exception

@@ -19,6 +19,7 @@ from fleet_slip.errors import UsageError
 from fleet_slip.simulation.drives import simulate_logs
 from fleet_slip.simulation.scenario import load_scenario
 from tests.support.commands import run_on
+from tests.support.reported import call
 
 HASH = "5e" * 32
 
@@ -95,9 +96,8 @@ def test_the_command_judges_and_writes_nothing(
     root = shutil.copytree(smoke_root, tmp_path / "data")
     shutil.copytree(tuned, root / "tuned")
     before = {path for path in root.rglob("*") if "runs" not in path.parts}
-    done = run_on(root, "evaluate", "smoke", "--blind", "--json")
-    assert done.exit_code == 0, done.stderr
-    rows = {row["name"]: row["figures"] for row in json.loads(done.stdout)["blind"]}
+    told = json.loads(call(root, "evaluate", "smoke", "--blind", "--json"))
+    rows = {row["name"]: row["figures"] for row in told["blind"]}
     assert rows["all"]["smoke@1"]["coverage"] > 0.95
     assert rows["all"]["smoke@1"]["rmse_deg"] > rows["all"]["smoke@1"]["error_std_deg"] > 0
     assert {path for path in root.rglob("*") if "runs" not in path.parts} == before

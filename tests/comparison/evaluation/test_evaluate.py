@@ -9,11 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import fleet_slip
 from fleet_slip.arrays import FloatArray
-from fleet_slip.cli.app import app
 from fleet_slip.comparison.evaluation import evaluated_drives
 from fleet_slip.comparison.evaluation.estimators import published_estimate
 from fleet_slip.comparison.evaluation.evaluate import keep
@@ -33,15 +31,13 @@ from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support import reported
 
 SCENARIOS = ("nominal", "adhesion_0_4", "wheel_missing")
 
 
 def call(root: Path, *words: str) -> Any:
-    result = CliRunner().invoke(app, ["--root", str(root), *words, "--json"])
-    if result.exception is not None:
-        raise result.exception
-    return json.loads(result.stdout)
+    return json.loads(reported.call(root, *words, "--json"))
 
 
 def evaluate(root: Path, *scenarios: str) -> Any:
@@ -209,7 +205,7 @@ def test_the_filters_are_tuned_once(root: Path) -> None:
     ]
     tuned = json.loads((root / "tuned" / "kalman" / "1.json").read_text())["content"]
     seconds, *drives = tuned["key"]["drives"]
-    assert seconds == 120
+    assert seconds == reported.LITTLE_S
     assert [model for _, model, _ in drives] == ["d_class_sedan"] * 8
     assert all(name.startswith("smoke-") for name, _, _ in drives)
     assert all(mass_kg is None for _, _, mass_kg in drives), "the model does not know it"
@@ -249,7 +245,6 @@ def test_rivals_run_on_the_same_drives(
 ) -> None:
     monkeypatch.setattr("fleet_slip.comparison.rivals.compare.LEARNERS", LEARNERS[:1])
     monkeypatch.setattr("fleet_slip.comparison.rivals.compare.OF_WINDOWS", LEARNERS[:1])
-    monkeypatch.setattr("fleet_slip.comparison.observers.tuning.LAST_FACTOR", 4.0)
     copy = tmp_path / "data"
     shutil.copytree(root, copy)
     content = call(copy, "evaluate", "smoke", "--scenario", "nominal", "--rivals")
