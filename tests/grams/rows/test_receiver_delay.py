@@ -2,7 +2,7 @@
 
 import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,18 +44,33 @@ outage_duration_s = 5.0
 DELAYS = "SELECT value, uncertainty, drives FROM calibration WHERE number = 'receiver_delay'"
 
 
-def late_fleet(folder: Path, delay_s: float, grams: Sequence[str] = ("signals", "delay")) -> Fleet:
-    file = folder / "late.toml"
-    file.write_text(CAMPAIGN.format(delay_s))
-    fleet = fleet_slip.open(folder / "data")
-    fleet.simulate(str(file))
-    for name in grams:
-        fleet.gram(name)
+LateFleet = Callable[..., Fleet]
+
+
+@pytest.fixture(scope="module")
+def late_fleet(tmp_path_factory: pytest.TempPathFactory) -> LateFleet:
+    """Return a fleet of its own in a folder: each delay is simulated once."""
+    made: dict[float, Path] = {}
+
+    def fleet(folder: Path, delay_s: float, grams: Sequence[str] = ("delay",)) -> Fleet:
+        (folder / "late.toml").write_text(CAMPAIGN.format(delay_s))
+        if delay_s not in made:
+            made[delay_s] = tmp_path_factory.mktemp("late") / "data"
+            first = fleet_slip.open(made[delay_s])
+            first.simulate(str(folder / "late.toml"))
+            first.gram()
+        found = fleet_slip.open(shutil.copytree(made[delay_s], folder / "data"))
+        for name in grams:
+            found.gram(name)
+        return found
+
     return fleet
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.087, 0.3])
-def test_the_delay_is_found_with_its_uncertainty(tmp_path: Path, delay_s: float) -> None:
+def test_the_delay_is_found_with_its_uncertainty(
+    late_fleet: LateFleet, tmp_path: Path, delay_s: float
+) -> None:
     fleet = late_fleet(tmp_path, delay_s)
     with fleet.session(DELAYS) as session:
         ((value, uncertainty, drives),) = session.sql(DELAYS).fetchall()
@@ -103,7 +118,7 @@ def test_a_car_of_few_drives_takes_the_delay_of_its_type_and_one_of_many_its_own
     assert few.cars["a"] == cars["a"]
 
 
-def test_the_delay_of_a_type_is_told_by_its_cars(tmp_path: Path) -> None:
+def test_the_delay_of_a_type_is_told_by_its_cars(late_fleet: LateFleet, tmp_path: Path) -> None:
     """The drives of one car stand in for those of five, of which one has had two receivers."""
     fleet = late_fleet(tmp_path, 0.087)
     condition = parse_condition("true")
@@ -139,12 +154,12 @@ def corrected_rows(fleet: Fleet) -> list[tuple[Any, ...]]:
         return session.sql(CORRECTED).fetchall()
 
 
-def test_a_late_course_teaches_what_one_in_time_does(tmp_path: Path) -> None:
+def test_a_late_course_teaches_what_one_in_time_does(late_fleet: LateFleet, tmp_path: Path) -> None:
     """From one command: the Gram rows that tell the delay are computed by it."""
     coefficients = []
     for delay_s in (0.0, 0.187):
         (tmp_path / str(delay_s)).mkdir()
-        fleet = late_fleet(tmp_path / str(delay_s), delay_s, grams=("signals", "course"))
+        fleet = late_fleet(tmp_path / str(delay_s), delay_s, grams=("course",))
         assert {row[2] for row in corrected_rows(fleet)} <= {
             round(delay_s / 0.0025) + off for off in (-1, 0, 1)
         }
@@ -155,8 +170,10 @@ def test_a_late_course_teaches_what_one_in_time_does(tmp_path: Path) -> None:
     assert coefficients[1] == pytest.approx(coefficients[0], rel=0.1)
 
 
-def test_gram_rows_follow_the_delay_that_more_drives_tell(tmp_path: Path) -> None:
-    fleet = late_fleet(tmp_path, 0.187, grams=("signals",))
+def test_gram_rows_follow_the_delay_that_more_drives_tell(
+    late_fleet: LateFleet, tmp_path: Path
+) -> None:
+    fleet = late_fleet(tmp_path, 0.187, grams=())
     ((first,), *_) = fleet.sql("SELECT min(day) FROM drives").fetchall()
     fleet.gram("course", cohort=f"day = '{first}'")
     early = corrected_rows(fleet)
@@ -168,8 +185,10 @@ def test_gram_rows_follow_the_delay_that_more_drives_tell(tmp_path: Path) -> Non
     assert fleet.check().wide_drives
 
 
-def test_what_a_forgotten_drive_told_of_the_delay_is_gone(tmp_path: Path) -> None:
-    fleet = late_fleet(tmp_path, 0.187, grams=("signals", "course"))
+def test_what_a_forgotten_drive_told_of_the_delay_is_gone(
+    late_fleet: LateFleet, tmp_path: Path
+) -> None:
+    fleet = late_fleet(tmp_path, 0.187, grams=("course",))
     ((drive,), *_) = fleet.sql("SELECT min(drive_id) FROM drives").fetchall()
     fleet.forget(drive=drive)
     kept = corrected_rows(fleet)
@@ -181,8 +200,10 @@ def test_what_a_forgotten_drive_told_of_the_delay_is_gone(tmp_path: Path) -> Non
     assert corrected_rows(other) == kept
 
 
-def test_what_a_course_of_unknown_delay_taught_is_not_published(tmp_path: Path) -> None:
-    fleet = late_fleet(tmp_path, 0.06, grams=("signals", "calibration"))
+def test_what_a_course_of_unknown_delay_taught_is_not_published(
+    late_fleet: LateFleet, tmp_path: Path
+) -> None:
+    fleet = late_fleet(tmp_path, 0.06, grams=("calibration",))
     drives = [drive for (drive,) in fleet.sql("SELECT drive_id FROM drives").fetchall()]
     few = f"drive_id <= '{sorted(drives)[1]}'"
     fleet.gram("course", cohort=few)
@@ -192,7 +213,7 @@ def test_what_a_course_of_unknown_delay_taught_is_not_published(tmp_path: Path) 
     assert fleet.publish("late", selection, force=True).new
 
 
-def test_quality_names_a_car_whose_delay_changed(tmp_path: Path) -> None:
+def test_quality_names_a_car_whose_delay_changed(late_fleet: LateFleet, tmp_path: Path) -> None:
     fleet = late_fleet(tmp_path, 0.06)
     assert not changed(fleet)
     later = CAMPAIGN.format(0.187) + "\n"
