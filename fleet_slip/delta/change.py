@@ -149,7 +149,13 @@ class Change:
         return [
             *(action for action in self.add if action.path not in both),
             *(
-                _removal(file, data_change=self.data_change)
+                RemoveAction(
+                    path=file.path,
+                    data_change=self.data_change,
+                    deletion_timestamp=_now_ms(),
+                    size=file.size_bytes,
+                    partition_values=_partition(file.day),
+                )
                 for file in self.remove
                 if file.path not in both
             ),
@@ -175,16 +181,6 @@ def addition(path: str, encoded: Encoded, day: date | None) -> AddAction:
         modification_time=_now_ms(),
         data_change=True,
         stats=encoded.statistics,
-    )
-
-
-def _removal(file: TableFile, *, data_change: bool) -> RemoveAction:
-    return RemoveAction(
-        path=file.path,
-        data_change=data_change,
-        deletion_timestamp=_now_ms(),
-        size=file.size_bytes,
-        partition_values=_partition(file.day),
     )
 
 

@@ -107,7 +107,11 @@ class _Writer(Nodes):
     def write(self, exact: Sequence[Fraction]) -> None:
         """Write all; `exact` is the intercept and the coefficients in the unit of the angle."""
         places = [place for place, _ in self.program.angle.terms]
-        self._declare_given()
+        program = self.program
+        self._given["signal"] = self.declare("signals", len(program.signals), self.kind)
+        for name, told in (("fact", program.facts), ("number", program.numbers)):
+            if told:
+                self._given[name] = self.declare(f"{name}s", len(told))
         values, there = [self._value(place) for place in places], self._there(*places)
         for number, place in enumerate(places):
             if self._is_constant(place):  # of no car: with a row for each, it can stand by others
@@ -119,13 +123,6 @@ class _Writer(Nodes):
         name, of = operation_of(self.program.steps[step]), operands_of(self.program.steps[step])
         values = of[:1] if name in ("where", "at_least") else of
         return name == "constant" or (bool(of) and all(map(self._is_constant, values)))
-
-    def _declare_given(self) -> None:
-        program = self.program
-        self._given["signal"] = self.declare("signals", len(program.signals), self.kind)
-        for name, told in (("fact", program.facts), ("number", program.numbers)):
-            if told:
-                self._given[name] = self.declare(f"{name}s", len(told))
 
     def _value(self, step: int) -> str:
         """Return the value of a step: any of its range where it is missing."""

@@ -217,7 +217,16 @@ def forget_called(
         subject = Forgettable("drive", drive)
         reports.append(forget(warehouse, subject, now=now, source_file=source_file))
         progress(1, len(drives))
-    return _together(reports)
+    return ForgetReport(
+        drives=sum(one.drives for one in reports),
+        rows=sum(one.rows for one in reports),
+        files_rewritten=sum(one.files_rewritten for one in reports),
+        files_removed=sum(one.files_removed for one in reports),
+        models=tuple(sorted({name for one in reports for name in one.models})),
+        old_files_deleted=sum(one.old_files_deleted for one in reports),
+        old_files_left=max(one.old_files_left for one in reports),
+        pending=tuple(dict.fromkeys(name for one in reports for name in one.pending)),
+    )
 
 
 def _drives_called(
@@ -242,17 +251,3 @@ def _named_rows(warehouse: Warehouse, calling: Calling, *, old: bool) -> Iterato
     if old:
         for table in (warehouse.logs, warehouse.grams):
             yield from (one.rows for one in read_old_files(table.snapshot()))
-
-
-def _together(reports: list[ForgetReport]) -> ForgetReport:
-    """Return one report of all; what may still have the rows of any of the drives is pending."""
-    return ForgetReport(
-        drives=sum(one.drives for one in reports),
-        rows=sum(one.rows for one in reports),
-        files_rewritten=sum(one.files_rewritten for one in reports),
-        files_removed=sum(one.files_removed for one in reports),
-        models=tuple(sorted({name for one in reports for name in one.models})),
-        old_files_deleted=sum(one.old_files_deleted for one in reports),
-        old_files_left=max(one.old_files_left for one in reports),
-        pending=tuple(dict.fromkeys(name for one in reports for name in one.pending)),
-    )

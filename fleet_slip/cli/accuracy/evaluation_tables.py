@@ -2,13 +2,10 @@
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fleet_slip.cli.output import cell, print_line, print_table, print_text, stdout
 from fleet_slip.words import number_of
-
-if TYPE_CHECKING:
-    pass
 
 PLACES = ("inside", "outside")
 """Of an unstable section."""

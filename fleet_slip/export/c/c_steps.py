@@ -49,7 +49,8 @@ class StepWriter:
     def value(self, step: int) -> str:
         """Return what a step is in C, after what computes it."""
         if step not in self._values:
-            self._values[step] = self._computed(step)
+            name, plain = operation_of(self.program.steps[step]), plain_of(self.program.steps[step])
+            self._values[step] = _COMPUTED.get(name, StepWriter._arithmetic)(self, step, *plain)
         return self._values[step]
 
     def there(self, *steps: int) -> str:
@@ -76,10 +77,6 @@ class StepWriter:
             present = f"({self._word(root)} != MISSING)" if taken else _PRESENT[name](self, root)
             self._there[root] = self._declare("bool", "has", root, present)
         return self._there[root]
-
-    def _computed(self, step: int) -> str:
-        name, plain = operation_of(self.program.steps[step]), plain_of(self.program.steps[step])
-        return _COMPUTED.get(name, StepWriter._arithmetic)(self, step, *plain)
 
     def _arithmetic(self, step: int, *of: int) -> str:
         name, values = operation_of(self.program.steps[step]), [self.value(one) for one in of]

@@ -133,7 +133,12 @@ def _query(
     late: Late = None,
 ) -> pa.Table:
     paths = {warehouse.logs.uri(file.path): file.path for file in files}
-    whole = feature_set == PLAIN and _signals_are_whole(warehouse, files)
+    # Whether each signal is in all rows of a file or in none, by the Delta log's statistics.
+    whole = feature_set == PLAIN and all(
+        file.null_counts.get(signal, file.rows) in (0, file.rows)
+        for file in files
+        for signal in warehouse.catalogue.gram_signals
+    )
     absent = absent_columns(files, warehouse.catalogue.stored_columns)
     statement = gram_statement(warehouse.catalogue, feature_set, whole=whole, absent=absent)
     identity = features().identity(feature_set)
@@ -155,13 +160,4 @@ def set_late(database: duckdb.DuckDBPyConnection, late: Late) -> None:
     database.execute(
         f"SET VARIABLE {COURSE_LATE} = map($cars::VARCHAR[], $late::INTEGER[])",
         {"cars": cars, "late": [(late or {})[car] for car in cars]},
-    )
-
-
-def _signals_are_whole(warehouse: Warehouse, files: Sequence[TableFile]) -> bool:
-    """Whether each signal is in all rows of a file or in none, by the Delta log's statistics."""
-    return all(
-        file.null_counts.get(signal, file.rows) in (0, file.rows)
-        for file in files
-        for signal in warehouse.catalogue.gram_signals
     )

@@ -245,6 +245,7 @@ def test_rivals_run_on_the_same_drives(
 ) -> None:
     monkeypatch.setattr("fleet_slip.comparison.rivals.compare.LEARNERS", LEARNERS[:1])
     monkeypatch.setattr("fleet_slip.comparison.rivals.compare.OF_WINDOWS", LEARNERS[:1])
+    monkeypatch.setattr("fleet_slip.comparison.rivals.learners.MOST_TREES", 60)
     copy = tmp_path / "data"
     shutil.copytree(root, copy)
     content = call(copy, "evaluate", "smoke", "--scenario", "nominal", "--rivals")
