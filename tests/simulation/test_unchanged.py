@@ -1,7 +1,8 @@
 """What was simulated before stays what it was: the bits of rows and the digests of batches.
 
-The sums were taken before cars, roads and sensors had imperfections. Digests name files and tell a
-changed campaign, so that they must not change either.
+The sums were taken before cars, roads and sensors had imperfections; those of
+`proving_ground` and of drives with imperfections before roads were rough and stability control
+braked. Digests name files and tell a changed campaign, so that they must not change either.
 """
 
 from hashlib import sha256
@@ -29,6 +30,16 @@ CAMPAIGNS = {
         "666d56a88a5707d9955eccd5973d30c27ede9245abee08b2108475bb2d4aff24",
         "de6c065a4801c718125e3b3e2c994ac0a47fe6e0dc7f1f10aee7d4ea7a0ab77c",
     ),
+    "proving_ground": (
+        "016cdde8f2f7e919bba668bf9bc43eb2503b4ad58da57fcfb35cd32d602eed9d",
+        "b0160f9ba855a7ecadb3597b1538a230bec9f5cad536d937bf442d986992be26",
+        "b8127600b9df9adde3d0397e17edb1af18aa32e74b89798aa13315cdf756c1af",
+    ),
+    "fleet_realistic": (
+        "811e4a664234c2ad30f5c0450d34b9cb01d8746d20931b4d094672d7f4c9f134",
+        "5cd5ad22cfefb706c9fce81e49dbde3386c5bc91516b0999f18c18377e0c0c09",
+        "28d36f05bd13a20fee83f8a8ca940c456508e9c18eed3e328f247a9021a69c57",
+    ),
 }
 """Digest of the campaign, of its first batch, and of the rows of that batch's first two drives."""
 
@@ -36,6 +47,10 @@ SCENARIOS = {
     "nominal": (
         "bdd969f0355eaf27df0ed93fd8d615235f538c1f597820ba18a202c8f89c1965",
         "dd90dec81007115530cbe34f68ed40345ba7bd5aa5dab4ccdc4bb17399fea7cb",
+    ),
+    "imperfect": (
+        "e4836c9e7441765ec4a789262fae0c652491c4abf3a7d0f7570e7af72593fc4c",
+        "e800e1d53879b6c9b14df42244d301d19092ef0185a8306327e6a71a1c9ee26d",
     ),
     "adhesion_0_4": (
         "9166610825998f76ca310a6aaeab4d2025651cc91a4342a4dc0fc748f087dc6e",
