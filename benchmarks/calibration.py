@@ -78,12 +78,13 @@ def _true(spec: DriveSpec) -> dict[str, float]:
     sensors, car = spec.flaws.sensors, spec.flaws.car
     lean_mps2 = GRAVITY_MPS2 * math.sin(math.radians(sensors.inertial_roll_deg))
     wheels_deg = (sensors.wheel_angle_offset_fl_deg + sensors.wheel_angle_offset_fr_deg) / 2
+    radii = (car.radius_error_fl, car.radius_error_fr, car.radius_error_rl, car.radius_error_rr)
     return {
         "yaw_rate_offset": spec.sensors.yaw_rate_bias_rad_s,
         "yaw_rate_offset_by_wheels": spec.sensors.yaw_rate_bias_rad_s,
         "ay_offset": spec.sensors.ay_bias_mps2 + lean_mps2,
         "steering_offset": math.radians(wheels_deg + car.thrust_angle_deg),
-        "speed_ratio": spec.vehicle.tyre.rolling_radius_m / 0.31,
+        "speed_ratio": spec.vehicle.tyre.rolling_radius_m / 0.31 * (1 + sum(radii) / 4),
     }
 
 

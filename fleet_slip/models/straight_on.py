@@ -69,13 +69,14 @@ class StraightOn:
 
 def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) -> StraightOn:
     """Return the intercept of a model without one. Raises `DataError` if no car tells offsets."""
-    numbers = calibrate(warehouse, condition).cars
+    evidence = calibrate(warehouse, condition).evidence
     cohort = load_cohort(warehouse, condition, training=False)
     signals = tuple(dict.fromkeys(name for term in manifest.terms for name in term.inputs))
     predictor = Predictor.of(manifest)
     found = []
     for car, gram, facts in _by_car(cohort, tuple(dict.fromkeys((*OFFSETS, *signals)))):
-        known = numbers.get(car, {})
+        # Whatever part of ay is the road's: these are the roads that the model was taught on.
+        known = evidence.calibrated(car, leaning=True) if car in evidence.told else {}
         if set(OFFSETS.values()) <= set(known):
             told = _of_car(predictor, gram, signals, known, facts)
             found.append((gram.n, *told, *(known[one].count for one in COLUMNS.values())))

@@ -57,14 +57,18 @@ def calibrate(
     elif day:
         _print_changed(changed, day)
     elif car is not None:
-        _print_car(car, found.car(car))
+        _print_car(car, found.car(car), found.evidence.refusals(car))
         _say_of_roads(found.roads)
     else:
         _print_fleet(found)
         _say_of_roads(found.roads)
 
 
-def _print_car(car: str, numbers: Mapping[NumberName, CalibratedNumber]) -> None:
+def _print_car(
+    car: str,
+    numbers: Mapping[NumberName, CalibratedNumber],
+    refusals: Mapping[NumberName, str],
+) -> None:
     print_table(
         f"{car}, by its own drives",
         ["number", "unit", "value", "+-", "drives", "count on board", "of"],
@@ -82,7 +86,9 @@ def _print_car(car: str, numbers: Mapping[NumberName, CalibratedNumber]) -> None
         ],
         left=2,
     )
-    if missing := [name for name in CAR_NUMBERS if name not in numbers]:
+    for name, reason in refusals.items():
+        say(f"{name} is missing: {reason}")
+    if missing := [name for name in CAR_NUMBERS if name not in {**numbers, **refusals}]:
         say(
             f"not told by its drives, which lack a signal, or are too straight or even: "
             f"{', '.join(missing)}"
@@ -150,7 +156,12 @@ def _print_changed(changed: Sequence[ChangedNumber], since: date) -> None:
 
 
 def _say_of_roads(roads: Roads) -> None:
-    if roads.banked and roads.lean:
+    if roads.hide_offsets:
+        say(
+            "bends look banked, and roads may always lean to one side, which fewer than "
+            f"{FEWEST_CARS} cars with offsets cannot tell from their own: no car has ay_offset"
+        )
+    elif roads.banked and roads.lean:
         say(
             f"bends are banked, and the roads lean: {float(roads.lean):+.3f} m/s^2 +- "
             f"{roads.uncertainty:.2g} of ay in all {number_of(roads.cars, 'car')}, which ay_offset "
@@ -158,7 +169,7 @@ def _say_of_roads(roads: Roads) -> None:
         )
     elif not roads.banked:
         say(
-            "bends are not seen to be banked: a road that always leans to one side counts as "
+            "bends are seen not to be banked: a road that always leans to one side counts as "
             f"ay_offset. {FEWEST_CARS} cars or more tell the one from the other"
         )
 

@@ -97,6 +97,9 @@ class Calibration:
                 car: {name: vars(one) for name, one in numbers.items()}
                 for car, numbers in self.cars.items()
             },
+            "missing": {
+                car: refused for car in self.cars if (refused := self.evidence.refusals(car))
+            },
             "roads": {
                 "banked": self.roads.banked,
                 "lean_mps2": None if self.roads.lean is None else float(self.roads.lean),

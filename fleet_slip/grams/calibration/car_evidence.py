@@ -17,7 +17,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName
-from fleet_slip.grams.calibration.road_lean import are_banked, roads_of
+from fleet_slip.grams.calibration.road_lean import FEWEST_CARS, are_banked, roads_of
 from fleet_slip.grams.calibration.tell_by_satellite import LASTING_BY_SATELLITE, tell_by_satellite
 from fleet_slip.grams.calibration.tell_numbers import Telling, bank_of_bends, tell_numbers
 from fleet_slip.grams.cohorts.drive_sums import DriveSums
@@ -35,8 +35,9 @@ LASTING: Mapping[bool, Mapping[NumberName, float]] = {
         "speed_ratio": 0.001,
     },
     True: {
+        "yaw_rate_offset": 0.0007,
         "yaw_rate_offset_by_wheels": 0.001,
-        "steering_offset": 0.00015,
+        "steering_offset": 0.0002,
         "speed_ratio": 0.03,
     },
 }
@@ -94,6 +95,15 @@ class ChangedNumber:
     after: float
     uncertainty: float
 
+
+LEANS = (
+    "roads are banked, and may always lean to one side, which nobody can tell from the car's own "
+    f"offset: {FEWEST_CARS} cars or more can"
+)
+TIGHT_BENDS = (
+    "bends are so tight that a bank is not in proportion to them: satellite speed tells it"
+)
+"""Why a number is missing."""
 
 SURE_ERRORS = 4.0
 """Standard errors by which a number has changed: by chance in one of 16,000."""
@@ -195,14 +205,20 @@ class CarEvidence:
         """Return a number as it is without the lean of the roads."""
         return telling.value - (self.roads.lean or 0) * telling.by_lean
 
-    def calibrated(self, car: str, drives: int | None = None) -> dict[NumberName, CalibratedNumber]:
-        """Return the numbers of a car, by all of its drives or by the first so many."""
+    def calibrated(
+        self, car: str, drives: int | None = None, *, leaning: bool = False
+    ) -> dict[NumberName, CalibratedNumber]:
+        """Return the numbers of a car, by all of its drives or by the first so many.
+
+        `ay_offset` is missing where nobody can tell it from the lean of the roads; with `leaning`
+        it is there with it, as the accelerometer says on these roads.
+        """
         slices = self._slices(car, 0, drives)
         told = self.told[car] if drives is None else self.tell(slices)
         sure = self.uncertainties(told, slices)
         found: dict[NumberName, CalibratedNumber] = {}
         for name in CAR_NUMBERS:
-            if name in told:
+            if name in told and (leaning or not self._hidden(name)):
                 at = slices[told[name].kind]
                 rows = int(self.sums[told[name].kind].table.n[at].sum())
                 value = self._level(told[name])
@@ -216,6 +232,18 @@ class CarEvidence:
                     drives=at.stop - at.start,
                     rows=rows,
                 )
+        return found
+
+    def _hidden(self, name: NumberName) -> bool:
+        return name == "ay_offset" and self.roads.hide_offsets
+
+    def refusals(self, car: str) -> dict[NumberName, str]:
+        """Return why numbers of a car are missing that its drives would tell on other roads."""
+        told, found = self.told[car], {}
+        if "ay_offset" in told and self._hidden("ay_offset"):
+            found["ay_offset"] = LEANS
+        if "yaw_rate_offset" in told and "speed_ratio" not in told:
+            found["speed_ratio"] = TIGHT_BENDS
         return found
 
     def changed(self, since: date) -> list[ChangedNumber]:

@@ -25,9 +25,13 @@ LEAST_TURNING_RAD_S = Fraction(2, 100)
 """Standard deviation of how fast the direction changes, below which a car drove too straight. The
 noise of accelerometers is a third of it."""
 
-LEAST_CHANGE_OF_SPEED = Fraction(5, 100)
+LEAST_CHANGE_OF_SPEED = {False: Fraction(5, 100), True: Fraction(10, 100)}
 """Standard deviation of one over speed over its mean, below which a car drove too evenly to tell
-the offset of one sensor from that of the other."""
+the offset of one sensor from that of the other; on banked roads also the bank from speed."""
+
+TIGHT_1PM = Fraction(1, 50)
+"""Standard deviation of curvature beyond which bends are mostly so tight that their bank does not
+grow with curvature any more: it looks like speed."""
 
 LEAST_CURVATURE_1PM = Fraction(1, 1000)
 SPEED_RATIOS = {False: (Fraction(4, 5), Fraction(5, 4)), True: (Fraction(3, 4), Fraction(4, 3))}
@@ -160,7 +164,7 @@ def tell_numbers(sums: Mapping[str, Gram | None], banked: bool) -> dict[NumberNa
     if noise is None:
         return found
     _tell_wheels(found, of_course, noise)
-    change = LEAST_CHANGE_OF_SPEED * of_course.mean("slowness")
+    change = LEAST_CHANGE_OF_SPEED[banked] * of_course.mean("slowness")
     if of_course.variance("slowness") >= change**2:
         _tell_course(found, of_course, noise if banked else None)
     if steering and "ay_offset" in found:
@@ -213,7 +217,9 @@ def _tell_course(found: dict[NumberName, Telling], sums: ExactSums, noise: Fract
     if not least <= ratio <= most:
         return
     values = (yaw_rate_offset, ay_offset, ratio)
-    for (name, gradient), value in zip(gradients.items(), values, strict=True):
+    if sums.variance("curvature") > TIGHT_1PM**2:
+        del gradients["speed_ratio"]
+    for (name, gradient), value in zip(gradients.items(), values, strict=False):
         lean, terms = Fraction(name == "ay_offset"), course_terms()
         found[name] = Telling("course", relation, terms, noise, value, gradient, {}, lean)
 

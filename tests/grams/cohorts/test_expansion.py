@@ -74,7 +74,7 @@ def offset(signals: cars.Signals, yaw_rate: float, ay: float) -> None:
 
 def drive(rng: np.random.Generator, car: int) -> dict[str, Any]:
     made = cars.broken(
-        cars.drive(rng, 2.0), lambda signals: offset(signals, 0.01 * (car - 1), 0.1 * (2 - car))
+        cars.drive(rng, 1.5), lambda signals: offset(signals, 0.01 * (car - 1), 0.1 * (2 - car))
     )
     return cars.counts({name: values[:1200] for name, values in made.items()})
 
