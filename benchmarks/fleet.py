@@ -63,16 +63,20 @@ def models() -> dict[str, tuple[str, ...]]:
     windows = tuple(w for w in one.windows if w not in facts and w not in RUNNING)
     offsets = tuple(name for name in one.calibrated if "_offset_" in name)
     plain = (*one.signals, *one.features, *windows)
+    slips = {name for name, column in features().calibrated.items() if "slip_" in column.number}
+    own = tuple(name for name in one.calibrated if name not in slips)
     table_one = all_signals()
     return {
         "Table I, model 4": table_one,
         "windows": plain,
         "windows, running biases": (*plain, *RUNNING),
         "windows, own offsets": (*plain, *offsets),
-        "windows, own offsets and other own numbers": (*plain, *one.calibrated),
+        "windows, own offsets and other own numbers": (*plain, *own),
+        "windows, own numbers, satellites' too": (*plain, *one.calibrated),
         "windows, running biases, mass and model": (*plain, *RUNNING, *facts),
         "windows, own offsets, mass and model": (*plain, *offsets, *facts),
-        "windows, all own numbers, mass and model": (*plain, *one.calibrated, *facts),
+        "windows, all own numbers, mass and model": (*plain, *own, *facts),
+        "the same, satellites' numbers too": (*plain, *one.calibrated, *facts),
     }
 
 
@@ -95,6 +99,8 @@ def errors_of_models(
     with calibrated_by(found):
         summed = sum_cohort(warehouse, Folding(by="vehicle", count=FOLDS), cohort, SET)
     for name, inputs in models().items():
+        if not set(inputs) <= set(summed.inputs):
+            continue  # no car has a receiver
         one = cross_validate_inputs(
             name, summed.sums, inputs, catalogue().label, input_scales()
         ).pooled
