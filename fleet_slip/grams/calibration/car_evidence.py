@@ -239,7 +239,8 @@ class CarEvidence:
 
     def refusals(self, car: str) -> dict[NumberName, str]:
         """Return why numbers of a car are missing that its drives would tell on other roads."""
-        told, found = self.told[car], {}
+        told = self.told[car]
+        found: dict[NumberName, str] = {}
         if "ay_offset" in told and self._hidden("ay_offset"):
             found["ay_offset"] = LEANS
         if "yaw_rate_offset" in told and "speed_ratio" not in told:
