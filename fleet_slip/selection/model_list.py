@@ -121,9 +121,12 @@ def inputs_of(cohort: Cohort | SummedCohort, order: str) -> tuple[str, ...]:
 
 
 def require_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
-    """Return the inputs. Raises `QuestionError` for an unknown, `UsageError` for a repeated one."""
+    """Return the inputs, of a family of windows or gates its members.
+
+    Raises `QuestionError` for an unknown one, `UsageError` for a repeated one.
+    """
     known = features().feature_set(feature_set).inputs
-    order = tuple(name.strip() for name in names)
+    order = tuple(one for name in names for one in features().members(name.strip()))
     if unknown := [name for name in order if name not in known]:
         raise QuestionError(
             f"{','.join(order)}: {', '.join(unknown)} is not an input. Inputs of the feature set "

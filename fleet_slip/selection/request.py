@@ -65,7 +65,8 @@ class SelectionRequest:
         str | None,
         Doc(
             "Add the nested models of an order of signals, separated by commas; 'catalogue' is all "
-            "inputs in the order of configs/signals.toml."
+            "inputs in the order of configs/signals.toml, a family of windows or gates its "
+            "columns."
         ),
     ] = None
     features: Annotated[

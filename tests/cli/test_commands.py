@@ -222,7 +222,11 @@ FORGED = (
         (["score", "smoke", "--cohort", "true) OR (true"], 5, "not valid SQL"),
         (["select", "--cohort", "1; DROP VIEW grams"], 5, "not valid SQL"),
         (["select", "--nested", "ax,beta"], 5, "beta is not an input"),
-        (["select", "--models", "table9"], 3, "Known: course, estimator, gated, table1"),
+        (
+            ["select", "--models", "table9"],
+            3,
+            "Known: course, estimator, gated, gated_small, table1",
+        ),
         (["select", "--by", "vehicle"], 5, "at least two folds"),
         (["show", "nothing"], 5, "no model is called"),
         (["score", "smoke@9"], 5, "has no version"),

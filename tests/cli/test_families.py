@@ -1,7 +1,8 @@
 """How a table names the columns of a large model."""
 
+from fleet_slip.catalogue.features import features
 from fleet_slip.cli.begin.selection_tables import MANY_SIGNALS, in_families
-from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.selection.model_list import load_model_list, require_inputs
 
 
 def test_a_large_model_is_named_by_families_and_what_belongs_to_none() -> None:
@@ -24,3 +25,16 @@ def test_a_part_of_a_family_is_named_column_by_column() -> None:
 def test_a_small_model_is_named_in_full() -> None:
     names = [f"x{number}" for number in range(MANY_SIGNALS)]
     assert in_families(names) == " ".join(names)
+
+
+def test_families_of_a_question_stand_for_their_columns() -> None:
+    asked = require_inputs(["ay", " ax_mean", "excess"], "gated")
+    known = features()
+    assert asked == ("ay", *known.members("ax_mean"), *known.members("excess"))
+
+
+def test_the_small_gated_list_is_made_of_the_gated_set_without_its_long_ring() -> None:
+    (sixty,) = load_model_list("gated_small").model
+    assert len(sixty.signals) == 60
+    assert set(sixty.signals) <= set(features().feature_set("gated").inputs)
+    assert not set(sixty.signals) & set(features().members("road"))
