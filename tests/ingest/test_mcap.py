@@ -205,3 +205,73 @@ def test_messages_in_another_encoding_are_named(tmp_path: Path) -> None:
         writer.add_message(channel, START_NS, b"\x08\x01", START_NS)
         writer.finish()  # type: ignore[no-untyped-call]
     assert "no message in it can be decoded (protobuf)" in failure(tmp_path / "log.mcap")
+
+
+MIXED = HEADER.format(
+    "bool on\nint8 small\nuint16 wide\nfloat32 single\nstring note\nint64 large\nfloat64[] more"
+)
+
+
+def write_mixed(file: Path, notes: list[str]) -> list[dict[str, Any]]:
+    """Write messages of all kinds of numbers, with a note each; return what they say."""
+    random = np.random.default_rng(5)
+    said = []
+    with file.open("wb") as stream:
+        writer = Writer(stream, chunk_size=4000)
+        schema = writer.register_msgdef("test/Mixed", MIXED)
+        for i, note in enumerate(notes):
+            value = {
+                "on": bool(i % 2),
+                "small": int(random.integers(-128, 128)),
+                "wide": int(random.integers(2**16)),
+                "single": float(np.float32(random.normal())),
+                "note": note,
+                "large": int(random.integers(-(2**52), 2**52)),
+                "more": random.normal(size=3).tolist(),
+            }
+            now = START_NS + i * 10**7
+            writer.write_message("/mixed", schema, {"header": header(i / 100), **value}, now, now)
+            said.append(value)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return said
+
+
+@pytest.mark.parametrize(
+    "notes",
+    [
+        pytest.param(["same"] * 400, id="all alike"),
+        pytest.param([f"{i:04}" for i in range(400)], id="texts of one length"),
+        pytest.param(["x" * (i % 7) for i in range(400)], id="texts of other lengths"),
+        pytest.param(["a"] * 200 + ["longer"] * 200, id="alike for a while"),
+    ],
+)
+def test_what_is_decoded_at_once_is_what_the_decoder_says(tmp_path: Path, notes: list[str]) -> None:
+    said = write_mixed(tmp_path / "log.mcap", notes)
+    names = ["small", "wide", "single", "large"]
+    with mcap_log.open_mcap(Budget.of(tmp_path / "log.mcap")) as source:
+        columns = [*(f"/mixed.{name}" for name in names), "/mixed.more[2]"]
+        source.bases(columns)
+        rows = pl.concat(source.batches(columns))
+    expected = [[*(float(one[name]) for name in names), one["more"][2]] for one in said]
+    assert rows.select(columns).rows() == [tuple(one) for one in expected]
+    stamps = [START_NS + i * 10**7 for i in range(400)]
+    times = [float(at // 10**9) + float(at % 10**9) * 1e-9 for at in stamps]
+    assert rows[OWN_TIME].to_list() == times
+
+
+def test_alike_messages_are_not_decoded_one_by_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_mixed(tmp_path / "log.mcap", ["same"] * 400)
+    looked = []
+
+    def look(_message: Any, published_ns: int) -> float:
+        looked.append(published_ns)
+        return published_ns * 1e-9
+
+    monkeypatch.setattr(mcap_log, "stamp_s", look)
+    with mcap_log.open_mcap(Budget.of(tmp_path / "log.mcap")) as source:
+        source.bases(["/mixed.large", "/mixed.more[0]"])
+        assert not looked
+        source.bases(["/mixed.on"])
+    assert len(looked) == 400, "a truth is no number with a place of its own"

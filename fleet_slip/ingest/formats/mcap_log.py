@@ -7,20 +7,29 @@ read once for what is in it, and once more for the columns that are asked for.
 
 import io
 import json
-from array import array
+import struct
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pyarrow as pa
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.mcap_fields import (
+    AlikeMessages,
+    Block,
+    Decode,
+    field_of,
+    leaves_of,
+    stamp_s,
+)
 from fleet_slip.ingest.formats.source import (
     OWN_TIME,
     Base,
@@ -36,21 +45,31 @@ _LARGEST_RECORD, _LARGEST_RATIO = 2**27, 1000
 """Bytes of a record or of a chunk unpacked, and how many times its size a chunk may become."""
 LARGEST_MESSAGE = 2**22
 """Bytes of a message that is decoded: each may become an object of its own."""
-_MOST_ITEMS, _DEEPEST = 64, 20
-"""Items of an array that are columns, and levels of messages in messages."""
-
-Decode = Callable[[bytes], Any]
 
 MAGIC = b"\x89MCAP0\r\n"
 PIECE_ROWS = 2**13
 """Messages of one topic that are in memory at once."""
+_MESSAGE, _MESSAGE_INDEX = 5, 7
+_RECORD, _HEAD = struct.Struct("<BQ"), struct.Struct("<BQH12xQ")
+"""What begins a record; a message also says of which channel it is, and when it was published."""
 
 
 def read_records(budget: Budget) -> Iterator[Any]:
-    """Yield the records of a file; those in chunks come singly. Raises `InputError`."""
+    """Yield the records of a file, all messages of a chunk as a `Block` behind the others of it.
+
+    Raises `InputError`.
+    """
     path, unfolded = budget.file, 0
     with reading_with(path, "mcap.stream_reader") as mcap, path.open("rb") as file:
-        reader = mcap.StreamReader(
+
+        class Reader(mcap.StreamReader):  # type: ignore[misc, name-defined]
+            """Passes over indices: unpacking one takes as long as its messages."""
+
+            def _read_record(self, opcode: int, length: int) -> Any:
+                kind = 0 if opcode == _MESSAGE_INDEX else opcode  # which is unknown
+                return super()._read_record(kind, length)
+
+        reader = Reader(
             file, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST_RECORD
         )
         for record in reader.records:
@@ -58,9 +77,35 @@ def read_records(budget: Budget) -> Iterator[Any]:
                 chunk = _unpacked(path, record)
                 unfolded += chunk.uncompressed_size
                 budget.require_unfolded(unfolded)
-                yield from mcap.breakup_chunk(chunk, validate_crc=True)
+                stream, size = mcap.get_chunk_data_stream(chunk, validate_crc=True)
+                block, others = _messages_in(stream.read(size))
+                chunk.data, chunk.uncompressed_size, chunk.uncompressed_crc = others, len(others), 0
+                yield from mcap.breakup_chunk(chunk)
+                yield block
+            elif type(record).__name__ == "Message":
+                heads = np.array([(record.channel_id, 0, len(record.data))])
+                yield Block(record.data, heads, np.array([record.publish_time], np.uint64))
             else:
                 yield record
+
+
+def _messages_in(content: bytes) -> tuple[Block, bytes]:
+    """Return the messages of a chunk, and its other records."""
+    heads, published_ns, others, at = [], [], [], 0
+    padded, last = content + bytes(_HEAD.size), len(content) - _RECORD.size
+    while at <= last:
+        kind, size, channel, moment_ns = _HEAD.unpack_from(padded, at)
+        end = at + _RECORD.size + size
+        if kind == _MESSAGE:
+            heads.append((channel, at + _HEAD.size, end))
+            published_ns.append(moment_ns)
+        else:
+            others.append(content[at:end])
+        at = end
+    messages = np.array(heads, np.int64).reshape(-1, 3)
+    if at != len(content) or (messages[:, 1] > messages[:, 2]).any():
+        raise EOFError("a record is cut off")
+    return Block(content, messages, np.array(published_ns, np.uint64)), b"".join(others)
 
 
 def _unpacked(path: Path, chunk: Any) -> Any:
@@ -93,64 +138,10 @@ def decoder_of(channel: Any, schema: Any) -> Decode | None:
     return decode
 
 
-def stamp_s(message: Any, published_ns: int) -> float:
-    """Return when a message was taken: as its header says, else when it was published."""
-    stamp = field_of(message, "header.stamp") or field_of(message, "stamp")
-    parts = [_attribute(stamp, name) for name in ("sec", "nanosec")]
-    if all(isinstance(part, int) for part in parts) and any(parts):
-        return float(parts[0]) + float(parts[1]) * 1e-9
-    return published_ns * 1e-9
-
-
-def field_of(message: Any, path: str) -> Any:
-    """Return a field of a field, or None if there is none; arrays by [number]."""
-    for name in _steps(path):
-        if not name.startswith("["):
-            message = _attribute(message, name)
-        elif name[1:-1].isdecimal() and _is_array(message) and int(name[1:-1]) < len(message):
-            message = message[int(name[1:-1])]
-        else:
-            return None
-    return message
-
-
-@lru_cache(maxsize=10_000)
-def _steps(path: str) -> tuple[str, ...]:
-    return tuple(path.replace("[", ".[").split("."))
-
-
-def _attribute(message: Any, name: str) -> Any:
-    if isinstance(message, dict):
-        return message.get(name)
-    return getattr(message, name, None) if name in _names(message) else None
-
-
-def _names(message: Any) -> Sequence[str]:
-    if isinstance(message, dict):
-        return [str(name) for name in message]
-    names: Sequence[str] = getattr(type(message), "__slots__", ())
-    return names
-
-
-def _is_array(value: Any) -> bool:
-    return isinstance(value, list | tuple | array)
-
-
-def leaves_of(value: Any, path: str = "", depth: int = 0) -> Iterator[str]:
-    """Yield the paths of the numbers and texts in a message."""
-    if isinstance(value, bool | int | float | str):
-        yield path
-    elif _is_array(value):
-        for number, item in enumerate(list(value)[:_MOST_ITEMS]):
-            yield from leaves_of(item, f"{path}[{number}]", depth + 1) if depth < _DEEPEST else ()
-    elif depth < _DEEPEST:
-        for name in _names(value):
-            below = f"{path}.{name}" if path else name
-            yield from leaves_of(_attribute(value, name), below, depth + 1)
-
-
 _Fields = dict[str, str]
 """Paths of fields in the messages of one topic, by column."""
+_Channels = dict[int, tuple[Any, Decode | None]]
+"""Channels by their number, with what decodes their messages."""
 
 
 @dataclass
@@ -172,6 +163,7 @@ class McapSource(ClockSource):
         self._rows: dict[str, int] = {}
         self._numbers: set[str] = set()
         self._texts: set[str] = set()
+        self._alike = AlikeMessages()
 
     def channels(self) -> list[Channel]:
         """Return the numbers and texts in the first message of each topic."""
@@ -213,14 +205,20 @@ class McapSource(ClockSource):
     def _topics(self) -> dict[str, list[str]]:
         """The fields of the first message of each topic that can be decoded."""
         found: dict[str, list[str]] = {}
-        encodings = set()
+        encodings: set[str] = set()
+        done: set[int] = set()
         with reading_with(self._file, "mcap"):
-            for channel, decode, message in self._messages():
-                encodings.add(channel.message_encoding)
-                if len(message.data) > LARGEST_MESSAGE:
-                    continue
-                if decode is not None and channel.topic not in found:
-                    found[channel.topic] = list(leaves_of(decode(message.data)))
+            for channels, block in self._blocks():
+                for number in set(block.heads[:, 0].tolist()) - done:
+                    channel, decode = channels[number]
+                    encodings.add(channel.message_encoding)
+                    sizes = (data for _, data, _ in block.of([number]).one_by_one())
+                    data = next((one for one in sizes if len(one) <= LARGEST_MESSAGE), None)
+                    if data is None:
+                        continue
+                    done.add(number)
+                    if decode is not None and channel.topic not in found:
+                        found[channel.topic] = list(leaves_of(decode(data)))
         if not found:
             raise InputError(
                 f"{shown(self._file)}: no message in it can be decoded "
@@ -229,17 +227,17 @@ class McapSource(ClockSource):
             )
         return found
 
-    def _messages(self) -> Iterator[tuple[Any, Decode | None, Any]]:
+    def _blocks(self) -> Iterator[tuple[_Channels, Block]]:
         """Yield all messages, in the file's order, with their channels and what decodes them."""
         schemas: dict[int, Any] = {}
-        channels: dict[int, tuple[Any, Decode | None]] = {}
+        channels: _Channels = {}
         messages = 0
         for record in read_records(self._budget):
             kind = type(record).__name__
-            if kind == "Message":
-                messages += 1
+            if kind == "Block":
+                messages += len(record)
                 self._budget.require_rows(messages)
-                yield *channels[record.channel_id], record
+                yield channels, record
             elif kind == "Schema":
                 schemas[record.id] = record
             elif kind == "Channel" and record.id not in channels:
@@ -257,37 +255,62 @@ class McapSource(ClockSource):
         self._rows, self._numbers = dict.fromkeys(wanted, 0), set()
         coming = {topic: _Rows(fields) for topic, fields in wanted.items()}
         with reading_with(self._file, "mcap"):
-            for channel, decode, message in self._messages():
-                rows = coming.get(channel.topic)
-                if rows is None or decode is None:
-                    continue
-                if len(message.data) > LARGEST_MESSAGE:
-                    raise InputError(
-                        f"{shown(self._file)}: a message of {channel.topic!r} has "
-                        f"{len(message.data):,} bytes; at most {LARGEST_MESSAGE:,} are decoded."
-                    )
-                found = decode(message.data)
-                rows.times_s.append(stamp_s(found, message.publish_time))
-                rows.values.append([field_of(found, name) for name in rows.fields.values()])
-                if len(rows.times_s) >= PIECE_ROWS:
-                    coming[channel.topic] = self._put_aside(channel.topic, rows)
+            for channels, block in self._blocks():
+                by_topic: dict[str, list[int]] = defaultdict(list)
+                for number in np.unique(block.heads[:, 0]).tolist():
+                    by_topic[channels[number][0].topic].append(number)
+                for topic in coming.keys() & by_topic.keys():
+                    some = block.of(by_topic[topic])
+                    coming[topic] = self._take(topic, coming[topic], some, channels)
                     if self._numbers & self._texts:
                         return False
             for topic, rows in coming.items():
                 self._put_aside(topic, rows)
         return not self._numbers & self._texts
 
+    def _take(self, topic: str, rows: _Rows, block: Block, channels: _Channels) -> _Rows:
+        """Decode messages of a topic, many at once where they are alike; return what waits."""
+        channel, decode = channels[int(block.heads[0, 0])]
+        if channel.message_encoding == "cdr" and decode is not None:
+            found = self._alike.read(decode, topic, [*rows.fields.values()], block)
+            if found is not None and not self._texts.intersection(rows.fields):
+                rows = self._put_aside(topic, rows)
+                self._numbers.update(rows.fields)
+                columns = zip([OWN_TIME, *rows.fields], found, strict=True)
+                self._write(topic, pl.DataFrame(dict(columns)))
+                return rows
+        for number, data, published_ns in block.one_by_one():
+            decode = channels[number][1]
+            if decode is None:
+                continue
+            if len(data) > LARGEST_MESSAGE:
+                raise InputError(
+                    f"{shown(self._file)}: a message of {topic!r} has "
+                    f"{len(data):,} bytes; at most {LARGEST_MESSAGE:,} are decoded."
+                )
+            message = decode(data)
+            rows.times_s.append(stamp_s(message, published_ns))
+            rows.values.append([field_of(message, name) for name in rows.fields.values()])
+            if len(rows.times_s) >= PIECE_ROWS:
+                rows = self._put_aside(topic, rows)
+        return rows
+
     def _put_aside(self, topic: str, rows: _Rows) -> _Rows:
         """Put rows aside; return room for more."""
+        if not rows.times_s and self._rows[topic]:
+            return rows
         frame = {OWN_TIME: pl.Series(rows.times_s, dtype=pl.Float64)}
         columns = zip(*rows.values, strict=True) if rows.values else [()] * len(rows.fields)
         for column, values in zip(rows.fields, columns, strict=True):
             frame[column] = self._column(column, values)
-        content = io.BytesIO()
-        pl.DataFrame(frame).write_ipc_stream(content)
-        self._spool.add(topic, content.getvalue())
-        self._rows[topic] += len(rows.times_s)
+        self._write(topic, pl.DataFrame(frame))
         return _Rows(rows.fields)
+
+    def _write(self, topic: str, rows: pl.DataFrame) -> None:
+        content = io.BytesIO()
+        rows.write_ipc_stream(content)
+        self._spool.add(topic, content.getvalue())
+        self._rows[topic] += len(rows)
 
     def _column(self, column: str, values: Sequence[Any]) -> pl.Series:
         """Return some values of a column: all of it are numbers, or texts."""
