@@ -41,7 +41,7 @@ WHAT = {
     "soak --store": "commands and looks of seven writers and a reader on an S3 server",
 }
 PATIENCE_S = 7200
-LAST_LINES = 25
+LAST_LINES = 80
 
 
 def pieces(given: argparse.Namespace) -> Iterator[list[str]]:

@@ -18,12 +18,13 @@ import random
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from benchmarks import interleave_checks as checks
 from benchmarks.forking import forked
@@ -159,6 +160,16 @@ def _cars(inputs: Inputs) -> set[str]:
     }
 
 
+def _answer(job: Callable[[], Mapping[str, int]], answer: Path) -> NoReturn:
+    """Do a job of a process of its own, which must not clean up what belongs to its parent."""
+    try:
+        answer.write_text(json.dumps(job()))
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
+    os._exit(0)
+
+
 def run(options: argparse.Namespace, folder: Path, url: str) -> int:
     """Let all work until the time is over; print counts and findings."""
     inputs = write_inputs(folder / "inputs")
@@ -179,8 +190,7 @@ def run(options: argparse.Namespace, folder: Path, url: str) -> int:
     for name, job in {**jobs, "reader": soak.read}.items():
         answers.append(folder / f"{name}.json")
         if not os.fork():
-            answers[-1].write_text(json.dumps(job()))
-            os._exit(0)
+            _answer(job, answers[-1])
     for _ in answers:
         os.wait()
     counts = Counter[str]()
