@@ -13,7 +13,8 @@ from fleet_slip.cli.options import Cohort
 from fleet_slip.cli.output import Json, cell, print_json, print_table, say
 from fleet_slip.dates import date_of
 from fleet_slip.grams.calibration.calibration import Calibration
-from fleet_slip.grams.calibration.car_evidence import SURE_ERRORS, CalibratedNumber, ChangedNumber
+from fleet_slip.grams.calibration.car_evidence import CalibratedNumber
+from fleet_slip.grams.calibration.numbers_over_drives import SURE_ERRORS, ChangedNumber
 from fleet_slip.grams.calibration.road_lean import FEWEST_CARS, Roads
 from fleet_slip.words import number_of
 

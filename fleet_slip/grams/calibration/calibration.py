@@ -3,7 +3,7 @@
 The numbers of a car are exact functions of the sum of its drives' Gram rows (`car_numbers`) and of
 what the roads of all cars have in common (`road_lean`), so that they are the same in whatever order
 drives came, and a drive that is forgotten is gone from them. `car_evidence` tells how sure they
-are.
+are, `numbers_over_drives` what more drives make of them.
 """
 
 import math
@@ -20,11 +20,12 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.dates import date_of
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.calibration.car_evidence import (
-    CalibratedNumber,
-    CarEvidence,
+from fleet_slip.grams.calibration.car_evidence import CalibratedNumber, CarEvidence
+from fleet_slip.grams.calibration.numbers_over_drives import (
     ChangedNumber,
     Convergence,
+    changed_numbers,
+    convergence,
 )
 from fleet_slip.grams.calibration.road_lean import Roads
 from fleet_slip.grams.calibration.tell_by_satellite import kinds_by_set
@@ -81,11 +82,11 @@ class Calibration:
 
     def changed(self, since: date | str) -> list[ChangedNumber]:
         """Return the numbers of cars that are others from a day on."""
-        return self.evidence.changed(date_of(since, "since"))
+        return changed_numbers(self.evidence, date_of(since, "since"))
 
     def convergence(self) -> tuple[Convergence, ...]:
         """Return how sure the numbers are after 1, 2, 5, 10 ... drives of a car."""
-        return self.evidence.convergence()
+        return convergence(self.evidence)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `calibrate --json` prints."""

@@ -6,16 +6,14 @@ differ, is that of the whole fleet; how much a car's driving tells is its own. D
 same roads again, so that there is a limit to what more of them tell.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import date
 from fractions import Fraction
-from math import hypot, sqrt
+from math import sqrt
 from typing import Any
 
 import numpy as np
 
-from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName
 from fleet_slip.grams.calibration.road_lean import FEWEST_CARS, are_banked, roads_of
 from fleet_slip.grams.calibration.tell_by_satellite import LASTING_BY_SATELLITE, tell_by_satellite
@@ -64,38 +62,6 @@ class CalibratedNumber:
     rows: int
 
 
-@dataclass(frozen=True)
-class Convergence:
-    """How sure a number is after so many drives of a car.
-
-    Attributes:
-        drives: the first so many of each car that has them.
-        cars: how many have.
-        stated: root mean square of the standard errors.
-        measured: the same by how much the next so many drives of a car differ; None if no car has.
-    """
-
-    number: NumberName
-    drives: int
-    cars: int
-    stated: float
-    measured: float | None
-
-
-@dataclass(frozen=True)
-class ChangedNumber:
-    """A number of which a car's drives from a day on tell otherwise than those before.
-
-    `uncertainty` is the standard error of the difference; all in the number's unit.
-    """
-
-    car: str
-    number: NumberName
-    before: float
-    after: float
-    uncertainty: float
-
-
 LEANS = (
     "roads are banked, and may always lean to one side, which nobody can tell from the car's own "
     f"offset: {FEWEST_CARS} cars or more can"
@@ -104,12 +70,6 @@ TIGHT_BENDS = (
     "bends are so tight that a bank is not in proportion to them: satellite speed tells it"
 )
 """Why a number is missing."""
-
-SURE_ERRORS = 4.0
-"""Standard errors by which a number has changed: by chance in one of 16,000."""
-
-STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-"""Numbers of drives that a convergence is shown for."""
 
 
 class CarEvidence:
@@ -120,14 +80,14 @@ class CarEvidence:
         self.sums = sums
         self._moments = {kind: one.moments() for kind, one in sums.items()}
         self.cars = sorted({car for one in sums.values() for car in one.cars})
-        banks = [bank_of_bends(self._totals(self._slices(car))) for car in self.cars]
+        banks = [bank_of_bends(self._totals(self.slices(car))) for car in self.cars]
         self._banked = are_banked([bank for bank in banks if bank is not None])
-        self.told = {car: self.tell(self._slices(car)) for car in self.cars}
+        self.told = {car: self.tell(self.slices(car)) for car in self.cars}
         offsets = [told["ay_offset"].value for told in self.told.values() if "ay_offset" in told]
         self.roads = roads_of(self._banked, offsets)
         self.variances = self._variances()
 
-    def _slices(self, car: str, first: int = 0, last: int | None = None) -> dict[str, slice]:
+    def slices(self, car: str, first: int = 0, last: int | None = None) -> dict[str, slice]:
         """Return where the drives `first` to `last` of a car stand, by kind."""
         found = {}
         for kind, one in self.sums.items():
@@ -164,7 +124,7 @@ class CarEvidence:
         expected: dict[NumberName, list[float]] = {}
         for car, told in self.told.items():
             for name, telling in told.items():
-                found = self.influence(telling, self._slices(car)[telling.kind])
+                found = self.influence(telling, self.slices(car)[telling.kind])
                 if found is None or len(found.shifts) < 2:
                     continue
                 shares = found.shares
@@ -201,7 +161,7 @@ class CarEvidence:
             for name, variance in own.items()
         }
 
-    def _level(self, telling: Telling) -> Fraction:
+    def level(self, telling: Telling) -> Fraction:
         """Return a number as it is without the lean of the roads."""
         return telling.value - (self.roads.lean or 0) * telling.by_lean
 
@@ -213,7 +173,7 @@ class CarEvidence:
         `ay_offset` is missing where nobody can tell it from the lean of the roads; with `leaning`
         it is there with it, as the accelerometer says on these roads.
         """
-        slices = self._slices(car, 0, drives)
+        slices = self.slices(car, 0, drives)
         told = self.told[car] if drives is None else self.tell(slices)
         sure = self.uncertainties(told, slices)
         found: dict[NumberName, CalibratedNumber] = {}
@@ -221,14 +181,14 @@ class CarEvidence:
             if name in told and (leaning or not self._hidden(name)):
                 at = slices[told[name].kind]
                 rows = int(self.sums[told[name].kind].table.n[at].sum())
-                value = self._level(told[name])
+                value = self.level(told[name])
                 count = CAR_NUMBERS[name].count(value)
                 if count is None:
                     continue
                 found[name] = CalibratedNumber(
                     value=float(value),
                     count=count,
-                    uncertainty=_three_digits(sure[name]) if name in sure else None,
+                    uncertainty=three_digits(sure[name]) if name in sure else None,
                     drives=at.stop - at.start,
                     rows=rows,
                 )
@@ -247,76 +207,11 @@ class CarEvidence:
             found["speed_ratio"] = TIGHT_BENDS
         return found
 
-    def changed(self, since: date) -> list[ChangedNumber]:
-        """Return the numbers that are others from a day on, surely; by car."""
-        found = []
-        for car in self.cars:
-            before, after = {}, {}
-            for kind, at in self._slices(car).items():
-                early = sum(day < since for _, day, _ in self.sums[kind].drives[at])
-                before[kind] = slice(at.start, at.start + early)
-                after[kind] = slice(at.start + early, at.stop)
-            was, now = self.tell(before), self.tell(after)
-            of_was, of_now = self.uncertainties(was, before), self.uncertainties(now, after)
-            for name in CAR_NUMBERS:
-                if name in of_was and name in of_now:
-                    error = _three_digits(hypot(of_was[name], of_now[name]))
-                    one, other = float(self._level(was[name])), float(self._level(now[name]))
-                    if abs(other - one) > SURE_ERRORS * error:
-                        found.append(ChangedNumber(car, name, one, other, error))
-        return found
-
-    def convergence(self) -> tuple[Convergence, ...]:
-        """Return how sure the numbers are after so many drives of a car."""
-        most = max(
-            (
-                len(range(*s.indices(s.stop)))
-                for one in self.sums.values()
-                for s in one.cars.values()
-            ),
-            default=0,
-        )
-        return tuple(row for step in STEPS if step <= most for row in self._converged(step))
-
-    def _converged(self, step: int) -> list[Convergence]:
-        stated: dict[NumberName, list[float]] = {}
-        differences: dict[NumberName, list[float]] = {}
-        for car in self.cars:
-            first, others = self._slices(car, 0, step), self._slices(car, step, 2 * step)
-            if any(at.stop - at.start < step for at in first.values()):
-                continue
-            told = self.tell(first)
-            for name, error in self.uncertainties(told, first).items():
-                stated.setdefault(name, []).append(error)
-            if all(at.stop - at.start == step for at in others.values()):
-                for name, other in self.tell(others).items():
-                    if name in told:
-                        apart = float(told[name].value - other.value)
-                        differences.setdefault(name, []).append(apart)
-        return [
-            Convergence(
-                name,
-                step,
-                len(stated[name]),
-                _three_digits(_root_mean_square(stated[name])),
-                _three_digits(_root_mean_square(differences[name]) / sqrt(2))
-                if name in differences
-                else None,
-            )
-            for name in CAR_NUMBERS
-            if name in stated
-        ]
-
 
 def _range(at: slice) -> Any:
     return np.arange(at.start, at.stop)
 
 
-def _root_mean_square(values: Sequence[float]) -> float:
-    squares: FloatArray = np.square(values)
-    return float(np.sqrt(squares.mean()))
-
-
-def _three_digits(value: float) -> float:
+def three_digits(value: float) -> float:
     """Return an uncertainty as it is stated, which is the same on every machine."""
     return float(f"{value:.3g}")

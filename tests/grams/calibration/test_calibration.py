@@ -18,6 +18,7 @@ from fleet_slip.cli.app import app
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.calibration.car_evidence import CarEvidence
+from fleet_slip.grams.calibration.numbers_over_drives import convergence
 from fleet_slip.grams.calibration.road_lean import roads_of
 from fleet_slip.grams.calibration.tell_numbers import FLAT, KINDS, tell_numbers
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
@@ -111,7 +112,7 @@ def test_offsets_lie_within_their_stated_uncertainty(fleet: Any) -> None:
 
 def test_more_drives_make_it_surer_as_was_stated(fleet: Any) -> None:
     rows, _ = fleet
-    of = {(row.number, row.drives): row for row in evidence(rows).convergence()}
+    of = {(row.number, row.drives): row for row in convergence(evidence(rows))}
     for name in (*TRUE, "yaw_rate_offset_by_wheels"):
         one, two = of[name, 1], of[name, 2]  # type: ignore[index]
         assert one.cars == 40
@@ -128,7 +129,7 @@ def test_the_numbers_are_the_same_in_any_order(fleet: Any) -> None:
     assert [one.calibrated(car) for car in one.cars] == [
         other.calibrated(car) for car in other.cars
     ]
-    assert one.convergence() == other.convergence()
+    assert convergence(one) == convergence(other)
 
 
 def test_least_squares_is_the_exact_fit() -> None:
