@@ -18,7 +18,7 @@ from fleet_slip.cli.app import app
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.calibration.car_evidence import CarEvidence
-from fleet_slip.grams.calibration.numbers_over_drives import convergence
+from fleet_slip.grams.calibration.numbers_over_drives import changed_numbers, convergence
 from fleet_slip.grams.calibration.road_lean import roads_of
 from fleet_slip.grams.calibration.tell_numbers import FLAT, KINDS, tell_numbers
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
@@ -220,10 +220,11 @@ def test_a_number_that_changes_is_named_and_no_other() -> None:
             row = gram_row(f"car-{i}", n, biased(rng, TRUE | {"ay_offset": 0.4 * repaired}))
             rows.append(row | {"day": DAY + timedelta(days=n)})
     found = evidence(rows)
-    changed = found.changed(DAY + timedelta(days=2))
+    changed = changed_numbers(found, DAY + timedelta(days=2))
     assert [(one.car, one.number) for one in changed] == [("car-5", "ay_offset")]
     assert changed[0].after - changed[0].before == pytest.approx(0.4, abs=0.06)
-    assert found.changed(DAY) == found.changed(DAY + timedelta(days=4)) == []
+    assert changed_numbers(found, DAY) == []
+    assert changed_numbers(found, DAY + timedelta(days=4)) == []
 
 
 def test_the_lean_of_roads_is_what_the_cars_do_not_explain() -> None:
@@ -276,7 +277,7 @@ def test_one_drive_of_one_car_has_no_uncertainty() -> None:
     one = found.calibrated("car")["yaw_rate_offset"]
     assert one.uncertainty is None
     assert one.value == pytest.approx(0.013, abs=4e-3)
-    assert found.convergence() == ()
+    assert convergence(found) == ()
 
 
 def test_no_gram_rows_tell_nothing() -> None:
