@@ -1,19 +1,20 @@
 """How far off the numbers are that a car's drives tell, and whether their uncertainty holds.
 
     python -m benchmarks.calibration [--root FOLDER] [--campaign fleet_realistic] [--cars 60]
-        [--tracks country,hill]
+        [--tracks country,hill] [--days 7]
 
 Simulates 30 drives of each car of a campaign and asks for its numbers after 1, 5 and 30: the error
 against what the simulator knows, its standard deviation, the share of cars within two stated
 errors, and cars without the number. The road's lean counts as an error. `--tracks` puts the cars on
-eight drawn roads of each class. A folder that is there is used again.
+eight drawn roads of each class. `--days` takes the first days of the campaign as it is instead, and
+asks for the numbers by all drives. A folder that is there is used again.
 """
 
 import argparse
 import json
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -36,11 +37,16 @@ def main() -> None:
     parser.add_argument("--campaign", default="fleet_realistic")
     parser.add_argument("--cars", type=int, default=60)
     parser.add_argument("--tracks", help="classes of roads, such as country,hill")
+    parser.add_argument("--days", type=int, help="of the campaign with all of its cars")
     given = parser.parse_args()
-    campaign = small(given.campaign, given.cars, given.tracks)
+    if given.days:
+        usual = load_campaign(given.campaign)
+        campaign = usual.model_copy(update={"number_of_days": given.days})
+    else:
+        campaign = small(given.campaign, given.cars, given.tracks)
     with tempfile.TemporaryDirectory() as temporary:
         evidence = evidence_of(given.root or Path(temporary), campaign)
-    for line in figures(evidence, truth(campaign)):
+    for line in figures(evidence, truth(campaign), (None,) if given.days else STEPS):
         print(json.dumps(line), flush=True)
 
 
@@ -68,9 +74,7 @@ def evidence_of(root: Path, campaign: Campaign) -> CarEvidence:
 def truth(campaign: Campaign) -> dict[str, dict[str, float]]:
     """Return what the simulator knows of each car's numbers, by car."""
     return {
-        spec.vehicle_id: _true(spec)
-        for day in campaign.days()[: STEPS[-1]]
-        for spec in campaign.drives(day)
+        spec.vehicle_id: _true(spec) for day in campaign.days() for spec in campaign.drives(day)
     }
 
 
@@ -89,13 +93,15 @@ def _true(spec: DriveSpec) -> dict[str, float]:
 
 
 def figures(
-    evidence: CarEvidence, known: dict[str, dict[str, float]]
+    evidence: CarEvidence,
+    known: dict[str, dict[str, float]],
+    steps: Sequence[int | None] = STEPS,
 ) -> Iterator[dict[str, object]]:
-    """Yield how far off each number is after so many drives."""
+    """Yield how far off each number is after so many drives; None: after all."""
     roads = evidence.roads
     lean = None if roads.lean is None else round(float(roads.lean), 4)
     yield {"banked": roads.banked, "lean_mps2": lean, "of_cars": roads.cars}
-    for step in STEPS:
+    for step in steps:
         told = {car: evidence.calibrated(car, drives=step) for car in evidence.cars}
         for name in CAR_NUMBERS:
             pairs = [

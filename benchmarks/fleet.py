@@ -5,6 +5,7 @@
     fleet-slip --root ROOT gram --features calibration
     fleet-slip --root ROOT gram --features fleet
     python -m benchmarks.fleet ROOT [--cohort SQL] [--calibrated-by SQL] [--no-rivals] [--json]
+        [--exact]
 
 Every model is fitted exactly, on the drives of nine tenths of the cars, and tested on the others'.
 Numbers of a car come from all its drives, the tested ones too: they need no label. With
@@ -15,20 +16,26 @@ Rivals: the extended Kalman filter with the parameters of the car's class, with 
 told everything (mass, tyres, adhesion), each also without the offsets that calibrate tells, and
 without a state for its accelerometer's bias; a network, boosted trees and neuro-fuzzy rules on what
 the models get, on a sample of rows.
+
+`--exact` simulates the cohort's days again with a label that makes no error, and judges the models
+by it, too, which the label of the warehouse teaches: how far they are from the truth.
 """
 
 import argparse
 import json
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
 
+from benchmarks.exact_label import judge, simulate_exactly
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.comparison.observers import ekf
 from fleet_slip.comparison.observers.drive_signals import DriveSignals, read_drive
@@ -42,7 +49,6 @@ from fleet_slip.grams.cohorts import expansion, fold_sums
 from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.folding import Folding, assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.regression.validation.crossval import cross_validate_inputs
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from fleet_slip.views import connect
@@ -54,6 +60,17 @@ SET = "fleet"
 RUNNING = ("yaw_rate_bias", "ay_bias")
 LEARNED = ("Table I, model 4", "windows", "windows, all own numbers, mass and model")
 """The models whose inputs the learned rivals get, too."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """How far off one estimator is: RMSE in degrees, against the label and the exact angle."""
+
+    name: str
+    inputs: int
+    rmse_deg: float
+    correlation: float
+    exact_rmse_deg: float | None = None
 
 
 def models() -> dict[str, tuple[str, ...]]:
@@ -93,18 +110,21 @@ def calibrated_by(found: Calibration) -> Iterator[None]:
 
 
 def errors_of_models(
-    warehouse: Warehouse, cohort: str, found: Calibration
-) -> Iterator[tuple[str, int, float, float]]:
-    """Yield each model's name, number of inputs, RMSE in degrees and correlation."""
+    warehouse: Warehouse, cohort: str, found: Calibration, exact: Warehouse | None
+) -> Iterator[Row]:
+    """Yield each model's errors, also against the label of another warehouse if there is one."""
+    folding = Folding(by="vehicle", count=FOLDS)
     with calibrated_by(found):
-        summed = sum_cohort(warehouse, Folding(by="vehicle", count=FOLDS), cohort, SET)
+        summed = sum_cohort(warehouse, folding, cohort, SET)
+        judges = [summed.sums]
+        if exact:
+            judges.append(sum_cohort(exact, folding, cohort, SET).sums)
     for name, inputs in models().items():
         if not set(inputs) <= set(summed.inputs):
             continue  # no car has a receiver
-        one = cross_validate_inputs(
-            name, summed.sums, inputs, catalogue().label, input_scales()
-        ).pooled
-        yield name, len(inputs), one.rmse_deg, one.correlation
+        one, *others = judge(summed.sums, judges, inputs)
+        against = others[0].rmse_deg if others else None
+        yield Row(name, len(inputs), one.rmse_deg, one.correlation, against)
 
 
 def class_car(spec: DriveSpec) -> VehicleParameters:
@@ -146,9 +166,7 @@ def without_offsets(signals: DriveSignals, found: Calibration, car: str) -> Driv
     )
 
 
-def errors_of_filters(
-    warehouse: Warehouse, cohort: str, found: Calibration
-) -> Iterator[tuple[str, int, float, float]]:
+def errors_of_filters(warehouse: Warehouse, cohort: str, found: Calibration) -> Iterator[Row]:
     """Yield the same of the extended Kalman filter, over the rows that the models see."""
     campaign = load_campaign("fleet")
     query = f"SELECT drive_id, day FROM drives WHERE {cohort} ORDER BY drive_id"
@@ -173,12 +191,10 @@ def errors_of_filters(
     for name, parts in errors.items():
         error = np.concatenate(parts)
         rmse = float(np.degrees(np.sqrt(np.mean(error**2))))
-        yield name, 0, rmse, float(np.corrcoef(truth + error, truth)[0, 1])
+        yield Row(name, 0, rmse, float(np.corrcoef(truth + error, truth)[0, 1]))
 
 
-def errors_of_learners(
-    warehouse: Warehouse, cohort: str, found: Calibration
-) -> Iterator[tuple[str, int, float, float]]:
+def errors_of_learners(warehouse: Warehouse, cohort: str, found: Calibration) -> Iterator[Row]:
     """Yield the same of networks, trees and neuro-fuzzy rules, on a sample of rows."""
     loaded = load_cohort(warehouse, cohort)
     sets = {name: models()[name] for name in LEARNED}
@@ -195,7 +211,7 @@ def errors_of_learners(
             if figures.rmse_deg is None or figures.correlation is None:
                 raise RuntimeError(f"{learner.name} estimates nothing")
             about = f"{learner.name}: {name}"
-            yield about, len(inputs), figures.rmse_deg, figures.correlation
+            yield Row(about, len(inputs), figures.rmse_deg, figures.correlation)
 
 
 def main() -> None:
@@ -205,25 +221,31 @@ def main() -> None:
     parser.add_argument("--calibrated-by", default="campaign = 'fleet'")
     parser.add_argument("--no-rivals", action="store_true")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--exact", action="store_true")
     options = parser.parse_args()
     warehouse = Warehouse(data_root(options.root))
-    found = calibrate(warehouse, options.calibrated_by)
+    given = (warehouse, options.cohort, calibrate(warehouse, options.calibrated_by))
     if not options.json:
-        print(f"{'':<48}{'inputs':>7}{'RMSE deg':>10}{'r':>8}   folds by vehicle", flush=True)
-    rows = [errors_of_models(warehouse, options.cohort, found)]
-    if not options.no_rivals:
-        rows += [
-            errors_of_learners(warehouse, options.cohort, found),
-            errors_of_filters(warehouse, options.cohort, found),
-        ]
-    for part in rows:
-        for name, inputs, rmse, correlation in part:
-            if options.json:
-                row = {"name": name, "inputs": inputs, "rmse_deg": rmse, "correlation": correlation}
-                print(json.dumps(row), flush=True)
-            else:
-                shown = inputs or ""
-                print(f"{name:<48}{shown:>7}{rmse:>10.4f}{correlation:>8.4f}", flush=True)
+        last = f"{'exact':>10}" if options.exact else ""
+        print(f"{'':<48}{'inputs':>7}{'RMSE deg':>10}{'r':>8}{last}   folds by vehicle", flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        exact = None
+        if options.exact:
+            exact = simulate_exactly(warehouse, options.cohort, SET, Path(folder))
+        rows = [errors_of_models(*given, exact)]
+        if not options.no_rivals:
+            rows += [errors_of_learners(*given), errors_of_filters(*given)]
+        for row in chain.from_iterable(rows):
+            print(json.dumps(as_document(row)) if options.json else in_columns(row), flush=True)
+
+
+def as_document(row: Row) -> dict[str, object]:
+    return {name: value for name, value in vars(row).items() if value is not None}
+
+
+def in_columns(row: Row) -> str:
+    exact = "" if row.exact_rmse_deg is None else f"{row.exact_rmse_deg:>10.4f}"
+    return f"{row.name:<48}{row.inputs or '':>7}{row.rmse_deg:>10.4f}{row.correlation:>8.4f}{exact}"
 
 
 if __name__ == "__main__":

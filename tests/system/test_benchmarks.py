@@ -33,7 +33,7 @@ TINY = {
     "drift_days": "{root} --drives 1 --training 5 --deals 2",
     "encoding": "--root {root} --campaign smoke --copies 1",
     "features": "{root} 15",
-    "fleet": "{root} --no-rivals",
+    "fleet": "{root} --no-rivals --exact",
     "few_cars": "--draws 2",
     "flips": "--flips 1",
     "fuzz": "--cases 10 --target config",
