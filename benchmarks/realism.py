@@ -26,11 +26,10 @@ from benchmarks.documents import insert
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.blocks.drive_columns import DriveColumns
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, as_counts
 from fleet_slip.comparison.evaluation.estimators import (
     ColumnEstimate,
     LinearEstimate,
-    as_counts,
     published_estimate,
 )
 from fleet_slip.comparison.observers import ekf, kalman

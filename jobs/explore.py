@@ -19,15 +19,14 @@ def _():
     from matplotlib.figure import Figure
 
     import fleet_slip
-    from fleet_slip.comparison.report.track_map import CLASSES
     from fleet_slip.comparison.watch.drive_frames import drive_frames
     from fleet_slip.errors import FleetSlipError
     from fleet_slip.monitoring.control_chart import control_chart
-    from fleet_slip.pages.drawing import DESK, STYLE, colour
+    from fleet_slip.pages.drawing import DESK, SHADES, STYLE, colour
     from fleet_slip.words import number_of
 
     return (
-        CLASSES, DESK, STYLE, Figure, FleetSlipError, LinearSegmentedColormap, alt, colour,
+        DESK, SHADES, STYLE, Figure, FleetSlipError, LinearSegmentedColormap, alt, colour,
         control_chart, drive_frames, fleet_slip, mo, mpl, np, number_of, pl,
     )  # fmt: skip
 
@@ -110,13 +109,13 @@ def _(mo, trained, training):
 
 @app.cell
 def _(
-    CLASSES, Figure, LinearSegmentedColormap, colour, drive, drive_frames, fleet, mo, name, np
+    Figure, LinearSegmentedColormap, SHADES, colour, drive, drive_frames, fleet, mo, name, np
 ):  # fmt: skip
     mo.stop(name.value is None, mo.md("No model yet: `fleet-slip publish`."))
     frames = drive_frames(fleet.warehouse, drive.value, fleet.model(name.value))
     error = frames.estimate_deg - frames.sideslip_deg
     # As in the report; the hundredth of the points beyond the bound have the last colour.
-    shades = LinearSegmentedColormap.from_list("error", [colour(one) for one in CLASSES])
+    shades = LinearSegmentedColormap.from_list("error", [colour(one) for one in SHADES])
     bound = max(float(np.nanquantile(abs(error), 0.99)), 0.01)
     error_map = Figure(figsize=(9, 4.5), layout="constrained")
     _axes = error_map.subplots()

@@ -169,11 +169,7 @@ class JudgedModels(PublishedModels):
         `model` raises.
         """
         with needed("watch", "a page or a film of a drive"):
-            from fleet_slip.comparison.watch.drive_frames import (
-                drive_frames,
-                is_scenario,
-                scenario_frames,
-            )
+            from fleet_slip.comparison.watch.drive_frames import drive_frames, is_scenario
             from fleet_slip.comparison.watch.playing import write_film, write_page
 
             if output.suffix == ".mp4":  # said at once: to estimate a drive takes seconds
@@ -184,6 +180,8 @@ class JudgedModels(PublishedModels):
             raise UsageError(f"{output}: the suffix says the format: {', '.join(writers)}.")
         version = self.resolve(model)
         if is_scenario(what):
+            from fleet_slip.comparison.watch.scenario_frames import scenario_frames
+
             with open_workers(self.root, threads) as executor:
                 frames = scenario_frames(self.warehouse, what, version, executor)
         else:

@@ -55,6 +55,9 @@ PALETTE: Mapping[str, Colour] = {
 FONT = "DejaVu Sans"
 """Ships with matplotlib, so that figures are the same everywhere."""
 
+SHADES = ("below_3", "below_2", "below_1", "near_0", "above_1", "above_2", "above_3")
+"""Colours of differences, from far below to far above."""
+
 STYLE: Any = {
     "svg.fonttype": "none",
     "font.family": FONT,

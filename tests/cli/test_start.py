@@ -22,6 +22,8 @@ from tests.support.commands import COMMAND, run
 
 TABLES = {"deltalake", "numpy", "pyarrow"}
 ENGINES = {"duckdb", "highway_env", "jinja2", "matplotlib", "numba", "pint", "polars"}
+SIMULATOR = ("fleet_slip.vehicle", "fleet_slip.simulation.drives", "fleet_slip.simulation.job")
+DRIVE = "smoke-2024-05-01-0000"
 PROGRAM = """
 import atexit, json, sys
 atexit.register(lambda: print(json.dumps(sorted(sys.modules)), file=sys.stderr))
@@ -52,6 +54,17 @@ def test_a_command_does_not_wait_for_what_it_does_not_need(
     imported = imported_by(tmp_path / "nothing-here", *arguments)
     assert "fleet_slip.cli.main" in imported
     assert not imported & spared
+
+
+def test_watching_a_drive_of_the_logs_waits_for_no_simulator(
+    smoke_root: Path, tmp_path: Path
+) -> None:
+    words = ["watch", DRIVE, "smoke", "--until", "1", "--output", str(tmp_path / "watch.html")]
+    imported = imported_by(smoke_root, *words)
+    assert (tmp_path / "watch.html").exists()
+    assert "fleet_slip.comparison.watch.drive_frames" in imported
+    assert not {name for name in imported if name.startswith(SIMULATOR)}
+    assert "highway_env" not in imported
 
 
 def test_every_command_is_listed_in_its_own_words() -> None:

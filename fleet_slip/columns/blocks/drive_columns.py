@@ -4,7 +4,7 @@ Gram rows, scores, evaluations and predictions with windows come through it, and
 the SQL of `fleet_slip.columns.column_sql` says.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.definitions import limit_of
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.block_kernel import GAPS, run
 from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS, Region
 from fleet_slip.columns.blocks.block_program import padded
@@ -53,6 +54,23 @@ class DriveCounts:
         counts = {name: values[rows] for name, values in self.counts.items()}
         present = {name: values[rows] for name, values in self.present.items()}
         return DriveCounts(self.ticks[rows], counts, present, facts, numbers)
+
+
+def as_counts(
+    values: Mapping[str, FloatArray], names: Sequence[str], facts: Mapping[str, Any]
+) -> DriveCounts:
+    """Return the counts of some signals of a drive that has a row for every tick.
+
+    The values are by SI column, shape (ticks,), NaN where null.
+    """
+    counts, present = {}, {}
+    for name in names:
+        given = values[catalogue()[name].column]
+        present[name] = np.isfinite(given)
+        scaled = np.where(present[name], given, 0.0) / float(catalogue()[name].scale)
+        counts[name] = np.rint(scaled).astype(np.int64)
+    ticks = np.arange(len(next(iter(counts.values()))))
+    return DriveCounts(ticks, counts, present, facts)
 
 
 class Workspace:

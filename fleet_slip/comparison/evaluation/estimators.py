@@ -1,6 +1,6 @@
 """What is evaluated: anything that turns a drive's signals into side-slip angles."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.blocks.drive_columns import DriveCounts
+from fleet_slip.columns.blocks.drive_columns import as_counts
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.models.estimates.predictor import Predictor
@@ -56,18 +56,6 @@ class LinearEstimate:
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs to compute the same estimates."""
         return {"intercept": self.intercept, "coefficients": dict(self.coefficients)}
-
-
-def as_counts(signals: Signals, names: Sequence[str], facts: Mapping[str, Any]) -> DriveCounts:
-    """Return the counts of some signals of a drive that has a row for every tick."""
-    counts, present = {}, {}
-    for name in names:
-        values = signals[catalogue()[name].column]
-        present[name] = np.isfinite(values)
-        scaled = np.where(present[name], values, 0.0) / float(catalogue()[name].scale)
-        counts[name] = np.rint(scaled).astype(np.int64)
-    ticks = np.arange(len(next(iter(counts.values()))))
-    return DriveCounts(ticks, counts, present, facts)
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.comparison.evaluation.estimators import Estimate, TrainedModels, train_models
-from fleet_slip.comparison.evaluation.evaluated_drives import (
-    EvaluatedDrive,
-    find_stretches,
-    rear_compliance,
-)
+from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.evaluation.filters import Bank, FilterEstimate, filter_bank
 from fleet_slip.comparison.evaluation.gps_noise import GpsSweep, sweep_gps_noise
 from fleet_slip.comparison.evaluation.identified import NAME as IDENTIFIED
@@ -25,6 +21,7 @@ from fleet_slip.comparison.evaluation.targets import (
     check_filter_targets,
     check_targets,
 )
+from fleet_slip.comparison.evaluation.unstable import find_stretches, rear_compliance
 from fleet_slip.files.documents import Document, DocumentFolder, checksum
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.models.estimates.predictor import Predictor

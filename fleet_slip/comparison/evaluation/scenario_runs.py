@@ -9,12 +9,8 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.comparison.evaluation.estimators import Estimate
-from fleet_slip.comparison.evaluation.evaluated_drives import (
-    CRITERION,
-    EvaluatedDrive,
-    find_unstable,
-    load_drives,
-)
+from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive, load_drives
+from fleet_slip.comparison.evaluation.unstable import CRITERION, find_unstable
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.progress import Progress, no_progress

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.comparison.evaluation.estimators import LinearEstimate
-from fleet_slip.comparison.evaluation.evaluated_drives import find_stretches, rear_compliance
 from fleet_slip.comparison.evaluation.scenario_runs import (
     GPS_OUTAGE_S,
     ErrorFigures,
     EvaluatedScenario,
 )
+from fleet_slip.comparison.evaluation.unstable import find_stretches, rear_compliance
 from fleet_slip.simulation.sensing.sensors import Sensors
 
 PAPER_TABLE_TWO = {

@@ -10,8 +10,7 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
-from fleet_slip.columns.blocks.drive_columns import DriveColumns
-from fleet_slip.comparison.evaluation.estimators import as_counts
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, as_counts
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario, error_figures
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.folding import Folding, assign_folds

@@ -8,8 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive, find_stretches
+from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
+from fleet_slip.comparison.evaluation.unstable import find_stretches
 from fleet_slip.pages.drawing import Size, colour
 from fleet_slip.pages.page_parts import degrees
 

@@ -12,7 +12,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario
 from fleet_slip.comparison.report.time_series import smooth
-from fleet_slip.pages.drawing import Size, colour
+from fleet_slip.pages.drawing import SHADES, Size, colour
 from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 
 SMOOTHED_S = 0.5
@@ -24,7 +24,6 @@ EDGES_DEG = (0.1, 0.3, 1.0)
 FINE_EDGES_DEG = (0.03, 0.06, 0.12)
 """The same where models on a dry road are compared."""
 
-CLASSES = ("below_3", "below_2", "below_1", "near_0", "above_1", "above_2", "above_3")
 WIDTHS = (4.4, 3.6, 3.0, 2.4, 3.0, 3.6, 4.4)
 SPACING_M = 3.0
 SCALE_BAR_M = 200.0
@@ -82,7 +81,7 @@ def _draw(axes: Axes, one: Map, edges: Sequence[float]) -> None:
     shown = np.isfinite(error) & run.drive.evaluated
     classes = np.digitize(error, edges)
     kinds = np.where(shown, classes, -1)
-    for kind, name in enumerate(CLASSES):
+    for kind, name in enumerate(SHADES):
         lines = [np.column_stack([x[part], y[part]]) for part in _stretches(kinds, kind, run.drive)]
         axes.add_collection(
             LineCollection(lines, colors=colour(name), linewidths=WIDTHS[kind], capstyle="round")
@@ -120,8 +119,8 @@ def _scale_bar(axes: Axes, left_m: float, bottom_m: float) -> None:
 def _key(figure: Figure, size: Size, edges: Sequence[float]) -> None:
     """Draw what the colours mean, along the lower edge."""
     width, height = figure.get_size_inches()
-    margin, each = 0.15, min(0.95, (size.width_in - 0.3) / len(CLASSES))
-    for i, (name, thickness) in enumerate(zip(CLASSES, WIDTHS, strict=True)):
+    margin, each = 0.15, min(0.95, (size.width_in - 0.3) / len(SHADES))
+    for i, (name, thickness) in enumerate(zip(SHADES, WIDTHS, strict=True)):
         axes = figure.add_axes(
             ((margin + i * each) / width, 0.34 / height, each / width, 0.1 / height)
         )

@@ -11,8 +11,8 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.column_plan import ColumnPlan
-from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
-from fleet_slip.comparison.evaluation.estimators import Signals, as_counts
+from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts, as_counts
+from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.rivals.learner import Fitted, Names, one_thread
 from fleet_slip.errors import DataError

@@ -7,16 +7,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.arrays import FloatArray, float_column
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
-from fleet_slip.comparison.evaluation.evaluated_drives import float_column, load_drives
-from fleet_slip.comparison.evaluation.scenario_runs import simulate_scenarios
-from fleet_slip.comparison.report.gate_strips import gates_on
+from fleet_slip.comparison.evaluation.open_gates import gates_on
 from fleet_slip.errors import DataError, QuestionError, UsageError
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.resources import config_names
 from fleet_slip.simulation.roads import load_track
-from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.views import connect
 from fleet_slip.warehouse.minimum_cohort import require_single_cars
 from fleet_slip.warehouse.tables import Warehouse
@@ -81,26 +78,6 @@ def is_scenario(what: str) -> bool:
     return what.endswith(".toml") or what in config_names("scenarios")
 
 
-def scenario_frames(
-    warehouse: Warehouse, name: str, version: ModelVersion, executor: Any
-) -> DriveFrames:
-    """Return the frames of a test drive, simulated if missing. Raises `ConfigError`."""
-    scenario = load_scenario(name)
-    simulate_scenarios(warehouse, [scenario], executor)
-    (drive,) = load_drives(warehouse, [scenario])
-    columns = {
-        **drive.signals,
-        "sideslip_rad": drive.sideslip_rad,
-        "vx_mps": drive.vx_mps,
-        "vy_mps": drive.vy_mps,
-        "station_m": drive.station_m,
-        "lateral_offset_m": drive.lateral_offset_m,
-    }
-    facts = {**drive.facts, "track": scenario.track.name, "drive_id": scenario.drive_id}
-    title = f"{scenario.name}: {scenario.description}"
-    return _frames(title, columns, facts, drive.time_s, version)
-
-
 def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> DriveFrames:
     """Return the frames of a drive of the logs. Raises `QuestionError` and `CohortError`."""
     require_single_cars("a drive of the logs", "Watch a scenario, which is simulated.")
@@ -117,16 +94,21 @@ def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> 
     columns = {name: float_column(rows, name) for name in names}
     facts = {name: rows[name][0].as_py() for name in (*FACTS, "track")}
     facts["drive_id"] = drive_id
-    return _frames(drive_id, columns, facts, float_column(rows, "time_s"), version)
+    return frames_of(drive_id, columns, facts, float_column(rows, "time_s"), version)
 
 
-def _frames(
+def frames_of(
     title: str,
     columns: Mapping[str, FloatArray],
     facts: Mapping[str, Any],
     time_s: FloatArray,
     version: ModelVersion,
 ) -> DriveFrames:
+    """Return the frames of a drive. Raises `DataError` if nothing of it can be shown.
+
+    The columns are those of the catalogue, shape (ticks,), NaN where null; `facts` tell the model
+    and mass of the car, its `drive_id`, and its `track` if that is known.
+    """
     seen = np.flatnonzero(np.diff(np.floor((time_s - time_s[0]) * FRAMES_PER_S + 1e-6), prepend=-1))
     # The drive as the view `log` has it; NaN is null there.
     arrays = {name: pa.array(values, from_pandas=True) for name, values in columns.items()}

@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from fleet_slip.comparison.evaluation.estimators import LinearEstimate
-from fleet_slip.comparison.evaluation.evaluated_drives import apply_failure, join, peak_slip
+from fleet_slip.comparison.evaluation.evaluated_drives import apply_failure
 from fleet_slip.comparison.evaluation.scenario_runs import error_figures
 from fleet_slip.comparison.evaluation.targets import passed_noise_deg
+from fleet_slip.comparison.evaluation.unstable import join, peak_slip
 from fleet_slip.errors import QuestionError
 from fleet_slip.simulation.scenario import Failure, load_scenario
 from fleet_slip.vehicle.parameters import constants, load_vehicle

@@ -16,6 +16,7 @@ from jinja2 import meta
 
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.comparison.evaluation.evaluate import evaluations_of, keep
+from fleet_slip.comparison.evaluation.open_gates import gates_of
 from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
 from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
 from fleet_slip.comparison.report import paper_tables
@@ -23,7 +24,7 @@ from fleet_slip.comparison.report.column_worth import by_length, looks_back
 from fleet_slip.comparison.report.facts import NAMES, Facts
 from fleet_slip.comparison.report.further_pictures import draw_pictures, road_pictures
 from fleet_slip.comparison.report.further_tables import limits, standings
-from fleet_slip.comparison.report.gate_strips import gates_of, opening
+from fleet_slip.comparison.report.gate_strips import opening
 from fleet_slip.comparison.report.judging import (
     CLAIMS,
     LIMITS,
