@@ -7,8 +7,8 @@ from functools import partial
 
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.delta import TableFile
+from fleet_slip.grams.received.car_keys import load_car_keys
 from fleet_slip.grams.received.received_table import check_signed_rows, find_unsound
-from fleet_slip.grams.received.signatures import load_car_keys
 from fleet_slip.grams.rows.check_grams import (
     DriveGrams,
     differing_drives,

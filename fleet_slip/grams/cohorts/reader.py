@@ -22,7 +22,7 @@ from fleet_slip.grams.cohorts.cells import NO_CELLS, Cells, RollupReader
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.outweighing import Outweighing, find_outweighing
-from fleet_slip.grams.received.signatures import CarKey, load_car_keys
+from fleet_slip.grams.received.car_keys import CarKey, load_car_keys
 from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.grams.rows.receiver_delay import RECEIVER
 from fleet_slip.grams.rows.same_drives import has_received

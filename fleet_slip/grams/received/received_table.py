@@ -22,6 +22,7 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import RECEIVED, RECEIVED_FILES
 from fleet_slip.errors import QuestionError
+from fleet_slip.grams.received.car_keys import KEYS_VARIABLE, CarKeys
 from fleet_slip.grams.received.counted_sets import CountedSet, counted_by_identity
 from fleet_slip.grams.received.messages import (
     DAY_LAYOUTS,
@@ -36,7 +37,7 @@ from fleet_slip.grams.received.messages import (
 )
 from fleet_slip.grams.received.plausible import find_impossible
 from fleet_slip.grams.received.received_rows import ReceivedRows
-from fleet_slip.grams.received.signatures import FORGED, KEYS_VARIABLE, CarKeys, check_signatures
+from fleet_slip.grams.received.signatures import FORGED, check_signatures
 from fleet_slip.grams.rows.drive_parts import Parts
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table, is_received, list_array
 from fleet_slip.warehouse.tables import SIGNED

@@ -23,11 +23,12 @@ from fleet_slip.arrays import BoolArray
 from fleet_slip.config import read_named_file
 from fleet_slip.delta import Change, Unit, retry_conflicts
 from fleet_slip.errors import InputError
+from fleet_slip.grams.received.car_keys import load_car_keys
 from fleet_slip.grams.received.messages import read_messages
 from fleet_slip.grams.received.new_messages import NewMessages, choose_new
 from fleet_slip.grams.received.received_rows import Refused, sort_out
 from fleet_slip.grams.received.received_table import received_table
-from fleet_slip.grams.received.signatures import judge_signatures, load_car_keys
+from fleet_slip.grams.received.signatures import judge_signatures
 from fleet_slip.grams.rows.gram_files import (
     files_to_rewrite,
     is_of_received,

@@ -11,7 +11,8 @@ import fleet_slip
 from fleet_slip.catalogue.course_change import BESIDE
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.received.signatures import KEYS_VARIABLE, sign_days, sign_messages
+from fleet_slip.grams.received.car_keys import KEYS_VARIABLE
+from fleet_slip.grams.received.signatures import sign_days, sign_messages
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.models.ed25519 import generate
 from fleet_slip.regression.exact.gram import Gram

@@ -16,7 +16,8 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.app import app
 from fleet_slip.delta import Change
 from fleet_slip.errors import AlarmError, ConfigError, DataError, InputError
-from fleet_slip.grams.received.signatures import KEYS_VARIABLE, sign_messages
+from fleet_slip.grams.received.car_keys import KEYS_VARIABLE
+from fleet_slip.grams.received.signatures import sign_messages
 from fleet_slip.models.ed25519 import generate
 from fleet_slip.regression.exact.gram import Gram
 from tests.support.messages import START_S, drive_counts, gram_of, message_of

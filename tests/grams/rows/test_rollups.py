@@ -21,7 +21,7 @@ from fleet_slip.grams.cohorts.day_sums import sum_days
 from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.folding import EACH, FoldCount, Folding, FoldKey
 from fleet_slip.grams.cohorts.reader import GramReader
-from fleet_slip.grams.received.signatures import KEYS_VARIABLE
+from fleet_slip.grams.received.car_keys import KEYS_VARIABLE
 from fleet_slip.grams.rows import rollup
 from fleet_slip.grams.rows.gram_files import write_rows
 from fleet_slip.grams.rows.rollup import Rollup, hash_numbers, make_rollup, read_rollup
