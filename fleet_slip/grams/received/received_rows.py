@@ -16,9 +16,9 @@ from fleet_slip.catalogue.course_change import LATE_PARTS, MOST_EARLY, MOST_LATE
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.grams.received.counted_sets import CountedSet, counted_sets
+from fleet_slip.grams.received.found_messages import Found
 from fleet_slip.grams.received.messages import (
     LONGEST_VEHICLE,
-    Found,
     Messages,
     keep_signatures,
     without_signatures,

@@ -24,7 +24,7 @@ from fleet_slip.config import read_named_file
 from fleet_slip.delta import Change, Unit, retry_conflicts
 from fleet_slip.errors import InputError
 from fleet_slip.grams.received.car_keys import load_car_keys
-from fleet_slip.grams.received.messages import read_messages
+from fleet_slip.grams.received.found_messages import read_messages
 from fleet_slip.grams.received.new_messages import NewMessages, choose_new
 from fleet_slip.grams.received.received_rows import Refused, sort_out
 from fleet_slip.grams.received.received_table import received_table

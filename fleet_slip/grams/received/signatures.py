@@ -26,6 +26,7 @@ from fleet_slip.grams.received.day_tree import (
     grow,
     levels_for,
 )
+from fleet_slip.grams.received.found_messages import read_messages
 from fleet_slip.grams.received.messages import (
     CHECKSUM_BYTES,
     DAY_LAYOUTS,
@@ -37,7 +38,6 @@ from fleet_slip.grams.received.messages import (
     Messages,
     is_signed,
     levels_of,
-    read_messages,
 )
 from fleet_slip.grams.received.received_rows import ReceivedRows
 

@@ -13,7 +13,7 @@ import pytest
 import fleet_slip
 from fleet_slip.grams.received.car_keys import KEYS_VARIABLE
 from fleet_slip.grams.received.day_tree import grow
-from fleet_slip.grams.received.messages import read_messages
+from fleet_slip.grams.received.found_messages import read_messages
 from fleet_slip.grams.received.signatures import check_signatures, sign_days, sign_messages
 from fleet_slip.models.ed25519 import generate
 from tests.support.messages import START_S, gram_of, message_of

@@ -13,8 +13,8 @@ import pytest
 import fleet_slip
 from fleet_slip.cli.app import app
 from fleet_slip.errors import InputError, QuestionError
-from fleet_slip.grams.received import messages
-from fleet_slip.grams.received.messages import read_messages
+from fleet_slip.grams.received import found_messages
+from fleet_slip.grams.received.found_messages import read_messages
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.warehouse.audit import Forgettable
@@ -243,7 +243,7 @@ def test_what_is_no_file_of_messages_is_not_read_to_its_end(piece: bytes) -> Non
 
 
 def test_a_file_has_so_many_messages_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(messages, "MOST_MESSAGES", 5)
+    monkeypatch.setattr(found_messages, "MOST_MESSAGES", 5)
     found = read_messages(b"".join(drives(9)))
     assert [len(some) for _, some in found.runs] == [5]
     assert [number for number, _ in found.refused] == [6]
