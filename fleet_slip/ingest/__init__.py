@@ -10,8 +10,9 @@ The way of a row, in the order of its stations:
 5. `drives.open_drives` keeps the rows of a part until it has ended.
 6. `drives.measured_drives` brings a drive to ticks, by `drives.resampling`, and to counts.
 7. `drives.stream` goes through the steps above; it yields ended drives and refused rows.
-8. `landing.landing` leaves out what was forgotten, passes the rest on to `landing.data_files`, and
-   commits the files of a batch; `landing.ingest_job` goes through all batches.
+8. `landing.landing` leaves out what was forgotten, by `landing.allowed_rows`, passes the rest on to
+   `landing.data_files`, and commits the files of a batch; `landing.ingest_job` goes through all
+   batches.
 """
 
 from fleet_slip.ingest.drives.measured_drives import IngestCounts

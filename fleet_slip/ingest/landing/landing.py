@@ -4,7 +4,7 @@
 forgotten is left out, drives and refused rows become data files. `landing.committing` commits them.
 """
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,9 +12,7 @@ from itertools import chain, count, pairwise
 
 import polars as pl
 import pyarrow as pa
-import pyarrow.compute as pc
 
-from fleet_slip.catalogue.counts import as_arrow
 from fleet_slip.delta import Table
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drafting.preview import signals_of
@@ -23,6 +21,7 @@ from fleet_slip.ingest.drives.stream import MeasuredStream, open_measured
 from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
 from fleet_slip.ingest.formats.reading import expected_rows
 from fleet_slip.ingest.landing import data_files
+from fleet_slip.ingest.landing.allowed_rows import car_of, keep_drives, keep_refused, names_in
 from fleet_slip.ingest.landing.data_files import DataFiles, Part, Rows, TableName, digest_of
 from fleet_slip.ingest.landing.marks import FileMarks, Origin
 from fleet_slip.ingest.landing.same_recordings import Found, Replace, SameRecordings, let_return
@@ -31,7 +30,7 @@ from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit
-from fleet_slip.warehouse.recordings import Recording, Spots, find_spots, record_drive
+from fleet_slip.warehouse.recordings import Spots, find_spots
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
 
 
@@ -172,7 +171,7 @@ def _write_file(
         longest = max([*([longest] if longest else []), *drives], key=lambda one: one.ticks.size)
         kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), audit)
         left_out |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in kept}
-        vehicles |= set(map(_car_of, kept))
+        vehicles |= set(map(car_of, kept))
         ticks += _rows_of(kept)
         if is_new:
             spots += [(one.drive_id, find_spots(one.ticks, one.counts)) for one in kept]
@@ -184,7 +183,7 @@ def _write_file(
             rest["logs"] = kept
     for table, following in pairwise(chain(refused.tables(), [None])):
         allowed = keep_refused(table, audit, left_out)
-        vehicles |= _names(allowed, "vehicle_id")
+        vehicles |= names_in(allowed, "vehicle_id")
         if not allowed.num_rows or "quarantine" not in lacking:
             continue
         if following is not None:
@@ -254,37 +253,6 @@ class _RefusedRows:
             yield self._stream.quarantine_table(self._rows)
 
 
-def keep_drives(drives: Sequence[MeasuredDrive], audit: Audit) -> list[MeasuredDrive]:
-    """Return the drives that were not forgotten under any name, nor their cars."""
-    barred = audit.barred(set(map(_car_of, drives)), {drive.drive_id for drive in drives})
-    known = audit.recordings()
-    return [
-        drive
-        for drive in drives
-        if drive.drive_id not in barred.drives
-        and _car_of(drive) not in barred.vehicles
-        and not (known is not None and known.has(_recording_of(drive)))
-    ]
-
-
-def keep_refused(refused: pa.Table, audit: Audit, left_out: Collection[str] = ()) -> pa.Table:
-    """Return the refused rows that may land, where some drives of their file may not.
-
-    A refused row goes with its car, or with the drive that it would have been of: the name of a
-    drive that was cut at gaps in time begins with it.
-    """
-    vehicles, named = _names(refused, "vehicle_id"), _names(refused, "drive_id")
-    barred = audit.barred(vehicles, named)
-    drives = barred.drives | set(left_out)
-    whole = {name for name in named if any(drive.startswith(f"{name}-") for drive in drives)}
-    for column, unwanted in (("vehicle_id", barred.vehicles), ("drive_id", drives | whole)):
-        if unwanted:
-            names = pa.array(sorted(unwanted), pa.string())
-            mine = pc.is_in(refused[column].cast(pa.string()), names)
-            refused = refused.filter(pc.invert(pc.fill_null(mine, False)))
-    return refused
-
-
 def tables_of(warehouse: Warehouse) -> dict[TableName, Table]:
     """Return the tables that files land in, in the order in which they are committed."""
     return {"quarantine": warehouse.quarantine, "logs": warehouse.logs}
@@ -292,16 +260,3 @@ def tables_of(warehouse: Warehouse) -> dict[TableName, Table]:
 
 def _rows_of(drives: Iterable[MeasuredDrive]) -> int:
     return sum(drive.ticks.size for drive in drives)
-
-
-def _car_of(drive: MeasuredDrive) -> str:
-    return str(drive.metadata["vehicle_id"])
-
-
-def _recording_of(drive: MeasuredDrive) -> Recording:
-    ticks = as_arrow(drive.ticks)
-    return record_drive(_car_of(drive), str(drive.metadata["day"]), ticks, drive.counts)
-
-
-def _names(rows: pa.Table, column: str) -> frozenset[str]:
-    return frozenset(rows[column].unique().drop_null().cast(pa.string()).to_pylist())
