@@ -13,7 +13,7 @@ from mcap_ros2.writer import Writer
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import Mapping
-from fleet_slip.ingest.formats import mcap_log
+from fleet_slip.ingest.formats import mcap_log, mcap_records
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.source import OWN_TIME
 from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
@@ -148,7 +148,7 @@ def test_a_field_with_a_text_far_down_is_one_of_texts(
 def test_a_chunk_too_large_for_the_memory_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mcap_log, "_LARGEST_RECORD", 1000)
+    monkeypatch.setattr(mcap_records, "_LARGEST_RECORD", 1000)
     file = write(tmp_path / "log.mcap")
     assert "at most 1,000 are read at once. Write it again in smaller chunks" in failure(file)
 

@@ -25,8 +25,8 @@ from fleet_slip.ingest.formats.duckdb_table import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.formats.duckdb_table import MAGIC_AT as DUCKDB_AT
 from fleet_slip.ingest.formats.duckdb_table import DuckdbRows, open_duckdb
 from fleet_slip.ingest.formats.matlab import HDF5_AT, HDF5_MAGIC, MAT5_MAGIC, open_mat, open_mat73
-from fleet_slip.ingest.formats.mcap_log import MAGIC as MCAP_MAGIC
 from fleet_slip.ingest.formats.mcap_log import open_mcap
+from fleet_slip.ingest.formats.mcap_records import MAGIC as MCAP_MAGIC
 from fleet_slip.ingest.formats.mdf import MAGICS as MDF_MAGICS
 from fleet_slip.ingest.formats.mdf import open_mdf
 from fleet_slip.ingest.formats.mdf_bus import open_mdf_bus
