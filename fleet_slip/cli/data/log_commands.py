@@ -182,11 +182,11 @@ def ingest(
 
 def _require_sound(reports: "list[IngestReport]") -> None:
     """Raise `AlarmError` for much that was refused, and for whatever looks wrong and does harm."""
-    from fleet_slip.ingest.drives import suspicion  # noqa: PLC0415 - takes a while
+    from fleet_slip.ingest.drives import file_suspicion  # noqa: PLC0415 - takes a while
 
     for report in reports:
         refused, read = sum(report.counts.quarantined.values()), report.counts.rows_read
-        many = max(read * suspicion.LARGEST_REFUSED, suspicion.FEWEST_REFUSED)
+        many = max(read * file_suspicion.LARGEST_REFUSED, file_suspicion.FEWEST_REFUSED)
         if report.new and refused > many:
             raise AlarmError(
                 f"{report.file}: {refused:,} of {number_of(read, 'row')} were refused. See: "

@@ -29,6 +29,7 @@ from fleet_slip.ingest.drives.drive_cutter import (
     DriveCutter,
     sample_intervals_s,
 )
+from fleet_slip.ingest.drives.file_suspicion import assumed_rate, find_refusals
 from fleet_slip.ingest.drives.measured_drives import (
     IngestCounts,
     MeasuredDrive,
@@ -40,7 +41,7 @@ from fleet_slip.ingest.drives.measured_drives import (
 from fleet_slip.ingest.drives.open_drives import MAX_OPEN_ROWS, DriveRows, OpenDrives
 from fleet_slip.ingest.drives.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.drives.several_cars import SeveralCars, unmapped_cars
-from fleet_slip.ingest.drives.suspicion import Suspicion, assumed_rate, find_refusals
+from fleet_slip.ingest.drives.suspicion import Suspicion
 from fleet_slip.ingest.formats.parquet_batches import partition_keys
 from fleet_slip.ingest.formats.reading import log_digest, require_unchanged_log
 from fleet_slip.ingest.logs.log_files import parts_of
