@@ -23,8 +23,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.catalogue import features as features_module
+from fleet_slip.catalogue.feature_catalogue import FeatureCatalogue
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
-from fleet_slip.catalogue.features import FeatureCatalogue, features
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.time_columns import Window
 from fleet_slip.columns.blocks.column_plan import ColumnPlan

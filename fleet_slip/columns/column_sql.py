@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from fleet_slip.catalogue.definitions import Definition
-from fleet_slip.catalogue.features import FeatureCatalogue
+from fleet_slip.catalogue.feature_catalogue import FeatureCatalogue
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.columns.counted_columns import CountedColumns, rows_of
 from fleet_slip.columns.operations import plain_of, size_of

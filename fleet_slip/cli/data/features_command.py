@@ -4,8 +4,8 @@ from typing import Annotated
 
 import typer
 
+from fleet_slip.catalogue.feature_catalogue import FeatureCatalogue
 from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
-from fleet_slip.catalogue.features import FeatureCatalogue
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.cli.output import All, Json, print_json, print_table
 from fleet_slip.columns.column_sql import column_query

@@ -6,7 +6,7 @@ from functools import cached_property, lru_cache
 
 from fleet_slip.catalogue.course_change import COURSE, YAW_RATE
 from fleet_slip.catalogue.definitions import Definition, limit_of, plain_column
-from fleet_slip.catalogue.features import FeatureCatalogue
+from fleet_slip.catalogue.feature_catalogue import FeatureCatalogue
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.block_program import BlockProgram
 from fleet_slip.columns.blocks.compile_plan import compile_plan

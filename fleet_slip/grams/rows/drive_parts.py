@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.course_change import OVER
+from fleet_slip.catalogue.feature_catalogue import FeatureCatalogue
 from fleet_slip.catalogue.feature_sets import FeatureSet
-from fleet_slip.catalogue.features import FeatureCatalogue
 
 UNKNOWN_PART = "unknown"
 """Part of the rows whose regime is not known because a signal is absent."""

@@ -6,7 +6,7 @@ import pyarrow as pa
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.features import FeatureCatalogue
+from fleet_slip.catalogue.feature_catalogue import FeatureCatalogue
 from fleet_slip.delta import Change
 from fleet_slip.grams.rows.backlog import find_backlog, named_files
 from fleet_slip.grams.rows.gram_files import is_of_received
