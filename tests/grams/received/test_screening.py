@@ -10,7 +10,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.received import new_messages
+from fleet_slip.grams.received import screening
 from fleet_slip.grams.received.receiving import ReceiveReport
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.retention import Retention, retain
@@ -250,7 +250,7 @@ def test_what_takes_long_is_said_before(
     send: Send, fleet: fleet_slip.Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[str] = []
-    monkeypatch.setattr(new_messages, "MANY", 1)
+    monkeypatch.setattr(screening, "MANY", 1)
     monkeypatch.setattr(LOGGER, "info", lambda text, *given: told.append(text % given))
     send(0, "A", "B")
     assert not [one for one in told if "compared" in one]
