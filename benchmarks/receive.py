@@ -27,8 +27,8 @@ import numpy as np
 import fleet_slip
 from fleet_slip.grams.received.car_keys import KEYS_VARIABLE, load_car_keys
 from fleet_slip.grams.received.found_messages import read_messages
-from fleet_slip.grams.received.received_rows import by_layout
 from fleet_slip.grams.received.signatures import judge_signatures, sign_days, sign_messages
+from fleet_slip.grams.received.sound_messages import by_layout
 from fleet_slip.models.ed25519 import generate
 from fleet_slip.regression.exact.gram import Gram
 from tests.support.fleet_messages import messages_of

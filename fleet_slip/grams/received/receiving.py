@@ -26,9 +26,10 @@ from fleet_slip.errors import InputError
 from fleet_slip.grams.received.car_keys import load_car_keys
 from fleet_slip.grams.received.found_messages import read_messages
 from fleet_slip.grams.received.new_messages import NewMessages, choose_new
-from fleet_slip.grams.received.received_rows import Refused, sort_out
+from fleet_slip.grams.received.received_rows import Refused
 from fleet_slip.grams.received.received_table import received_table
 from fleet_slip.grams.received.signatures import judge_signatures
+from fleet_slip.grams.received.sound_messages import sort_out
 from fleet_slip.grams.rows.gram_files import (
     files_to_rewrite,
     is_of_received,
