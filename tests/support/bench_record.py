@@ -78,13 +78,16 @@ def slower_than(before: Sequence[Record], now: Record) -> str | None:
 
 
 def draw(records: Sequence[Record], plot: Path) -> None:
-    """Draw each benchmark over its records, relative to its first."""
-    figure, axes = plt.subplots(figsize=(8, 4))
+    """Draw each benchmark over the commits that were measured, relative to its first record."""
+    figure, axes = plt.subplots(figsize=(8, 4), layout="constrained")
+    commits = list(dict.fromkeys(one.commit for one in records))
     for command in dict.fromkeys(one.command for one in records):
         mine = [one for one in records if one.command == command]
         ratios = [one.relative / mine[0].relative for one in mine]
-        axes.plot(range(len(mine)), ratios, marker="o", label=command)
+        axes.plot([commits.index(one.commit) for one in mine], ratios, marker="o", label=command)
     axes.axhline(SLOWER, color="0.7")
-    axes.set(xlabel="record", ylabel="processor time, relative to the first record")
+    axes.set_xticks(range(len(commits)), commits, rotation=90)
+    axes.set(xlabel="commit", ylabel="processor time, relative to the first record")
     axes.legend(fontsize="small")
     figure.savefig(plot)
+    plt.close(figure)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from tests.support.bench_record import Record, add_record, read_records, slower_than
+from tests.support.bench_record import Record, add_record, draw, read_records, slower_than
 
 
 def test_what_takes_longer_in_yardsticks_is_named(tmp_path: Path) -> None:
@@ -16,3 +16,15 @@ def test_what_takes_longer_in_yardsticks_is_named(tmp_path: Path) -> None:
     told = slower_than(read_records(file), Record("d", "start", 12.1, 1.0))
     assert told is not None and told.startswith("start: 12.1 s of processors, 1.21 times")
     assert slower_than(read_records(file), Record("d", "another", 99.0, 1.0)) is None
+
+
+def test_records_are_drawn_over_the_commits_they_are_of(tmp_path: Path) -> None:
+    records = [
+        Record(commit, command, 10.0, 1.0)
+        for commit in ("0abc1", "9def2+")
+        for command in ("start", "encoding --copies 1")
+    ]
+    draw(records, tmp_path / "bench.svg")
+    drawn = (tmp_path / "bench.svg").read_text("utf-8")
+    for text in ("0abc1", "9def2+", "start", "encoding"):
+        assert drawn.count(f"<!-- {text}") == 1
