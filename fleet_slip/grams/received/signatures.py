@@ -40,6 +40,7 @@ from fleet_slip.grams.received.messages import (
     levels_of,
 )
 from fleet_slip.grams.received.received_rows import ReceivedRows
+from fleet_slip.words import shown
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -74,7 +75,8 @@ def sign_messages(content: bytes, private_key: bytes) -> bytes:
 def sign_days(content: bytes, private_key: bytes) -> bytes:
     """Sign the messages that stand one behind the other by one signature for each car and day.
 
-    They stand by car and day then, of more than 1,024 in several trees. As `sign_messages` else.
+    They stand by car and day then, of more than 1,024 in several trees. As `sign_messages` else;
+    raises `InputError` also for a drive whose day cannot be written in 4 bytes.
     """
     key = _private_key(private_key)
     days: dict[tuple[bytes, int], list[tuple[int, bytes]]] = {}
@@ -88,11 +90,20 @@ def sign_days(content: bytes, private_key: bytes) -> bytes:
             more = PLACE_BYTES + NODE_BYTES * levels + SIGNATURE_BYTES
             bodies = [_renamed(one, DAY_LAYOUTS[plain] + levels, more) for plain, one in some]
             root, paths = grow(bodies)
-            signature = key.sign(claim_of(bodies[0], len(some), root) or b"")
+            claim = claim_of(bodies[0], len(some), root)
+            if claim is None:
+                raise InputError(_no_day(bodies[0]))
+            signature = key.sign(claim)
             for leaf, (body, path) in enumerate(zip(bodies, paths, strict=True)):
                 place = leaf.to_bytes(2, "little") + len(some).to_bytes(2, "little")
                 signed.append(_with_checksum(body + place + path + signature))
     return b"".join(signed)
+
+
+def _no_day(message: bytes) -> str:
+    vehicle, day = car_and_day(message)
+    name = shown(vehicle.rstrip(b"\0").decode(errors="replace"))
+    return f"a drive of {name} begins {day:,} days after 1970: nothing is signed. Mend its clock."
 
 
 def _private_key(private_key: bytes) -> "Ed25519PrivateKey":

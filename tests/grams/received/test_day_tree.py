@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import fleet_slip
+from fleet_slip.errors import InputError
 from fleet_slip.grams.received.car_keys import KEYS_VARIABLE
 from fleet_slip.grams.received.day_tree import grow
 from fleet_slip.grams.received.found_messages import read_messages
@@ -152,6 +153,14 @@ def test_a_tree_without_messages_signs_nothing() -> None:
     assert not is_right(tree_by_the_page(day_of(1), claimed=0)[0])
     assert not is_right(tree_by_the_page(day_of(3), claimed=2)[2])
     assert not is_right(tree_by_the_page(day_of(3), claimed=9)[0])
+
+
+def test_what_begins_on_no_day_is_not_signed() -> None:
+    beyond = message_of(gram_of(1), "VIN1", 2**32 * DAY_S)
+    with pytest.raises(InputError, match="VIN1 begins 4,294,967,296 days after 1970: nothing is"):
+        sign_days(day_of(1)[0] + beyond, PRIVATE)
+    (last,) = split(sign_days(message_of(gram_of(1), "VIN1", 2**32 * DAY_S - 1), PRIVATE))
+    assert is_right(last)
 
 
 def test_a_signature_of_a_day_is_none_of_a_message() -> None:
