@@ -8,6 +8,7 @@ from fleet_slip.models.estimates.score import cohort_of_rows
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.versions import Registry
 from fleet_slip.warehouse.condition import Condition, asking, drive_columns
+from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -38,6 +39,6 @@ def find_seen(
     if not seen.any() or seen.all():
         return SeenDrives(len(names), int(seen.sum()), cohort)
     kept = [name for name, old in zip(names.to_pylist(), seen, strict=True) if not old]
-    listed = ", ".join("'" + name.replace("'", "''") + "'" for name in kept)
+    listed = ", ".join(map(sql_text, kept))
     others = Condition(cohort.text, f"({cohort.sql} AND drive_id IN ({listed}))")
     return SeenDrives(len(names), int(seen.sum()), others)

@@ -37,6 +37,7 @@ from fleet_slip.monitoring.reversed_label import find_reversed_labels
 from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.warehouse.condition import Condition, asking, parse_cohort, parse_condition
+from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.minimum_cohort import require_vehicles, tells_single_cars
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -167,12 +168,8 @@ def _vehicle_models(reader: GramReader, condition: Condition) -> list[Condition]
     require_training({source for _, source in found}, condition)
     models = sorted({model for model, _ in found}, key=str)
     return [
-        parse_condition(f"vehicle_model IS NOT DISTINCT FROM {_literal(model)}") for model in models
+        parse_condition(f"vehicle_model IS NOT DISTINCT FROM {sql_text(model)}") for model in models
     ]
-
-
-def _literal(text: str | None) -> str:
-    return "NULL" if text is None else "'" + text.replace("'", "''") + "'"
 
 
 def find_wrong_labels(cohort: Cohort, limits: QualityThresholds | None = None) -> dict[str, Fault]:

@@ -9,6 +9,7 @@ from fleet_slip.grams.cohorts.gram_cohort import Served
 from fleet_slip.regression.inference.drive_moments import DriveMoments
 from fleet_slip.regression.inference.influential import Influential, find_influential
 from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 HASH_CHARACTERS = 16
@@ -31,6 +32,6 @@ def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Conditi
     if not tells_single_cars():
         tell = f"left(sha256(vehicle_id), {HASH_CHARACTERS})"
         names = sorted(sha256_of(name)[:HASH_CHARACTERS] for name in vehicles)
-    quoted = ", ".join("'" + name.replace("'", "''") + "'" for name in names)
+    quoted = ", ".join(map(sql_text, names))
     others = f"(vehicle_id IS NULL OR {tell} NOT IN ({quoted}))"
     return parse_condition(f"{condition.sql} AND {others}")

@@ -28,6 +28,11 @@ STUCK_S = 0.7
 Result = TypeVar("Result")
 
 
+def sql_text(text: str | None) -> str:
+    """Return a text as SQL has it, in quotes; NULL for none."""
+    return "NULL" if text is None else "'" + text.replace("'", "''") + "'"
+
+
 def open_database(
     *, reading: Folder | None = None, spill: bool = False, threads: int | None = None
 ) -> duckdb.DuckDBPyConnection:

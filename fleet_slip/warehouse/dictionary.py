@@ -9,6 +9,7 @@ from pydantic import Field, RootModel
 from fleet_slip.catalogue.signals import SignalCatalogue
 from fleet_slip.config import Config, load_toml
 from fleet_slip.resources import folder
+from fleet_slip.warehouse.database import sql_text
 
 COMMON = "common"
 """Section of `warehouse/columns.toml` for columns of several views."""
@@ -55,8 +56,7 @@ def describe_columns(database: duckdb.DuckDBPyConnection, signals: SignalCatalog
         )
         if description:
             text = f"{description} [{unit}]" if unit else description
-            quoted = text.replace("'", "''")
-            database.execute(f"COMMENT ON COLUMN {view}.{column} IS '{quoted}'")
+            database.execute(f"COMMENT ON COLUMN {view}.{column} IS {sql_text(text)}")
     return pa.Table.from_pylist(rows)
 
 

@@ -28,6 +28,7 @@ from fleet_slip.selection.model_list import Search
 from fleet_slip.selection.search import SearchedModels, search_models
 from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 from fleet_slip.views import connect
+from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.tables import Warehouse
 
 DRIVES = ("nominal", "melbourne", "noise_doubled", "style_sporty")
@@ -189,10 +190,11 @@ def weigh_cars(warehouse: Warehouse) -> Cars | None:
     campaign = largest_fleet(warehouse)
     if campaign is None:
         return None
-    quoted = campaign.replace("'", "''")
     one = features().feature_set(SET)
     try:
-        cohort = load_cohort(warehouse, f"{TRAINING_DRIVES} AND campaign = '{quoted}'", SET)
+        cohort = load_cohort(
+            warehouse, f"{TRAINING_DRIVES} AND campaign = {sql_text(campaign)}", SET
+        )
         known = [name for name in one.inputs if name in cohort.inputs]
         before = [name for name in known if name not in {*one.calibrated, *features().factors}]
         own = [name for name in one.calibrated if name in known]

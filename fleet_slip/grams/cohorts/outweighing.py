@@ -20,6 +20,7 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.grams.cohorts.cells import Cells
 from fleet_slip.grams.rows.rollup import BUCKETS, hash_numbers
 from fleet_slip.warehouse.condition import Condition, asking
+from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.minimum_cohort import UNNAMED, tells_single_cars
 
 if TYPE_CHECKING:
@@ -45,8 +46,8 @@ class Outweighing:
     def condition(self) -> str:
         """SQL condition of the Gram rows that are not to count."""
         return (
-            f"(source = 'received' AND vehicle_id = {_literal(self.vehicle_id)} AND (n > "
-            f"{self.rows} OR (n = {self.rows} AND drive_id >= {_literal(self.drive_id)})))"
+            f"(source = 'received' AND vehicle_id = {sql_text(self.vehicle_id)} AND (n > "
+            f"{self.rows} OR (n = {self.rows} AND drive_id >= {sql_text(self.drive_id)})))"
         )
 
 
@@ -90,7 +91,7 @@ def most_rows(rows: IntArray) -> int:
 def _left_out(
     opened: "OpenedGrams", condition: Condition, cars: Sequence[str], most: int
 ) -> tuple[Outweighing, ...]:
-    names = ", ".join(map(_literal, cars))
+    names = ", ".join(map(sql_text, cars))
     text = opened.statement("outweighing.sql", condition, cars=names, most=str(most))
     with asking(opened.database, condition):
         rows = opened.database.sql(text).fetchall()
@@ -116,7 +117,3 @@ def drives_by_car(outweighing: Sequence[Outweighing]) -> dict[str, int]:
     if outweighing and not tells_single_cars():
         return {UNNAMED: sum(one.drives for one in outweighing)}
     return {one.vehicle_id: one.drives for one in outweighing}
-
-
-def _literal(text: str) -> str:
-    return "'" + text.replace("'", "''") + "'"

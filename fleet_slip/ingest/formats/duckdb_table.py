@@ -20,6 +20,7 @@ from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.parquet_batches import BATCH_ROWS, plain_column
 from fleet_slip.ingest.formats.source import Channel, require_columns
 from fleet_slip.limits import memory_bytes
+from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.read_only_sql import one_query
 from fleet_slip.words import shown
 
@@ -107,8 +108,7 @@ def open_duckdb(rows: DuckdbRows, budget: Budget) -> Iterator[DuckdbSource]:
             "autoload_known_extensions": False,
         }
         with duckdb.connect(config=settings) as connection:
-            quoted = str(file).replace("'", "''")
-            connection.execute(f"ATTACH '{quoted}' AS {_NAME} (TYPE duckdb, READ_ONLY)")
+            connection.execute(f"ATTACH {sql_text(str(file))} AS {_NAME} (TYPE duckdb, READ_ONLY)")
             connection.execute("SET enable_external_access = false")
             connection.execute("SET lock_configuration = true")
             _require_stored(connection, rows, budget)
