@@ -28,7 +28,7 @@ CLOCK_S = 60.0
 
 
 @dataclass(frozen=True)
-class Examined:
+class Finding:
     """One thing that was looked at: what was found, and what to do if it is not fit."""
 
     subject: str
@@ -45,7 +45,7 @@ class Examined:
 class Fitness:
     """All that was looked at."""
 
-    examined: tuple[Examined, ...]
+    examined: tuple[Finding, ...]
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -69,50 +69,50 @@ def examine(root: Folder, count_workers: Callable[[], int] | None = None) -> Fit
     return Fitness((*found, *_extras()))
 
 
-def _machine() -> Iterator[Examined]:
-    yield Examined("Python", ".".join(map(str, sys.version_info[:3])))
-    yield Examined("processors", str(len(os.sched_getaffinity(0))))
+def _machine() -> Iterator[Finding]:
+    yield Finding("Python", ".".join(map(str, sys.version_info[:3])))
+    yield Finding("processors", str(len(os.sched_getaffinity(0))))
     memory = memory_bytes()
-    yield Examined(
+    yield Finding(
         "memory",
         f"{memory / 2**30:.1f} GiB",
         "" if memory >= MEMORY_BYTES else "give the process 1 GiB, which large commands take.",
     )
     files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     few = files != resource.RLIM_INFINITY and files < FILES_WISHED
-    yield Examined(
+    yield Finding(
         "open files",
         f"{files:,}" if files != resource.RLIM_INFINITY else "no limit",
         f"{OPEN_FILES} are needed; raise the limit: ulimit -n {FILES_WISHED}" if few else "",
     )
 
 
-def _compiled_code() -> Examined:
+def _compiled_code() -> Finding:
     subject = "folder of compiled code"
     try:
         from fleet_slip.kept_code import find_folder  # noqa: PLC0415 - of the extra
     except ModuleNotFoundError:
-        return Examined(subject, "nothing is compiled: the extra `compiled` is not installed")
+        return Finding(subject, "nothing is compiled: the extra `compiled` is not installed")
     folder = find_folder()
     if folder is None:
-        return Examined(
+        return Finding(
             subject,
             "none",
             "every process compiles anew, for seconds. Set NUMBA_CACHE_DIR to a folder that this "
             "user alone can write.",
         )
-    return Examined(subject, folder)
+    return Finding(subject, folder)
 
 
-def _root(root: Folder) -> Iterator[Examined]:
+def _root(root: Folder) -> Iterator[Finding]:
     subject = f"data root {root}"
     try:
         skew = _probe(root)
     except FleetSlipError as error:
-        yield Examined(subject, "not usable", str(error))
+        yield Finding(subject, "not usable", str(error))
         return
-    yield Examined(subject, "files can be made once, read, listed and deleted")
-    yield Examined(
+    yield Finding(subject, "files can be made once, read, listed and deleted")
+    yield Finding(
         "clock",
         f"{abs(skew):.0f} s from that of the data root",
         "" if abs(skew) <= CLOCK_S else "set the clock of this machine, or of the store.",
@@ -120,7 +120,7 @@ def _root(root: Folder) -> Iterator[Examined]:
     disk = root.free_bytes()
     if disk is not None:
         free, size = disk
-        yield Examined(
+        yield Finding(
             "disk",
             f"{free / 1e9:,.1f} of {size / 1e9:,.1f} GB are free",
             "" if free >= DISK_BYTES else "make room: a full disk stops every job.",
@@ -145,18 +145,18 @@ def _probe(root: Folder) -> float:
     return began - mine[0].modified_ns / 1e9
 
 
-def _cluster(count_workers: Callable[[], int]) -> Examined:
+def _cluster(count_workers: Callable[[], int]) -> Finding:
     try:
         workers = count_workers()
     except FleetSlipError as error:
-        return Examined("cluster", "not usable", str(error))
+        return Finding("cluster", "not usable", str(error))
     none = "start workers: docs/cluster.md"
-    return Examined(
+    return Finding(
         "cluster", f"{number_of(workers, 'worker')}, of this version", "" if workers else none
     )
 
 
-def _extras() -> Iterator[Examined]:
+def _extras() -> Iterator[Finding]:
     """Yield which optional parts are installed; that one is missing is no problem."""
     about = metadata("fleet-slip")
     for extra in about.get_all("Provides-Extra") or ():
@@ -167,7 +167,7 @@ def _extras() -> Iterator[Examined]:
         ]
         absent = [name for name in packages if not _is_installed(name)]
         found = "installed" if not absent else f"not installed: {', '.join(absent)}"
-        yield Examined(f"extra {extra}", found)
+        yield Finding(f"extra {extra}", found)
 
 
 def _is_installed(package: str) -> bool:

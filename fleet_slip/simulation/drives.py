@@ -10,7 +10,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.simulation.campaign import Batch, DriveSpec
 from fleet_slip.simulation.manoeuvres import road_with
-from fleet_slip.simulation.sensing.receivers import Fixes, ReceiverLog
+from fleet_slip.simulation.sensing.receivers import ReceiverFixes, ReceiverLog
 from fleet_slip.simulation.sensing.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
 from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
 from fleet_slip.vehicle.lanes.road import Road
@@ -29,7 +29,7 @@ class DriveLog:
     spec: DriveSpec
     measurement: Measurement
     lost_control_s: float | None
-    fixes: Fixes | None = None
+    fixes: ReceiverFixes | None = None
     """What its satellite receiver logged, if the campaign has receivers."""
 
     @property

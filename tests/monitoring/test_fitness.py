@@ -15,7 +15,7 @@ from fleet_slip.monitoring.fitness import examine
 from tests.support.commands import RunCommand
 
 
-def found(root: Path, subject: str, **options: Any) -> fitness.Examined:
+def found(root: Path, subject: str, **options: Any) -> fitness.Finding:
     [one] = [
         one for one in examine(LocalFolder(root), **options).examined if one.subject == subject
     ]

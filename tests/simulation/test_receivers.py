@@ -11,7 +11,7 @@ from fleet_slip.errors import ConfigError
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.drives import simulate_logs
 from fleet_slip.simulation.imperfections import Range
-from fleet_slip.simulation.sensing.receivers import Fixes, Receiver, ReceiverLog, Receivers
+from fleet_slip.simulation.sensing.receivers import Receiver, ReceiverFixes, ReceiverLog, Receivers
 
 TICK_S = 0.01
 RAD = 2 * np.pi / 65536
@@ -39,7 +39,7 @@ def truth(ticks: int = 3000, speed: float = 15.0) -> dict[str, NDArray[np.float6
     }
 
 
-def logged(receiver: Receiver, drive: dict[str, NDArray[np.float64]], *cuts: int) -> Fixes:
+def logged(receiver: Receiver, drive: dict[str, NDArray[np.float64]], *cuts: int) -> ReceiverFixes:
     """Return what is logged of a drive that comes in blocks."""
     log = ReceiverLog(receiver, np.random.default_rng(5))
     for begin, end in zip((0, *cuts), (*cuts, len(drive["vx_mps"])), strict=True):
@@ -48,7 +48,7 @@ def logged(receiver: Receiver, drive: dict[str, NDArray[np.float64]], *cuts: int
 
 
 def changes(
-    fixes: Fixes, drive: dict[str, NDArray[np.float64]], ticks: int
+    fixes: ReceiverFixes, drive: dict[str, NDArray[np.float64]], ticks: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the course's change less the yaw rate's integral, in rad, and the ticks it is of."""
     r = drive["yaw_rate_rad_s"]

@@ -19,7 +19,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.rivals.learner import (
     SEED,
-    Fitted,
+    FittedLearner,
     Names,
     Scaling,
     hold_back,
@@ -132,7 +132,7 @@ def learn(
     return best
 
 
-def fit_anfis(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
+def fit_anfis(inputs: FloatArray, label: FloatArray, trip: Names) -> FittedLearner:
     """Fit rules to rows; centres and widths are those that estimate drives held back best."""
     scaling, of_label = Scaling.of(inputs), Scaling.of(label)
     scaled, wanted = scaling(inputs), of_label(label)
@@ -162,4 +162,4 @@ def fit_anfis(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
 
     arrays = (found.centre, found.log_width, conclusions, axes)
     size = sum(array.nbytes for array in arrays) + scaling.size_bytes + of_label.size_bytes
-    return Fitted(predict, int(size))
+    return FittedLearner(predict, int(size))

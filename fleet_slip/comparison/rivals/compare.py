@@ -12,7 +12,7 @@ from fleet_slip.comparison.evaluation.evaluate import Rival
 from fleet_slip.comparison.evaluation.filters import Bank
 from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures, error_figures
 from fleet_slip.comparison.rivals.inputs import Inputs, LearnedEstimate, RowSample, draw_sample
-from fleet_slip.comparison.rivals.learner import Fitted, Learner, one_thread
+from fleet_slip.comparison.rivals.learner import FittedLearner, Learner, one_thread
 from fleet_slip.comparison.rivals.learners import LEARNERS, OF_WINDOWS
 from fleet_slip.comparison.rivals.tree_filter import BASE, train_tree_filter
 from fleet_slip.grams.calibration.calibration import calibrate
@@ -84,7 +84,7 @@ def train(learner: Learner, sample: RowSample, inputs: Inputs, suffix: str) -> R
     )
 
 
-def time_estimates(fitted: Fitted, values: FloatArray) -> tuple[float, float]:
+def time_estimates(fitted: FittedLearner, values: FloatArray) -> tuple[float, float]:
     """Return the microseconds of one estimate by itself, and of each of many at once."""
     many = values[:MANY_ROWS]
     singles = [

@@ -14,7 +14,7 @@ from fleet_slip.columns.blocks.column_plan import ColumnPlan
 from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts, as_counts
 from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
-from fleet_slip.comparison.rivals.learner import Fitted, Names, one_thread
+from fleet_slip.comparison.rivals.learner import FittedLearner, Names, one_thread
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.expansion import CarCounts
 from fleet_slip.grams.cohorts.folding import assign_folds
@@ -95,7 +95,7 @@ class LearnedEstimate:
     """A fitted learner with its inputs, in a car that knows its `facts`."""
 
     inputs: Inputs
-    fitted: Fitted
+    fitted: FittedLearner
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     def in_drive(self, drive: EvaluatedDrive) -> "LearnedEstimate":

@@ -19,7 +19,7 @@ Names = NDArray[np.str_]
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedLearner:
     """A fitted learner: (rows, columns) to side-slip in rad, and the bytes of its parameters."""
 
     predict: Callable[[FloatArray], FloatArray]
@@ -32,7 +32,7 @@ class Learner:
 
     name: str
     description: str
-    fit: Callable[[FloatArray, FloatArray, Names], Fitted]
+    fit: Callable[[FloatArray, FloatArray, Names], FittedLearner]
 
 
 @dataclass(frozen=True)

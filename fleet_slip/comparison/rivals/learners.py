@@ -8,7 +8,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.rivals.anfis import fit_anfis
 from fleet_slip.comparison.rivals.learner import (
     SEED,
-    Fitted,
+    FittedLearner,
     Learner,
     Names,
     Scaling,
@@ -26,7 +26,7 @@ PASSES = 60
 """Passes over the sample, at most."""
 
 
-def fit_perceptron(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
+def fit_perceptron(inputs: FloatArray, label: FloatArray, trip: Names) -> FittedLearner:
     """Fit two hidden layers of 64 neurons by Adam; keep the weights best on drives held back."""
     network = scikit_learn("neural_network").MLPRegressor(
         hidden_layer_sizes=LAYERS, activation="tanh", batch_size=BATCH_ROWS,
@@ -60,7 +60,7 @@ def fit_perceptron(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted
         return found * of_label.std + of_label.mean
 
     parameters = sum(array.nbytes for array in (*network.coefs_, *network.intercepts_))
-    return Fitted(predict, int(parameters) + scaling.size_bytes + of_label.size_bytes)
+    return FittedLearner(predict, int(parameters) + scaling.size_bytes + of_label.size_bytes)
 
 
 CENTRES = 1000
@@ -70,7 +70,7 @@ BANDWIDTHS = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)
 """Widths of its kernel to choose from, in standard deviations of the inputs."""
 
 
-def fit_general_regression(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
+def fit_general_regression(inputs: FloatArray, label: FloatArray, trip: Names) -> FittedLearner:
     """Fit a general regression network (Specht 1991): a mean of remembered labels.
 
     Each remembered row counts with exp(−d²/2h²), d its distance in scaled inputs. The width h is
@@ -87,7 +87,7 @@ def fit_general_regression(inputs: FloatArray, label: FloatArray, trip: Names) -
         return float(np.mean((estimate - label[others]) ** 2))
 
     width = min(BANDWIDTHS, key=error)
-    return Fitted(
+    return FittedLearner(
         lambda rows: kernel_mean(scaling(rows), centres, labels, width),
         int(centres.nbytes + labels.nbytes) + scaling.size_bytes + 8,
     )
@@ -110,7 +110,7 @@ def kernel_mean(
     return estimates
 
 
-def fit_regression(inputs: FloatArray, label: FloatArray, _: Names) -> Fitted:
+def fit_regression(inputs: FloatArray, label: FloatArray, _: Names) -> FittedLearner:
     """Fit by ordinary least squares, as equation (4) does, on the rows of the sample."""
     centre = inputs.mean(axis=0)
     weights = np.linalg.lstsq(inputs - centre, label - label.mean(), rcond=None)[0]
@@ -120,13 +120,13 @@ def fit_regression(inputs: FloatArray, label: FloatArray, _: Names) -> Fitted:
         estimate: FloatArray = rows @ weights + intercept
         return estimate
 
-    return Fitted(predict, int(weights.nbytes) + 8)
+    return FittedLearner(predict, int(weights.nbytes) + 8)
 
 
 MOST_TREES = 500
 
 
-def fit_trees(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
+def fit_trees(inputs: FloatArray, label: FloatArray, trip: Names) -> FittedLearner:
     """Fit gradient-boosted trees of at most 31 leaves, as many as drives held back ask for."""
     trees = scikit_learn("ensemble").HistGradientBoostingRegressor(
         learning_rate=0.1, max_iter=MOST_TREES, early_stopping=True, n_iter_no_change=20,
@@ -136,7 +136,7 @@ def fit_trees(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
     trees.fit(inputs[~held], label[~held], X_val=inputs[held], y_val=label[held])
     # scikit-learn shows the nodes of these trees nowhere else.
     nodes = sum(tree.nodes.nbytes for stage in trees._predictors for tree in stage)
-    return Fitted(trees.predict, int(nodes))
+    return FittedLearner(trees.predict, int(nodes))
 
 
 REGRESSION = Learner("regression", "ordinary least squares", fit_regression)

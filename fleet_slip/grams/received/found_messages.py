@@ -44,7 +44,7 @@ NO_FILE = f"and all that follows is not read, after {MOST_REFUSED:,} places that
 
 
 @dataclass
-class Found:
+class FoundMessages:
     """The messages that a file holds.
 
     Attributes:
@@ -58,13 +58,13 @@ class Found:
     count: int = 0
 
 
-def read_messages(content: bytes) -> Found:
+def read_messages(content: bytes) -> FoundMessages:
     """Read messages that stand one behind the other.
 
     After what is none, reading goes on where the next begins with "FSGR". Beyond `MOST_MESSAGES` or
     `MOST_REFUSED` all that is left is refused as one.
     """
-    found = Found()
+    found = FoundMessages()
     at, end, most = 0, len(content), 1
     while at < end:
         if len(found.refused) >= MOST_REFUSED or found.count >= MOST_MESSAGES:
@@ -88,7 +88,7 @@ def read_messages(content: bytes) -> Found:
 
 
 def _continued(
-    found: Found, messages: Messages, content: bytes, at: int
+    found: FoundMessages, messages: Messages, content: bytes, at: int
 ) -> tuple[int, Messages] | None:
     """Return messages as one with the run before them, which is taken back, if they continue it."""
     if not found.runs:

@@ -13,7 +13,7 @@ from fleet_slip.catalogue.course_change import LATE_PARTS, MOST_EARLY, MOST_LATE
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.grams.received.counted_sets import counted_sets
-from fleet_slip.grams.received.found_messages import Found
+from fleet_slip.grams.received.found_messages import FoundMessages
 from fleet_slip.grams.received.messages import (
     LONGEST_VEHICLE,
     Messages,
@@ -57,7 +57,7 @@ Judge = Callable[[ReceivedRows], Iterable[str | None]]
 
 
 def sort_out(
-    found: Iterable[tuple[int, Found]], judge: Judge | None = None
+    found: Iterable[tuple[int, FoundMessages]], judge: Judge | None = None
 ) -> tuple[list[ReceivedRows], list[Refused]]:
     """Divide the messages of files into those that may land, by their signals, and others."""
     refused: list[Refused] = []
@@ -86,7 +86,7 @@ def sort_out(
     return kept, refused
 
 
-def by_layout(file: int, found: Found) -> Iterator[ReceivedRows]:
+def by_layout(file: int, found: FoundMessages) -> Iterator[ReceivedRows]:
     """Yield the messages of a file, those of one layout and length together."""
     alike: dict[Any, list[tuple[int, Messages]]] = {}
     for first, messages in found.runs:

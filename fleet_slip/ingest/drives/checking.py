@@ -31,7 +31,7 @@ MAX_KEYS = 100_000
 _PROBLEM = "problem"
 
 
-class Block(NamedTuple):
+class CheckedBlock(NamedTuple):
     """Some rows of a file: the good ones, the bad ones, and how many were read until its end."""
 
     rows: pl.DataFrame
@@ -54,7 +54,7 @@ class RowChecker:
         self.rows = self.left_out = 0
         self.keys = DriveKeys()
 
-    def blocks(self) -> Iterator[Block]:
+    def blocks(self) -> Iterator[CheckedBlock]:
         """Yield the rows of each batch. Raises `InputError`."""
         for batch in read_batches(self._file, self._mapping):
             yield self._check(batch)
@@ -66,7 +66,7 @@ class RowChecker:
                 f"mapping {self._mapping.name!r}: {describe(self._mapping.where)}."
             )
 
-    def _check(self, batch: pl.DataFrame) -> Block:
+    def _check(self, batch: pl.DataFrame) -> CheckedBlock:
         raw = batch.select(pl.all().name.prefix(RAW))
         fields, meeting = self._understand(raw.schema)
         if RAW + ROW in raw.columns:
@@ -88,7 +88,7 @@ class RowChecker:
             )
         if self._mapping.time.rate_hz is not None:
             rows = rows.with_columns((pl.col("row") / self._mapping.time.rate_hz).alias("time"))
-        return Block(rows, refused, self.rows)
+        return CheckedBlock(rows, refused, self.rows)
 
     def _understand(self, schema: pl.Schema) -> tuple[list[Field], pl.Expr | None]:
         """Return the fields of batches with a schema, and the condition on their rows."""

@@ -17,7 +17,7 @@ from fleet_slip.canonical import canonical_ascii
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives.checking import (
-    Block,
+    CheckedBlock,
     RowChecker,
     describe_refused,
     find_look_alikes,
@@ -103,17 +103,19 @@ class MeasuredStream:
             cutter = DriveCutter(self.mapping.time, longest_s)
             for block in chain(early, blocks):
                 yield self._piece(cutter, block, intervals_s)
-            no_more = Block(block.rows.clear(), no_rows(), block.read)
+            no_more = CheckedBlock(block.rows.clear(), no_rows(), block.read)
             yield self._piece(cutter, no_more, intervals_s, last=True)
         self._require_usable()
 
-    def _usual_intervals(self, blocks: Iterator[Block]) -> tuple[list[Block], dict[int, float]]:
+    def _usual_intervals(
+        self, blocks: Iterator[CheckedBlock]
+    ) -> tuple[list[CheckedBlock], dict[int, float]]:
         """Return the first blocks, and the usual time between samples of each time base in them.
 
         It is that of rows up to a number that is the same however a file is cut into blocks. Of a
         time base that is not among them, its first drive tells it.
         """
-        early: list[Block] = []
+        early: list[CheckedBlock] = []
         enough = RATE_ROWS
         for block in blocks:
             early.append(block)
@@ -128,7 +130,7 @@ class MeasuredStream:
     def _piece(
         self,
         cutter: DriveCutter,
-        block: Block,
+        block: CheckedBlock,
         intervals_s: dict[int, float],
         *,
         last: bool = False,
@@ -299,14 +301,14 @@ def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
     return digest.hexdigest(), content.hexdigest()
 
 
-def _reach(blocks: list[Block]) -> int:
+def _reach(blocks: list[CheckedBlock]) -> int:
     """Return how many rows tell the usual time; of several bases good ones are counted."""
     if "base" in blocks[-1].rows.columns:
         return sum(block.rows.height for block in blocks)
     return blocks[-1].read
 
 
-def _trial(mapping: Mapping, blocks: list[Block], until: int) -> pl.DataFrame:
+def _trial(mapping: Mapping, blocks: list[CheckedBlock], until: int) -> pl.DataFrame:
     """Return the rows of the first blocks up to a number, cut into parts."""
     rows = blocks[0].rows if len(blocks) == 1 else pl.concat([block.rows for block in blocks])
     several = "base" in rows.columns

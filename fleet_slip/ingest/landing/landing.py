@@ -24,7 +24,12 @@ from fleet_slip.ingest.landing import data_files
 from fleet_slip.ingest.landing.allowed_rows import car_of, keep_drives, keep_refused, names_in
 from fleet_slip.ingest.landing.data_files import DataFiles, Part, Rows, TableName, digest_of
 from fleet_slip.ingest.landing.marks import FileMarks, Origin
-from fleet_slip.ingest.landing.same_recordings import Found, Replace, SameRecordings, let_return
+from fleet_slip.ingest.landing.same_recordings import (
+    RecordingInLogs,
+    Replace,
+    SameRecordings,
+    let_return,
+)
 from fleet_slip.ingest.logs.log_files import LocalCopies, Log
 from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.ingest.mapping.mapping import Mapping
@@ -60,7 +65,7 @@ class FileOutcome:
     vehicles: set[str] = field(default_factory=set)
     left_out: int = 0
     marks: FileMarks = field(default_factory=FileMarks)
-    found: Found = field(default_factory=Found)
+    found: RecordingInLogs = field(default_factory=RecordingInLogs)
 
 
 @dataclass(frozen=True)

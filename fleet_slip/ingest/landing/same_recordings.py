@@ -21,7 +21,7 @@ mapping of the same name that has been changed since are `corrected`."""
 
 
 @dataclass(frozen=True)
-class Found:
+class RecordingInLogs:
     """What the logs have of a file's recording.
 
     Attributes:
@@ -52,7 +52,7 @@ class SameRecordings:
 
     def judge(
         self, file: Log, name: str, digest: str, marks: FileMarks, earlier: str | None
-    ) -> Found:
+    ) -> RecordingInLogs:
         """Return what the logs have of a file.
 
         `name` is the file's as `source_file` has it; `earlier` is the digest of what its path had
@@ -81,7 +81,7 @@ class SameRecordings:
             raise RepeatedError(_sentence(file, drives, there, changed=changed))
         self._batch.update(marks.units)
         self._files[Origin.of(digest).digest] = file
-        return Found(origins, replaced if drives else frozenset(), len(drives))
+        return RecordingInLogs(origins, replaced if drives else frozenset(), len(drives))
 
 
 def let_return(warehouse: Warehouse, digest: str, first_drive: str) -> bool:

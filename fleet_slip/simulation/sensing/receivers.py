@@ -60,7 +60,7 @@ class Receivers(Config):
 
 
 @dataclass(frozen=True)
-class Fixes:
+class ReceiverFixes:
     """What a receiver logs of one drive: counts of `SATELLITE_SIGNALS`, valid where `fix` is."""
 
     counts: dict[str, NDArray[np.int16]]
@@ -101,10 +101,10 @@ class ReceiverLog:
         self._blocks.append((course, speed, fix))
         self._ticks += ticks
 
-    def fixes(self) -> Fixes:
+    def fixes(self) -> ReceiverFixes:
         """Return what was recorded."""
         course, speed, fix = (np.concatenate(parts) for parts in zip(*self._blocks, strict=True))
-        return Fixes(dict(zip(SATELLITE_SIGNALS, (course, speed), strict=True)), fix)
+        return ReceiverFixes(dict(zip(SATELLITE_SIGNALS, (course, speed), strict=True)), fix)
 
 
 @equation

@@ -12,7 +12,7 @@ from fleet_slip.comparison.rivals.compare import (
     train,
 )
 from fleet_slip.comparison.rivals.inputs import Inputs, RowSample
-from fleet_slip.comparison.rivals.learner import Fitted, Learner, Names, hold_back
+from fleet_slip.comparison.rivals.learner import FittedLearner, Learner, Names, hold_back
 from fleet_slip.comparison.rivals.learners import (
     CENTRES,
     LAYERS,
@@ -127,7 +127,7 @@ def test_no_fold_is_tested_on_drives_that_it_was_fitted_on() -> None:
     number = np.array([int(name.removeprefix("drive-")) for name in data.trip])
     seen: list[set[int]] = []
 
-    def remember(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted:
+    def remember(inputs: FloatArray, label: FloatArray, trip: Names) -> FittedLearner:
         assert {f"drive-{n:.0f}" for n in inputs[:, 0]} == set(trip)
         seen.append(set(inputs[:, 0].astype(int)))
         return fit_regression(inputs, label, trip)

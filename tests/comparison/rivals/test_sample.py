@@ -9,7 +9,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.comparison.rivals.inputs import Inputs, LearnedEstimate, draw_sample
-from fleet_slip.comparison.rivals.learner import Fitted
+from fleet_slip.comparison.rivals.learner import FittedLearner
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.models.versions import Registry
@@ -64,7 +64,7 @@ def test_a_rival_sees_on_a_drive_what_it_was_trained_on(
     """Its estimate is the window itself: the same number in a sample and on a drive."""
     cohort = load_cohort(warehouse, "campaign = 'smoke'")
     sample = draw_sample(warehouse, cohort, inputs(), rows=1000)
-    estimate = LearnedEstimate(inputs(), Fitted(lambda rows: rows[:, 3], 0))
+    estimate = LearnedEstimate(inputs(), FittedLearner(lambda rows: rows[:, 3], 0))
     drive_id = str(sample.trip[0])
     columns = [catalogue()[name].column for name in catalogue().inputs]
     with connect(smoke_root) as database:
