@@ -15,7 +15,7 @@ The way of a row, in the order of its stations:
    batches.
 """
 
-from fleet_slip.ingest.drives.measured_drives import IngestCounts
+from fleet_slip.ingest.drives.file_totals import IngestCounts
 from fleet_slip.ingest.mapping.mapping import Mapping, load_mapping
 
 __all__ = [

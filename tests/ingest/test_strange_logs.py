@@ -11,7 +11,8 @@ import pytest
 
 from fleet_slip.errors import AlarmError, ConfigError
 from fleet_slip.ingest import load_mapping
-from fleet_slip.ingest.drives.measured_drives import IngestCounts, MeasuredDrive
+from fleet_slip.ingest.drives.file_totals import IngestCounts
+from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
 from fleet_slip.ingest.drives.one_sided import find_one_sided
 from fleet_slip.ingest.drives.stream import open_measured
 from fleet_slip.ingest.drives.suspicion import RADIUS_M, WHEELS, find_suspicions

@@ -15,7 +15,8 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import ConfigError
 from fleet_slip.extras import needed
 from fleet_slip.files.storage_errors import storage_errors
-from fleet_slip.ingest.drives.measured_drives import IngestCounts, MeasuredDrive
+from fleet_slip.ingest.drives.file_totals import IngestCounts
+from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
 from fleet_slip.ingest.drives.stream import open_measured
 from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
 from fleet_slip.ingest.logs.log_files import Log, local_copy

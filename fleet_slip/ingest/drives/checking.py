@@ -13,13 +13,11 @@ from fleet_slip.arrays import BoolArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives.fields import (
     LONGEST_TEXT,
-    RAW,
-    REASONS,
-    Field,
     fields_of,
     meets_conditions,
 )
 from fleet_slip.ingest.drives.log_rows import read_batches
+from fleet_slip.ingest.drives.raw_columns import RAW, REASONS, Field
 from fleet_slip.ingest.drives.time_bases import ROW
 from fleet_slip.ingest.formats.source import BASE
 from fleet_slip.ingest.mapping.mapping import Mapping

@@ -1,8 +1,7 @@
 """Makes drives of checked rows: their names and trips, their ticks and counts; and counts them."""
 
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import partial
 from typing import Any
@@ -247,49 +246,3 @@ class Trips:
             trip_id = drive_id
         self._last[group] = trip_id, end_s
         return trip_id
-
-
-@dataclass(frozen=True)
-class IngestCounts:
-    """What became of a file's rows: read are left out, kept or quarantined."""
-
-    rows_read: int
-    rows_left_out: int
-    """Rows that do not meet the mapping's conditions."""
-    rows_kept: int
-    quarantined: dict[str, int]
-    """Rejected rows by reason."""
-    drives: int
-    drives_resampled: int
-    ticks: int
-    """Rows of the result; equal to `rows_kept` where nothing was resampled."""
-
-    def without(self, drives: int, ticks: int) -> "IngestCounts":
-        """Return the counts where some drives were left out, and so many ticks are left."""
-        return replace(self, drives=self.drives - drives, ticks=ticks)
-
-
-@dataclass
-class Totals:
-    """What became of a file's rows so far."""
-
-    rows_kept: int = 0
-    quarantined: Counter[str] = field(default_factory=Counter)
-    refused: Counter[tuple[str, str]] = field(default_factory=Counter)
-    """Rejected rows by what is wrong, where that is a signal, and by the reason."""
-    drives: int = 0
-    drives_resampled: int = 0
-    ticks: int = 0
-    samples: Counter[str] = field(default_factory=Counter)
-    """Values of each signal in the file's rows; `values` are those on ticks."""
-    values: Counter[str] = field(default_factory=Counter)
-
-    def add(self, rows: DriveRows, drive: MeasuredDrive) -> None:
-        """Count a drive that was made of rows."""
-        self.rows_kept += rows.height
-        self.drives += 1
-        self.drives_resampled += drive.method != "snap"
-        self.ticks += drive.ticks.size
-        for name, counts in drive.counts.items():
-            self.samples[name] += rows.number_of(name)
-            self.values[name] += len(counts) - counts.null_count

@@ -7,7 +7,6 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -30,10 +29,9 @@ from fleet_slip.ingest.drives.drive_cutter import (
     sample_intervals_s,
 )
 from fleet_slip.ingest.drives.file_suspicion import assumed_rate, find_refusals
+from fleet_slip.ingest.drives.file_totals import IngestCounts, Totals
 from fleet_slip.ingest.drives.measured_drives import (
-    IngestCounts,
     MeasuredDrive,
-    Totals,
     Trips,
     drive_id,
     to_ticks,
@@ -47,17 +45,11 @@ from fleet_slip.ingest.formats.reading import log_digest, require_unchanged_log
 from fleet_slip.ingest.logs.log_files import parts_of
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
-from fleet_slip.words import number_of, shown
+from fleet_slip.words import shown
 
 RATE_ROWS, MOST_RATE_ROWS = 2**17, 2**21
 """The fewest and the most first rows of a file whose median step is the usual time between rows."""
 FEWEST_STEPS = 1000
-MAX_DRIVES = 10_000
-"""Short drives in one file. With more, time or the drive's column is not what the mapping says."""
-SHORT_ROWS = 1000
-MAX_TICKS = 40_000_000
-"""Ticks of all drives of one file together, where it has few rows for so many."""
-MOST_TICKS_A_ROW = 1000
 
 
 @dataclass(frozen=True)
@@ -93,7 +85,6 @@ class MeasuredStream:
         self._cars = SeveralCars()
         self.name = os.fsencode(file.name).decode("utf-8", "replace")
         self._stem = self.name.split(".", 1)[0] or self.name
-        self._first_refused: dict[str, Any] | None = None
 
     def pieces(self) -> Iterator[Piece]:
         """Yield what the file becomes, in order, once. Raises `InputError`, at its end too."""
@@ -105,7 +96,7 @@ class MeasuredStream:
                 yield self._piece(cutter, block, intervals_s)
             no_more = CheckedBlock(block.rows.clear(), no_rows(), block.read)
             yield self._piece(cutter, no_more, intervals_s, last=True)
-        self._require_usable()
+        self.totals.require_usable(self.file, self.mapping)
 
     def _usual_intervals(
         self, blocks: Iterator[CheckedBlock]
@@ -150,7 +141,7 @@ class MeasuredStream:
                 "and none of them ends. Sort the file by drive and time."
             )
         bad = join_refused(refused)
-        self._note_refused(bad)
+        self.totals.add_refused(bad, self.mapping.signals)
         return Piece(drives, bad)
 
     def _drive(self, rows: DriveRows, intervals_s: dict[int, float]) -> MeasuredDrive:
@@ -173,58 +164,8 @@ class MeasuredStream:
             raise InputError(f"{shown(self.file)}: {error}") from None
         self.totals.add(rows, drive)
         self._cars.add(rows, drive)
-        self._require_sane_drives()
+        self.totals.require_sane_drives(self.file, self.mapping)
         return drive
-
-    def _note_refused(self, refused: pl.DataFrame) -> None:
-        if refused.height:
-            self.totals.quarantined.update(refused["reason"])
-            of_signals = refused.filter(pl.col("signal").is_in(list(self.mapping.signals)))
-            self.totals.refused.update(zip(of_signals["signal"], of_signals["reason"], strict=True))
-            first = refused.row(refused["row"].arg_min() or 0, named=True)
-            self._first_refused = min(self._first_refused or first, first, key=lambda r: r["row"])
-
-    def _require_sane_drives(self) -> None:
-        totals = self.totals
-        if totals.drives > MAX_DRIVES and totals.rows_kept < SHORT_ROWS * totals.drives:
-            raise InputError(
-                f"{shown(self.file)}: it falls into more than {MAX_DRIVES:,} drives, of "
-                f"{totals.rows_kept / totals.drives:.0f} rows on average. Check time, split_gap_s "
-                f"and the drive's column in the mapping {self.mapping.name!r}."
-            )
-        if totals.ticks > MAX_TICKS and totals.ticks > MOST_TICKS_A_ROW * totals.rows_kept:
-            raise InputError(
-                f"{shown(self.file)}: {totals.rows_kept:,} rows last {totals.ticks:,} ticks of "
-                "100 Hz. Check the unit of time and split_gap_s in the mapping "
-                f"{self.mapping.name!r}."
-            )
-
-    def _require_usable(self) -> None:
-        totals, name = self.totals, self.mapping.name
-        if not totals.rows_kept and self._first_refused is not None:
-            reasons = ", ".join(f"{n:,} {reason}" for reason, n in totals.quarantined.most_common())
-            first = self._first_refused
-            example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
-            raise InputError(
-                f"{shown(self.file)}: none of its "
-                f"{number_of(totals.quarantined.total(), 'row')} is usable ({reasons}; first: "
-                f"{example}). Check columns, units and time in the mapping {name!r}."
-            )
-        if not totals.ticks:
-            raise InputError(
-                f"{shown(self.file)}: no row is on a tick of 100 Hz, and longest_gap_s = "
-                f"{self.mapping.time.longest_gap_s:g} forbids to interpolate. Raise it in the "
-                f"mapping {name!r} if the signals change slowly enough."
-            )
-        for signal, source in self.mapping.signals.items():
-            if totals.samples[signal] and not totals.values[signal]:
-                raise InputError(
-                    f"{shown(self.file)}: {signal} has "
-                    f"{number_of(totals.samples[signal], 'value')} in {source.column!r}, and none "
-                    "is on a tick of 100 Hz: they are further apart than longest_gap_s. Give the "
-                    f"signal in the mapping {name!r} a longest_gap_s of its own, or interpolate = "
-                    "false."
-                )
 
     def quarantine_table(self, refused: Sequence[pl.DataFrame]) -> pa.Table:
         """Return refused rows as those of the table `quarantine`, in the file's order."""
@@ -252,16 +193,7 @@ class MeasuredStream:
 
     def counts(self) -> IngestCounts:
         """Return what became of the rows, once all pieces were taken."""
-        totals = self.totals
-        return IngestCounts(
-            rows_read=self.checker.rows,
-            rows_left_out=self.checker.left_out,
-            rows_kept=totals.rows_kept,
-            quarantined=dict(sorted(totals.quarantined.items())),
-            drives=totals.drives,
-            drives_resampled=totals.drives_resampled,
-            ticks=totals.ticks,
-        )
+        return self.totals.counts(self.checker.rows, self.checker.left_out)
 
     def suspicions(self) -> tuple[Suspicion, ...]:
         """Return the signals of which many values were refused, once all pieces were taken."""

@@ -10,7 +10,7 @@ from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.ingest.drives.checking import find_look_alikes
-from fleet_slip.ingest.drives.measured_drives import IngestCounts
+from fleet_slip.ingest.drives.file_totals import IngestCounts
 from fleet_slip.ingest.drives.suspicion import Suspicion
 from fleet_slip.ingest.landing.committing import Superseding, land_batch
 from fleet_slip.ingest.landing.data_files import unit_of

@@ -16,7 +16,8 @@ import pyarrow as pa
 from fleet_slip.delta import Table
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drafting.preview import signals_of
-from fleet_slip.ingest.drives.measured_drives import IngestCounts, MeasuredDrive, drive_id
+from fleet_slip.ingest.drives.file_totals import IngestCounts
+from fleet_slip.ingest.drives.measured_drives import MeasuredDrive, drive_id
 from fleet_slip.ingest.drives.stream import MeasuredStream, open_measured
 from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
 from fleet_slip.ingest.formats.reading import expected_rows
