@@ -119,7 +119,7 @@ class LogsAndGrams(Rooted):
         folders, at any depth, and patterns, the logs are taken that have not landed unchanged; with
         `as_one` they are parts of one log. Objects are given as URLs.
         Returns a report of each file read, in order; `each` gets it once the file is committed.
-        Progress is in files for folders and patterns, else in rows where a format tells them.
+        Progress is in files for folders and patterns, else in bytes.
         Without a cluster, threads read a folder's small files; large ones are read one by one, by
         all cores.
 
@@ -154,7 +154,7 @@ class LogsAndGrams(Rooted):
             threads = executor if by_file else elsewhere
             taking_out = TakingOut(self.warehouse)
             logs = [log for _, share in shares for log in share]
-            rows = no_progress if by_file or progress is None else _rows_of(logs, told)
+            read = no_progress if by_file or progress is None else _bytes_of(logs, told)
             for plan, share in shares:
                 known = KnownFiles.of(self.warehouse, plan) if folders else None
                 wanted = share
@@ -164,7 +164,7 @@ class LogsAndGrams(Rooted):
                     told(landed, len(logs))
                 try:
                     for report in ingest_files(
-                        warehouse, wanted, plan, threads, known, rows, replace, taking_out, failures
+                        warehouse, wanted, plan, threads, known, read, replace, taking_out, failures
                     ):
                         reports[report.file] = report
                         figures.rows += report.counts.ticks if report.new else 0
@@ -276,17 +276,18 @@ class LogsAndGrams(Rooted):
         return report
 
 
-def _rows_of(logs: "Iterable[Log]", told: Progress) -> Progress:
-    """Return what counts the rows read of each log among about so many that all have."""
-    from fleet_slip.ingest.formats.reading import expected_rows
+def _bytes_of(logs: "Iterable[Log]", told: Progress) -> Progress:
+    """Return what counts the bytes read of each log among those that all have."""
+    from fleet_slip.ingest.logs.log_files import size_of
 
-    total = sum(map(expected_rows, logs))
+    total = sum(map(size_of, logs))
     left = total
 
     def count(more: int, _of_one: int) -> None:
         nonlocal left
-        more = min(more, left)  # a guess may be too low, and a batch is written again at a conflict
+        more = min(more, left)  # a batch is written again at a conflict
         left -= more
-        told(more, total)
+        if total:
+            told(more, total)
 
     return count

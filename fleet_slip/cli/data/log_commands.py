@@ -162,7 +162,7 @@ def ingest(
     each = remarks(quiet=json or folders)
     with (
         recording(fleet.root, "ingest", sys.argv[1:]),
-        progress(*(("ingest", "files") if folders else ("read", "rows"))) as show,
+        progress(*(("ingest", "files") if folders else ("read", "bytes"))) as show,
     ):
         reports = fleet.ingest(
             files,

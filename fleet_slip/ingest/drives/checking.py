@@ -19,6 +19,7 @@ from fleet_slip.ingest.drives.fields import (
 from fleet_slip.ingest.drives.log_rows import read_batches
 from fleet_slip.ingest.drives.raw_columns import RAW, REASONS, Field
 from fleet_slip.ingest.drives.time_bases import ROW
+from fleet_slip.ingest.formats.meter import Meter
 from fleet_slip.ingest.formats.source import BASE
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.ingest.mapping.row_condition import describe
@@ -46,15 +47,15 @@ class RowChecker:
         keys: what the numbers in the column `group` stand for.
     """
 
-    def __init__(self, file: Path, mapping: Mapping) -> None:
+    def __init__(self, file: Path, mapping: Mapping, meter: Meter) -> None:
         """Take a file that is not open yet."""
-        self._file, self._mapping = file, mapping
+        self._file, self._mapping, self._meter = file, mapping, meter
         self.rows = self.left_out = 0
         self.keys = DriveKeys()
 
     def blocks(self) -> Iterator[CheckedBlock]:
         """Yield the rows of each batch. Raises `InputError`."""
-        for batch in read_batches(self._file, self._mapping):
+        for batch in read_batches(self._file, self._mapping, self._meter):
             yield self._check(batch)
         if not self.rows:
             raise InputError(f"{shown(self._file)}: it has a header and no rows. Export it again.")

@@ -17,6 +17,7 @@ import polars as pl
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives.time_bases import merge_bases
 from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.meter import Meter
 from fleet_slip.ingest.formats.parquet_batches import BATCH_ROWS
 from fleet_slip.ingest.formats.reading import file_errors, open_source
 from fleet_slip.ingest.formats.source import Base, ClockSource, Source
@@ -125,23 +126,32 @@ def _read(opened: PartBases, stretches: list[_Stretch]) -> Iterator[pl.DataFrame
             yield from there.bases[stretch.place].read()
 
 
-def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
+def read_batches(log: Path, mapping: Mapping, meter: Meter | None = None) -> Iterator[pl.DataFrame]:
     """Yield the columns of a log that a mapping uses, in its order, in bounded batches.
 
-    Rows of several time bases come as `merge_bases` says. Raises `InputError` if a file cannot be
-    read, or a column is missing or ambiguous.
+    Rows of several time bases come as `merge_bases` says. The meter is told how many rows come.
+    Raises `InputError` if a file cannot be read, or a column is missing or ambiguous.
     """
+    meter = meter or Meter()
     wanted, parts, time = mapping.time_bases(), parts_of(log), mapping.time.key
     if time is None or (len(wanted) == 1 and not mapping.time.own_clock):
         for part in parts:
             with _open_part(part, mapping) as source:
-                yield from Budget.of(part).metered(source.batches(next(iter(wanted.values()))))
+                columns = next(iter(wanted.values()))
+                if meter.is_watched and part == parts[0]:
+                    meter.expect(source.expected_rows(columns), of=part.stat().st_size)
+                yield from Budget.of(part).metered(source.batches(columns))
     elif len(parts) == 1:
-        with _open_part(log, mapping) as source:
-            yield from _merged(_bases_of(source, log, mapping, wanted), mapping)
+        with _open_part(log, mapping, meter) as source:
+            bases = _bases_of(source, log, mapping, wanted)
+            if meter.is_watched:
+                meter.expect(sum(map(source.expected_rows, wanted.values())))
+            yield from _merged(bases, mapping)
     else:
         with PartBases(partial(_open_bases, mapping)) as opened:
-            yield from _merged(join_parts(log, parts, mapping, opened), mapping)
+            bases = join_parts(log, parts, mapping, opened)
+            meter.expect(sum(base.count_rows() for base in bases))
+            yield from _merged(bases, mapping)
 
 
 def _merged(bases: list[Base], mapping: Mapping) -> Iterator[pl.DataFrame]:
@@ -152,9 +162,9 @@ def _merged(bases: list[Base], mapping: Mapping) -> Iterator[pl.DataFrame]:
 
 
 @contextmanager
-def _open_part(part: Path, mapping: Mapping) -> Iterator[Source]:
+def _open_part(part: Path, mapping: Mapping, meter: Meter | None = None) -> Iterator[Source]:
     """Open a file that says times as the mapping does. Raises `InputError`."""
-    with file_errors(part), open_source(part, mapping.formats) as source:
+    with file_errors(part), open_source(part, mapping.formats, meter) as source:
         if source.has_clock != mapping.time.own_clock:
             raise InputError(
                 f"{shown(part)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "

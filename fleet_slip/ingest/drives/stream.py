@@ -40,10 +40,12 @@ from fleet_slip.ingest.drives.open_drives import MAX_OPEN_ROWS, DriveRows, OpenD
 from fleet_slip.ingest.drives.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.drives.several_cars import SeveralCars, unmapped_cars
 from fleet_slip.ingest.drives.suspicion import Suspicion
+from fleet_slip.ingest.formats.meter import Meter
 from fleet_slip.ingest.formats.parquet_batches import partition_keys
 from fleet_slip.ingest.formats.reading import log_digest, require_unchanged_log
-from fleet_slip.ingest.logs.log_files import parts_of
+from fleet_slip.ingest.logs.log_files import parts_of, size_of
 from fleet_slip.ingest.mapping.mapping import Mapping
+from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 from fleet_slip.words import shown
 
@@ -73,11 +75,13 @@ class MeasuredStream:
     `<mapping>-<digest>-<number>`, and `-2`, `-3` … follow where a gap in time cut one.
     """
 
-    def __init__(self, file: Path, mapping: Mapping, digest: str, content: str) -> None:
-        """Take the file, the mapping, the digest of both, and that of the file alone."""
+    def __init__(
+        self, file: Path, mapping: Mapping, digest: str, content: str, meter: Meter
+    ) -> None:
+        """Take the file, the mapping, the digest of both, that of the file alone, and a meter."""
         self.file, self.mapping, self.digest, self.content = file, mapping, digest, content
         self.prefix = f"{mapping.name}-{digest[:12]}"
-        self.checker = RowChecker(file, mapping)
+        self.checker, self._meter = RowChecker(file, mapping, meter), meter
         self.totals = Totals()
         self._open = OpenDrives()
         self._stretches: Counter[int] = Counter()
@@ -93,9 +97,11 @@ class MeasuredStream:
             longest_s = LONGEST_DRIVE_S * min([1.0, *(s / STEP_S for s in intervals_s.values())])
             cutter = DriveCutter(self.mapping.time, longest_s)
             for block in chain(early, blocks):
+                self._meter.count(block.read)
                 yield self._piece(cutter, block, intervals_s)
             no_more = CheckedBlock(block.rows.clear(), no_rows(), block.read)
             yield self._piece(cutter, no_more, intervals_s, last=True)
+        self._meter.end()
         self.totals.require_usable(self.file, self.mapping)
 
     def _usual_intervals(
@@ -213,10 +219,16 @@ class MeasuredStream:
 
 
 @contextmanager
-def open_measured(file: Path, mapping: Mapping) -> Iterator[MeasuredStream]:
-    """Open a measured file. Raises `InputError`, if it changes until the end too."""
+def open_measured(
+    file: Path, mapping: Mapping, progress: Progress = no_progress
+) -> Iterator[MeasuredStream]:
+    """Open a measured file; progress is in its bytes.
+
+    Raises `InputError`, if it changes until the end too.
+    """
     with require_unchanged_log(file):
-        yield MeasuredStream(file, mapping, *_identity(file, mapping))
+        meter = Meter(size_of(file), progress)
+        yield MeasuredStream(file, mapping, *_identity(file, mapping), meter)
 
 
 def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:

@@ -119,6 +119,7 @@ def _containers(stream: BinaryIO, budget: Budget) -> Iterator[bytes]:
                 raise budget.damaged("a container that ends too early")
             yield _unfolded(content, _CONTAINER_HEADER.unpack(header)[0], budget)
         at += size + size % _PADDING
+        budget.meter.pass_over(at, budget.size)
 
 
 def _unfolded(content: bytes, method: int, budget: Budget) -> bytes:

@@ -8,12 +8,13 @@ of it takes several bytes however well it is packed, since sensors are noisy.
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import polars as pl
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.meter import Meter
 from fleet_slip.words import shown
 
 FREE_ROWS, ROWS_PER_BYTE = 10**6, 4
@@ -33,11 +34,13 @@ class Budget:
     file: Path
     size: int
     """Bytes of the file."""
+    meter: Meter = field(default_factory=Meter, compare=False)
+    """Who is told how much of it was passed over."""
 
     @classmethod
-    def of(cls, file: Path) -> "Budget":
+    def of(cls, file: Path, meter: Meter | None = None) -> "Budget":
         """Return the budget of a file. Raises `OSError`."""
-        return cls(file, file.stat().st_size)
+        return cls(file, file.stat().st_size, meter or Meter())
 
     @property
     def rows(self) -> int:

@@ -48,6 +48,8 @@ BLF = ".blf"
 SUFFIXES = {BLF, ".asc", ".log", ".trc"}
 
 _MOST_NUMBERS = 100_000
+TOLD_EVERY = 2**12
+"""Frames that are read one by one until it is told how far the file is read."""
 
 
 def require_lines(budget: Budget) -> None:
@@ -118,6 +120,8 @@ class CanSource(ClockSource):
 
     def _count(self, name: str, signals: dict[str, Any]) -> int:
         """Return how many frames of a message have one of the signals."""
+        if any(signal.multiplexer_ids is None for signal in signals.values()):
+            return self._frames[_key(self._messages[name])].sizes_on(self._bus.channel).total()
         return sum(table.height for table in self._read(name, signals))
 
     def _read(self, name: str, signals: dict[str, Any]) -> Iterator[pl.DataFrame]:
@@ -215,6 +219,8 @@ class CanSource(ClockSource):
                 return
             for number, frame in enumerate(trace):
                 self._budget.require_rows(number)
+                if not number % TOLD_EVERY:
+                    self._budget.meter.pass_over(trace.file.buffer.tell(), self._budget.size)
                 if frame.is_error_frame or frame.is_remote_frame:
                     continue
                 key = frame.arbitration_id, frame.is_extended_id

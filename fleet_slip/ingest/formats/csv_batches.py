@@ -28,6 +28,8 @@ from fleet_slip.words import shown
 BLOCK_BYTES = 2**22
 """CSV is parsed in blocks of about this size."""
 
+_SAMPLE_BYTES = 2**18
+
 LINE_BLOCKS = 4
 """Blocks that one line may fill. Where it fills more, usually a quote was not closed."""
 
@@ -72,6 +74,14 @@ class CsvSource:
         with self.file.open("rb") as stream:
             names = _csv_header(text_of(stream, self.csv_format), self.file, self.csv_format)
         return [Channel(name) for name in names if names.count(name) == 1]
+
+    def expected_rows(self, _columns: Sequence[str]) -> int:
+        """Return how many lines the file has, if those of its begin are like all others."""
+        with self.file.open("rb") as stream:
+            sample = stream.read(_SAMPLE_BYTES)
+        lines = sample.count(b"\n") - 1  # without the header
+        is_text = lines > 0 and b"\0" not in sample
+        return round(self.budget.size * lines / len(sample)) if is_text else 0
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield the named columns as text or plain numbers, and `EXTRA_FIELDS`."""

@@ -66,6 +66,10 @@ class MatSource:
                 found += [Channel(name, unit, f"{rows} rows") for name in names]
         return found
 
+    def expected_rows(self, columns: Sequence[str]) -> int:
+        """Return how many rows the first of some columns has."""
+        return _rows_columns(self.find(columns[0])[0].shape)[0]
+
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield all rows, some at once. Raises `InputError` if columns differ in length."""
         found = {name: self.find(name) for name in columns}

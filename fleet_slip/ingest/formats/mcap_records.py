@@ -50,6 +50,7 @@ def read_records(budget: Budget) -> Iterator[Any]:
                 chunk.data, chunk.uncompressed_size, chunk.uncompressed_crc = others, len(others), 0
                 yield from mcap.breakup_chunk(chunk)
                 yield block
+                budget.meter.pass_over(file.tell(), budget.size)
             elif type(record).__name__ == "Message":
                 heads = np.array([(record.channel_id, 0, len(record.data))])
                 yield Block(record.data, heads, np.array([record.publish_time], np.uint64))

@@ -62,17 +62,22 @@ class MdfSource(ClockSource):
             number, index = self._find(name)
             groups.setdefault(number, {})[name] = index
         return [
-            Base(f"group {number}", partial(self._records, number), partial(self._read, number, of))
+            Base(
+                f"group {number}",
+                partial(self.count_records, number),
+                partial(self._read, number, of),
+            )
             for number, of in sorted(groups.items())
         ]
 
-    def _records(self, number: int) -> int:
+    def count_records(self, number: int) -> int:
+        """Return how many samples a group says that it has."""
         return int(self._mdf.groups[number].channel_group.cycles_nr)
 
     def _read(self, number: int, indices: dict[str, int]) -> Iterator[pl.DataFrame]:
         """Read channels of a group, some records at a time."""
         self._require_sound(number, indices)
-        records = self._records(number)
+        records = self.count_records(number)
         for start in range(0, max(records, 1), WINDOW_RECORDS):
             yield self._window(number, indices, start, min(WINDOW_RECORDS, records - start))
 
@@ -87,7 +92,7 @@ class MdfSource(ClockSource):
     def windows(self, number: int, indices: dict[str, int]) -> Iterator[list[Any]]:
         """Yield channels of a group as asammdf's signals, some records at a time."""
         self._require_sound(number, indices)
-        records = self._records(number)
+        records = self.count_records(number)
         for start in range(0, records, WINDOW_RECORDS):
             yield self._signals(number, indices, start, min(WINDOW_RECORDS, records - start))
 

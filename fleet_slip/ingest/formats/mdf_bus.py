@@ -37,7 +37,9 @@ class MdfBus(CanSource):
 
     def _read_trace(self) -> None:
         """Keep the frames of the wanted messages, and note the numbers of all."""
-        for number, places in self._mdf.groups_with(f"{_FRAME}ID"):
+        groups = [*self._mdf.groups_with(f"{_FRAME}ID")]
+        frames, passed = sum(self._mdf.count_records(number) for number, _ in groups), 0
+        for number, places in groups:
             names = ("ID", "DataBytes", "DataLength", "IDE", "BusChannel")
             there = {n: places[_FRAME + n] for n in names if _FRAME + n in places}
             if "DataBytes" not in there:
@@ -47,6 +49,8 @@ class MdfBus(CanSource):
                 )
             for window in self._mdf.windows(number, there):
                 self._keep(self._block(dict(zip(there, window, strict=True))))
+                passed += len(window[0])
+                self._budget.meter.pass_over(passed, frames)
         if not self._numbers:
             raise InputError(
                 f"{shown(self._file)}: there is no CAN frame in it ({_FRAME}ID). Map its channels "

@@ -43,7 +43,7 @@ class ParquetSource:
         self._file, self._stream = budget.file, stream
         parquet = pq.ParquetFile(stream)
         _require_within(budget, parquet.metadata)
-        self._schema = parquet.schema_arrow
+        self._schema, self._rows = parquet.schema_arrow, parquet.metadata.num_rows
         self._keys = {
             name: text
             for name, text in partition_keys(budget.file).items()
@@ -54,6 +54,10 @@ class ParquetSource:
         """Return the columns."""
         readable = [f.name for f in self._schema if is_readable(f.type)]
         return [Channel(name) for name in (*readable, *self._keys)]
+
+    def expected_rows(self, _columns: Sequence[str]) -> int:
+        """Return how many rows there are."""
+        return int(self._rows)
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield rows. Raises `InputError`."""

@@ -12,7 +12,6 @@ from typing import TypeVar
 
 import polars as pl
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.blf_frames import MAGIC as BLF_MAGIC
@@ -30,15 +29,15 @@ from fleet_slip.ingest.formats.mcap_records import MAGIC as MCAP_MAGIC
 from fleet_slip.ingest.formats.mdf import MAGICS as MDF_MAGICS
 from fleet_slip.ingest.formats.mdf import open_mdf
 from fleet_slip.ingest.formats.mdf_bus import open_mdf_bus
+from fleet_slip.ingest.formats.meter import Meter
 from fleet_slip.ingest.formats.parquet_batches import PARQUET_MAGIC, open_parquet
 from fleet_slip.ingest.formats.source import Source
 from fleet_slip.ingest.formats.tdms import MAGIC as TDMS_MAGIC
 from fleet_slip.ingest.formats.tdms import open_tdms
-from fleet_slip.ingest.logs.log_files import Log, parts_of
+from fleet_slip.ingest.logs.log_files import parts_of
 from fleet_slip.words import shown
 
 _ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
-_SAMPLE_BYTES = 2**18
 _BINARY = {
     (".parquet", ".pq"): "a Parquet file",
     (".mf4", ".mdf"): "an MDF file",
@@ -111,13 +110,13 @@ def log_digest(log: Path) -> "hashlib._Hash":
 
 
 @contextmanager
-def open_source(file: Path, formats: FileFormats) -> Iterator[Source]:
+def open_source(file: Path, formats: FileFormats, meter: Meter | None = None) -> Iterator[Source]:
     """Open a file, in the format that its first bytes tell. Raises `InputError`.
 
     Each format makes sure that the file stands for itself: that no value of it is to be fetched
     from another file, or computed, and that it is not far more than its `Budget` once decoded.
     """
-    budget = Budget.of(file)
+    budget = Budget.of(file, meter)
     with file.open("rb") as stream:
         start = stream.read(HDF5_AT + len(HDF5_MAGIC))
     for magic, program in _ARCHIVES.items():
@@ -192,28 +191,3 @@ def file_errors(file: Path) -> Iterator[None]:
         raise InputError(
             f"{shown(file)}: cannot be read: {reason}. Is it complete? Copy or export it again."
         ) from None
-
-
-def expected_rows(log: Log) -> int:
-    """Return about how many rows a log has, for its progress; 0 where only reading it would tell.
-
-    A Parquet file says it, text has the lines of its begin throughout; objects are not asked.
-    Never raises for what is wrong with the log: who reads it does.
-    """
-    if not isinstance(log, Path):
-        return 0
-    try:
-        return sum(map(_expected_in, parts_of(log)))
-    except (InputError, OSError, pa.ArrowException):
-        return 0
-
-
-def _expected_in(file: Path) -> int:
-    with file.open("rb") as stream:
-        sample = stream.read(_SAMPLE_BYTES)
-    if sample.startswith(PARQUET_MAGIC):
-        return int(pq.read_metadata(file).num_rows)
-    lines = sample.count(b"\n") - 1  # without the header
-    if b"\0" in sample or lines < 1:
-        return 0
-    return round(file.stat().st_size * lines / len(sample))

@@ -72,6 +72,10 @@ class Source(Protocol):
         """Return all that can be read, in the file's order."""
         ...
 
+    def expected_rows(self, columns: Sequence[str]) -> int:
+        """Return about how many rows `batches` yields; 0 where only reading them would tell."""
+        ...
+
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield rows that have the named columns: text, 64-bit floats, dates or timestamps.
 
@@ -94,6 +98,10 @@ class ClockSource(ABC):
     @abstractmethod
     def bases(self, columns: Sequence[str]) -> list[Base]:
         """Return the time bases that have one of the columns. Raises `InputError`."""
+
+    def expected_rows(self, columns: Sequence[str]) -> int:
+        """Return how many rows the time bases have together."""
+        return sum(base.count_rows() for base in self.bases(columns))
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield the rows of each time base that has one of the columns, base by base."""

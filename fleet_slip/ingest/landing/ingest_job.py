@@ -90,7 +90,7 @@ def ingest_files(
     process take those of small files only, since a large one keeps all cores and much of the
     memory busy by itself. `known` remembers what landed. A recording that is there is refused,
     unless it is to be replaced: then `superseding` takes it out in the same commit.
-    `progress` counts rows of each file as it is read, but for those that an executor's workers
+    `progress` counts bytes of each file as it is read, but for those that an executor's workers
     read.
 
     A file that is not usable does not hold up the others: when they are done `InputError` tells

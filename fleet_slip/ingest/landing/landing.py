@@ -20,7 +20,6 @@ from fleet_slip.ingest.drives.file_totals import IngestCounts
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive, drive_id
 from fleet_slip.ingest.drives.stream import MeasuredStream, open_measured
 from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
-from fleet_slip.ingest.formats.reading import expected_rows
 from fleet_slip.ingest.landing import data_files
 from fleet_slip.ingest.landing.allowed_rows import car_of, keep_drives, keep_refused, names_in
 from fleet_slip.ingest.landing.data_files import DataFiles, Part, Rows, TableName, digest_of
@@ -101,7 +100,7 @@ def write_batch(
     A file that cannot be used is a failure of its own, and nothing of it is written. What landed
     before is not written again, nor a recording that is there, unless that is to give way. The
     longest drive of what is new is looked at: one of a batch, so that a folder of small files is
-    not held up. `progress` counts rows of each file.
+    not held up. `progress` counts bytes of each file.
     """
     audit = Audit(warehouse.root)
     forgotten = audit.begun()
@@ -119,13 +118,16 @@ def write_batch(
         }
         for asked in files:
             try:
-                with copies.of(asked.file) as file, open_measured(file, mapping) as stream:
+                with (
+                    copies.of(asked.file) as file,
+                    open_measured(file, mapping, progress) as stream,
+                ):
                     if not tables["logs"].lacks(stream.digest) and let_return(
                         warehouse, stream.digest, drive_id(stream.prefix, 0)
                     ):
                         for name, stored in tables_of(warehouse).items():
                             landed[name] = stored.snapshot().landed_among(len(files))
-                    outcome, drive, rest = _write_file(stream, asked.file, tables, audit, progress)
+                    outcome, drive, rest = _write_file(stream, asked.file, tables, audit)
                     if outcome.is_new:
                         earlier = asked.earlier
                         if earlier and not landed["logs"](data_files.unit_of(earlier).name):
@@ -163,7 +165,6 @@ def _write_file(
     file: Log,
     tables: dict[TableName, DataFiles],
     audit: Audit,
-    progress: Progress,
 ) -> tuple[FileOutcome, MeasuredDrive | None, dict[TableName, Rows]]:
     """Read a file, write all but its last rows; return what it became, its longest drive, these."""
     is_new = tables["logs"].lacks(stream.digest)
@@ -173,7 +174,7 @@ def _write_file(
     longest: MeasuredDrive | None = None
     left_out, vehicles, ticks = set[str](), set[str](), 0
     spots: list[tuple[str, Spots]] = []
-    for drives in _groups(_read_drives(stream, refused, progress)):
+    for drives in _groups(_read_drives(stream, refused)):
         longest = max([*([longest] if longest else []), *drives], key=lambda one: one.ticks.size)
         kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), audit)
         left_out |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in kept}
@@ -208,17 +209,9 @@ def _write_file(
     return outcome, longest, rest
 
 
-def _read_drives(
-    stream: MeasuredStream, refused: "_RefusedRows", progress: Progress
-) -> Iterator[MeasuredDrive]:
-    """Yield the drives of a file; keep its refused rows, and tell how many rows were read."""
-    expected = expected_rows(stream.file) if progress is not no_progress else 0
-    read = 0
+def _read_drives(stream: MeasuredStream, refused: "_RefusedRows") -> Iterator[MeasuredDrive]:
+    """Yield the drives of a file; keep its refused rows."""
     for piece in stream.pieces():
-        rows = stream.checker.rows
-        if expected:
-            progress(rows - read, max(expected, rows))
-        read = rows
         refused.add(piece.refused)
         yield from piece.drives
 
