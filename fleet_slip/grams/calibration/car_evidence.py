@@ -26,11 +26,17 @@ ROADS = 8
 """So many drives are as good as endless ones: more are on the same roads again, whose slopes are
 the same."""
 
+LEAST_PART = 1e-9
+"""A drive of which the others of its car are less than this part has no other to differ from."""
+
+PAIRS = 300
+"""Cars of which two drives are compared: enough to tell a variance to a tenth."""
+
 LASTING: Mapping[bool, Mapping[NumberName, float]] = {
     False: {
         "yaw_rate_offset_by_wheels": 0.001,
-        "steering_offset": 0.00002,
-        "speed_ratio": 0.001,
+        "steering_offset": 0.00004,
+        "speed_ratio": 0.0015,
     },
     True: {
         "yaw_rate_offset": 0.0007,
@@ -42,6 +48,10 @@ LASTING: Mapping[bool, Mapping[NumberName, float]] = {
 """Standard errors that no drive takes away, on flat and on banked roads: noise flattens and wheels
 slip. Where bends are banked, a body that leans 2 to 6 degrees per g makes its accelerometer say 3
 to 10 % more, which is no speed."""
+
+OF_A_DRIVE: Mapping[NumberName, float] = {"yaw_rate_offset_by_wheels": 0.002}
+"""Standard error that each drive adds however much it tells: a circuit turns to one side more than
+to the other, and makes wheels slip to that side. Two drives on one circuit do not show it."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +96,7 @@ class CarEvidence:
         offsets = [told["ay_offset"].value for told in self.told.values() if "ay_offset" in told]
         self.roads = roads_of(self._banked, offsets)
         self.variances = self._variances()
+        self.variances_of_one = self._variances_of_one()
 
     def slices(self, car: str, first: int = 0, last: int | None = None) -> dict[str, slice]:
         """Return where the drives `first` to `last` of a car stand, by kind."""
@@ -118,25 +129,48 @@ class CarEvidence:
         """Return the variance of residuals, as drives differ, of each number's plane.
 
         A drive's shift, about its car's number, has the variance times its share times one less
-        the part of the share in the car's.
+        the part of the share in the car's. Every drive counts the same: errors do not grow with
+        shares as noise does, and drives that tell little would decide for those that tell much.
         """
-        squares: dict[NumberName, list[float]] = {}
-        expected: dict[NumberName, list[float]] = {}
+        ratios: dict[NumberName, list[float]] = {}
         for car, told in self.told.items():
             for name, telling in told.items():
                 found = self.influence(telling, self.slices(car)[telling.kind])
-                if found is None or len(found.shifts) < 2:
+                if found is None:
                     continue
-                shares = found.shares
-                squares.setdefault(name, []).extend((found.shifts**2).tolist())
-                expected.setdefault(name, []).extend(
-                    (shares * (1 - shares / shares.sum())).tolist()
+                expected = found.shares * (1 - found.shares / found.shares.sum())
+                alone = expected <= LEAST_PART * found.shares
+                ratios.setdefault(name, []).extend(
+                    (found.shifts[~alone] ** 2 / expected[~alone]).tolist()
                 )
-        return {
-            name: sum(squares[name]) / total
-            for name in squares
-            if (total := sum(expected[name])) > 0
-        }
+        return {name: sum(some) / len(some) for name, some in ratios.items() if some}
+
+    def _variances_of_one(self) -> dict[NumberName, float]:
+        """Return the same of the numbers that one drive tells: how far a car's first two differ.
+
+        What makes roads differ, such as the bank of their bends, moves a number that several roads
+        tell at once; one road alone explains its own.
+        """
+        ratios: dict[NumberName, list[float]] = {}
+        pairs = [
+            car for car in self.cars if all(s.stop - s.start > 1 for s in self.slices(car).values())
+        ]
+        for car in pairs[:PAIRS]:
+            one, other = (self._of_drive(car, drive) for drive in (0, 1))
+            for name in one.keys() & other.keys():
+                apart = one[name][0] - other[name][0]
+                ratios.setdefault(name, []).append(apart**2 / (one[name][1] + other[name][1]))
+        return {name: sum(some) / len(some) for name, some in ratios.items()}
+
+    def _of_drive(self, car: str, drive: int) -> dict[NumberName, tuple[float, float]]:
+        """Return the numbers that a drive alone tells, and their shares."""
+        at = self.slices(car, drive, drive + 1)
+        found = {}
+        for name, telling in self.tell(at).items():
+            influence_of_it = self.influence(telling, at[telling.kind])
+            if influence_of_it is not None:
+                found[name] = float(telling.value), float(influence_of_it.shares.sum())
+        return found
 
     def uncertainties(
         self, told: Mapping[NumberName, Telling], slices: Mapping[str, slice]
@@ -146,8 +180,11 @@ class CarEvidence:
         for name, telling in told.items():
             found = self.influence(telling, slices[telling.kind])
             if found is not None and name in self.variances:
-                again = 1 + len(found.shares) / ROADS
-                own[name] = self.variances[name] * float(found.shares.sum()) * again
+                drives = len(found.shares)
+                of_one = self.variances_of_one if drives == 1 else self.variances
+                told_by_it = of_one.get(name, self.variances[name]) * float(found.shares.sum())
+                of_roads = OF_A_DRIVE.get(name, 0.0) ** 2 / drives
+                own[name] = told_by_it * (1 + drives / ROADS) + of_roads
         for name in own:
             by_satellite = LASTING_BY_SATELLITE.get(told[name].kind, {})
             own[name] += {**LASTING[self._banked], **by_satellite}.get(name, 0.0) ** 2

@@ -35,6 +35,7 @@ from tests.support.logs import land, log_rows
 
 DAY = date(2024, 5, 1)
 TRUE = {"yaw_rate_offset": 0.013, "ay_offset": -0.21, "steering_offset": 0.004}
+NONE_OFF = dict.fromkeys(TRUE, 0.0)
 COLUMNS = features().feature_set("calibration").columns[:-1]
 
 
@@ -156,12 +157,14 @@ def test_the_wheels_tell_the_radius_and_the_steering_the_wheelbase() -> None:
     assert found["yaw_rate_offset_by_wheels"].value == pytest.approx(0.013, abs=3e-4)
 
 
-def on_real_roads(rng: np.random.Generator, offsets: dict[str, float]) -> dict[str, Any]:
+def on_real_roads(
+    rng: np.random.Generator, offsets: dict[str, float], bank: float = -20
+) -> dict[str, Any]:
     """Return the counts of a drive where bends are banked, roads fall and wheels differ."""
 
     def change(signals: cars.Signals) -> None:
         speed = cars.RADIUS_M * sum(signals[f"wheel_{c}"] for c in ("fl", "fr", "rl", "rr")) / 4
-        signals["ay"] += offsets["ay_offset"] + 0.2 - 20 * signals["yaw_rate"] / speed
+        signals["ay"] += offsets["ay_offset"] + 0.2 + bank * signals["yaw_rate"] / speed
         signals["yaw_rate"] += offsets["yaw_rate_offset"]
         signals["wheel_rr"] *= 1.004
 
@@ -197,6 +200,22 @@ def test_roads_that_lean_and_are_banked_are_taken_out() -> None:
     assert not found.refusals("car-03")
     on_these_roads = alone.calibrated("car-03", leaning=True)["ay_offset"].value
     assert on_these_roads == pytest.approx(true["car-03"]["ay_offset"] + 0.2, abs=0.1)
+
+
+def test_one_drive_is_as_sure_as_it_is_where_roads_differ() -> None:
+    """A road's bank is its own: one drive explains it, and several at once do not."""
+    rng = np.random.default_rng(31)
+    rows = [
+        gram_row(f"car-{i:02d}", n, on_real_roads(rng, NONE_OFF, bank=-rng.uniform(10, 60)))
+        for i in range(15)
+        for n in range(4)
+    ]
+    found = evidence(rows)
+    assert found.roads.banked
+    told = [found.calibrated(car, drives=1).get("yaw_rate_offset") for car in found.cars]
+    squares = [(one.value / one.uncertainty) ** 2 for one in told if one and one.uncertainty]
+    assert len(squares) > 12
+    assert 0.33 < np.mean(squares) < 2
 
 
 def test_bends_too_tight_for_their_bank_tell_no_speed() -> None:
