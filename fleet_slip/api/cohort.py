@@ -1,9 +1,16 @@
 """Drives that satisfy a condition, and what Gram rows tell of them."""
 
-from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import Rooted, open_workers, takes
+from fleet_slip.api.requests import (
+    DiagnosisRequest,
+    ExaminedRequest,
+    FoldedRequest,
+    RegimesRequest,
+    ShrinkRequest,
+    WhatIfRequest,
+)
 from fleet_slip.errors import UsageError
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.warehouse.tables import Warehouse
@@ -11,10 +18,8 @@ from fleet_slip.warehouse.tables import Warehouse
 if TYPE_CHECKING:
     from fleet_slip.api.examined_model import ExaminedModel
     from fleet_slip.comparison.observers.identification import Identified
-    from fleet_slip.grams.cohorts.folding import Folding, FoldKey
+    from fleet_slip.grams.cohorts.folding import Folding
     from fleet_slip.grams.cohorts.gram_cohort import Cohort
-    from fleet_slip.models.model_version import ModelVersion
-    from fleet_slip.regression.inference.drive_moments import ClusterUnit
     from fleet_slip.selection.diagnostics import Diagnosis
     from fleet_slip.selection.regimes import RegimeComparison
     from fleet_slip.selection.select_models import RequestedSelection
@@ -48,133 +53,82 @@ class FleetCohort(Rooted):
 
         return answer_request(self.warehouse, request, self.condition)
 
-    def diagnose(
-        self,
-        model: "str | ModelVersion | None" = None,
-        *,
-        signals: str | None = None,
-        features: str | None = None,
-        against: str | None = None,
-        serial: bool = False,
-        sensor_noise: Mapping[str, float] | None = None,
-        cluster: "ClusterUnit | None" = None,
-    ) -> "Diagnosis":
+    @takes(DiagnosisRequest)
+    def diagnose(self, request: DiagnosisRequest) -> "Diagnosis":
         """Fit a model's signals to the cohort and examine the fit.
-
-        Args:
-            model: a published model, by default the only one.
-            signals: instead of a model, inputs separated by commas, or `catalogue` for all.
-            features: the feature set that `signals` are of.
-            against: condition of another cohort: does it have the same coefficients?
-            serial: Durbin-Watson and AR(1) least squares, from what `fleet.gram("lags")` makes.
-            sensor_noise: standard deviations of the noise in the logs, in SI units by signal: shows
-                the coefficients without it (errors in variables).
-            cluster: what is independent evidence, as in `select`.
 
         Raises `UsageError` for both a model and signals, and what `Fleet.model` raises.
         """
         from fleet_slip.catalogue.features import features as known
         from fleet_slip.selection.diagnostics import diagnose
 
-        examined = self._examined(model, signals, features)
-        cohort = self._load(examined.feature_set)
+        examined = self._examined(request)
+        cohort, against = self._load(examined.feature_set), request.against
         lagged = next(name for name, one in known().sets.items() if one.lagged)
         return diagnose(
             cohort,
             examined.inputs(cohort),
-            lagged=self._load(lagged) if serial else None,
+            lagged=self._load(lagged) if request.serial else None,
             against=self._load(examined.feature_set, against) if against else None,
-            sensor_noise=sensor_noise,
-            cluster=cluster,
+            sensor_noise=request.sensor_noise,
+            cluster=request.cluster,
             intercept=examined.intercept,
         )
 
-    def what_if(
-        self,
-        model: "str | ModelVersion | None" = None,
-        *,
-        noise: Mapping[str, float] | None = None,
-        bias: Mapping[str, float] | None = None,
-        signals: str | None = None,
-        features: str | None = None,
-    ) -> "WhatIf":
+    @takes(WhatIfRequest)
+    def what_if(self, request: WhatIfRequest) -> "WhatIf":
         """Predict a model's error with worse sensors, in closed form, and the best model for these.
 
-        `noise` (standard deviation of white noise) and `bias`, in SI units by signal, come on top
-        of what the logs have; the rest is as in `diagnose`. Raises `UsageError` if nothing is added
-        or both a model and signals are named, `QuestionError` for a signal inside a feature, and
-        what `Fleet.model` raises.
+        Raises `UsageError` if nothing is added or both a model and signals are named,
+        `QuestionError` for a signal inside a feature, and what `Fleet.model` raises.
         """
         from fleet_slip.catalogue.signals import catalogue
         from fleet_slip.models.estimates.counts_model import counts_model
         from fleet_slip.regression.exact.least_squares import fit
         from fleet_slip.selection.what_if import what_if
 
+        noise, bias = request.noise or {}, request.bias or {}
         if not noise and not bias:
             raise UsageError(
                 "say what is added: noise such as ay=0.2, or bias such as yaw_rate=0.02."
             )
-        examined = self._examined(model, signals, features)
+        examined = self._examined(request)
         cohort = self._load(examined.feature_set)
         if examined.version is not None:
             one = counts_model(examined.version.manifest)
         else:
             inputs = examined.inputs(cohort)
             one = fit(cohort.serving(inputs).table.total(), inputs, catalogue().label).model
-        return what_if(
-            cohort, one, bias=bias or {}, noise=noise or {}, intercept=examined.intercept
-        )
+        return what_if(cohort, one, bias=bias, noise=noise, intercept=examined.intercept)
 
-    def regimes(
-        self,
-        signals: str | None = None,
-        *,
-        model: "str | ModelVersion | None" = None,
-        over: Sequence[str] = (),
-        features: str | None = None,
-        by: "FoldKey" = "drive",
-        folds: int | str | None = None,
-        worth: str | None = None,
-    ) -> "RegimeComparison":
+    @takes(RegimesRequest)
+    def regimes(self, request: RegimesRequest) -> "RegimeComparison":
         """Return a model's error by speed and lateral acceleration, and whether to split it there.
 
-        One model for all rows is cross-validated against one a regime. `signals` are inputs
-        separated by commas, by default those of `model`, or all; `over` the regimes, by default all
-        of `features` (`fleet.gram("regimes")` makes them), by default the first set that divides
-        rows and has the inputs; `worth` as in `select`. Raises
+        One model for all rows is cross-validated against one a regime, from what
+        `fleet.gram("regimes")` makes. Raises `UsageError` for both a model and signals, and
         `DataError` for a feature set without such regimes.
         """
         from fleet_slip.selection.regimes import compare_regimes, divided_set
         from fleet_slip.selection.request import parse_worth
 
-        gain = parse_worth(worth)
-        if model is not None:
-            if signals is not None:
-                raise UsageError("name a published model or signals, not both.")
-            version = self._examined(model, None, None).version
+        gain, signals = parse_worth(request.worth), request.signals
+        if request.model is not None:
+            version = self._examined(ExaminedRequest(request.model, signals=signals)).version
             signals = ",".join(version.manifest.signals) if version else None
-        features = features or divided_set(signals)
-        return compare_regimes(*self._dealt(signals, features, by, folds), over, gain)
+        features = request.features or divided_set(signals)
+        return compare_regimes(*self._dealt(request, signals, features), request.over, gain)
 
-    def shrink(
-        self,
-        signals: str | None = None,
-        *,
-        features: str = "signals",
-        by: "FoldKey" = "drive",
-        folds: int | str | None = None,
-        naive: bool = False,
-        cluster: "ClusterUnit | None" = None,
-    ) -> "tuple[Shrunk, ...]":
+    @takes(ShrinkRequest)
+    def shrink(self, request: ShrinkRequest) -> "tuple[Shrunk, ...]":
         """Compare least squares with ridge, lasso, James-Stein and Pace regression.
 
-        Penalties are chosen by cross-validation inside each training fold. `signals` are inputs of
-        the feature set separated by commas, by default all; `naive` and `cluster` as in `select`.
+        Penalties are chosen by cross-validation inside each training fold.
         """
         from fleet_slip.selection.shrinkage import compare_shrinkage
 
-        dealt = self._dealt(signals, features, by, folds)
-        return compare_shrinkage(*dealt, naive=naive, cluster=cluster)
+        dealt = self._dealt(request, request.signals, request.features)
+        return compare_shrinkage(*dealt, naive=request.naive, cluster=request.cluster)
 
     def identify(self, name: str, *, threads: int | None = None, **measured: float) -> "Identified":
         """Identify the tyres and the yaw inertia of the car that made the cohort's drives.
@@ -201,19 +155,18 @@ class FleetCohort(Rooted):
         return load_cohort(self.warehouse, condition or self.condition, feature_set)
 
     def _dealt(
-        self, signals: str | None, features: str, by: "FoldKey", folds: int | str | None
+        self, request: FoldedRequest, signals: str | None, features: str
     ) -> "tuple[Cohort, tuple[str, ...], Folding]":
         """Return the cohort, the inputs that are asked for, and how it is dealt into folds."""
         from fleet_slip.grams.cohorts.folding import Folding, make_folding
         from fleet_slip.selection.model_list import WHOLE_SET, inputs_of
 
-        folding, cohort = make_folding(by, folds, Folding().count), self._load(features)
+        folding = make_folding(request.by, request.folds, Folding().count)
+        cohort = self._load(features)
         return cohort, inputs_of(cohort, signals or WHOLE_SET), folding
 
-    def _examined(
-        self, model: "str | ModelVersion | None", signals: str | None, features: str | None
-    ) -> "ExaminedModel":
+    def _examined(self, request: ExaminedRequest) -> "ExaminedModel":
         from fleet_slip.api.examined_model import subject_of
         from fleet_slip.models.versions import Registry
 
-        return subject_of(Registry(self.root / "models"), model, signals, features)
+        return subject_of(Registry(self.root / "models"), request)

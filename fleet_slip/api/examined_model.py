@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from fleet_slip.api.requests import ExaminedRequest
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.errors import UsageError
@@ -31,17 +32,13 @@ class ExaminedModel:
         return inputs_of(cohort, self.named or WHOLE_SET)
 
 
-def subject_of(
-    registry: Registry,
-    model: str | ModelVersion | None,
-    signals: str | None,
-    feature_set: str | None,
-) -> ExaminedModel:
+def subject_of(registry: Registry, request: ExaminedRequest) -> ExaminedModel:
     """Return what is examined, by default the only model. Raises `UsageError` for both kinds."""
-    if signals is not None or feature_set is not None:
+    model = request.model
+    if request.signals is not None or request.features is not None:
         if model is not None:
             raise UsageError("name a published model or signals (of a feature set), not both.")
-        return ExaminedModel(feature_set or PLAIN, signals, None)
+        return ExaminedModel(request.features or PLAIN, request.signals, None)
     if model is None:
         model = registry.only(", or signals")
     version = model if isinstance(model, ModelVersion) else registry.resolve(model)

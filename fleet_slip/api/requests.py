@@ -1,9 +1,9 @@
-"""What a run, a night and forgetting take, said once: for the methods of `Fleet` and for commands.
+"""What calls take that commands take too, said once: for `Fleet`, `FleetCohort` and commands.
 
 A field with a `Doc` is an option of the command, too; the others are of Python alone.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from datetime import date
 from pathlib import Path
@@ -12,11 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from typing_extensions import Doc
 
 from fleet_slip.api.calls import ShowProgress, ShowStep, Workers
+from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import UsageError
-from fleet_slip.selection.request import DEFAULT_MODELS, WORTH
+from fleet_slip.grams.cohorts.folding import FoldKey
+from fleet_slip.regression.inference.drive_moments import ClusterUnit
+from fleet_slip.selection.request import CLUSTER, DEFAULT_MODELS, NAIVE, WORTH
 
 if TYPE_CHECKING:
+    from fleet_slip.models.model_version import ModelVersion
     from fleet_slip.simulation.campaign import Campaign
 
 Subject = Literal["vehicle", "drive", "drive_name", "source_file"]
@@ -98,3 +102,118 @@ class ForgetRequest:
         if len(given) != 1:
             raise UsageError("give one of vehicle, drive, drive_name and source_file.")
         return given[0]
+
+
+SIGNALS = Doc(
+    "Instead of a published model: signals to fit, separated by commas; 'catalogue' is all inputs."
+)
+
+
+@dataclass(frozen=True)
+class ExaminedRequest:
+    """What is examined: a published model, or signals that are named."""
+
+    model: Annotated[
+        "str | ModelVersion | None",
+        Doc(
+            "NAME, NAME@VERSION or NAME@ALIAS of a published model. Default: the only one that "
+            "there is, unless `signals` is given."
+        ),
+    ] = None
+    _: KW_ONLY
+    signals: Annotated[str | None, SIGNALS] = None
+    features: Annotated[
+        str | None, Doc("Feature set that `signals` are of. Default: the logged signals.")
+    ] = None
+
+
+@dataclass(frozen=True)
+class DiagnosisRequest(ExaminedRequest):
+    """What `FleetCohort.diagnose` takes."""
+
+    _: KW_ONLY
+    against: Annotated[
+        str | None, Doc("Condition of another cohort: does it have the same coefficients?")
+    ] = None
+    serial: Annotated[
+        bool,
+        Doc(
+            "Durbin-Watson and AR(1) generalised least squares, from lagged Gram rows: fleet-slip "
+            "gram --features lags"
+        ),
+    ] = False
+    sensor_noise: Annotated[
+        Mapping[str, float] | None,
+        Doc(
+            "Noise that the logs already have, such as ay=0.1 in SI units, once for each signal: "
+            "shows the coefficients without it (errors in variables)."
+        ),
+    ] = None
+    cluster: Annotated[ClusterUnit | None, CLUSTER] = None
+
+
+@dataclass(frozen=True)
+class WhatIfRequest(ExaminedRequest):
+    """What `FleetCohort.what_if` takes; both come on top of what the logs have."""
+
+    _: KW_ONLY
+    noise: Annotated[
+        Mapping[str, float] | None,
+        Doc(
+            "Standard deviation of white noise that is added, in SI units, such as ay=0.2, once "
+            "for each signal."
+        ),
+    ] = None
+    bias: Annotated[
+        Mapping[str, float] | None,
+        Doc("Bias that is added, in SI units, such as yaw_rate=0.02, once for each signal."),
+    ] = None
+
+
+@dataclass(frozen=True)
+class FoldedRequest:
+    """Inputs of a feature set, and the folds that drives are dealt into."""
+
+    signals: Annotated[str | None, SIGNALS] = None
+    _: KW_ONLY
+    by: Annotated[FoldKey, Doc("What a fold is made of.")] = "drive"
+    folds: Annotated[
+        int | str | None,
+        Doc(
+            "Number of folds, or each: every drive, or whatever folds are made of, is a fold of "
+            "its own. Default: 5."
+        ),
+    ] = None
+
+
+@dataclass(frozen=True)
+class RegimesRequest(FoldedRequest):
+    """What `FleetCohort.regimes` takes."""
+
+    _: KW_ONLY
+    model: Annotated[
+        "str | ModelVersion | None",
+        Doc(
+            "NAME, NAME@VERSION or NAME@ALIAS of a published model, whose signals are taken. "
+            "Default: all signals, unless `signals` is given."
+        ),
+    ] = None
+    over: Annotated[
+        Sequence[str],
+        Doc("Regimes to divide by, separated by commas, such as speed. Default: all of the set's."),
+    ] = ()
+    features: Annotated[
+        str | None,
+        Doc("Feature set that divides rows by regimes. Default: the first with the signals."),
+    ] = None
+    worth: Annotated[str | None, WORTH] = None
+
+
+@dataclass(frozen=True)
+class ShrinkRequest(FoldedRequest):
+    """What `FleetCohort.shrink` takes."""
+
+    _: KW_ONLY
+    features: Annotated[str, Doc("Feature set that `signals` are of.")] = PLAIN
+    naive: Annotated[bool, NAIVE] = False
+    cluster: Annotated[ClusterUnit | None, CLUSTER] = None

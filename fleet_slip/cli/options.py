@@ -1,4 +1,4 @@
-"""Options that several commands share: a selection as one parameter, and what is examined."""
+"""Options of commands: those of a request as one parameter, and some that several share."""
 
 import functools
 import inspect
@@ -13,9 +13,6 @@ from fleet_slip.api.calls import documented, type_of
 from fleet_slip.cli.completing import complete_config, complete_feature_set, complete_model
 from fleet_slip.dates import date_of, last_day
 from fleet_slip.errors import UsageError
-from fleet_slip.grams.cohorts.folding import FoldKey
-from fleet_slip.regression.inference.drive_moments import ClusterUnit
-from fleet_slip.selection.request import SelectionRequest
 
 R = TypeVar("R")
 
@@ -34,9 +31,14 @@ DETAILS: dict[str, dict[str, Any]] = {
 
 READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "campaign": (str, str),
+    "bias": (list[str] | None, lambda values: quantities(values, "--bias")),
     "folds": (str | None, lambda folds: folds),
     "landing": (str, str),
+    "model": (str | None, lambda model: model),
     "night": (str | None, lambda night: date_of(night, "--night")),
+    "noise": (list[str] | None, lambda values: quantities(values, "--noise")),
+    "over": (str | None, lambda over: [one.strip() for one in over.split(",")] if over else ()),
+    "sensor_noise": (list[str] | None, lambda values: quantities(values, "--sensor-noise")),
     "through": (str | None, last_day),
 }
 """Fields of other types on the command line, and what reads them."""
@@ -45,10 +47,15 @@ RESAMPLING = ("repeat", "bootstrap")
 """Fields that tell more of a winner and choose none."""
 
 
-def option(request: type, name: str, *names: str) -> Any:
-    """Return the option for a field of a request, under other names if these are given."""
+def option(request: type, name: str, *names: str, argument: bool = False) -> Any:
+    """Return the option for a field of a request, under other names if these are given.
+
+    As an `argument` it is a published model.
+    """
     told = documented(request)
     text = _NAMED.sub(lambda one: "--" + one[1].replace("_", "-"), told[name])
+    if argument:
+        return typer.Argument(metavar="MODEL", help=text, autocompletion=complete_model)
     default = next(one.default for one in fields(request) if one.name == name)
     alone = (f"--{name.replace('_', '-')}",) if default is False else ()
     return typer.Option(*(names or alone), help=text, **DETAILS.get(name, {}))
@@ -58,20 +65,25 @@ _NAMED = re.compile("`([a-z_]+)`")
 
 
 def request_options(
-    request: type, *, without: Collection[str] = (), **names: str
+    request: type, *, without: Collection[str] = (), argument: str = "", **names: str
 ) -> Callable[[Callable[..., R]], Callable[..., R]]:
     """Give a command the options of a request in place of its parameter of that type.
 
-    `names` are options that are called otherwise than their fields.
+    `names` are options that are called otherwise than their fields; the `argument` names a model.
     """
     given = [
         inspect.Parameter(
             one.name,
             inspect.Parameter.KEYWORD_ONLY,
-            default=inspect.Parameter.empty if one.default is MISSING else one.default,
+            default={MISSING: inspect.Parameter.empty, (): None}.get(one.default, one.default),
             annotation=Annotated[
                 READ[one.name][0] if one.name in READ else type_of(one.type),
-                option(request, one.name, *filter(None, [names.get(one.name)])),
+                option(
+                    request,
+                    one.name,
+                    *filter(None, [names.get(one.name)]),
+                    argument=one.name == argument,
+                ),
             ],
         )
         for one in fields(request)
@@ -109,34 +121,6 @@ Unexamined = Annotated[
     typer.Option(
         "--unexamined",
         help="Take drives whose sensors are not in order, too. As a rule all are examined first.",
-    ),
-]
-By = Annotated[FoldKey, typer.Option(help="What a fold is made of.")]
-FoldCount = Annotated[str | None, option(SelectionRequest, "folds")]
-Worth = Annotated[str | None, option(SelectionRequest, "worth")]
-Naive = Annotated[bool, option(SelectionRequest, "naive")]
-Cluster = Annotated[ClusterUnit | None, option(SelectionRequest, "cluster")]
-Model = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="MODEL",
-        help="NAME, NAME@VERSION or NAME@ALIAS of a published model. Default: the only one that "
-        "there is, unless --signals is given.",
-        autocompletion=complete_model,
-        show_default=False,
-    ),
-]
-Signals = Annotated[
-    str | None,
-    typer.Option(
-        help="Instead of a published model: signals to fit, separated by commas; 'catalogue' is "
-        "all inputs."
-    ),
-]
-FeatureSetOption = Annotated[
-    str | None,
-    typer.Option(
-        "--features", help="Feature set that --signals are of. Default: the logged signals."
     ),
 ]
 

@@ -39,6 +39,15 @@ WORTH = Doc(
     "the rule of the list."
 )
 
+NAIVE = Doc(
+    "Take rows for independent evidence, not drives or cars. At 100 Hz they are not: then every "
+    "criterion keeps nearly everything."
+)
+CLUSTER = Doc(
+    "What is independent evidence: vehicle, since a car's drives share its biases and tyres, or "
+    "drive. Default: vehicle where there are several, else drive."
+)
+
 _WORTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
 
 
@@ -117,20 +126,8 @@ class SelectionRequest:
             "say which; diagnose says it before."
         ),
     ] = False
-    naive: Annotated[
-        bool,
-        Doc(
-            "Take rows for independent evidence, not drives or cars. At 100 Hz they are not: then "
-            "every criterion keeps nearly everything."
-        ),
-    ] = False
-    cluster: Annotated[
-        ClusterUnit | None,
-        Doc(
-            "What is independent evidence: vehicle, since a car's drives share its biases and "
-            "tyres, or drive. Default: vehicle where there are several, else drive."
-        ),
-    ] = None
+    naive: Annotated[bool, NAIVE] = False
+    cluster: Annotated[ClusterUnit | None, CLUSTER] = None
     intercept: Annotated[
         bool,
         Doc(

@@ -14,7 +14,15 @@ import pytest
 from fleet_slip.api.calls import documented
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.api.requests import ForgetRequest, NightRequest, RunRequest
+from fleet_slip.api.requests import (
+    DiagnosisRequest,
+    ForgetRequest,
+    NightRequest,
+    RegimesRequest,
+    RunRequest,
+    ShrinkRequest,
+    WhatIfRequest,
+)
 from fleet_slip.cli.commands import COMMANDS, GROUPS, CommandGroup, load_command
 from fleet_slip.cli.options import RESAMPLING
 from fleet_slip.selection.request import SelectionRequest
@@ -119,16 +127,25 @@ def test_a_selections_options_stand_once_and_are_those_of_the_api() -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "request_type"),
-    [("run", RunRequest), ("nightly", NightRequest), ("forget", ForgetRequest)],
+    ("command", "request_type", "owner"),
+    [
+        ("run", RunRequest, Fleet),
+        ("nightly", NightRequest, Fleet),
+        ("forget", ForgetRequest, Fleet),
+        ("diagnose", DiagnosisRequest, FleetCohort),
+        ("what-if", WhatIfRequest, FleetCohort),
+        ("regimes", RegimesRequest, FleetCohort),
+        ("shrink", ShrinkRequest, FleetCohort),
+    ],
 )
 def test_options_are_the_fields_of_a_request_with_their_words(
-    command: str, request_type: type
+    command: str, request_type: type, owner: type
 ) -> None:
-    in_python = set(inspect.signature(getattr(Fleet, command)).parameters) - {"self"}
+    method = getattr(owner, command.replace("-", "_"))
+    in_python = set(inspect.signature(method).parameters) - {"self"}
     assert in_python == {field.name for field in fields(request_type)}
     taken = {one.name: one.help for one in load_command(command).params}
     told = documented(request_type)
     assert told
-    assert {name: taken[name] for name in told} == told
-    assert all(text in getattr(Fleet, command).__doc__ for text in told.values())
+    assert {name: taken[name].replace("--signals", "`signals`") for name in told} == told
+    assert all(text in method.__doc__ for text in told.values())

@@ -1,46 +1,24 @@
 """The command diagnose: a model's coefficients on a cohort, and how far to trust them."""
 
-from typing import Annotated
-
 import typer
 
+from fleet_slip.api.requests import DiagnosisRequest
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.left_out import say_influential
-from fleet_slip.cli.options import Cluster, Cohort, FeatureSetOption, Model, Signals, quantities
+from fleet_slip.cli.options import Cohort, request_options
 from fleet_slip.cli.output import Json, print_json, print_line, print_table, say
 from fleet_slip.regression.inference.standard_errors import INTERCEPT, Estimate
 from fleet_slip.selection.diagnostics import CohortComparison, Diagnosis
 from fleet_slip.words import number_of
 
 
+@request_options(DiagnosisRequest, argument="model")
 def diagnose(
     context: typer.Context,
-    model: Model = None,
-    signals: Signals = None,
-    feature_set: FeatureSetOption = None,
+    request: DiagnosisRequest,
     cohort: Cohort = TRAINING_DRIVES,
-    against: Annotated[
-        str | None,
-        typer.Option(help="Condition of another cohort: does it have the same coefficients?"),
-    ] = None,
-    serial: Annotated[
-        bool,
-        typer.Option(
-            "--serial",
-            help="Durbin-Watson and AR(1) generalised least squares, from lagged Gram rows: "
-            "fleet-slip gram --features lags",
-        ),
-    ] = False,
-    cluster: Cluster = None,
-    sensor_noise: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Noise that the logs already have, such as ay=0.1 in SI units: shows the "
-            "coefficients without it (errors in variables). May be repeated."
-        ),
-    ] = None,
     json: Json = False,
 ) -> None:
     """Fit a model's signals to a cohort and examine the fit, from Gram rows.
@@ -50,15 +28,7 @@ def diagnose(
 
     Example: **fleet-slip diagnose waterford**
     """
-    result = context.obj.cohort(cohort).diagnose(
-        model,
-        signals=signals,
-        features=feature_set,
-        against=against,
-        serial=serial,
-        sensor_noise=quantities(sensor_noise, "--sensor-noise"),
-        cluster=cluster,
-    )
+    result = context.obj.cohort(cohort).diagnose(**vars(request))
     if json:
         print_json({"cohort": cohort, **result.as_dict()})
     else:

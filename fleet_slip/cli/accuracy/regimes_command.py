@@ -1,50 +1,22 @@
 """The command that shows a model's error by regime: regimes."""
 
 import math
-from typing import Annotated
 
 import typer
 
+from fleet_slip.api.requests import RegimesRequest
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.completing import complete_model
-from fleet_slip.cli.options import By, Cohort, FoldCount, Signals, Worth
+from fleet_slip.cli.options import Cohort, request_options
 from fleet_slip.cli.output import Json, print_json, print_line, print_table
 from fleet_slip.selection.regimes import RegimeComparison
 from fleet_slip.words import number_of
 
 
+@request_options(RegimesRequest, argument="model")
 def regimes(
     context: typer.Context,
-    model: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="MODEL",
-            help="NAME, NAME@VERSION or NAME@ALIAS of a published model, whose signals are taken. "
-            "Default: all signals, unless --signals is given.",
-            autocompletion=complete_model,
-            show_default=False,
-        ),
-    ] = None,
-    signals: Signals = None,
-    over: Annotated[
-        str | None,
-        typer.Option(
-            help="Regimes to divide by, separated by commas, such as speed. Default: all of the "
-            "set's."
-        ),
-    ] = None,
+    request: RegimesRequest,
     cohort: Cohort = TRAINING_DRIVES,
-    feature_set: Annotated[
-        str | None,
-        typer.Option(
-            "--features",
-            help="Feature set that divides rows by regimes. Default: the first with the signals.",
-            show_default=False,
-        ),
-    ] = None,
-    by: By = "drive",
-    folds: FoldCount = None,
-    worth: Worth = None,
     json: Json = False,
 ) -> None:
     """Show a model's error by speed and lateral acceleration, and whether to split it there.
@@ -54,20 +26,11 @@ def regimes(
 
     Example: **fleet-slip regimes --over speed**
     """
-    divided_by = [name.strip() for name in over.split(",")] if over else []
-    result: RegimeComparison = context.obj.cohort(cohort).regimes(
-        signals,
-        model=model,
-        over=divided_by,
-        features=feature_set,
-        by=by,
-        folds=folds,
-        worth=worth,
-    )
+    result: RegimeComparison = context.obj.cohort(cohort).regimes(**vars(request))
     if json:
         print_json({"cohort": cohort, **result.as_dict()})
     else:
-        _print_regimes(result, by)
+        _print_regimes(result, request.by)
 
 
 def _print_regimes(result: RegimeComparison, by: str) -> None:

@@ -2,23 +2,19 @@
 
 import typer
 
-from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.api.requests import ShrinkRequest
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.options import By, Cluster, Cohort, FeatureSetOption, FoldCount, Naive, Signals
+from fleet_slip.cli.options import Cohort, request_options
 from fleet_slip.cli.output import Json, cell, figures_cells, print_json, print_table
 from fleet_slip.selection.shrinkage import Shrunk
 from fleet_slip.words import number_of
 
 
+@request_options(ShrinkRequest)
 def shrink(
     context: typer.Context,
-    signals: Signals = None,
-    feature_set: FeatureSetOption = None,
+    request: ShrinkRequest,
     cohort: Cohort = TRAINING_DRIVES,
-    by: By = "drive",
-    folds: FoldCount = None,
-    naive: Naive = False,
-    cluster: Cluster = None,
     json: Json = False,
 ) -> None:
     """Compare least squares with ridge, lasso, James-Stein and Pace regression.
@@ -28,16 +24,15 @@ def shrink(
 
     Example: **fleet-slip shrink --signals ay,yaw_rate**
     """
-    found: tuple[Shrunk, ...] = context.obj.cohort(cohort).shrink(
-        signals, features=feature_set or PLAIN, by=by, folds=folds, naive=naive, cluster=cluster
-    )
+    found: tuple[Shrunk, ...] = context.obj.cohort(cohort).shrink(**vars(request))
     inputs = found[0].cross_validation.signals  # least squares keeps all
     if json:
         print_json({"cohort": cohort, "methods": found})
         return
     first = found[0].cross_validation
     print_table(
-        f"{number_of(first.drives, 'drive')}, {number_of(len(first.folds), 'fold')} by {by}",
+        f"{number_of(first.drives, 'drive')}, {number_of(len(first.folds), 'fold')} by "
+        f"{request.by}",
         ["method", "signals kept", "penalty", "correlation", "RMSE deg", "mean deg", "std deg"],
         [
             [

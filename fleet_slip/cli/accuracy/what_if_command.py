@@ -1,33 +1,20 @@
 """The command that predicts a model's error with worse sensors: what-if."""
 
-from typing import Annotated
-
 import typer
 
+from fleet_slip.api.requests import WhatIfRequest
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.options import Cohort, FeatureSetOption, Model, Signals, quantities
+from fleet_slip.cli.options import Cohort, request_options
 from fleet_slip.cli.output import Json, figures_cells, print_json, print_table
 from fleet_slip.regression.inference.standard_errors import INTERCEPT
 from fleet_slip.selection.what_if import WhatIf
 from fleet_slip.words import number_of
 
 
+@request_options(WhatIfRequest, argument="model")
 def what_if(
     context: typer.Context,
-    model: Model = None,
-    noise: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="White noise that is added, as SIGNAL=STANDARD_DEVIATION in SI units, such as "
-            "ay=0.2. May be repeated."
-        ),
-    ] = None,
-    bias: Annotated[
-        list[str] | None,
-        typer.Option(help="Bias that is added, such as yaw_rate=0.02. May be repeated."),
-    ] = None,
-    signals: Signals = None,
-    feature_set: FeatureSetOption = None,
+    request: WhatIfRequest,
     cohort: Cohort = TRAINING_DRIVES,
     json: Json = False,
 ) -> None:
@@ -37,12 +24,10 @@ def what_if(
 
     Example: **fleet-slip what-if waterford --noise ay=0.2 --bias yaw_rate=0.02**
     """
-    noises, biases = quantities(noise, "--noise"), quantities(bias, "--bias")
-    result: WhatIf = context.obj.cohort(cohort).what_if(
-        model, noise=noises, bias=biases, signals=signals, features=feature_set
-    )
+    result: WhatIf = context.obj.cohort(cohort).what_if(**vars(request))
     if json:
-        print_json({"cohort": cohort, "noise": noises, "bias": biases, **result.as_dict()})
+        added = {"noise": request.noise, "bias": request.bias}
+        print_json({"cohort": cohort, **added, **result.as_dict()})
     else:
         _print_what_if(result)
 
