@@ -71,7 +71,7 @@ def _printable(text: str) -> str:
     return text
 
 
-def added(default: float, **bounds: Any) -> Any:
+def added(default: object, **bounds: Any) -> Any:
     """Return a field that came later: at its default it is in no dump, and changes no digest."""
     return Field(default=default, exclude_if=lambda value: value == default, **bounds)
 

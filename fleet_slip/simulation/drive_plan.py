@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from fleet_slip.config import Config
+from fleet_slip.config import Config, added
 from fleet_slip.errors import ConfigError
 from fleet_slip.simulation.imperfections import (
     NONE,
@@ -154,9 +154,7 @@ class DrawnPlan(Plan):
 
     sensor_bias_std: SensorBiases
     """Of cars; in trials of the other ones."""
-    imperfections: ImperfectionRanges | None = Field(
-        default=None, exclude_if=lambda ranges: ranges is None
-    )
+    imperfections: ImperfectionRanges | None = added(None)
     """None: cars, sensors and roads are those of the textbook."""
 
 

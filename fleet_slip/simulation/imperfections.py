@@ -144,9 +144,7 @@ class ImperfectionRanges(Config):
 
     load_position_m: Range | None = None
     """Where load sits, before the centre of gravity of the car without it; None: at that place."""
-    tread_wear_per_100_days: Range | None = Field(
-        default=None, exclude_if=lambda wear: wear is None
-    )
+    tread_wear_per_100_days: Range | None = added(None)
     """Share of the tread that a car's tyres lose; new ones follow where none is left."""
     car: dict[str, Range] = Field(default={})
     sensors: dict[str, Range] = Field(default={})

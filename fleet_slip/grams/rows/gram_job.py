@@ -64,9 +64,7 @@ def update_grams(
     return retry_conflicts(lambda: _update_once(warehouse, progress, feature_set, executor, among))
 
 
-def reconcile(
-    warehouse: Warehouse, progress: Progress = no_progress, *, unreadable: Collection[str] = ()
-) -> list[GramReport]:
+def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list[GramReport]:
     """Bring up to date what was computed here before, but for `unreadable` log files."""
     grams = warehouse.grams.snapshot()
     identities = {name: features().identity(name) for name in (PLAIN, *features().sets)}
@@ -82,7 +80,7 @@ def reconcile(
         if unreadable:
             active = {file.path for file in warehouse.logs.snapshot().files}
             among = (active if among is None else among).difference(unreadable)
-        reports.append(update_grams(warehouse, progress, name, among=among))
+        reports.append(update_grams(warehouse, feature_set=name, among=among))
     return reports
 
 

@@ -1,12 +1,13 @@
 """What looks wrong in a course: it turns as the yaw rate does, and slips as a car does."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.course_change import COURSE, LARGEST_RAD
-from fleet_slip.catalogue.course_relation import CourseRelation, relate
+from fleet_slip.catalogue.course_relation import CourseFault, CourseRelation, relate
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.ingest.drives.relations import slope_of
 
@@ -20,13 +21,10 @@ MOST_SCALE_ERROR = 0.02
 LEAST_SPEED_MPS = 3.0
 SPEED = "satellite_speed"
 
-Found = tuple[str, str, str, str]
-"""A kind of fault, the signal, the figure that shows it, and a remedy."""
-
 
 def course_fault(
     signals: Mapping[str, FloatArray], speed: FloatArray | None = None
-) -> Found | None:
+) -> CourseFault | None:
     """Return what fault the course of a drive seems to have; `speed` is that of the wheels."""
     if not {"course", "yaw_rate"} <= set(signals):
         return None
@@ -38,21 +36,19 @@ def course_fault(
     if (slope, correlation) != (1.0, 0.0):  # else it is too little to tell
         figure = f"over a second it changes by {slope:+.2f} times what the yaw rate adds up to"
         if correlation < -LEAST_CORRELATION:
-            return (
-                "reversed",
-                COURSE,
-                figure,
-                "Turn clockwise_from_north, or swap north and east.",
-            )
+            remedy = "Turn clockwise_from_north, or swap north and east."
+            return CourseFault("reversed", (COURSE,), figure, remedy)
         if correlation < LEAST_CORRELATION:
             figure = f"over a second its change hardly goes with the yaw rate ({correlation:+.2f})"
-            return "values", COURSE, figure, "Is it a course over ground, and of this car?"
+            remedy = "Is it a course over ground, and of this car?"
+            return CourseFault("values", (COURSE,), figure, remedy)
         if not SOUND[0] <= slope <= SOUND[1]:
-            return "scaled", COURSE, figure, "Check its unit, and that of the yaw rate."
+            remedy = "Check its unit, and that of the yaw rate."
+            return CourseFault("scaled", (COURSE,), figure, remedy)
     return _of_fixes(signals, speed) or _of_relation(_relation(signals, turned))
 
 
-def _of_fixes(signals: Mapping[str, FloatArray], speed: FloatArray | None) -> Found | None:
+def _of_fixes(signals: Mapping[str, FloatArray], speed: FloatArray | None) -> CourseFault | None:
     """Return what is wrong with the receiver's speed, or with how many fixes have a course."""
     told = signals.get("satellite_speed")
     if told is None:
@@ -61,34 +57,27 @@ def _of_fixes(signals: Mapping[str, FloatArray], speed: FloatArray | None) -> Fo
     own = float(np.isfinite(signals["course"][fast]).mean()) if fast.any() else 1.0
     if own < LEAST_OF_THEIR_OWN:
         figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of backwards"
-        return (
-            "values",
-            COURSE,
-            figure,
-            "They are left out. Map it as the receiver tells it.",
-        )
+        remedy = "They are left out. Map it as the receiver tells it."
+        return CourseFault("values", (COURSE,), figure, remedy)
     both = fast & (speed > LEAST_SPEED_MPS) if speed is not None else fast
     if speed is not None and both.sum() >= SECOND:
         ratio = float(np.median(told[both] / speed[both]))
         if not SOUND[0] <= ratio <= SOUND[1]:
             figure = f"it is {ratio:.2f} times the speed of the wheels"
-            return "scaled", SPEED, figure, "Check both units: the antenna's place is by it."
+            remedy = "Check both units: the antenna's place is by it."
+            return CourseFault("scaled", (SPEED,), figure, remedy)
     return None
 
 
-def _of_relation(relation: CourseRelation | None) -> Found | None:
+def _of_relation(relation: CourseRelation | None) -> CourseFault | None:
     if relation is None:
         return None
     if fault := relation.fault or relation.misplaced:
-        return fault.kind, COURSE, fault.figure, fault.remedy
+        return replace(fault, signals=(COURSE,))
     if abs(relation.scale - 1) > MOST_SCALE_ERROR:
         figure = f"it turns {relation.scale:.3f} times as the yaw rate adds up to"
-        return (
-            "scale",
-            COURSE,
-            figure,
-            "The gyroscope's is off, which learning allows for.",
-        )
+        remedy = "The gyroscope's is off, which learning allows for."
+        return CourseFault("scale", (COURSE,), figure, remedy)
     return None
 
 

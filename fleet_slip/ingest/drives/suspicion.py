@@ -81,8 +81,7 @@ def find_suspicions(signals: Signals) -> list[Suspicion]:
     if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
         found += _label(usual, speed)  # which is judged by them
     if fault := course_fault(usual, speed):
-        kind, signal, figure, remedy = fault
-        found.append(Suspicion(kind, (signal,), figure, remedy))
+        found.append(Suspicion(**vars(fault)))
     return found
 
 

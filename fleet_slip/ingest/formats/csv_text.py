@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
 import pyarrow as pa
 from pydantic import Field, field_validator, model_validator
 
-from fleet_slip.config import Config
+from fleet_slip.config import Config, added
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
@@ -32,11 +32,11 @@ class CsvFormat(Config):
 
     separator: str = ","
     decimal_comma: bool = False
-    encoding: Encoding = Field(default="utf-8", exclude_if=lambda value: value == "utf-8")
+    encoding: Encoding = added("utf-8")
     """UTF-8 is with or without a byte order mark."""
-    header_line: Line = Field(default=1, exclude_if=lambda value: value == 1)
+    header_line: Line = added(1)
     """The line with the names of the columns; those above it are passed over."""
-    data_line: Line | None = Field(default=None, exclude_if=lambda value: value is None)
+    data_line: Line | None = added(None)
     """The first line of data, if it is not the next: a line of units may be between."""
 
     @field_validator("separator")

@@ -15,7 +15,7 @@ from pydantic import (
 
 from fleet_slip.canonical import canonical_ascii
 from fleet_slip.catalogue.signals import Identifier, catalogue
-from fleet_slip.config import Config, Name, PositiveFloat, load_config
+from fleet_slip.config import Config, Name, PositiveFloat, added, load_config
 from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database
 from fleet_slip.ingest.formats.csv_batches import PlainNumbers
@@ -45,13 +45,9 @@ class FromColumn(Config):
     column: Name
 
 
-def _is_empty(value: object) -> bool:
-    return value in ((), None)
-
-
 OptionalFact = Annotated[
     Annotated[Name | FromColumn, AfterValidator(require_drive_column)] | None,
-    Field(exclude_if=_is_empty),
+    added(None),
 ]
 
 
@@ -78,18 +74,18 @@ class Mapping(Config):
     missing: tuple[str, ...] = ()
     """Texts that mean "no value", besides the empty one; `nan` also clears NaN in binary files."""
     csv: CsvFormat = CsvFormat()
-    can: CanBus | None = Field(default=None, exclude_if=_is_empty)
-    duckdb: DuckdbRows | None = Field(default=None, exclude_if=_is_empty)
+    can: CanBus | None = added(None)
+    duckdb: DuckdbRows | None = added(None)
     time: TimeBase
     drive: DriveMetadata
     signals: Annotated[
         dict[str, SignalColumn], BeforeValidator(split_components), Field(min_length=1)
     ]
-    label: LabelSensor | None = Field(default=None, exclude_if=_is_empty)
+    label: LabelSensor | None = added(None)
     """Where the label's sensor is, and whether it tells two velocities instead of an angle."""
-    where: tuple[RowCondition, ...] = Field(default=(), exclude_if=_is_empty)
+    where: tuple[RowCondition, ...] = added(())
     """Conditions that a row meets, all of them, or is left out and only counted; also as text."""
-    vehicles: tuple[VehicleFacts, ...] | Name = Field(default=(), exclude_if=_is_empty)
+    vehicles: tuple[VehicleFacts, ...] | Name = added(())
     """What is known of each car; a text is the path of a CSV file, seen from the mapping's own."""
 
     @field_validator("where", mode="before")

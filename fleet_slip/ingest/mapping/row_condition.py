@@ -13,7 +13,7 @@ import polars as pl
 from pydantic import Field, model_validator
 
 from fleet_slip.catalogue.signals import Identifier, catalogue
-from fleet_slip.config import Config, Name
+from fleet_slip.config import Config, Name, added
 from fleet_slip.ingest.mapping.units import conversion_factor
 
 Bound = Annotated[float, Field(allow_inf_nan=False)]
@@ -39,10 +39,6 @@ _COMPARISON = re.compile(
 _LONGEST = 2000
 
 
-def _is_none(value: object) -> bool:
-    return value is None
-
-
 class RowCondition(Config):
     """A condition on one column, in the column's own unit; a missing value does not meet it.
 
@@ -51,12 +47,12 @@ class RowCondition(Config):
     """
 
     column: Name | None = None
-    signal: Identifier | None = Field(default=None, exclude_if=_is_none)
+    signal: Identifier | None = added(None)
     at_least: Bound | None = None
     at_most: Bound | None = None
-    above: Bound | None = Field(default=None, exclude_if=_is_none)
-    below: Bound | None = Field(default=None, exclude_if=_is_none)
-    other_than: Bound | None = Field(default=None, exclude_if=_is_none)
+    above: Bound | None = added(None)
+    below: Bound | None = added(None)
+    other_than: Bound | None = added(None)
     one_of: tuple[Name, ...] = ()
     """Texts, such as the states of a fix; of a column of numbers, numbers as text."""
 

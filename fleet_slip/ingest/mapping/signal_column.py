@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import HALF_TURN, Signal, catalogue
-from fleet_slip.config import Config, Name
+from fleet_slip.config import Config, Name, added
 from fleet_slip.ingest.mapping.units import conversion_factor, require_unit
 
 FiniteFloat = Annotated[float, Field(allow_inf_nan=False)]
@@ -41,11 +41,6 @@ Table = Annotated[
 ]
 
 
-def _absent(value: object) -> bool:
-    """Whether a key says nothing, so that mappings without it stay what they were."""
-    return value in (None, (), 0.0)
-
-
 class SignBit(Config):
     """The column that says the sign of another one, which has the magnitude alone."""
 
@@ -65,36 +60,32 @@ class SignalColumn(Config):
     unit: str
     negate: bool = False
     """For axes that are not ISO 8855, such as y to the right."""
-    sign: SignBit | None = Field(default=None, exclude_if=lambda value: value is None)
+    sign: SignBit | None = added(None)
     """Where a column of its own says the sign, as on the buses of some cars."""
     offset: FiniteFloat = 0.0
     """Added after the sign, in the column's unit."""
-    gain: FiniteFloat = Field(default=1.0, exclude_if=lambda value: value == 1.0)
+    gain: FiniteFloat = added(1.0)
     """Multiplies the value, such as the ratio of a steering gear."""
-    radius_m: Annotated[FiniteFloat, Field(ge=0.05, le=2)] | None = Field(
-        default=None, exclude_if=_absent
-    )
+    radius_m: Annotated[FiniteFloat, Field(ge=0.05, le=2)] | None = added(None)
     """Rolling radius of a wheel whose speed is logged as a velocity."""
-    table: Table = Field(default=(), exclude_if=_absent)
+    table: Table = added(())
     """Points (value, value in `unit`), straight lines between them; outside is out of range."""
-    delay_s: Annotated[FiniteFloat, Field(ge=-10, le=10, default=0.0, exclude_if=_absent)]
+    delay_s: FiniteFloat = added(0.0, ge=-10, le=10)
     """How much later than it happened a value stands in the file."""
-    interpolate: bool = Field(default=True, exclude_if=bool)
+    interpolate: bool = added(True)
     """False: samples stand at the nearest tick, and ticks between them have no value."""
-    longest_gap_s: Annotated[FiniteFloat, Field(gt=0, le=10)] | None = Field(
-        default=None, exclude_if=_absent
-    )
+    longest_gap_s: Annotated[FiniteFloat, Field(gt=0, le=10)] | None = added(None)
     """Instead of the mapping's, for a signal with a rate of its own."""
-    time: Name | None = Field(default=None, exclude_if=_absent)
+    time: Name | None = added(None)
     """The column of this signal's times, where the file has several, in the unit of the others."""
 
-    component: Literal["north", "east"] | None = Field(default=None, exclude_if=_absent)
+    component: Literal["north", "east"] | None = added(None)
     """Of the velocity over ground, if it is one: set for `course = { north = …, east = … }`."""
-    clockwise_from_north: bool | None = Field(default=None, exclude_if=lambda value: value is None)
+    clockwise_from_north: bool | None = added(None)
     """Whether the course is told so; False: counterclockwise from east."""
-    antenna_x_m: Place | None = Field(default=None, exclude_if=lambda value: value is None)
+    antenna_x_m: Place | None = added(None)
     """How far the receiver's antenna is before the centre of gravity."""
-    antenna_y_m: Place | None = Field(default=None, exclude_if=lambda value: value is None)
+    antenna_y_m: Place | None = added(None)
     """How far it is to the left of the centre of gravity."""
 
     @property

@@ -9,7 +9,7 @@ from zoneinfo import available_timezones
 import polars as pl
 from pydantic import Field, field_validator, model_validator
 
-from fleet_slip.config import Config, Name, PositiveFloat
+from fleet_slip.config import Config, Name, PositiveFloat, added
 from fleet_slip.ingest.formats.source import OWN_TIME
 from fleet_slip.ingest.mapping.units import require_unit
 
@@ -33,15 +33,15 @@ class TimeBase(Config):
     column: Name | None = None
     unit: str | None = None
     format: Name | None = None
-    date: DateColumn | None = Field(default=None, exclude_if=lambda value: value is None)
+    date: DateColumn | None = added(None)
     rate_hz: Annotated[float, Field(ge=1, le=100_000)] | None = None
-    epoch: bool = Field(default=False, exclude_if=lambda value: not value)
+    epoch: bool = added(False)
     """Numbers are counted from 1970, in UTC, so that they tell the date."""
-    zone: str | None = Field(default=None, exclude_if=lambda value: value is None)
+    zone: str | None = added(None)
     """Where the clock of timestamps without a zone stands, such as `Europe/Berlin`."""
-    assumed: bool = Field(default=False, exclude_if=lambda value: not value)
+    assumed: bool = added(False)
     """Nobody knows the rate: each ingest says so."""
-    own_clock: bool = Field(default=False, exclude_if=lambda value: not value)
+    own_clock: bool = added(False)
     longest_gap_s: Annotated[PositiveFloat, Field(le=10)] = 0.1
     """Samples of a signal that lie further apart are not interpolated between."""
     split_gap_s: Annotated[PositiveFloat, Field(le=60)] = 1.0

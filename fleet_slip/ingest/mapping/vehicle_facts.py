@@ -5,10 +5,10 @@ import io
 from pathlib import Path
 from typing import Annotated, TypeVar
 
-from pydantic import AfterValidator, Field, ValidationError, ValidationInfo
+from pydantic import AfterValidator, ValidationError, ValidationInfo
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.config import Config, Name, PositiveFloat, faults_of, read_named_file
+from fleet_slip.config import Config, Name, PositiveFloat, added, faults_of, read_named_file
 from fleet_slip.errors import ConfigError
 
 Told = TypeVar("Told")
@@ -24,10 +24,7 @@ def require_drive_column(told: Told, info: ValidationInfo) -> Told:
     return told
 
 
-OptionalFact = Annotated[
-    Annotated[Name, AfterValidator(require_drive_column)] | None,
-    Field(exclude_if=lambda value: value is None),
-]
+OptionalFact = Annotated[Annotated[Name, AfterValidator(require_drive_column)] | None, added(None)]
 
 
 class VehicleFacts(Config):
