@@ -6,11 +6,15 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from fleet_slip.errors import ConfigError, UsageError
-from fleet_slip.export.c.a2l import a2l_text
-from fleet_slip.export.c.c_checks import c_fuzz_target, c_self_test
 from fleet_slip.export.c.c_gram import c_gram_header, c_gram_source
 from fleet_slip.export.c.c_names import c_prefix, file_prefix
-from fleet_slip.export.c.c_source import c_header, c_source
+from fleet_slip.export.c.c_source import (
+    a2l_text,
+    c_fuzz_target,
+    c_header,
+    c_self_test,
+    c_source,
+)
 from fleet_slip.export.c.on_board import sets_on_board
 from fleet_slip.export.checks import Check, checks_csv, make_checks
 from fleet_slip.export.compile import compile_program

@@ -2,11 +2,9 @@
 
 from collections.abc import Iterable
 
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.export.filling import fill_in_version
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
-
-AXES = "x forward, y left, z up; angles and yaw rate are positive to the left (ISO 8855)"
 
 _FILES = {
     "_test.c": "program of its own: runs the checks, and ends with 0 if all angles agree",
@@ -28,54 +26,14 @@ _FILES = {
 }
 """What a file is, by the end of its name; longer ends stand before those that end them."""
 
-_USE = {
-    "c": """    cc -std=c99 {prefix}.c {prefix}_test.c -o self_test && ./self_test
-
-Call `{prefix}_start` when a drive begins, and `{prefix}_step` at every tick.""",
-    "sql": "Run the statement in `fleet-slip shell`, or in any engine that has a table `log`.",
-    "dbc": "Load it into the tool that plans the bus. One message tells that there is an angle.",
-    "onnx": "Give it a tick, and the state that it returned at the tick before.",
-    "fmu": """In Simulink: the block FMU (Import), with a fixed step of one tick. With fmpy:
-
-    fmpy simulate {prefix}_fmi2.fmu --output-interval {tick_s:g}""",
-}
-
 
 def read_me(
-    version: ModelVersion, program: Program, target: str, prefix: str, names: Iterable[str]
+    version: ModelVersion, program: Program, target: str, stem: str, names: Iterable[str]
 ) -> str:
-    """Return the page, in Markdown."""
-    angle, trained = program.angle, version.manifest.trained_on
-    tick_s = float(SAMPLE_TIME_S)
-    files = "\n".join(f"| `{name}` | {_what(name)} |" for name in names)
-    inputs = "\n".join(
-        f"| `{one.name}` | {one.unit} | {one.scale:f} | {one.min_count} to {one.max_count} |"
-        for one in program.signals
-    )
-    return f"""# {version.reference}
-
-Estimates `{angle.column}` in {angle.unit}, from {trained.drives:,} drives. Exported by fleet-slip.
-
-| file | is |
-| --- | --- |
-{files}
-
-## What it is given, every {tick_s:g} s
-
-A tick is {tick_s:g} s. Physical value = scale * count. Axes: {AXES}.
-
-| input | unit | scale | valid counts |
-| --- | --- | --- | --- |
-{inputs}
-
-It gives `{angle.column}` in {angle.unit}: counts of {angle.scale:f}, within
-{float(angle.error):.6f} counts of the exact model. Where an input is missing or out of its range,
-there is no angle until all columns have a value again.
-
-## How it is used
-
-{_USE[target].format(prefix=prefix, tick_s=tick_s)}
-"""
+    """Return the page, in Markdown; `stem` is what the names of files begin with."""
+    named = {name: _what(name) for name in names}
+    words = {"target": target, "stem": stem, "named": named}
+    return fill_in_version("templates/README.md", version, program, **words)
 
 
 def _what(name: str) -> str:

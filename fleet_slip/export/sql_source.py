@@ -5,6 +5,7 @@ DuckDB, SQLite and PostgreSQL do. What is used more than once is a column of a l
 
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.columns.sql_operations import PLAIN_SQL, SqlLayers, fact_sql
+from fleet_slip.export.filling import fill_in_version
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 
@@ -12,44 +13,22 @@ ROWS = "log"
 """The table or view that the plain statement reads: `drive_id`, `tick`, and columns in SI units."""
 
 
-def sql_statement(version: ModelVersion, program: Program, rows: str = ROWS) -> str:
+def sql_statement(
+    version: ModelVersion, program: Program, rows: str = ROWS, macro: str = ""
+) -> str:
     """Return the statement, which gives `drive_id`, `tick`, `angle` in counts, and it in SI units.
 
     `angle` is null where there is none. Rows are the ticks of drives, in any order.
     """
-    angle, text, before = program.angle, [], rows
-    for number, columns in enumerate([*_given(program), *_layers(program)]):
-        kept = ["*"] if number else ["drive_id", "tick"]
-        listed = ",\n        ".join([*kept, *columns])
-        text.append(f"layer_{number} AS (\n    SELECT\n        {listed}\n    FROM {before}\n)")
-        before = f"layer_{number}"
-    layered = ",\n\n".join(text)
-    return (
-        f"{_comment(version, program)}\nWITH {layered},\n\n"
-        f"rounded AS (\n    SELECT drive_id, tick, {_rounded(program)} AS angle\n"
-        f"    FROM {before}\n)\n\n"
-        f"SELECT\n    drive_id,\n    tick,\n    angle,\n"
-        f"    CAST(angle AS DOUBLE PRECISION) * {angle.scale:f} AS {angle.column}\nFROM rounded\n"
-    )
+    layers = [*_given(program), *_layers(program)]
+    words = {"layers": layers, "rounded": _rounded(program), "rows": rows, "macro": macro}
+    return fill_in_version("templates/statement.sql", version, program, **words)
 
 
 def sql_macro(version: ModelVersion, program: Program) -> str:
     """Return the statement as a macro of DuckDB, which takes the name of a table."""
     name = f"{program.angle.name}_{version.manifest.name}"
-    statement = sql_statement(version, program, "query_table(source)")
-    comment, body = statement.split("\nWITH ", 1)
-    return f"{comment}\nCREATE OR REPLACE MACRO {name}(source) AS TABLE\nWITH {body.rstrip()};\n"
-
-
-def _comment(version: ModelVersion, program: Program) -> str:
-    angle, trained = program.angle, version.manifest.trained_on
-    return (
-        f"-- {version.reference}: {angle.column}, exported by fleet-slip. Do not edit.\n"
-        f"-- SHA-256 of the version: {version.sha256}\n"
-        f"-- Trained on {trained.drives} drives, SHA-256 {trained.told_by or 'unknown'}\n"
-        f"-- angle: counts of {angle.scale:f} {angle.unit}, "
-        f"within {float(angle.error):.12f} counts of the exact model"
-    )
+    return sql_statement(version, program, "query_table(source)", name)
 
 
 def _given(program: Program) -> list[list[str]]:

@@ -2,26 +2,42 @@
 
 The layout of a message is that of `fleet_slip.grams.received.messages`. Of each feature set as many
 rows are counted as no sum of products can reach 2^61 of: nothing overflows. Columns are computed by
-the steps of an exported estimator, changes of them as `fleet_slip.grams.rows.course_sums` does.
-The C stands in `templates/`.
+the steps of an exported estimator, changes of them as `fleet_slip.grams.rows.course_sums` does: a
+fix comes late, so that columns, course and yaw rate are kept of as many ticks as a change and a
+delay take, and a tick is counted once its fix is here. The C stands in `templates/`.
 """
 
 import re
 from collections.abc import Mapping, Sequence
 from itertools import accumulate
+from typing import Any
 
-from fleet_slip.export.c.c_changes import words_of_sets
-from fleet_slip.export.c.c_names import array_of, indented, read_template, table_of
-from fleet_slip.export.c.c_source import helper_texts, sample_lines
-from fleet_slip.export.c.c_steps import StepWriter
+from fleet_slip.catalogue.course_change import (
+    BESIDE,
+    COARSER,
+    COURSE,
+    LATE_PARTS,
+    MOST_EARLY,
+    MOST_LATE,
+    YAW_RATE,
+    course_units,
+)
+from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S
+from fleet_slip.export.c.c_names import field_names
+from fleet_slip.export.c.c_source import helper_texts, keep_lines, start_lines
+from fleet_slip.export.c.c_steps import StepWriter, state_fields
 from fleet_slip.export.c.on_board import OnBoard, lower
+from fleet_slip.export.filling import fill_template
+from fleet_slip.export.program import Steps
 from fleet_slip.grams.received.messages import (
     HEADER_BYTES,
     LAYOUT,
     LONGEST_VEHICLE,
     MAGIC,
+    MOST_COLUMNS,
     MOST_PARTS,
     MOST_ROWS,
+    SET_LAYOUT,
     message_size,
 )
 from fleet_slip.grams.received.plausible import most_rows
@@ -32,60 +48,58 @@ _HELPER = re.compile(r"^static \w+ (\w+)\(", re.MULTILINE)
 
 def c_gram_header(prefix: str, sets: Sequence[OnBoard]) -> str:
     """Return the header: what is kept, and the functions."""
-    return read_template("gram.h").substitute(_words(prefix, sets))
+    return fill_template("c/templates/gram.h", **_words(prefix, sets))
 
 
 def c_gram_source(prefix: str, sets: Sequence[OnBoard]) -> str:
     """Return the source that goes with the header."""
-    text = read_template("gram.c").substitute(_words(prefix, sets))
+    text = fill_template("c/templates/gram.c", **_words(prefix, sets))
     for name in _HELPER.findall(text):  # the model's own functions may have these names
         text = re.sub(rf"\b{name}\(", f"gram_{name}(", text)
     return text
 
 
-def _words(prefix: str, sets: Sequence[OnBoard]) -> Mapping[str, object]:
-    """Return what is filled into the templates of header and source."""
+def _words(prefix: str, sets: Sequence[OnBoard]) -> Mapping[str, Any]:
+    """Return the words of the templates of header and source."""
     steps, places = lower(sets)
     writer = StepWriter(steps)
+    changed = [(number, one) for number, one in enumerate(sets) if one.of.times]
+    rows = [[writer.kept(places[name]) for name in one.computed] for one in sets]
     parts = [MOST_PARTS * max(1, len(one.of.times)) for one in sets]
     sizes = [len(one.columns) + packed_size(len(one.columns)) for one in sets]
-    words = {
+    numbers = [part * size for part, size in zip(parts, sizes, strict=True)]
+    words: dict[str, Any] = {
         "prefix": prefix,
         "upper": prefix.upper(),
-        "sets": len(sets),
+        "program": steps,
+        "fields": field_names(steps),
+        "sets": sets,
+        "changed": changed,
+        "rows": rows,
         "most_parts": MOST_PARTS,
         "most_rows": MOST_ROWS,
         "parts": sum(parts),
-        "numbers": sum(part * size for part, size in zip(parts, sizes, strict=True)),
+        "numbers": sum(numbers),
         "longest_vehicle": LONGEST_VEHICLE,
         "longest_message": max(
             message_size(len(one.columns), of_set=number > 0) for number, one in enumerate(sets)
         ),
         "header_bytes": HEADER_BYTES,
-        "magic": "\n".join(
-            f"    message[{i}] = {byte}U; /* {chr(byte)} */" for i, byte in enumerate(MAGIC)
-        ),
-        "magic_bytes": len(MAGIC),
-        "comment": "\n".join(_comments(sets)),
-        "counted": table_of(_counted(sets, parts, sizes)),
+        "magic": MAGIC,
+        "layout": LAYOUT,
+        "set_layout": SET_LAYOUT,
+        "counted": _counted(sets, parts, numbers),
     }
-    words |= _of_signals(prefix, writer, places, sets[0])
-    if len(sets) > 1:
-        words |= words_of_sets(prefix, steps, writer, places, sets)
-    return words | {"helpers": "\n".join(helper_texts(writer))}
-
-
-def _comments(sets: Sequence[OnBoard]) -> list[str]:
-    """Return which columns each set has, a bit of its mask each, the first the lowest."""
-    lines = [f" * {one.of.identity}: {', '.join(one.columns)}." for one in sets]
-    return [*lines[:-1], f"{lines[-1]} */"]
+    if changed:
+        words |= _words_of_changes(steps, writer, places, sets, changed)
+    words |= {"lines": [*writer.lines, *words.get("keeps", ())], "helpers": helper_texts(writer)}
+    return words
 
 
 def _counted(
-    sets: Sequence[OnBoard], parts: Sequence[int], sizes: Sequence[int]
+    sets: Sequence[OnBoard], parts: Sequence[int], numbers: Sequence[int]
 ) -> list[list[str]]:
     """Return the table of sets, a field of `counted_set` each."""
-    numbers = [part * size for part, size in zip(parts, sizes, strict=True)]
     firsts = zip(accumulate(parts, initial=0), accumulate(numbers, initial=0), strict=True)
     return [
         [
@@ -101,27 +115,48 @@ def _counted(
     ]
 
 
-def _of_signals(
-    prefix: str, writer: StepWriter, places: Mapping[str, int], plain: OnBoard
-) -> dict[str, str]:
-    """Return the words of what counts the logged signals alone."""
-    row = [writer.kept(places[name]) for name in plain.columns]
-    body = [*writer.lines, *array_of("row", row), "count_row(gram, 0U, 0U, row);"]
-    add = f"void {prefix}_gram_add({prefix}_gram *gram, const {prefix}_gram_sample *sample)"
+def _words_of_changes(
+    steps: Steps,
+    writer: StepWriter,
+    places: Mapping[str, int],
+    sets: Sequence[OnBoard],
+    changed: Sequence[tuple[int, OnBoard]],
+) -> dict[str, Any]:
+    """Return the words of what counts changes of columns from fix to fix."""
+    units, track = course_units(), max(one.kept_ticks for _, one in changed)
+    course, yaw_rate = (writer.kept(places[name]) for name in (COURSE, YAW_RATE))
+    keeps = keep_lines(steps, writer)
+    writer.done["nearest_64"] += 1
+    constants = {
+        "CHANGED": f"{len(changed)}U",
+        "MOST_TIMES": f"{max(len(one.of.times) for _, one in changed)}U",
+        "MOST_COLUMNS": f"{max(len(one.computed) for _, one in changed) + len(BESIDE) + 1}U",
+        "TRACK": f"{track}U",
+        "TURN": f"INT64_C({units.turn})",
+        "COURSE_COUNTS": f"INT64_C({2 * HALF_TURN})",
+        "DIVISOR": f"INT64_C({units.divisor})",
+        "LARGEST": f"INT64_C({units.largest})",
+        "SLOW": units.slow,
+        "UNTURNED": units.unturned,
+        "COARSER": COARSER,
+        "LATE_PARTS": LATE_PARTS,
+        "ROUND_LATE": LATE_PARTS // 2,
+        "EARLIEST": -MOST_EARLY,
+        "GAIN": f"INT64_C({4 * HALF_TURN // LATE_PARTS})",
+    }
+    firsts = list(accumulate((len(one.columns) for one in sets), initial=0))
     return {
-        "missing": "INT16_MIN",
-        "fields": indented(sample_lines(writer.program, "int16_t")).rstrip("\n"),
-        "track_type": "",
-        "state": "",
-        "start_comment": "",
-        "late": "",
-        "otherwise": "do not call it then",
-        "pass": "",
-        "changes": "",
-        "start": "",
-        "tick": f"\n{add}\n{{\n{indented(body)}}}\n",
-        "columns_bits": "",
-        "layout": f"{LAYOUT}U",
-        "which": "from->mask",
-        "columns": "",
+        "track": track,
+        "state": [one for one in state_fields(steps) if one.name != "nothing"],
+        "start": start_lines(steps, writer),
+        "keeps": keeps,
+        "course": course,
+        "yaw_rate": yaw_rate,
+        "constants": constants,
+        "earliest": LATE_PARTS * MOST_EARLY,
+        "latest": LATE_PARTS * MOST_LATE,
+        "late_ms": f"{1000 * float(SAMPLE_TIME_S) / LATE_PARTS:g}",
+        "columns_bytes": MOST_COLUMNS // 8,
+        "places": [place for one in sets for place in one.places],
+        "firsts": firsts[:-1],
     }

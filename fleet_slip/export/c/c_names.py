@@ -2,8 +2,6 @@
 
 import re
 from collections.abc import Sequence
-from importlib.resources import files
-from string import Template
 
 from fleet_slip.canonical import sha256_of
 from fleet_slip.export.program import Steps
@@ -16,11 +14,6 @@ INDENT = "    "
 LONGEST_PREFIX = 24
 """C99 tells external names apart by 31 characters, and so does rule 5.1 of MISRA C:2012. After the
 prefix `_gram_` and one more do."""
-
-
-def read_template(name: str) -> Template:
-    """Return a file of C with names to be filled in."""
-    return Template((files("fleet_slip.export.c") / "templates" / name).read_text("utf-8"))
 
 
 def file_prefix(version: ModelVersion) -> str:
@@ -76,22 +69,6 @@ def plain_text(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9 @_.:,^-]", "_", text)
 
 
-def indented(lines: Sequence[str]) -> str:
-    """Return lines of a body."""
-    return "".join(f"{INDENT}{line}\n" for line in lines)
-
-
-def table_of(rows: Sequence[Sequence[str]]) -> str:
-    """Return the structs of an array."""
-    return ",\n".join(f"{INDENT}{{{', '.join(row)}}}" for row in rows)
-
-
-def array_of(name: str, values: Sequence[str], kind: str = "int32_t") -> list[str]:
-    """Return the lines of an array of numbers."""
-    *most, last = values
-    return [
-        f"{kind} {name}[{len(values)}] = {{",
-        *(f"{INDENT}{value}," for value in most),
-        f"{INDENT}{last}",
-        "};",
-    ]
+def plain_unit(unit: str) -> str:
+    """Return a unit as it may stand in a comment."""
+    return plain_text(unit.replace("/", " per ").replace("*", " "))

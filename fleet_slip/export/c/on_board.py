@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
-from fleet_slip.catalogue.course_change import BESIDE, COURSE, YAW_RATE
+from fleet_slip.catalogue.course_change import BESIDE, COURSE, MOST_LATE, YAW_RATE
 from fleet_slip.catalogue.course_relation import COLUMNS
 from fleet_slip.catalogue.definitions import plain_column
 from fleet_slip.catalogue.feature_sets import PLAIN
@@ -44,6 +44,11 @@ class OnBoard:
         """The columns that are computed at each tick; of changes, the others come from fixes."""
         beside = (*BESIDE, catalogue().label) if self.of.times else ()
         return tuple(name for name in self.columns if name not in beside)
+
+    @property
+    def kept_ticks(self) -> int:
+        """Of how many ticks columns are kept: of a change, and of a fix that is late."""
+        return max(self.of.times) + 1 + (MOST_LATE if self.of.in_time else 0)
 
     @property
     def ranges(self) -> list[Range]:

@@ -1,4 +1,4 @@
-/* Fuzz target of ${model}: clang -fsanitize=fuzzer,address,undefined */
+/* Fuzz target of ${version.reference}: clang -fsanitize=fuzzer,address,undefined */
 #include <stddef.h>
 #include <stdlib.h>
 #include <string.h>
@@ -12,7 +12,13 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     static ${prefix}_state state;
     ${prefix}_sample sample;
     size_t at = 0U;
-${known}    ${prefix}_start(&state${given});
+//% if knows
+    ${prefix}_car car;
+    if (size < sizeof car) { return 0; }
+    (void)memcpy(&car, data, sizeof car);
+    at = sizeof car;
+//% endif
+    ${prefix}_start(&state${", &car" if knows});
     for (; (size - at) >= sizeof sample; at += sizeof sample) {
         int32_t angle;
         (void)memcpy(&sample, &data[at], sizeof sample);

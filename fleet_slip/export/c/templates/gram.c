@@ -1,9 +1,11 @@
 /* Gram rows of a drive, exported by fleet-slip. Do not edit.
  * Columns of rows by feature set, a bit of a mask each, the first the lowest:
-${comment}
+//% for one in sets
+ * ${one.of.identity}: ${one.columns|join(", ")}.${" */" if loop.last}
+//% endfor
 #include "${prefix}_gram.h"
 
-#define SETS ${sets}U
+#define SETS ${sets|length}U
 #define MISSING INT32_MIN
 
 /* What is counted of a feature set. */
@@ -18,10 +20,14 @@ typedef struct {
 } counted_set;
 
 static const counted_set counted[SETS] = {
-${counted}
+//% for one in counted
+    {${one|join(", ")}}${"," if not loop.last}
+//% endfor
 };
 
-${helpers}
+//% for helper in helpers
+${helper}
+//% endfor
 /* Sums and products of so many columns. */
 static uint32_t numbers_of(uint32_t columns)
 {
@@ -79,15 +85,39 @@ static void count_row(${prefix}_gram *gram, uint32_t set, uint32_t over, int32_t
         }
     }
 }
-${changes}
-void ${prefix}_gram_start(${prefix}_gram *gram${late})
+
+//% if changed
+//% include "c/templates/gram_changes.c"
+//% endif
+void ${prefix}_gram_start(${prefix}_gram *gram${", int32_t late" if changed})
 {
     for (uint32_t i = 0U; i < SETS; i++) {
         gram->used[i] = 0U;
         gram->lost[i] = 0U;
     }
-${start}}
-${tick}
+//% if changed
+//% if "state->" in start|join
+    ${prefix}_gram *const state = gram;
+//% endif
+//% for line in start
+    ${line}
+//% endfor
+//% for number, _ in changed
+    gram->at_columns_${number} = 0U;
+//% endfor
+    for (uint32_t i = 0U; i < TRACK; i++) {
+        gram->track[i].course = MISSING;
+        gram->track[i].yaw_rate = 0;
+        gram->track[i].turned = 0U;
+        gram->track[i].run = 0U;
+    }
+    gram->at = 0U;
+    gram->late = (late < (${earliest})) ? (${earliest}) : ((late > ${latest}) ? ${latest} : late);
+    gram->began = false;
+//% endif
+}
+
+//% include "c/templates/gram_tick.c"
 /* Writes the lowest bytes of a number, the lowest first; returns where the next one goes. */
 static uint32_t put(uint8_t *message, uint32_t at, uint64_t value, uint32_t bytes)
 {
@@ -111,7 +141,10 @@ static uint32_t crc_32(const uint8_t *bytes, uint32_t size)
     }
     return ~crc;
 }
-${columns_bits}
+
+//% if changed
+//% include "c/templates/gram_columns.c"
+//% endif
 uint32_t ${prefix}_gram_message(const ${prefix}_gram *gram, uint32_t part, const uint8_t *vehicle,
                                uint64_t start_s, uint8_t *message)
 {
@@ -126,8 +159,10 @@ uint32_t ${prefix}_gram_message(const ${prefix}_gram *gram, uint32_t part, const
     }
     const counted_set *const of = &counted[set];
     const ${prefix}_gram_part *const from = &gram->parts[of->first_part + place];
-${magic}
-    uint32_t at = put(message, ${magic_bytes}U, ${layout}, 2U);
+//% for byte in magic
+    message[${loop.index0}] = ${byte}U; /* ${"%c"|format(byte)} */
+//% endfor
+    uint32_t at = put(message, ${magic|length}U, ${"(set == 0U) ? %sU : %sU"|format(layout, set_layout) if changed else layout ~ "U"}, 2U);
     at = put(message, at, 0U, 2U); /* the length, below */
     at = put(message, at, of->definition, 8U);
     for (uint32_t i = 0U; i < ${longest_vehicle}U; i++) {
@@ -136,10 +171,15 @@ ${magic}
     at = put(message, at, place, 2U);
     at = put(message, at, gram->used[set], 2U);
     at = put(message, at, start_s, 8U);
-    at = put(message, at, ${which}, 4U);
+    at = put(message, at, ${"which_of(gram, set, from)" if changed else "from->mask"}, 4U);
     at = put(message, at, from->rows, 4U);
     at = put(message, at, gram->lost[set], 4U); /* byte ${header_bytes} is next */
-${columns}    uint32_t number = of->first_number + (place * numbers_of(of->columns));
+//% if changed
+    if (set > 0U) {
+        at = put_columns(message, at, set, from->mask);
+    }
+//% endif
+    uint32_t number = of->first_number + (place * numbers_of(of->columns));
     for (uint32_t i = 0U; i < of->columns; i++) {
         if (((from->mask >> i) & 1U) != 0U) {
             at = put(message, at, (uint64_t)gram->numbers[number], 8U);

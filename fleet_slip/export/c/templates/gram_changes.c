@@ -1,3 +1,7 @@
+//% for name, value in constants.items()
+#define ${name} ${value}
+//% endfor
+${""}
 /* What the columns of a feature set change by. */
 typedef struct {
     uint32_t set;
@@ -8,7 +12,9 @@ typedef struct {
 } changed_set;
 
 static const changed_set changed[CHANGED] = {
-${changed}
+//% for number, one in changed
+    {${number}U, ${one.computed|length}U, ${one.kept_ticks}U, ${one.of.times|length}U, {${one.of.times|map("string")|join("U, ")}U}}${"," if not loop.last}
+//% endfor
 };
 
 /* The place of so many ticks ago in a ring of so many, whose newest value is at a place. */
@@ -121,3 +127,4 @@ static void count_nothing(${prefix}_gram *gram)
         }
     }
 }
+
