@@ -15,7 +15,6 @@ from fleet_slip.comparison.report.error_charts import (
     error_over,
     left_out,
 )
-from fleet_slip.comparison.report.further_tables import compared, won
 from fleet_slip.comparison.report.gate_strips import angle_and_gates, opening
 from fleet_slip.comparison.report.paper_pictures import (
     FILTER_LABELS,
@@ -25,6 +24,7 @@ from fleet_slip.comparison.report.paper_pictures import (
 )
 from fleet_slip.comparison.report.point_charts import Named, density, points_by_drive
 from fleet_slip.comparison.report.report_data import DRAWN_FILTERS, ReportData
+from fleet_slip.comparison.report.tables import compared, won
 from fleet_slip.comparison.report.time_series import Line
 from fleet_slip.comparison.report.track_map import FINE_EDGES_DEG, Map, error_map
 from fleet_slip.pages.drawing import Picture

@@ -1,24 +1,17 @@
 """Judges the paper's claims, which `claims.toml` lists, by the report's data."""
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from importlib.resources import files
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined, meta
+from jinja2 import meta
 
 from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
 from fleet_slip.comparison.report.facts import Facts, NotEvaluatedError
 from fleet_slip.comparison.report.report_data import ReportData
-from fleet_slip.pages import page_parts as text
-
-TEXTS = Environment(undefined=StrictUndefined, keep_trailing_newline=True)  # noqa: S701 - no HTML
-TEXTS.filters |= {
-    one.__name__: one
-    for one in (text.count, text.degrees, text.listed, text.number, text.percent, text.scientific)
-}
+from fleet_slip.comparison.report.texts import TEXTS, expression, read_toml
+from fleet_slip.pages.page_parts import listed
 
 
 class Status(StrEnum):
@@ -52,7 +45,7 @@ class Judged:
     why: str
 
 
-_TABLE = tomllib.loads((files(__package__) / "claims.toml").read_text(encoding="utf-8"))
+_TABLE = read_toml("claims.toml")
 LIMITS: Mapping[str, float] = _TABLE.pop("limits")
 CLAIMS: Mapping[str, Claim] = {name: Claim(**table) for name, table in _TABLE.items()}
 """In the paper's order."""
@@ -76,13 +69,12 @@ def judge(claim: Claim, facts: Facts) -> Judged:
     if absent:
         return not_testable(
             "The drives that the model was trained on lack signals of model "
-            f"{text.listed(absent)} of Table I, which the paper's statements are about."
+            f"{listed(absent)} of Table I, which the paper's statements are about."
         )
     try:
         if claim.holds is None:
             return not_testable(_filled(claim.why, facts))
-        criterion_met = TEXTS.compile_expression(claim.holds, undefined_to_none=False)
-        held = criterion_met(_names(f"{{{{ {claim.holds} }}}}", facts))
+        held = expression(claim.holds)(_names(f"{{{{ {claim.holds} }}}}", facts))
         figure, why = _filled(claim.figure, facts), _filled(claim.why, facts)
     except NotEvaluatedError as lacking:
         return not_testable(

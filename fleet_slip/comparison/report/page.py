@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
-from fleet_slip.comparison.report import further_tables, own_tables, paper_tables
 from fleet_slip.comparison.report.further_pictures import draw_pictures
 from fleet_slip.comparison.report.judging import Judged, Status, judge_claims
 from fleet_slip.comparison.report.report_data import ReportData, gather
+from fleet_slip.comparison.report.tables import tables
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.pages.drawing import Picture, draw, png_file, svg_file
@@ -19,11 +19,21 @@ from fleet_slip.words import number_of
 SECTIONS = {"paper": "figure-", "memory": "memory-", "roads": "road-", "fleet": "fleet-"}
 """What the keys of a section's pictures begin with."""
 
+TABLES_IN = {
+    "tables": ("table-1", "table-2", "distances", "targets", "targets-filter"),
+    "further": (
+        "without-label", "own-car", "scenarios", "standings", "limits", "fleets", "rivals",
+    ),
+    "coefficients": ("coefficients",),
+    "storage": ("storage",),
+}  # fmt: skip
+"""The tables of each section, by their names in `tables.toml`."""
+
 
 def render(data: ReportData, shown: Sequence[Picture]) -> str:
     """Return the page."""
     drawn = [draw(one) for one in shown]
-    claims, learned = judge_claims(data), further_tables.rivals(data)
+    claims = judge_claims(data)
     return fill_in(
         "report.html.j2",
         version=data.version,
@@ -33,21 +43,10 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
             for section, prefix in SECTIONS.items()
         },
         beyond=[one for one in drawn if not one.picture.key.startswith((*SECTIONS.values(),))],
-        table_one=paper_tables.table_one(data),
-        table_two=paper_tables.table_two(data),
-        distances=paper_tables.distances(data),
-        targets=list(paper_tables.targets(data)),
-        further=[
-            *own_tables.without_label(data),
-            *own_tables.own_car(data),
-            further_tables.scenarios(data),
-            further_tables.standings(data),
-            *further_tables.limits(data),
-            *further_tables.fleets(data),
-            *([learned] if learned else []),
-        ],
-        coefficients=list(further_tables.coefficient_tables(data)),
-        storage=further_tables.storage(data),
+        **{
+            section: [one for name in names for one in tables(data, name)]
+            for section, names in TABLES_IN.items()
+        },
         tiles=_tiles(data, claims),
         claims=claims,
         tally=_tally(claims),

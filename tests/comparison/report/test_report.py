@@ -19,24 +19,22 @@ from fleet_slip.comparison.evaluation.evaluate import evaluations_of, keep
 from fleet_slip.comparison.evaluation.open_gates import gates_of
 from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
 from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
-from fleet_slip.comparison.report import paper_tables
 from fleet_slip.comparison.report.column_worth import by_length, looks_back
 from fleet_slip.comparison.report.facts import NAMES, Facts
 from fleet_slip.comparison.report.further_pictures import draw_pictures, road_pictures
-from fleet_slip.comparison.report.further_tables import limits, standings
 from fleet_slip.comparison.report.gate_strips import opening
 from fleet_slip.comparison.report.judging import (
     CLAIMS,
     LIMITS,
-    TEXTS,
     Status,
     judge,
     judge_claims,
 )
 from fleet_slip.comparison.report.kept_evaluation import blocks_won, difference
-from fleet_slip.comparison.report.own_tables import without_label
 from fleet_slip.comparison.report.page import render
 from fleet_slip.comparison.report.report_data import ReportData
+from fleet_slip.comparison.report.tables import tables
+from fleet_slip.comparison.report.texts import TEXTS
 from fleet_slip.comparison.report.training_findings import ANGLE_DEG, held_out_coefficients
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import Document
@@ -126,7 +124,7 @@ def test_the_same_data_give_the_same_bytes(reported: Reported, data: ReportData)
 def test_table_one_shows_folds_by_drive_and_by_whole_bands_of_speed(data: ReportData) -> None:
     selection = data.trained.selection
     bands = selection.cohort.folds("speed", selection.folds.count)
-    table = paper_tables.table_one(data)
+    (table,) = tables(data, "table-1")
     assert table.head[-2:] == ["by speed", "RMSE by speed"]
     for row, model in zip(table.rows, selection.models, strict=True):
         again = validate(CandidateModel(name="x", signals=model.signals), bands)
@@ -136,13 +134,12 @@ def test_table_one_shows_folds_by_drive_and_by_whole_bands_of_speed(data: Report
             degrees(again.pooled.rmse_deg),
         ]
         assert row[-1].text != row[-3].text
-    bare = paper_tables.table_one(replace(data, by_speed={}))
+    (bare,) = tables(replace(data, by_speed={}), "table-1")
     assert {len(row) for row in bare.rows} == {len(bare.head)} == {len(table.head) - 2}
 
 
 def test_the_distances_are_those_of_every_nested_model_and_the_null_one(data: ReportData) -> None:
-    table = paper_tables.distances(data)
-    assert table is not None
+    (table,) = tables(data, "distances")
     assert [row[0].text for row in table.rows] == [str(j) for j in range(len(table.rows))]
     assert len(table.rows) == 1 + len(data.trained.selection.models[-1].signals)
     assert table.rows[0][1].text == "none"
@@ -150,11 +147,11 @@ def test_the_distances_are_those_of_every_nested_model_and_the_null_one(data: Re
     expected = [float(row[4].text.replace(MINUS, "-")) for row in table.rows]
     (least,) = [j for j, row in enumerate(table.rows) if row[4].mark == "good"]
     assert expected[least] == min(expected)
-    assert paper_tables.distances(replace(data, distances="too few drives")) is None
+    assert not tables(replace(data, distances="too few drives"), "distances")
 
 
 def test_table_two_has_the_evaluations_numbers(data: ReportData) -> None:
-    rows = paper_tables.table_two(data).rows
+    rows = tables(data, "table-2")[0].rows
     assert [row[0].text for row in rows] == ["1", "2", "3", "4", "5"]
     for row in rows:
         estimator = data.evaluated.models[row[0].text]
@@ -358,7 +355,7 @@ def test_a_model_of_one_instant_has_no_figures_on_memory(data: ReportData) -> No
 
 
 def test_the_standings_mark_the_smallest_error_of_each_drive(data: ReportData) -> None:
-    shown = standings(data)
+    (shown,) = tables(data, "standings")
     names = shown.head[1:]
     for drive, *cells in shown.rows:
         found = {name: data.evaluated.figures(drive.text, name) for name in names}
@@ -373,7 +370,7 @@ def test_the_standings_mark_the_smallest_error_of_each_drive(data: ReportData) -
 
 
 def test_errors_stand_beside_the_bound_of_their_drive(data: ReportData) -> None:
-    (shown,) = limits(data)
+    (shown,) = tables(data, "limits")
     assert shown.head[:3] == ["test drive", "bound, degrees", "told the car"]
     nominal = next(cells for drive, *cells in shown.rows if drive.text == "nominal")
     bound, told, *times = (float(cell.text) for cell in nominal)
@@ -387,7 +384,7 @@ def test_errors_stand_beside_the_bound_of_their_drive(data: ReportData) -> None:
 
 def test_every_estimator_has_a_point_on_every_test_drive(data: ReportData) -> None:
     (picture,) = [one for one in draw_pictures(data) if one.key == "test-drives"]
-    names = standings(data).head[1:]
+    names = tables(data, "standings")[0].head[1:]
     for size in (DESK, PHONE):
         (axes,) = picture.draw(size).axes
         drawn = [
@@ -439,7 +436,7 @@ def test_gates_are_found_in_a_manifest_with_all_their_knots(data: ReportData) ->
 
 
 def test_what_no_label_taught_says_so(data: ReportData) -> None:
-    assert not list(without_label(data))
+    assert not tables(data, "without-label")
     learned = LearnedFrom(
         label="course",
         change_s=(2.0, 4.0),
