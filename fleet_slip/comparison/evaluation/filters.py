@@ -8,7 +8,6 @@ The tuned ones have the parameters that suit drives which the regression was tra
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields, replace
-from importlib.metadata import version as package_version
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.observers import ekf, ekf_bank, kalman, luenberger, sliding_mode
 from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive, read_drive
-from fleet_slip.comparison.observers.tuning import Estimator, Tuned, tune
+from fleet_slip.comparison.observers.tuning import Estimator, Tuned, checksum_of_sources, tune
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.files.documents import DocumentFolder
@@ -224,7 +223,7 @@ def _key(
         "tunable": list(one.tunable),
         "drives": drives.key(),
         "car": car.model_dump(mode="json"),
-        "package_version": package_version("fleet-slip"),
+        "program": checksum_of_sources(),
     }
 
 

@@ -7,7 +7,6 @@ measured: of the simulator's parameters it is given none that these do not tell.
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from importlib.metadata import version as package_version
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from fleet_slip.comparison.evaluation.filters import GROUP, TuningDrives, seen
 from fleet_slip.comparison.observers import ekf
 from fleet_slip.comparison.observers.drive_signals import LabelledDrive
 from fleet_slip.comparison.observers.identification import Identified, Measured, identify
+from fleet_slip.comparison.observers.tuning import checksum_of_sources
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.runs.log import LOGGER
@@ -67,7 +67,7 @@ def identified_estimate(
     What was found is kept below `tuned/` in the data root, and sought again only for other drives
     or another program.
     """
-    key = {"drives": drives.key(), "package_version": package_version("fleet-slip")}
+    key = {"drives": drives.key(), "program": checksum_of_sources()}
     kept = DocumentFolder(warehouse.root / "tuned" / "identified")
     documents = (kept.read(number).content for number in reversed(kept.numbers()))
     found = next((content for content in documents if content["key"] == key), None)

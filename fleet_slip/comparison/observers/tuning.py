@@ -4,11 +4,13 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.canonical import sha256_of
 from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
@@ -44,6 +46,12 @@ class Tuned(Generic[P]):
     parameters: P
     rmse_rad: float
     evaluations: int
+
+
+def checksum_of_sources(folder: Path = Path(__file__).parent) -> str:
+    """Return the SHA-256 of the modules of a folder: by itself, of all that is tuned."""
+    modules = sorted(folder.glob("*.py"))
+    return sha256_of("\0".join(module.read_text(encoding="utf-8") for module in modules))
 
 
 def rmse_rad(

@@ -19,6 +19,7 @@ from fleet_slip.comparison.evaluation.evaluated_drives import load_drives
 from fleet_slip.comparison.evaluation.filters import FILTERS, FilterEstimate, class_car
 from fleet_slip.comparison.observers import kalman
 from fleet_slip.comparison.observers.drive_signals import read_drive
+from fleet_slip.comparison.observers.tuning import checksum_of_sources
 from fleet_slip.comparison.rivals.learners import LEARNERS
 from fleet_slip.errors import DataError, RefusedError
 from fleet_slip.files.documents import DocumentFolder
@@ -204,6 +205,7 @@ def test_the_filters_are_tuned_once(root: Path) -> None:
         for name in ("ekf", "ekf_bank", "identified", "kalman", "luenberger", "sliding_mode")
     ]
     tuned = json.loads((root / "tuned" / "kalman" / "1.json").read_text())["content"]
+    assert tuned["key"]["program"] == checksum_of_sources()
     seconds, *drives = tuned["key"]["drives"]
     assert seconds == reported.LITTLE_S
     assert [model for _, model, _ in drives] == ["d_class_sedan"] * 8

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.observers import ekf, kalman, luenberger, sliding_mode
 from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive
 from fleet_slip.comparison.observers.kalman import FilterNoise
-from fleet_slip.comparison.observers.tuning import rmse_rad, tune
+from fleet_slip.comparison.observers.tuning import checksum_of_sources, rmse_rad, tune
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
@@ -100,3 +101,13 @@ def test_drives_without_labels_are_refused(executor: Executor) -> None:
     unknown = LabelledDrive("x", drive.signals, np.full(100, np.nan))
     with pytest.raises(DataError, match="no row has both"):
         rmse_rad(lambda d: kalman.estimate(d.signals, CAR, FilterNoise()), [unknown], executor)
+
+
+def test_what_was_found_is_of_these_sources(tmp_path: Path) -> None:
+    (tmp_path / "one.py").write_text("a = 1")
+    (tmp_path / "two.py").write_text("b = 2")
+    before = checksum_of_sources(tmp_path)
+    (tmp_path / "two.py").write_text("b = 3")
+    assert checksum_of_sources(tmp_path) != before
+    (tmp_path / "two.py").write_text("b = 2")
+    assert checksum_of_sources(tmp_path) == before != checksum_of_sources()
