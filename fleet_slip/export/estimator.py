@@ -173,7 +173,7 @@ class _Layout:
                     yield self._slide(operands[0], *plain)
                 slid.add(plain)
             elif name not in ("constant", "fact", "number"):
-                yield (do.OPERATIONS[name], place, operands[0], operands[-1])
+                yield (do.CODES[name], place, operands[0], operands[-1])
         for of, ring in self._rings.items():
             if ring[1]:
                 yield (do.KEEP, 0, at[of], *ring)

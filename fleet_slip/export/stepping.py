@@ -12,18 +12,19 @@ from fleet_slip.compiling import inner_loop, kernel
 
 MISSING = -(2**63)
 
-OPERATIONS = {
-    name: number
-    for number, name in enumerate(
-        ("+", "-", "*", "//", "nearest", "min", "max", "negative", "abs", "sign", "clip",
-         "at_least", "where", "else", "signal", "ago", "slide", "keep", "term")
-    )
-}  # fmt: skip
-"""The operations of steps, and what a tick takes besides; `slide` is the sums and the values."""
+(
+    ADD, SUBTRACT, MULTIPLY, DIVIDE, NEAREST, LEAST, MOST, NEGATIVE, ABSOLUTE, SIGN, CLIP,
+    AT_LEAST, WHERE,  # so far missing where an operand is
+    ELSE, SIGNAL, AGO, SLIDE, KEEP, TERM,
+) = range(19)  # fmt: skip
+"""What a tick does; `SLIDE` is the sums and the values of a window."""
 
-ADD, SUBTRACT, MULTIPLY, DIVIDE, NEAREST, LEAST, MOST = 0, 1, 2, 3, 4, 5, 6
-NEGATIVE, ABSOLUTE, SIGN, CLIP, AT_LEAST, WHERE, ELSE = 7, 8, 9, 10, 11, 12, 13
-SIGNAL, AGO, SLIDE, KEEP, TERM = 14, 15, 16, 17, 18
+CODES = {
+    **{"+": ADD, "-": SUBTRACT, "*": MULTIPLY, "//": DIVIDE, "nearest": NEAREST, "min": LEAST},
+    **{"max": MOST, "negative": NEGATIVE, "abs": ABSOLUTE, "sign": SIGN, "clip": CLIP},
+    **{"at_least": AT_LEAST, "where": WHERE, "else": ELSE},
+}
+"""Operations of steps that are computed from values of the same tick."""
 
 ROW = 8
 """Whole numbers of an operation."""

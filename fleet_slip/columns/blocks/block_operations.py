@@ -11,13 +11,12 @@ BLOCK_ROWS = 2**10
 TILE = 4
 """Columns are padded to a multiple of this; see `product_sums`."""
 
-COPY, ADD, SUBTRACT, MULTIPLY, NEGATE, ABSOLUTE, SIGN = 0, 1, 2, 3, 4, 5, 6
-"""The same for binary64 and int64."""
-LEAST, MOST, DIVIDE, NEAREST, FILL, BROADCAST, AT_LEAST = 7, 8, 9, 10, 11, 12, 13
-WHERE, ELSE, TO_BINARY64, CLIP, SHARE, SCALE = 14, 15, 16, 17, 18, 19
-
-ADD_UP, KEEP, QUOTIENT, AGO = 20, 21, 22, 23
-"""Operations on the rows of before."""
+(
+    COPY, ADD, SUBTRACT, MULTIPLY, NEGATE, ABSOLUTE, SIGN,  # the same for binary64 and int64
+    LEAST, MOST, DIVIDE, NEAREST, FILL, BROADCAST, AT_LEAST, WHERE, ELSE, TO_BINARY64, CLIP, SHARE,
+    SCALE,
+    ADD_UP, KEEP, QUOTIENT, AGO,  # on the rows of before
+) = range(24)  # fmt: skip
 
 INTEGERS = 30
 """An operation plus this writes int64; that of `COPY` reads binary64."""
