@@ -46,7 +46,7 @@ def publish(
     """Make the winner the next version of its model, and its champion.
 
     It must be above the floor, and no worse than the champion and the best of the champions so far
-    (`acceptance.gate`), else it is refused (`RefusedError`) unless forced. A `candidate` waits for
+    (`champion_rules`), else it is refused (`RefusedError`) unless forced. A `candidate` waits for
     somebody to promote it, and so does whatever is published while the champion is held by
     `rollback` or `pin`. A challenger that is the same estimator from the same rows changes nothing.
     If the champion changes meanwhile, all is decided again.

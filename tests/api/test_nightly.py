@@ -17,7 +17,7 @@ import fleet_slip
 from fleet_slip.api.nightly import Night
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import UsageError
-from fleet_slip.models.acceptance.gate import floor
+from fleet_slip.models.acceptance.champion_rules import floor
 from fleet_slip.monitoring.night_page import render_night
 from fleet_slip.monitoring.night_report import NightReport
 from fleet_slip.regression.exact.gram import Gram
@@ -45,7 +45,7 @@ def land(landing: Landing, night: int, **changes: str) -> Path:
 
 
 def configs(folder: Path, old: str, new: str) -> str:
-    """Return a folder of configs whose gate is another."""
+    """Return a folder of configs whose rules for champions are others."""
     shipped = Path(fleet_slip.__file__).parents[1] / "configs/publish.toml"
     text = shipped.read_text()
     assert old in text
@@ -55,8 +55,8 @@ def configs(folder: Path, old: str, new: str) -> str:
 
 
 @contextmanager
-def gate(folder: Path, old: str, new: str) -> Iterator[None]:
-    """Publish by another gate, here and in commands."""
+def champions_by(folder: Path, old: str, new: str) -> Iterator[None]:
+    """Publish by other rules, here and in commands."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("FLEET_SLIP_CONFIG", configs(folder, old, new))
         floor.cache_clear()
@@ -66,9 +66,9 @@ def gate(folder: Path, old: str, new: str) -> Iterator[None]:
 
 @pytest.fixture(scope="module", autouse=True)
 def forgiving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A gate that lets small differences pass: of so few drives they are large."""
+    """Rules that let small differences pass: of so few drives they are large."""
     own = tmp_path_factory.mktemp("forgiving") / "configs"
-    with gate(own, "worth_deg = 0.025", "worth_deg = 1.0  "):
+    with champions_by(own, "worth_deg = 0.025", "worth_deg = 1.0  "):
         yield
 
 
@@ -289,7 +289,7 @@ def test_a_worse_winner_becomes_a_candidate_and_calls_for_attention(
     place: Path, landing: Landing
 ) -> None:
     land(landing, 2)
-    with gate(place / "configs", "min_correlation = 0.5", "min_correlation = 0.999999"):
+    with champions_by(place / "configs", "min_correlation = 0.5", "min_correlation = 0.999999"):
         report, again = give(place, 2), give(place, 2)
     assert report.exit_code == 10
     assert (report.champion, report.candidate) == ("smoke@2", "smoke@3")

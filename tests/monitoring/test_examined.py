@@ -15,7 +15,7 @@ from fleet_slip.cli.app import app
 from fleet_slip.errors import RefusedError, UnexaminedError
 from fleet_slip.grams.cohorts.cells import NO_CELLS, RollupReader
 from fleet_slip.grams.rows import rollup
-from fleet_slip.models.acceptance import gate
+from fleet_slip.models.acceptance import champion_rules
 from fleet_slip.monitoring import examined, quality
 from fleet_slip.monitoring.quality import QualityReport
 from fleet_slip.runs.nights import hash_drive, with_all_drives, without_drives
@@ -110,7 +110,7 @@ def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
     assert fleet.publish("m", fleet.cohort(), candidate=True).candidate
 
 
-_FLOOR = gate.floor
+_FLOOR = champion_rules.floor
 
 
 def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_columns(
@@ -123,8 +123,8 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
         ("max_columns_per_drive", 0.1, r"columns? on 4 drives, more than 0\.1 a drive"),
         ("min_rows_per_column", 10**6, r"rows, fewer than 1000000 for each of its \d columns?"),
     ):
-        strict = gate.floor().model_copy(update={name: bound})
-        monkeypatch.setattr(gate, "floor", lambda strict=strict: strict)
+        strict = champion_rules.floor().model_copy(update={name: bound})
+        monkeypatch.setattr(champion_rules, "floor", lambda strict=strict: strict)
         with pytest.raises(RefusedError, match=told) as refused:
             fleet.publish("m", asked)
         dry = fleet.would_publish("m", asked)
@@ -132,7 +132,7 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
         assert fleet.would_publish("m", asked, candidate=True).candidate
         said = CliRunner().invoke(app, command)
         assert "winner: " in said.stdout and isinstance(said.exception, RefusedError)
-        monkeypatch.setattr(gate, "floor", _FLOOR)
+        monkeypatch.setattr(champion_rules, "floor", _FLOOR)
     assert not fleet.models().num_rows
     assert "m would be published. " in CliRunner().invoke(app, command).output
     assert fleet.publish("m", asked).new
@@ -143,8 +143,8 @@ def test_a_champion_of_more_columns_needs_drives_for_them_too(
 ) -> None:
     cohort = fleet.cohort("day = DATE '2026-10-05'")
     assert fleet.publish("m", cohort.select(model="ay, yaw_rate")).new
-    strict = gate.floor().model_copy(update={"max_columns_per_drive": 0.6})
-    monkeypatch.setattr(gate, "floor", lambda: strict)
+    strict = champion_rules.floor().model_copy(update={"max_columns_per_drive": 0.6})
+    monkeypatch.setattr(champion_rules, "floor", lambda: strict)
     with pytest.raises(RefusedError, match=r"3 columns on 4 drives, more than 0\.6 a drive"):
         fleet.publish("m", cohort.select(model="ay, yaw_rate, steering_wheel"))
     assert not fleet.would_publish("m", cohort.select(model="ay, steering_wheel")).refused

@@ -18,7 +18,7 @@ from fleet_slip.models.estimates.score import score
 from fleet_slip.models.versions import Registry
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-from tests.models.acceptance.test_gate import publish_from, write
+from tests.models.acceptance.test_champion_rules import publish_from, write
 from tests.support.s3_server import Server, forget_clients
 
 pytestmark = pytest.mark.long

@@ -18,7 +18,7 @@ from fleet_slip.errors import RefusedError
 from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.ingest.drives.measured_drives import SOURCE
 from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
-from fleet_slip.models.acceptance.gate import thin
+from fleet_slip.models.acceptance.champion_rules import find_lacks
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.trained_drives import TrainedDrives
 from fleet_slip.warehouse.condition import asking, parse_condition
@@ -51,7 +51,7 @@ def require_sound_drives(
     over.
     """
     found, looked_at, measured = _look(warehouse, manifest, made)
-    if measured and len(manifest.terms) > settled and (lacks := thin(manifest)):
+    if measured and len(manifest.terms) > settled and (lacks := find_lacks(manifest)):
         raise RefusedError(
             f"{manifest.name} was not published: {'; '.join(lacks)}. Ingest more drives, choose "
             "fewer columns, or publish it with force all the same."

@@ -1,10 +1,10 @@
-"""What the gate and the drives that made the champion say of a challenger."""
+"""What the rules for champions, and the drives that made this one, say of a challenger."""
 
 from dataclasses import dataclass
 from typing import Any
 
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
-from fleet_slip.models.acceptance.gate import compare, faults
+from fleet_slip.models.acceptance.champion_rules import compare, find_faults
 from fleet_slip.models.acceptance.vouched import ODD, odd_gain
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import Manifest
@@ -15,7 +15,7 @@ from fleet_slip.selection.select_models import Selection
 
 @dataclass(frozen=True)
 class Judgement:
-    """What the gate says of a challenger.
+    """What the rules say of a challenger.
 
     Attributes:
         problems: why it is not to become champion.
@@ -51,7 +51,7 @@ def judge(
     selection: Selection[Any],
 ) -> Judgement:
     """Compare a challenger with the champion, and with the best of the champions so far."""
-    problems = faults(manifest, champion.manifest if champion else None)
+    problems = find_faults(manifest, champion.manifest if champion else None)
     if champion is None:
         return Judgement(tuple(problems), "It is the first version")
     try:

@@ -20,7 +20,7 @@ from fleet_slip.grams.cohorts.folding import FOLD_KEYS, assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
 from fleet_slip.grams.cohorts.taught_cohort import TaughtCohort
 from fleet_slip.grams.rows.rollup import hash_numbers
-from fleet_slip.models.acceptance.gate import GROUPS, Contest, as_it_is, contest, worth
+from fleet_slip.models.acceptance.champion_rules import GROUPS, Contest, as_it_is, contest, worth
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.choice.winner import compare_paired

@@ -16,7 +16,7 @@ from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.marked_models import models_trained_on
-from fleet_slip.models.acceptance import gate
+from fleet_slip.models.acceptance import champion_rules
 from fleet_slip.models.aliases import CANDIDATE
 from fleet_slip.models.describe_winner import manifest_of
 from fleet_slip.models.diff import compare_versions
@@ -156,7 +156,7 @@ def test_the_champion_is_compared_as_it_is_not_fitted_anew(champion: Warehouse) 
     version = registry_of(champion).load("beta", 1)
     request = SelectionRequest(nested="ay,yaw_rate")
     answer = answer_request(champion, request, "drive_id LIKE 'more%'")
-    comparison = gate.compare(answer, [version])
+    comparison = champion_rules.compare(answer, [version])
     (as_it_is,) = comparison.incumbents
     assert as_it_is.counts.coefficients == counts_model(version.manifest).coefficients
     assert as_it_is.pooled.rows == comparison.challenger.pooled.rows == 48 * ROWS
@@ -169,8 +169,10 @@ def test_a_search_is_made_again_without_the_cars_that_are_held_out(champion: War
     answer = answer_request(champion, request)
     winner = next(model for model in answer.models if len(model.signals) == 4)
     answer = replace(answer, winner=replace(answer.winner, model=winner))
-    found = gate.compare(answer, [version]).challenger
-    groups = answer.cohort.folds("vehicle", gate.GROUPS).serving(CHOICE, LABEL, sparse=True)
+    found = champion_rules.compare(answer, [version]).challenger
+    groups = answer.cohort.folds("vehicle", champion_rules.GROUPS).serving(
+        CHOICE, LABEL, sparse=True
+    )
     assert found.fold_names == groups.names
     for figures, (training, test) in zip(found.folds, groups.splits(), strict=True):
         sets = stepwise_order(training, CHOICE, LABEL, "forward", len(winner.signals))
@@ -189,7 +191,7 @@ def test_cars_are_held_out_where_there_are_several_else_drives(
     cohort = " OR ".join(f"vehicle_id = 'car-{i}'" for i in range(cars))
     version = publish_from(warehouse, cohort).version
     request = SelectionRequest(nested="ay,yaw_rate")
-    comparison = gate.compare(answer_request(warehouse, request, cohort), [version])
+    comparison = champion_rules.compare(answer_request(warehouse, request, cohort), [version])
     assert (comparison.by, len(comparison.challenger.folds)) == (by, groups)
 
 
@@ -241,13 +243,13 @@ def test_a_person_sets_the_floor(
     kept = "\n".join(line for line in usual.splitlines() if not line.startswith(name))
     (tmp_path / "publish.toml").write_text(f"{kept}\n{floor}\n")
     monkeypatch.setenv(CONFIG_VARIABLE, str(tmp_path))
-    gate.floor.cache_clear()
+    champion_rules.floor.cache_clear()
     write(warehouse, "good", 48)
     try:
         with pytest.raises(RefusedError, match=problem):
             publish_from(warehouse)
     finally:
-        gate.floor.cache_clear()
+        champion_rules.floor.cache_clear()
 
 
 def test_a_floor_that_cannot_be_read_lets_nothing_pass(
@@ -257,12 +259,12 @@ def test_a_floor_that_cannot_be_read_lets_nothing_pass(
     (tmp_path / "own").mkdir()
     (tmp_path / "own" / "publish.toml").write_text("min_drives = 49\n")
     monkeypatch.setenv(CONFIG_VARIABLE, str(tmp_path / "own"))
-    gate.floor.cache_clear()
+    champion_rules.floor.cache_clear()
     try:
         with pytest.raises(ConfigError, match=r"publish\.toml"):
             publish_from(champion, force=True)
     finally:
-        gate.floor.cache_clear()
+        champion_rules.floor.cache_clear()
 
 
 def hold_by_rollback(registry: Registry) -> None:

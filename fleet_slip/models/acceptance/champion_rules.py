@@ -211,7 +211,7 @@ def as_it_is(name: str, model: LinearModel, folds: Folds) -> CrossValidation:
     return assemble(name, folds, tests, model, input_scales())
 
 
-def faults(manifest: Manifest, champion: Manifest | None) -> list[str]:
+def find_faults(manifest: Manifest, champion: Manifest | None) -> list[str]:
     """Return in what a manifest is below the floor, and what it must be."""
     least, figures, trained = floor(), manifest.cross_validation, manifest.trained_on
     found = []
@@ -231,7 +231,7 @@ def faults(manifest: Manifest, champion: Manifest | None) -> list[str]:
     return found
 
 
-def thin(manifest: Manifest) -> list[str]:
+def find_lacks(manifest: Manifest) -> list[str]:
     """Return of what a first champion of measured drives has too little for its columns."""
     if manifest.learned_from is not None:
         return []
