@@ -87,13 +87,9 @@ def _print_car(
         ],
         left=2,
     )
-    for name, reason in refusals.items():
-        say(f"{name} is missing: {reason}")
-    if missing := [name for name in CAR_NUMBERS if name not in {**numbers, **refusals}]:
-        say(
-            f"not told by its drives, which lack a signal, or are too straight or even: "
-            f"{', '.join(missing)}"
-        )
+    for reason in dict.fromkeys(refusals.values()):
+        names = [name for name, why in refusals.items() if why == reason]
+        say(f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} missing: {reason}")
 
 
 def _print_fleet(found: Calibration) -> None:

@@ -17,7 +17,8 @@ import numpy as np
 from fleet_slip.catalogue.car_numbers import CAR_NUMBERS, NumberName
 from fleet_slip.grams.calibration.road_lean import FEWEST_CARS, are_banked, roads_of
 from fleet_slip.grams.calibration.tell_by_satellite import LASTING_BY_SATELLITE, tell_by_satellite
-from fleet_slip.grams.calibration.tell_numbers import Telling, bank_of_bends, tell_numbers
+from fleet_slip.grams.calibration.tell_numbers import bank_of_bends, tell_numbers
+from fleet_slip.grams.calibration.telling import Telling, Told
 from fleet_slip.grams.cohorts.drive_sums import DriveSums
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.moments_relation import DriveTermSums, Influence, influence
@@ -76,9 +77,7 @@ LEANS = (
     "roads are banked, and may always lean to one side, which nobody can tell from the car's own "
     f"offset: {FEWEST_CARS} cars or more can"
 )
-TIGHT_BENDS = (
-    "bends are so tight that a bank is not in proportion to them: satellite speed tells it"
-)
+BEYOND = "it is beyond what 16 bits count of its grain"
 """Why a number is missing."""
 
 
@@ -92,7 +91,8 @@ class CarEvidence:
         self.cars = sorted({car for one in sums.values() for car in one.cars})
         banks = [bank_of_bends(self._totals(self.slices(car))) for car in self.cars]
         self._banked = are_banked([bank for bank in banks if bank is not None])
-        self.told = {car: self.tell(self.slices(car)) for car in self.cars}
+        self._whole = {car: self._tell(self.slices(car)) for car in self.cars}
+        self.told = {car: whole.numbers for car, whole in self._whole.items()}
         offsets = [told["ay_offset"].value for told in self.told.values() if "ay_offset" in told]
         self.roads = roads_of(self._banked, offsets)
         self.variances = self._variances()
@@ -116,8 +116,13 @@ class CarEvidence:
 
     def tell(self, slices: Mapping[str, slice]) -> dict[NumberName, Telling]:
         """Return the numbers that some drives tell, with the lean of their roads."""
+        return self._tell(slices).numbers
+
+    def _tell(self, slices: Mapping[str, slice]) -> Told:
         totals = self._totals(slices)
-        return tell_numbers(totals, self._banked) | tell_by_satellite(totals)
+        told = tell_numbers(totals, self._banked)
+        tell_by_satellite(totals, told)
+        return told
 
     def influence(self, telling: Telling, at: slice) -> Influence | None:
         """Return how drives move a number."""
@@ -235,13 +240,16 @@ class CarEvidence:
         return name == "ay_offset" and self.roads.hide_offsets
 
     def refusals(self, car: str) -> dict[NumberName, str]:
-        """Return why numbers of a car are missing that its drives would tell on other roads."""
-        told = self.told[car]
+        """Return why numbers of a car are missing."""
+        whole = self._whole[car]
         found: dict[NumberName, str] = {}
-        if "ay_offset" in told and self._hidden("ay_offset"):
-            found["ay_offset"] = LEANS
-        if "yaw_rate_offset" in told and "speed_ratio" not in told:
-            found["speed_ratio"] = TIGHT_BENDS
+        for name in CAR_NUMBERS:
+            if name not in whole.numbers:
+                found[name] = whole.missing[name]
+            elif self._hidden(name):
+                found[name] = LEANS
+            elif CAR_NUMBERS[name].count(self.level(whole.numbers[name])) is None:
+                found[name] = BEYOND
         return found
 
 

@@ -19,7 +19,8 @@ from fleet_slip.catalogue.course_relation import (
 )
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.calibration.tell_numbers import SPEED_RATIOS, WHEEL_SPEEDS, Telling
+from fleet_slip.grams.calibration.tell_numbers import SPEED_RATIOS, WHEEL_SPEEDS
+from fleet_slip.grams.calibration.telling import Telling, Told
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.moments_relation import ONE, ExactSums, Relation, Terms, solve
 
@@ -34,6 +35,14 @@ LASTING_BY_SATELLITE: Mapping[str, Mapping[NumberName, float]] = {
 }
 """Standard errors that no drive takes away, by kind: tyres slip and wear; a receiver of which we
 know to 5 ms how late it is moves l by the way of that time."""
+
+NO_RECEIVER = (
+    "no course by satellite: none is logged, or its Gram rows are missing (fleet-slip gram "
+    "--features calibration_course)"
+)
+FEW_TURNS = "its course by satellite has too few turns"
+NO_CAR = "its course by satellite is none of a car: look at the receiver, and where its antenna is"
+"""Why a number is missing."""
 
 SPEED = Relation(instruments=(ONE,), left=((("speed", ONE),),), right=((SATELLITE, ONE),), noise={})
 """The satellite's speed by that of the wheels. Neither delay nor noise changes a mean."""
@@ -57,9 +66,13 @@ def kinds_by_set() -> dict[str, dict[str, tuple[str, ...]]]:
     }
 
 
-def tell_by_satellite(sums: Mapping[str, Gram]) -> dict[NumberName, Telling]:
-    """Return the numbers that satellites tell of a car, from the sums of its drives; exactly."""
-    return {**_speed_ratio(sums.get(SATELLITE)), **_slip(sums.get(SLIP))}
+def tell_by_satellite(sums: Mapping[str, Gram], told: Told) -> None:
+    """Add the numbers that satellites tell of a car, from the sums of its drives; exactly.
+
+    They replace what its own sensors tell.
+    """
+    told.numbers.update(_speed_ratio(sums.get(SATELLITE)))
+    told.take(("slip_lever", "slip_compliance"), _slip(sums.get(SLIP)))
 
 
 def _speed_ratio(gram: Gram | None) -> dict[NumberName, Telling]:
@@ -78,16 +91,16 @@ def _speed_ratio(gram: Gram | None) -> dict[NumberName, Telling]:
     return {"speed_ratio": told}
 
 
-def _slip(gram: Gram | None) -> dict[NumberName, Telling]:
-    if gram is None or gram.n < FEWEST_CHANGES:
-        return {}
+def _slip(gram: Gram | None) -> dict[NumberName, Telling] | str:
+    if gram is None or gram.n == 0:
+        return NO_RECEIVER
     terms = slip_terms()
     sums = ExactSums(gram, terms)
-    if sums.variance(TURNED) < Fraction(LEAST_TURNED_RAD) ** 2:
-        return {}
+    if gram.n < FEWEST_CHANGES or sums.variance(TURNED) < Fraction(LEAST_TURNED_RAD) ** 2:
+        return FEW_TURNS
     solution = solve(CHANGE.system(sums, 0))
     if solution is None or not LEVERS_M[0] <= solution[1] <= LEVERS_M[1]:
-        return {}
+        return NO_CAR
     of_plane = (SLIP, CHANGE, terms, Fraction(0))
     return {
         "slip_lever": Telling(*of_plane, solution[1], (0.0, 1.0, 0.0, 0.0), {}),

@@ -12,12 +12,22 @@ it is taken out of their squares.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
 
 from fleet_slip.catalogue.car_numbers import NumberName
 from fleet_slip.catalogue.features import input_scales
+from fleet_slip.grams.calibration.telling import (
+    ALIKE,
+    EVEN,
+    NO_COURSE,
+    NO_STEERING,
+    NO_TYRE,
+    STRAIGHT,
+    TIGHT_BENDS,
+    Telling,
+    Told,
+)
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.moments_relation import ONE, ExactSums, Relation, Terms, solve
 
@@ -32,6 +42,11 @@ the offset of one sensor from that of the other; on banked roads also the bank f
 TIGHT_1PM = Fraction(1, 50)
 """Standard deviation of curvature beyond which bends are mostly so tight that their bank does not
 grow with curvature any more: it looks like speed."""
+
+OF_COURSE: tuple[NumberName, ...] = ("yaw_rate_offset", "ay_offset", "speed_ratio")
+OF_WHEELS: tuple[NumberName, ...] = ("yaw_rate_offset_by_wheels",)
+OF_STEERING: tuple[NumberName, ...] = ("steering_offset", "steer_per_curvature", "understeer")
+"""The numbers of each relation."""
 
 LEAST_CURVATURE_1PM = Fraction(1, 1000)
 SPEED_RATIOS = {False: (Fraction(4, 5), Fraction(5, 4)), True: (Fraction(3, 4), Fraction(4, 3))}
@@ -128,48 +143,40 @@ def steering_terms(yaw_rate_offset: Fraction) -> Terms:
     }
 
 
-@dataclass(frozen=True)
-class Telling:
-    """A number of a relation, its gradient by the unknowns, and by others that it depends on.
-
-    `noise` is the variance of the gyroscope's noise that was taken out; `by_lean` is how much a
-    lean of the road adds to the number.
-    """
-
-    kind: str
-    relation: Relation
-    terms: Terms
-    noise: Fraction
-    value: Fraction
-    gradient: tuple[float, ...]
-    also: Mapping[NumberName, float]
-    by_lean: Fraction = Fraction(0)
-
-
-def tell_numbers(sums: Mapping[str, Gram | None], banked: bool) -> dict[NumberName, Telling]:
+def tell_numbers(sums: Mapping[str, Gram | None], banked: bool) -> Told:
     """Return the numbers that the sums of a car's drives tell, by kind; exactly.
 
     `banked`: whether bends are, on the fleet's roads (`road_lean`). A number is missing where its
     columns are, where the sums do not determine it, or where the car drove too straight or too
     evenly to tell it from noise.
     """
-    found: dict[NumberName, Telling] = {}
+    told = Told()
     course, steering = sums.get("course"), sums.get("steering")
     if course is None or course.n == 0:
-        return found
+        told.take((*OF_WHEELS, *OF_COURSE, *OF_STEERING), NO_COURSE)
+        return told
     of_course = ExactSums(course, course_terms())
-    if of_course.variance("course_rate") < LEAST_TURNING_RAD_S**2:
-        return found
     noise = gyroscope_noise(course, steering)
-    if noise is None:
-        return found
-    _tell_wheels(found, of_course, noise)
+    if of_course.variance("course_rate") < LEAST_TURNING_RAD_S**2 or noise is None:
+        told.take((*OF_WHEELS, *OF_COURSE, *OF_STEERING), STRAIGHT)
+        return told
+    told.take(OF_WHEELS, _tell_wheels(of_course, noise))
     change = LEAST_CHANGE_OF_SPEED[banked] * of_course.mean("slowness")
-    if of_course.variance("slowness") >= change**2:
-        _tell_course(found, of_course, noise if banked else None)
-    if steering and "ay_offset" in found:
-        _tell_steering(found, steering, noise if banked else Fraction(0))
-    return found
+    if of_course.variance("slowness") < change**2:
+        told.take((*OF_COURSE, *OF_STEERING), EVEN)
+        return told
+    found = _tell_course(of_course, noise if banked else None)
+    told.take(OF_COURSE, found)
+    if isinstance(found, str):
+        told.take(OF_STEERING, found)
+    elif steering is None or steering.n == 0:
+        told.take(OF_STEERING, NO_STEERING)
+    else:
+        told.take(OF_STEERING, _tell_steering(found, steering, noise if banked else Fraction(0)))
+    if of_course.variance("curvature") > TIGHT_1PM**2 and "speed_ratio" in told.numbers:
+        del told.numbers["speed_ratio"]
+        told.take(("speed_ratio",), TIGHT_BENDS)
+    return told
 
 
 def bank_of_bends(sums: Mapping[str, Gram]) -> Fraction | None:
@@ -190,12 +197,12 @@ def gyroscope_noise(course: Gram, steering: Gram | None) -> Fraction | None:
     return sums.residual_variance("yaw_rate", (*inputs, "steer"))
 
 
-def _tell_course(found: dict[NumberName, Telling], sums: ExactSums, noise: Fraction | None) -> None:
+def _tell_course(sums: ExactSums, noise: Fraction | None) -> dict[NumberName, Telling] | str:
     """Tell by the relation of flat roads, or with a noise by that of banked ones."""
     relation, noise = (FLAT, Fraction(0)) if noise is None else (COURSE, noise)
     solution = solve(relation.system(sums, noise))
     if solution is None or not solution[1]:
-        return
+        return ALIKE
     gradients: dict[NumberName, tuple[float, ...]]
     if relation is FLAT:
         yaw_rate_offset, slope, of_slowness = solution
@@ -215,30 +222,33 @@ def _tell_course(found: dict[NumberName, Telling], sums: ExactSums, noise: Fract
         }
     least, most = SPEED_RATIOS[relation is COURSE]
     if not least <= ratio <= most:
-        return
+        return NO_TYRE
+    found: dict[NumberName, Telling] = {}
     values = (yaw_rate_offset, ay_offset, ratio)
-    if sums.variance("curvature") > TIGHT_1PM**2:
-        del gradients["speed_ratio"]
-    for (name, gradient), value in zip(gradients.items(), values, strict=False):
+    for (name, gradient), value in zip(gradients.items(), values, strict=True):
         lean, terms = Fraction(name == "ay_offset"), course_terms()
         found[name] = Telling("course", relation, terms, noise, value, gradient, {}, lean)
+    return found
 
 
-def _tell_wheels(found: dict[NumberName, Telling], sums: ExactSums, noise: Fraction) -> None:
+def _tell_wheels(sums: ExactSums, noise: Fraction) -> dict[NumberName, Telling] | str:
     solution = solve(WHEELS.system(sums, noise))
-    if solution is not None:
-        found["yaw_rate_offset_by_wheels"] = Telling(
-            "course", WHEELS, course_terms(), noise, solution[0], (1.0, 0.0, 0.0, 0.0), {}
-        )
+    if solution is None:
+        return ALIKE
+    of_wheels = ("course", WHEELS, course_terms(), noise)
+    told = Telling(*of_wheels, solution[0], (1.0, 0.0, 0.0, 0.0), {})
+    return {"yaw_rate_offset_by_wheels": told}
 
 
-def _tell_steering(found: dict[NumberName, Telling], gram: Gram, noise: Fraction) -> None:
+def _tell_steering(
+    found: Mapping[NumberName, Telling], gram: Gram, noise: Fraction
+) -> dict[NumberName, Telling] | str:
     yaw_rate_offset, ay_offset = found["yaw_rate_offset"].value, found["ay_offset"].value
     terms = steering_terms(yaw_rate_offset)
     sums = ExactSums(gram, terms)
     solution = solve(STEERING.system(sums, noise))
     if solution is None or sums.variance("bend") < LEAST_CURVATURE_1PM**2:
-        return
+        return STRAIGHT
     straight, by_bend, understeer = solution
 
     also: dict[NumberName, float] = {
@@ -247,8 +257,9 @@ def _tell_steering(found: dict[NumberName, Telling], gram: Gram, noise: Fraction
     }
     of_plane = ("steering", STEERING, terms, noise)
     value = straight + understeer * ay_offset
-    found["steering_offset"] = Telling(
-        *of_plane, value, (1.0, 0.0, float(ay_offset)), also, by_lean=understeer
-    )
-    found["steer_per_curvature"] = Telling(*of_plane, by_bend, (0.0, 1.0, 0.0), {})
-    found["understeer"] = Telling(*of_plane, understeer, (0.0, 0.0, 1.0), {})
+    gradient = (1.0, 0.0, float(ay_offset))
+    return {
+        "steering_offset": Telling(*of_plane, value, gradient, also, by_lean=understeer),
+        "steer_per_curvature": Telling(*of_plane, by_bend, (0.0, 1.0, 0.0), {}),
+        "understeer": Telling(*of_plane, understeer, (0.0, 0.0, 1.0), {}),
+    }

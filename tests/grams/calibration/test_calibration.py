@@ -20,7 +20,9 @@ from fleet_slip.grams.calibration.calibration import calibrate
 from fleet_slip.grams.calibration.car_evidence import CarEvidence
 from fleet_slip.grams.calibration.numbers_over_drives import changed_numbers, convergence
 from fleet_slip.grams.calibration.road_lean import roads_of
+from fleet_slip.grams.calibration.tell_by_satellite import NO_RECEIVER
 from fleet_slip.grams.calibration.tell_numbers import FLAT, KINDS, tell_numbers
+from fleet_slip.grams.calibration.telling import EVEN, NO_COURSE, NO_TYRE, STRAIGHT
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.maintenance.forget import forget
@@ -197,7 +199,7 @@ def test_roads_that_lean_and_are_banked_are_taken_out() -> None:
     assert alone.roads.lean is None
     assert "ay_offset" not in alone.calibrated("car-03")
     assert "10 cars" in alone.refusals("car-03")["ay_offset"]
-    assert not found.refusals("car-03")
+    assert set(found.refusals("car-03")) == {"slip_lever", "slip_compliance"}
     on_these_roads = alone.calibrated("car-03", leaning=True)["ay_offset"].value
     assert on_these_roads == pytest.approx(true["car-03"]["ay_offset"] + 0.2, abs=0.1)
 
@@ -267,8 +269,17 @@ def test_counts_are_rounded_to_the_grain_halves_away_from_zero() -> None:
     assert one.count(None) is None
 
 
-@pytest.mark.parametrize("kind", ["one row", "straight", "even circle", "constant speed"])
-def test_what_driving_does_not_tell_is_left_out(kind: str) -> None:
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        ("one row", STRAIGHT),
+        ("straight", STRAIGHT),
+        ("even circle", STRAIGHT),
+        ("constant speed", EVEN),
+        ("other unit", NO_TYRE),
+    ],
+)
+def test_what_driving_does_not_tell_is_left_out_and_why(kind: str, why: str) -> None:
     rng = np.random.default_rng(5)
     signals = cars.drive(rng, 2.0)
     n = cars.TICKS
@@ -281,13 +292,18 @@ def test_what_driving_does_not_tell_is_left_out(kind: str) -> None:
     elif kind == "even circle":
         for name, values in signals.items():
             signals[name] = values.mean() + 0.3 + 0.01 * rng.standard_normal(n)
+    elif kind == "other unit":
+        signals["ay"] *= 0.5
     else:
         scale = 15 / (0.31 * sum(signals[f"wheel_{c}"] for c in ("fl", "fr", "rl", "rr")) / 4)
         for corner in ("fl", "fr", "rl", "rr"):
             signals[f"wheel_{corner}"] = signals[f"wheel_{corner}"] * scale
-    rows = [gram_row("car", n, cars.counts(signals)) for n in range(2)]
-    found = evidence(rows).calibrated("car")
-    assert not {"yaw_rate_offset", "ay_offset", "steering_offset"} & found.keys(), found
+    found = evidence([gram_row("car", n, cars.counts(signals)) for n in range(2)])
+    refusals = found.refusals("car")
+    for name in ("yaw_rate_offset", "ay_offset", "speed_ratio", "steering_offset"):
+        assert name not in found.calibrated("car")
+        assert refusals[name] == why  # type: ignore[index]
+    assert refusals["slip_lever"] == NO_RECEIVER
 
 
 def test_one_drive_of_one_car_has_no_uncertainty() -> None:
@@ -301,8 +317,11 @@ def test_one_drive_of_one_car_has_no_uncertainty() -> None:
 
 def test_no_gram_rows_tell_nothing() -> None:
     for banked in (False, True):
-        assert tell_numbers({}, banked) == {}
-        assert tell_numbers({kind: Gram.zero(c) for kind, c in KINDS.items()}, banked) == {}
+        for sums in ({}, {kind: Gram.zero(c) for kind, c in KINDS.items()}):
+            told = tell_numbers(sums, banked)
+            assert not told.numbers
+            assert set(told.missing.values()) == {NO_COURSE}
+            assert len(told.missing) == 7
 
 
 def filled(warehouse: Warehouse, *names: str) -> None:

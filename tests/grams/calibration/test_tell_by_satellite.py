@@ -13,7 +13,8 @@ from fleet_slip.catalogue.course_relation import turned_scale
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.calibration.car_evidence import CarEvidence
-from fleet_slip.grams.calibration.tell_by_satellite import kinds_by_set, tell_by_satellite
+from fleet_slip.grams.calibration.tell_by_satellite import NO_CAR, kinds_by_set, tell_by_satellite
+from fleet_slip.grams.calibration.telling import Told
 from fleet_slip.grams.cohorts.drive_sums import DriveSums, collect_sums
 from fleet_slip.regression.exact.gram import Gram
 
@@ -95,4 +96,7 @@ def test_what_is_no_course_of_a_car_tells_nothing(times: int) -> None:
     counts[catalogue().label] = times * counts[catalogue().label]
     columns = COLUMNS[BY_COURSE]
     table = np.stack([counts[name].astype(np.int64) for name in columns], axis=1)
-    assert not tell_by_satellite({"slip": Gram.from_counts(columns, table)})
+    told = Told()
+    tell_by_satellite({"slip": Gram.from_counts(columns, table)}, told)
+    assert not told.numbers
+    assert told.missing["slip_lever"] == NO_CAR
