@@ -37,6 +37,7 @@ TINY = {
     "few_cars": "--draws 2",
     "flips": "--flips 1",
     "fuzz": "--cases 10 --target config",
+    "goals": "{root} smoke --roads 1",
     "gram_variants": "--root {root} --campaign smoke --only packed",
     "growth": "--root {folder} --part runs --sizes 10 20",
     "honest_cars": "{root} --cohort \"campaign = 'fleet'\" --trials 2 --cars 20 --many 10 --few 2",
