@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from fleet_slip.monitoring.monitor import Chart
     from fleet_slip.monitoring.quality import QualityReport
     from fleet_slip.monitoring.status import WarehouseStatus
-    from fleet_slip.warehouse.audit import Forgettable
 
 
 class HealthAndUpkeep(JudgedModels):
@@ -218,40 +217,36 @@ class HealthAndUpkeep(JudgedModels):
         Raises `UsageError` unless one subject is given, `QuestionError` if it was never forgotten,
         and `RefusedError` while it is being forgotten.
         """
-        from fleet_slip.warehouse.audit import ALLOWED, Audit
+        from fleet_slip.warehouse.audit import Audit, Forgettable
 
-        if source_file is not None:
-            if vehicle is not None or drive is not None:
-                raise UsageError("give one of vehicle, drive and source_file.")
-            return self._allow_file(source_file)
-        subject, audit = _forgettable(vehicle, drive), Audit(self.root)
+        asked = {"vehicle": vehicle, "drive": drive, "source_file": source_file}
+        given = [(kind, name) for kind, name in asked.items() if name is not None]
+        if len(given) != 1:
+            raise UsageError("give one of vehicle, drive and source_file.")
+        [(kind, name)] = given
         self.warehouse.require()
-        state = audit.state(subject)
-        if state is None:
-            raise QuestionError(f"{subject.kind} {subject.value!r} was never forgotten.")
-        if state == "begun":
-            raise RefusedError(
-                f"{subject.kind} {subject.value!r} is being forgotten. Give the command that "
-                "forgets it again, until it is done; then allow it."
-            )
-        if state != ALLOWED:
-            audit.allow(subject)
-        return state != ALLOWED
-
-    def _allow_file(self, name: str) -> bool:
-        from fleet_slip.warehouse.audit import Audit
-
-        self.warehouse.require()
-        states = Audit(self.root).allow_from(name).values()
-        if not states:
-            raise QuestionError(
+        audit, states = Audit(self.root), set[str]()
+        if kind == "source_file":
+            what = f"the file {name!r}"
+            unknown = (
                 f"no drive was forgotten by the name of its file {name!r}. Earlier versions kept "
                 "no such names: allow its drives, or its car."
             )
+            states.update(audit.allow_from(name).values())
+        else:
+            what = f"{kind} {name!r}"
+            subject = Forgettable("drive" if kind == "drive" else "vehicle", name)
+            unknown = f"{what} was never forgotten."
+            if state := audit.state(subject):
+                states.add(state)
+            if state == "done":
+                audit.allow(subject)
+        if not states:
+            raise QuestionError(unknown)
         if "begun" in states:
             raise RefusedError(
-                f"the file {name!r} is being forgotten. Give the command that forgets it again, "
-                "until it is done; then allow it."
+                f"{what} is being forgotten. Give the command that forgets it again, until it is "
+                "done; then allow it."
             )
         return "done" in states
 
@@ -271,11 +266,3 @@ class HealthAndUpkeep(JudgedModels):
             report = retain(self.warehouse, load_retention(config), date.today(), told)
             figures.rows, figures.size_bytes = report.forgotten.rows, report.vacuumed.size_bytes
         return report
-
-
-def _forgettable(vehicle: str | None, drive: str | None) -> "Forgettable":
-    from fleet_slip.warehouse.audit import Forgettable
-
-    if (vehicle is None) == (drive is None):
-        raise UsageError("give one of vehicle and drive.")
-    return Forgettable("drive", drive) if drive else Forgettable("vehicle", vehicle or "")
