@@ -28,7 +28,7 @@ from fleet_slip.models.estimates.score import score
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.simulation.simulation_job import simulate_campaign
 from fleet_slip.warehouse.tables import Warehouse
 
 SIGNALS = "ay,yaw_rate,steering_wheel,wheel_rl"

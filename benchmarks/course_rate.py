@@ -21,7 +21,7 @@ from fleet_slip.columns.blocks.drive_columns import Workspace
 from fleet_slip.files.data_root import data_root
 from fleet_slip.grams.rows.drive_parts import Parts
 from fleet_slip.grams.rows.drive_rows import LoggedDrive, read_drives
-from fleet_slip.grams.rows.wide import change_sums, drive_sums
+from fleet_slip.grams.rows.windowed_grams import change_sums, drive_sums
 from fleet_slip.warehouse.tables import Warehouse
 
 

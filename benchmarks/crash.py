@@ -34,7 +34,7 @@ from deltalake import DeltaTable
 # Whatever a command imports late is here before the fork.
 import fleet_slip.ingest.landing.ingest_job
 import fleet_slip.maintenance.repair
-import fleet_slip.simulation.job  # noqa: F401
+import fleet_slip.simulation.simulation_job  # noqa: F401
 from benchmarks.crash_commands import COMMANDS, Command, prepare_inputs
 from benchmarks.forking import forked
 from fleet_slip.cli.main import main as fleet_slip_main

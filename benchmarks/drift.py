@@ -26,7 +26,7 @@ from fleet_slip.monitoring.monitor import Chart, monitor
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import Campaign, load_campaign
-from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.simulation.simulation_job import simulate_campaign
 from fleet_slip.warehouse.tables import Warehouse
 
 NEW_DAYS = 6

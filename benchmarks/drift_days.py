@@ -32,7 +32,7 @@ from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.exact.least_squares import LinearModel, fit
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.simulation.simulation_job import simulate_campaign
 from fleet_slip.warehouse.tables import Warehouse
 
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")

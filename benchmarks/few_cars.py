@@ -10,8 +10,8 @@ import argparse
 
 import numpy as np
 
+from fleet_slip.regression.exact.distributions import f_upper
 from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.exact.special import f_upper
 from fleet_slip.regression.inference.drive_moments import DriveMoments
 from fleet_slip.regression.inference.standard_errors import cluster_covariance
 from tests.support.counts import Matrix, gram_of, names, table_of

@@ -31,7 +31,7 @@ from fleet_slip.grams.rows.statement import gram_statement
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.selection.select_models import select
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.simulation.simulation_job import simulate_campaign
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 5

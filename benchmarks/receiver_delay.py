@@ -26,7 +26,7 @@ import pyarrow as pa
 
 import fleet_slip
 from fleet_slip.catalogue.car_numbers import DELAY
-from fleet_slip.grams.cohorts.reader import open_grams
+from fleet_slip.grams.cohorts.gram_reader import open_grams
 from fleet_slip.grams.rows.receiver_delay import (
     RECEIVER,
     ReceiverDelay,

@@ -19,7 +19,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.cohorts.reader import GramReader
+from fleet_slip.grams.cohorts.gram_reader import GramReader
 from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.model_list import load_model_list

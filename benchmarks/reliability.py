@@ -25,7 +25,7 @@ from fleet_slip.maintenance.forget import forget
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.maintenance.verify_files import read_whole
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.simulation.simulation_job import simulate_campaign
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.writers import concurrency

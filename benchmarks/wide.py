@@ -32,7 +32,7 @@ from fleet_slip.columns.blocks.column_plan import ColumnPlan
 from fleet_slip.columns.blocks.drive_columns import Workspace
 from fleet_slip.delta import TableFile
 from fleet_slip.files.data_root import data_root
-from fleet_slip.grams.rows import aggregation, statement, wide
+from fleet_slip.grams.rows import aggregation, statement, windowed_grams
 from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.drive_parts import Parts
 from fleet_slip.grams.rows.drive_rows import read_drives
@@ -101,10 +101,12 @@ def stages(warehouse: Warehouse, file: TableFile, known: FeatureCatalogue) -> di
     plan = ColumnPlan.of_set(known, SET)
     workspace, parts = Workspace(plan), Parts()
     first = next(read_drives(warehouse, file, plan)).counts
-    wide.drive_sums(workspace, parts, first)  # compiles the kernel
+    windowed_grams.drive_sums(workspace, parts, first)  # compiles the kernel
     read = least_cpu_ns_row(file.rows, 2, lambda: list(read_drives(warehouse, file, plan)))
     rows = len(first.ticks)
-    computed = least_cpu_ns_row(rows, 10, lambda: wide.drive_sums(workspace, parts, first))
+    computed = least_cpu_ns_row(
+        rows, 10, lambda: windowed_grams.drive_sums(workspace, parts, first)
+    )
     return {"read_cpu_ns_row": round(read), "kernel_cpu_ns_row": round(computed)}
 
 
@@ -131,7 +133,7 @@ def measure_shipped(warehouse: Warehouse, file: TableFile, name: str) -> dict[st
 
     def work() -> None:
         for drive in drives:
-            wide.drive_sums(workspace, Parts(), drive)
+            windowed_grams.drive_sums(workspace, Parts(), drive)
 
     work()  # compiles the kernel
     spent = least_cpu_ns_row(rows, 10, work)
@@ -154,7 +156,7 @@ def measure(warehouse: Warehouse, columns: int, options: Any) -> dict[str, Any]:
         patch.object(features_module, "features", lambda: known),
         patch.object(aggregation, "features", lambda: known),
         patch.object(statement, "features", lambda: known),
-        patch.object(wide, "features", lambda: known),
+        patch.object(windowed_grams, "features", lambda: known),
     ):
         aggregate(warehouse, files[:1], threads=1, feature_set=SET)  # compiles the kernel
         rows = sum(file.rows for file in files)

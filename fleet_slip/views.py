@@ -105,7 +105,7 @@ def add_calibration(database: duckdb.DuckDBPyConnection, query: str) -> None:
 def _calibrate(database: duckdb.DuckDBPyConnection) -> None:
     # Imported when it is asked for: most queries are not about it.
     from fleet_slip.grams.calibration.calibration import calibration_table  # noqa: PLC0415
-    from fleet_slip.grams.cohorts.reader import OpenedGrams  # noqa: PLC0415
+    from fleet_slip.grams.cohorts.gram_reader import OpenedGrams  # noqa: PLC0415
 
     numbers, delays = (
         OpenedGrams(database, features().identity(name), 0, 0) for name in (CALIBRATION, DELAY)

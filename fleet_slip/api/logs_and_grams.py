@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from fleet_slip.ingest.mapping.mapping_list import MappingList
     from fleet_slip.maintenance.migration import MigrationReport
     from fleet_slip.simulation.campaign import Campaign
-    from fleet_slip.simulation.job import SimulationReport
+    from fleet_slip.simulation.simulation_job import SimulationReport
 
 
 class LogsAndGrams(Rooted):
@@ -56,7 +56,7 @@ class LogsAndGrams(Rooted):
         and `ClusterError`.
         """
         from fleet_slip.simulation.campaign import load_campaign
-        from fleet_slip.simulation.job import simulate_campaign
+        from fleet_slip.simulation.simulation_job import simulate_campaign
 
         chosen = load_campaign(campaign) if isinstance(campaign, str) else campaign
         wanted = chosen.chosen_days(days, last_day(through, "through"))
@@ -232,7 +232,7 @@ class LogsAndGrams(Rooted):
         are read, as the Gram rows of `signals` tell. Progress is in rows. Raises `QuestionError`
         for an unknown set, `StorageError`, `ConflictError` and `ClusterError`.
         """
-        from fleet_slip.grams.cohorts.reader import cohort_files
+        from fleet_slip.grams.cohorts.gram_reader import cohort_files
         from fleet_slip.grams.rows.gram_job import update_grams
         from fleet_slip.warehouse.condition import parse_cohort
 

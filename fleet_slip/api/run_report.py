@@ -11,7 +11,7 @@ from fleet_slip.selection.select_models import RequestedSelection
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
-    from fleet_slip.simulation.job import SimulationReport
+    from fleet_slip.simulation.simulation_job import SimulationReport
 
 
 @dataclass(frozen=True)

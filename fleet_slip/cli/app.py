@@ -12,7 +12,7 @@ import typer
 
 import fleet_slip
 from fleet_slip.cli.commands import CommandGroup
-from fleet_slip.cli.leaving import LOG_VARIABLE, leave
+from fleet_slip.cli.early_exit import LOG_VARIABLE, leave
 from fleet_slip.cli.logs import LogFormat, configure_logs
 from fleet_slip.cli.output import say
 from fleet_slip.cli.streams import Streams

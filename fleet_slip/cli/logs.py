@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
-from fleet_slip.cli.leaving import for_machines
+from fleet_slip.cli.early_exit import for_machines
 from fleet_slip.errors import hide_passwords, printable
 from fleet_slip.runs.log import LOGGER, current_run_id
 

@@ -3,7 +3,7 @@
 import signal
 import sys
 
-from fleet_slip.cli.leaving import leave, tell
+from fleet_slip.cli.early_exit import leave, tell
 from fleet_slip.errors import FleetSlipError, StorageError, is_lack_of_memory
 from fleet_slip.limits import memory_bytes, require_limits
 

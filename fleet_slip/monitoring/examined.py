@@ -24,7 +24,7 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import RECEIVED
 from fleet_slip.delta import Snapshot, TableFile
 from fleet_slip.grams.cohorts.folding import EACH, Folding
-from fleet_slip.grams.cohorts.reader import GramReader
+from fleet_slip.grams.cohorts.gram_reader import GramReader
 from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.ingest.drives.measured_drives import SOURCE

@@ -15,7 +15,7 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.monitoring.moments import DriveBatches
+from fleet_slip.monitoring.float_moments import DriveBatches
 from fleet_slip.monitoring.peers import MAD_TO_STD
 from fleet_slip.monitoring.plausibility import Fault
 from fleet_slip.monitoring.reversed_label import LEAST_EXPLAINED, label_parts, solve

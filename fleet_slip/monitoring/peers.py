@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.monitoring.moments import DriveBatches, MeanMoments
+from fleet_slip.monitoring.float_moments import DriveBatches, MeanMoments
 from fleet_slip.monitoring.plausibility import Fault
 from fleet_slip.monitoring.thresholds import QualityThresholds
 from fleet_slip.regression.exact.gram_table import GramTable

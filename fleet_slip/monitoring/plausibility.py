@@ -14,7 +14,7 @@ import numpy as np
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.turning import WITNESSES
-from fleet_slip.monitoring.moments import AT_ONCE, DriveBatches, MeanMoments
+from fleet_slip.monitoring.float_moments import AT_ONCE, DriveBatches, MeanMoments
 from fleet_slip.regression.exact.gram_table import GramTable
 
 FEWEST_WITNESSES = 3

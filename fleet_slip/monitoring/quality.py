@@ -25,10 +25,10 @@ from fleet_slip.grams.cohorts.gram_cohort import (
     load_cohort,
     require_training,
 )
-from fleet_slip.grams.cohorts.reader import GramReader
+from fleet_slip.grams.cohorts.gram_reader import GramReader
 from fleet_slip.grams.rows.receiver_delay import changed_delays
 from fleet_slip.ingest.landing.marks import Origin
-from fleet_slip.monitoring.moments import DriveBatches
+from fleet_slip.monitoring.float_moments import DriveBatches
 from fleet_slip.monitoring.odd_days import find_odd_days
 from fleet_slip.monitoring.peers import settle
 from fleet_slip.monitoring.plausibility import Fault, find_implausible

@@ -10,7 +10,7 @@ with their signs, then the sign with which each drive agrees with it.
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.monitoring.moments import DriveBatches
+from fleet_slip.monitoring.float_moments import DriveBatches
 from fleet_slip.monitoring.plausibility import Fault
 from fleet_slip.regression.exact.gram_table import GramTable
 

@@ -17,7 +17,7 @@ from fleet_slip.grams.cohorts.training_folds import clustered_moments
 from fleet_slip.regression.choice.nested_choice import Rule
 from fleet_slip.regression.choice.stepwise import METHODS
 from fleet_slip.regression.choice.winner import Worth, fall_short
-from fleet_slip.regression.exact.special import student_t_two_sided
+from fleet_slip.regression.exact.distributions import student_t_two_sided
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.influence import influential_cars, without_vehicles
 from fleet_slip.selection.label_noise import label_noise_deg

@@ -11,7 +11,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import load_toml
 from fleet_slip.errors import ConfigError
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
-from fleet_slip.grams.cohorts.reader import open_grams
+from fleet_slip.grams.cohorts.gram_reader import open_grams
 from fleet_slip.resources import find_config
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -17,7 +17,7 @@ from fleet_slip.catalogue.course_change import STRAIGHT, STRAIGHT_COURSE, TURNED
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
-from fleet_slip.grams.cohorts.reader import open_grams
+from fleet_slip.grams.cohorts.gram_reader import open_grams
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
 from fleet_slip.regression.exact.gram import packed_position
 from fleet_slip.regression.exact.gram_table import GramTable

@@ -30,7 +30,11 @@ from tests.support.commands import COMMAND, run
 
 TABLES = {"deltalake", "numpy", "pyarrow"}
 ENGINES = {"duckdb", "highway_env", "jinja2", "matplotlib", "numba", "pint", "polars"}
-SIMULATOR = ("fleet_slip.vehicle", "fleet_slip.simulation.drives", "fleet_slip.simulation.job")
+SIMULATOR = (
+    "fleet_slip.vehicle",
+    "fleet_slip.simulation.drives",
+    "fleet_slip.simulation.simulation_job",
+)
 DRIVE = "smoke-2024-05-01-0000"
 PROGRAM = """
 import atexit, json, sys

@@ -21,7 +21,7 @@ from asammdf import MDF, Signal
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import Mapping
 from fleet_slip.ingest.formats import budget, mcap_log
-from fleet_slip.ingest.formats.can_bus import CanBus
+from fleet_slip.ingest.formats.can.can_bus import CanBus
 from tests.support.fuzz.logs import DBC, FORMATS, sound_file
 from tests.support.measured import a_mapping, read_measured
 from tests.support.waiting import within

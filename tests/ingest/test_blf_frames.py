@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats import blf_frames
-from fleet_slip.ingest.formats.blf_frames import read_blf_frames
 from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.can import blf_frames
+from fleet_slip.ingest.formats.can.blf_frames import read_blf_frames
 
 Frame = tuple[float, int, bool, int, bytes]
 

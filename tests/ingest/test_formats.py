@@ -23,7 +23,7 @@ from fleet_slip.ingest import Mapping
 from fleet_slip.ingest.drafting.preview import preview_log
 from fleet_slip.ingest.formats import budget, matlab, mdf
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.source import reading_with
+from fleet_slip.ingest.formats.log_source import reading_with
 from tests.support.measured import MeasuredLog, a_mapping, read_measured, ticks
 
 START = datetime(2024, 5, 31, 12, tzinfo=UTC)

@@ -15,7 +15,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest import Mapping
 from fleet_slip.ingest.formats import mcap_log, mcap_records
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.source import OWN_TIME
+from fleet_slip.ingest.formats.log_source import OWN_TIME
 from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
 from tests.support.measured import a_mapping, read_measured
 from tests.support.reported import call

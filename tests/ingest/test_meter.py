@@ -12,7 +12,8 @@ import fleet_slip
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import Mapping, load_mapping
 from fleet_slip.ingest.drives import stream, time_bases
-from fleet_slip.ingest.formats import can_trace, csv_batches, mdf
+from fleet_slip.ingest.formats import csv_batches, mdf
+from fleet_slip.ingest.formats.can import can_trace
 from fleet_slip.ingest.formats.meter import Meter
 from fleet_slip.ingest.formats.reading import FileFormats, open_source
 from fleet_slip.ingest.logs.log_files import size_of

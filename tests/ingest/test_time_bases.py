@@ -18,7 +18,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives import log_rows, stream, time_bases
 from fleet_slip.ingest.drives.time_bases import DISORDER, HELD, ROW, merge_bases
-from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, ClockSource
+from fleet_slip.ingest.formats.log_source import OWN_TIME, Base, Channel, ClockSource
 from tests.support.measured import MeasuredLog, a_mapping, read_measured
 
 GAP_S = 1.0

@@ -32,7 +32,7 @@ from fleet_slip.runs.log import recording
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.job import simulate_batches
+from fleet_slip.simulation.simulation_job import simulate_batches
 from fleet_slip.warehouse.audit import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.maintenance.test_forget import CARS, drive, fill, mentions

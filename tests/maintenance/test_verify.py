@@ -23,7 +23,7 @@ from fleet_slip.maintenance.vacuum import vacuum
 from fleet_slip.maintenance.verify import verify
 from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.simulation.simulation_job import simulate_campaign
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts

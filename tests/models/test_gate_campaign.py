@@ -19,7 +19,7 @@ from fleet_slip.resources import find_config
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.simulation.simulation_job import simulate_campaign
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land
 from tests.support.once import made_once

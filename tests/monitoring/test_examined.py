@@ -13,7 +13,7 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli import left_out
 from fleet_slip.cli.app import app
 from fleet_slip.errors import RefusedError, UnexaminedError
-from fleet_slip.grams.cohorts.cells import NO_CELLS, RollupReader
+from fleet_slip.grams.cohorts.rollup_cells import NO_CELLS, RollupReader
 from fleet_slip.grams.rows import rollup
 from fleet_slip.models.acceptance import champion_rules
 from fleet_slip.monitoring import examined, quality

@@ -16,7 +16,7 @@ from asammdf import MDF, Signal
 from fleet_slip.ingest.drafting.draft import Draft, draft_mapping, signal_keys
 from fleet_slip.ingest.drafting.profile import profile_file
 from fleet_slip.ingest.drives.suspicion import RADIUS_M, WHEELS
-from fleet_slip.ingest.formats.can_bus import CanBus
+from fleet_slip.ingest.formats.can.can_bus import CanBus
 from fleet_slip.ingest.formats.reading import FileFormats
 from fleet_slip.ingest.mapping.signal_column import SignalColumn
 from tests.support.textbook_car import Car, a_car

@@ -13,7 +13,7 @@ from fleet_slip.cli.model_argument import OnlyModel
 from fleet_slip.cli.models.diff_command import score_against
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.progress_bar import progress
-from fleet_slip.cli.recorded import record_run
+from fleet_slip.cli.record_runs import record_run
 from fleet_slip.cli.workers import Threads
 from fleet_slip.errors import UsageError
 from fleet_slip.models.estimates.score import Score, score_statement

@@ -10,7 +10,7 @@ from fleet_slip.cli.left_out import examine_before_publishing
 from fleet_slip.cli.models.signing_commands import SignKey, signing_key
 from fleet_slip.cli.options import RESAMPLING, Unexamined, request_options
 from fleet_slip.cli.output import All, Json, print_json, say
-from fleet_slip.cli.recorded import record_run
+from fleet_slip.cli.record_runs import record_run
 from fleet_slip.errors import RefusedError
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import DryRun, Publication

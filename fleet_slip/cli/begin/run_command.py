@@ -19,7 +19,7 @@ from fleet_slip.cli.models.signing_commands import signing_key
 from fleet_slip.cli.options import request_options
 from fleet_slip.cli.output import All, Json, print_json, say
 from fleet_slip.cli.progress_bar import progress_of_steps
-from fleet_slip.cli.recorded import record_run
+from fleet_slip.cli.record_runs import record_run
 from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.data_root import data_root

@@ -13,7 +13,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.completing import complete_feature_set
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.progress_bar import progress
-from fleet_slip.cli.recorded import record_run
+from fleet_slip.cli.record_runs import record_run
 from fleet_slip.cli.workers import Cluster
 from fleet_slip.grams.rows.statement import gram_statement
 from fleet_slip.words import number_of

@@ -15,7 +15,7 @@ from fleet_slip.cli.completing import complete_config
 from fleet_slip.cli.options import option
 from fleet_slip.cli.output import Json, print_json, print_table, print_text, say
 from fleet_slip.cli.progress_bar import progress
-from fleet_slip.cli.recorded import record_run
+from fleet_slip.cli.record_runs import record_run
 from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.dates import last_day
 from fleet_slip.errors import AlarmError, UsageError

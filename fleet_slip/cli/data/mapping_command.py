@@ -44,7 +44,7 @@ def mapping(
     from fleet_slip.ingest.drafting.draft import draft_mapping  # noqa: PLC0415
     from fleet_slip.ingest.drafting.draft_text import name_of, write_draft  # noqa: PLC0415
     from fleet_slip.ingest.drafting.profile import profile_file  # noqa: PLC0415
-    from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database  # noqa: PLC0415 - takes a while
+    from fleet_slip.ingest.formats.can.can_bus import CanBus, read_can_database  # noqa: PLC0415 - takes a while
     from fleet_slip.ingest.formats.duckdb_table import DuckdbRows  # noqa: PLC0415
     from fleet_slip.ingest.formats.reading import FileFormats  # noqa: PLC0415
     from fleet_slip.ingest.logs.log_files import find_logs, local_copy  # noqa: PLC0415

@@ -12,7 +12,7 @@ from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.model_argument import OnlyModel
 from fleet_slip.cli.models.signing_commands import signing_key
 from fleet_slip.cli.output import All, Json, print_json, print_table, print_text, say
-from fleet_slip.cli.recorded import record_run
+from fleet_slip.cli.record_runs import record_run
 from fleet_slip.errors import UsageError
 from fleet_slip.export.costs import costs_content, describe_costs
 from fleet_slip.models.aliases import CHAMPION

@@ -14,7 +14,7 @@ from fleet_slip.api.requests import ForgetRequest
 from fleet_slip.cli.options import request_options
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.progress_bar import progress
-from fleet_slip.cli.recorded import record_run
+from fleet_slip.cli.record_runs import record_run
 from fleet_slip.cli.workers import Cluster
 from fleet_slip.errors import DamageError, PendingError, UsageError
 from fleet_slip.maintenance.compaction import TARGET_ROWS

@@ -4,7 +4,7 @@ import typer
 
 from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.progress_bar import progress
-from fleet_slip.cli.recorded import record_run
+from fleet_slip.cli.record_runs import record_run
 from fleet_slip.words import number_of
 
 

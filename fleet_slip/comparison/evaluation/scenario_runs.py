@@ -14,9 +14,9 @@ from fleet_slip.comparison.evaluation.unstable import CRITERION, find_unstable
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.progress import Progress, no_progress
-from fleet_slip.simulation.job import SimulationReport, simulate_batches
 from fleet_slip.simulation.scenario import Scenario
 from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.simulation_job import SimulationReport, simulate_batches
 from fleet_slip.warehouse.tables import Warehouse
 
 

@@ -24,7 +24,7 @@ from fleet_slip.comparison.report.paper_pictures import (
 )
 from fleet_slip.comparison.report.point_charts import Named, density, points_by_drive
 from fleet_slip.comparison.report.report_data import DRAWN_FILTERS, ReportData
-from fleet_slip.comparison.report.tables import compared, won
+from fleet_slip.comparison.report.report_tables import compared, won
 from fleet_slip.comparison.report.time_series import Line
 from fleet_slip.comparison.report.track_map import FINE_EDGES_DEG, Map, error_map
 from fleet_slip.pages.drawing import Picture

@@ -8,7 +8,7 @@ from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
 from fleet_slip.comparison.report.further_pictures import draw_pictures
 from fleet_slip.comparison.report.judging import Judged, Status, judge_claims
 from fleet_slip.comparison.report.report_data import ReportData, gather
-from fleet_slip.comparison.report.tables import tables
+from fleet_slip.comparison.report.report_tables import tables
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.pages.drawing import Picture, draw, png_file, svg_file

@@ -19,7 +19,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.expansion import CarCounts
 from fleet_slip.grams.cohorts.folding import assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
-from fleet_slip.grams.cohorts.reader import cohort_files
+from fleet_slip.grams.cohorts.gram_reader import cohort_files
 from fleet_slip.grams.rows.drive_rows import read_drives
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.validation.folds import FoldAssignment

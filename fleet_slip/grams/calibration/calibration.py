@@ -31,7 +31,7 @@ from fleet_slip.grams.calibration.road_lean import Roads
 from fleet_slip.grams.calibration.tell_by_satellite import kinds_by_set
 from fleet_slip.grams.calibration.tell_numbers import KINDS
 from fleet_slip.grams.cohorts.drive_sums import collect_sums
-from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
+from fleet_slip.grams.cohorts.gram_reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.rows.receiver_delay import (
     LASTING_S,
     RECEIVER_DELAY,

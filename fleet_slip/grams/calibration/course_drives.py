@@ -9,7 +9,7 @@ from fleet_slip.catalogue.course_relation import COLUMNS, turned_scale
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
-from fleet_slip.grams.cohorts.reader import GramReader
+from fleet_slip.grams.cohorts.gram_reader import GramReader
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.warehouse.condition import Condition

@@ -13,8 +13,8 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.grams.cohorts.expansion import expansion_of
 from fleet_slip.grams.cohorts.folding import EACH, Folding
 from fleet_slip.grams.cohorts.gram_cohort import empty_cohort, require_training
+from fleet_slip.grams.cohorts.gram_reader import GramReader, open_grams
 from fleet_slip.grams.cohorts.members import Hashed, Members
-from fleet_slip.grams.cohorts.reader import GramReader, open_grams
 from fleet_slip.grams.rows.gram_rows import gram_table
 from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.regression.exact.gram import Gram

@@ -19,7 +19,7 @@ from fleet_slip.catalogue.definitions import Number
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.grams.calibration.calibration import calibration_of
-from fleet_slip.grams.cohorts.reader import OpenedGrams
+from fleet_slip.grams.cohorts.gram_reader import OpenedGrams
 from fleet_slip.grams.cohorts.sweeping import swept
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
 from fleet_slip.regression.exact.gram import packed_position

@@ -14,7 +14,6 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError
-from fleet_slip.grams.cohorts.cells import Cells, dealt_folds
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
 from fleet_slip.grams.cohorts.expansion import Expansion, expansion_of
 from fleet_slip.grams.cohorts.folding import (
@@ -26,8 +25,9 @@ from fleet_slip.grams.cohorts.folding import (
     require_divided,
 )
 from fleet_slip.grams.cohorts.gram_cohort import empty_cohort, require_training
+from fleet_slip.grams.cohorts.gram_reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.cohorts.members import Hashed, Members, received_among
-from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
+from fleet_slip.grams.cohorts.rollup_cells import Cells, dealt_folds
 from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
 from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
 from fleet_slip.regression.exact.gram import Gram

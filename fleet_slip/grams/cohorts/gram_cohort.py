@@ -23,8 +23,8 @@ from fleet_slip.grams.cohorts.folding import (
     assign_folds,
     require_divided,
 )
+from fleet_slip.grams.cohorts.gram_reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.cohorts.members import Hashed, Members, received_among
-from fleet_slip.grams.cohorts.reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.inference.drive_moments import serving_drives

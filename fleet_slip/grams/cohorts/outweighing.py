@@ -17,14 +17,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.grams.cohorts.cells import Cells
+from fleet_slip.grams.cohorts.rollup_cells import Cells
 from fleet_slip.grams.rows.rollup import BUCKETS, hash_numbers
 from fleet_slip.warehouse.condition import Condition, asking
 from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.minimum_cohort import UNNAMED, tells_single_cars
 
 if TYPE_CHECKING:
-    from fleet_slip.grams.cohorts.reader import OpenedGrams
+    from fleet_slip.grams.cohorts.gram_reader import OpenedGrams
 
 MOST_CARS = 4
 MOST_GROUPS = 2

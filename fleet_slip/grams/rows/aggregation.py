@@ -63,7 +63,7 @@ def compute_grams(
     or `threads`, or by an executor as tasks of some files and one thread each.
     """
     if features().feature_set(feature_set).windows:
-        from fleet_slip.grams.rows.wide import wide_grams  # noqa: PLC0415 - the compiler takes a while
+        from fleet_slip.grams.rows.windowed_grams import wide_grams  # noqa: PLC0415 - the compiler takes a while
 
         own = LocalThreads(threads or cpu_count() or 1) if executor is None else None
         with own or nullcontext():

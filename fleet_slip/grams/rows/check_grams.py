@@ -21,7 +21,7 @@ from fleet_slip.grams.rows.drive_rows import rows_by_drive
 from fleet_slip.grams.rows.gram_files import is_of_received
 from fleet_slip.grams.rows.gram_job import unit_name
 from fleet_slip.grams.rows.gram_rows import is_received
-from fleet_slip.grams.rows.wide import wide_grams
+from fleet_slip.grams.rows.windowed_grams import wide_grams
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse

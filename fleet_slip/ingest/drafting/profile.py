@@ -15,13 +15,13 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.drafting.absent_values import Absent, find_absent, without_absent
 from fleet_slip.ingest.drafting.text_layout import guess_layout
 from fleet_slip.ingest.formats.csv_text import CsvFormat
+from fleet_slip.ingest.formats.log_source import OWN_TIME, Channel, Source
 from fleet_slip.ingest.formats.reading import (
     FileFormats,
     file_errors,
     open_source,
     require_unchanged_file,
 )
-from fleet_slip.ingest.formats.source import OWN_TIME, Channel, Source
 from fleet_slip.ingest.mapping.vocabulary import vocabulary
 
 MOST_ROWS = 200_000

@@ -19,8 +19,8 @@ from fleet_slip.ingest.drives.fields import (
 from fleet_slip.ingest.drives.log_rows import read_batches
 from fleet_slip.ingest.drives.raw_columns import RAW, REASONS, Field
 from fleet_slip.ingest.drives.time_bases import ROW
+from fleet_slip.ingest.formats.log_source import BASE
 from fleet_slip.ingest.formats.meter import Meter
-from fleet_slip.ingest.formats.source import BASE
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.ingest.mapping.row_condition import describe
 from fleet_slip.words import shown

@@ -17,10 +17,10 @@ import polars as pl
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives.time_bases import merge_bases
 from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.log_source import Base, ClockSource, Source
 from fleet_slip.ingest.formats.meter import Meter
 from fleet_slip.ingest.formats.parquet_batches import BATCH_ROWS
 from fleet_slip.ingest.formats.reading import file_errors, open_source
-from fleet_slip.ingest.formats.source import Base, ClockSource, Source
 from fleet_slip.ingest.logs.log_files import parts_of
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.words import shown

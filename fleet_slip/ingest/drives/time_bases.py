@@ -10,7 +10,7 @@ from itertools import chain
 import numpy as np
 import polars as pl
 
-from fleet_slip.ingest.formats.source import BASE, Base
+from fleet_slip.ingest.formats.log_source import BASE, Base
 
 DISORDER = "\0disorder"
 """Column that says what is wrong with a row's time among those of its base, null if nothing."""

@@ -22,7 +22,7 @@ from fleet_slip.ingest.formats.csv_text import (
     recoded,
     text_of,
 )
-from fleet_slip.ingest.formats.source import Channel, require_columns
+from fleet_slip.ingest.formats.log_source import Channel, require_columns
 from fleet_slip.words import shown
 
 BLOCK_BYTES = 2**22

@@ -17,8 +17,8 @@ from pydantic import model_validator
 from fleet_slip.config import Config, Name
 from fleet_slip.errors import InputError, QuestionError
 from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.log_source import Channel, require_columns
 from fleet_slip.ingest.formats.parquet_batches import BATCH_ROWS, plain_column
-from fleet_slip.ingest.formats.source import Channel, require_columns
 from fleet_slip.limits import memory_bytes
 from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.read_only_sql import one_query

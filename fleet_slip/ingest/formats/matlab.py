@@ -14,8 +14,8 @@ import polars as pl
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.log_source import Channel, as_column, describe_missing, reading_with
 from fleet_slip.ingest.formats.matlab_elements import open_matrices
-from fleet_slip.ingest.formats.source import Channel, as_column, describe_missing, reading_with
 from fleet_slip.words import shown
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"

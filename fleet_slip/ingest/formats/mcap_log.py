@@ -19,6 +19,14 @@ import polars as pl
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.log_source import (
+    OWN_TIME,
+    Base,
+    Channel,
+    ClockSource,
+    describe_missing,
+    reading_with,
+)
 from fleet_slip.ingest.formats.mcap_fields import (
     AlikeMessages,
     Block,
@@ -28,14 +36,6 @@ from fleet_slip.ingest.formats.mcap_fields import (
     stamp_s,
 )
 from fleet_slip.ingest.formats.mcap_records import read_records
-from fleet_slip.ingest.formats.source import (
-    OWN_TIME,
-    Base,
-    Channel,
-    ClockSource,
-    describe_missing,
-    reading_with,
-)
 from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.words import shown
 

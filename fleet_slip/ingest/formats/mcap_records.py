@@ -10,8 +10,8 @@ import pyarrow as pa
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.log_source import reading_with
 from fleet_slip.ingest.formats.mcap_fields import Block
-from fleet_slip.ingest.formats.source import reading_with
 from fleet_slip.words import shown
 
 MAGIC = b"\x89MCAP0\r\n"

@@ -15,8 +15,7 @@ import polars as pl
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.mdf_links import require_tree
-from fleet_slip.ingest.formats.source import (
+from fleet_slip.ingest.formats.log_source import (
     OWN_TIME,
     Base,
     Channel,
@@ -25,6 +24,7 @@ from fleet_slip.ingest.formats.source import (
     describe_missing,
     reading_with,
 )
+from fleet_slip.ingest.formats.mdf_links import require_tree
 from fleet_slip.words import shown
 
 MAGICS = (b"MDF     ", b"UnFinMF ")

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.can_bus import CanBus, parse_database
-from fleet_slip.ingest.formats.can_frames import Bytes, FrameBlock
-from fleet_slip.ingest.formats.can_trace import CanSource
+from fleet_slip.ingest.formats.can.can_bus import CanBus, parse_database
+from fleet_slip.ingest.formats.can.can_frames import Bytes, FrameBlock
+from fleet_slip.ingest.formats.can.can_trace import CanSource
 from fleet_slip.ingest.formats.mdf import MdfSource, open_mdf
 from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.words import shown

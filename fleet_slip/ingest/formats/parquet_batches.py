@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.source import Channel, require_columns
+from fleet_slip.ingest.formats.log_source import Channel, require_columns
 from fleet_slip.words import shown
 
 BATCH_ROWS = 2**15

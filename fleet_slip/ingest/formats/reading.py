@@ -14,15 +14,16 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.blf_frames import MAGIC as BLF_MAGIC
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.can_bus import CanBus
-from fleet_slip.ingest.formats.can_trace import open_can_trace
+from fleet_slip.ingest.formats.can.blf_frames import MAGIC as BLF_MAGIC
+from fleet_slip.ingest.formats.can.can_bus import CanBus
+from fleet_slip.ingest.formats.can.can_trace import open_can_trace
 from fleet_slip.ingest.formats.csv_batches import PlainNumbers, open_csv
 from fleet_slip.ingest.formats.csv_text import CsvFormat
 from fleet_slip.ingest.formats.duckdb_table import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.formats.duckdb_table import MAGIC_AT as DUCKDB_AT
 from fleet_slip.ingest.formats.duckdb_table import DuckdbRows, open_duckdb
+from fleet_slip.ingest.formats.log_source import Source
 from fleet_slip.ingest.formats.matlab import HDF5_AT, HDF5_MAGIC, MAT5_MAGIC, open_mat, open_mat73
 from fleet_slip.ingest.formats.mcap_log import open_mcap
 from fleet_slip.ingest.formats.mcap_records import MAGIC as MCAP_MAGIC
@@ -31,7 +32,6 @@ from fleet_slip.ingest.formats.mdf import open_mdf
 from fleet_slip.ingest.formats.mdf_bus import open_mdf_bus
 from fleet_slip.ingest.formats.meter import Meter
 from fleet_slip.ingest.formats.parquet_batches import PARQUET_MAGIC, open_parquet
-from fleet_slip.ingest.formats.source import Source
 from fleet_slip.ingest.formats.tdms import MAGIC as TDMS_MAGIC
 from fleet_slip.ingest.formats.tdms import open_tdms
 from fleet_slip.ingest.logs.log_files import parts_of

@@ -16,8 +16,8 @@ import polars as pl
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
+from fleet_slip.ingest.formats.log_source import OWN_TIME, Base, Channel, ClockSource, reading_with
 from fleet_slip.ingest.formats.matlab import MatSource
-from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, ClockSource, reading_with
 from fleet_slip.words import shown
 
 MAGIC = b"TDSm"

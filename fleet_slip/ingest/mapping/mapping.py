@@ -17,12 +17,12 @@ from fleet_slip.canonical import canonical_ascii
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, Name, PositiveFloat, added, load_config
 from fleet_slip.errors import ConfigError
-from fleet_slip.ingest.formats.can_bus import CanBus, read_can_database
+from fleet_slip.ingest.formats.can.can_bus import CanBus, read_can_database
 from fleet_slip.ingest.formats.csv_batches import PlainNumbers
 from fleet_slip.ingest.formats.csv_text import CsvFormat
 from fleet_slip.ingest.formats.duckdb_table import DuckdbRows
+from fleet_slip.ingest.formats.log_source import describe_unknown
 from fleet_slip.ingest.formats.reading import FileFormats
-from fleet_slip.ingest.formats.source import describe_unknown
 from fleet_slip.ingest.mapping.label_sensor import LabelSensor
 from fleet_slip.ingest.mapping.row_condition import RowCondition, text_conditions
 from fleet_slip.ingest.mapping.signal_column import (

@@ -10,7 +10,7 @@ import polars as pl
 from pydantic import Field, field_validator, model_validator
 
 from fleet_slip.config import Config, Name, PositiveFloat, added
-from fleet_slip.ingest.formats.source import OWN_TIME
+from fleet_slip.ingest.formats.log_source import OWN_TIME
 from fleet_slip.ingest.mapping.units import require_unit
 
 

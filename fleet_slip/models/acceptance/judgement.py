@@ -5,7 +5,7 @@ from typing import Any
 
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
 from fleet_slip.models.acceptance.champion_rules import compare, find_faults
-from fleet_slip.models.acceptance.vouched import ODD, odd_gain
+from fleet_slip.models.acceptance.vouching_drives import ODD, odd_gain
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion

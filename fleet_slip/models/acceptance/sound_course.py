@@ -13,7 +13,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.calibration.course_drives import course_moments
-from fleet_slip.grams.cohorts.reader import GramReader, open_grams
+from fleet_slip.grams.cohorts.gram_reader import GramReader, open_grams
 from fleet_slip.grams.rows.course_delays import GRAIN_S
 from fleet_slip.grams.rows.receiver_delay import ReceiverDelay, receiver_delays
 from fleet_slip.models.manifest import Manifest

@@ -14,7 +14,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import QuestionError
-from fleet_slip.regression.exact.special import normal_cdf, normal_density
+from fleet_slip.regression.exact.distributions import normal_cdf, normal_density
 from fleet_slip.regression.inference.evidence import Evidence
 
 

@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.exact import special
+from fleet_slip.regression.exact import distributions
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import Fit, fit
 from fleet_slip.regression.inference.drive_moments import DriveMoments
@@ -42,7 +42,7 @@ def chow_test(
     if denominator <= 0 or apart == 0:
         raise DataError("a Chow test needs noise and more rows than coefficients.")
     f = float((together - apart) / numerator / (apart / denominator))
-    return FTest(f, numerator, denominator, special.f_upper(f, numerator, denominator))
+    return FTest(f, numerator, denominator, distributions.f_upper(f, numerator, denominator))
 
 
 def wald_test(one: Fit, one_drives: DriveMoments, other: Fit, other_drives: DriveMoments) -> FTest:
@@ -64,7 +64,7 @@ def wald_test(one: Fit, one_drives: DriveMoments, other: Fit, other_drives: Driv
     if unit == "drive":  # none is in both
         fits = fits[0], replace(fits[1], cluster=fits[1].cluster + 1 + fits[0].cluster.max())
     f, degrees = hotelling(np.array([float(x) for x in gap]), fits)
-    return FTest(f, size, degrees, special.f_upper(f, size, degrees))
+    return FTest(f, size, degrees, distributions.f_upper(f, size, degrees))
 
 
 def _numbers(fitted: Fit) -> list[Fraction]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
-from fleet_slip.regression.exact import exact_roots, special
+from fleet_slip.regression.exact import distributions, exact_roots
 from fleet_slip.regression.exact.elimination import inverse_matrix
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import Fit, Scales, dependence, moments
@@ -203,7 +203,7 @@ def _inference(
         [*names, *model.signals], [*values, *model.weights.values()], errors, strict=True
     ):
         t = value / error if error else math.copysign(math.inf, value)
-        p = special.student_t_two_sided(t, degrees)
+        p = distributions.student_t_two_sided(t, degrees)
         estimates.append(Estimate(name, value, error, t, p))
     residual_std = exact_roots.sqrt(sigma2 * scales[fitted.model.label] ** 2)
     return Inference(tuple(estimates), residual_std, degrees, kind)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.regression.exact.special import normal_cdf, normal_density
+from fleet_slip.regression.exact.distributions import normal_cdf, normal_density
 
 
 def nonnegative_least_squares(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -15,10 +15,10 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.choice.signal_orders import backward
 from fleet_slip.regression.exact import exact_roots
+from fleet_slip.regression.exact.distributions import normal_density
 from fleet_slip.regression.exact.elimination import Elimination, eliminate
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel, dependence, fit_leading, moments
-from fleet_slip.regression.exact.special import normal_density
 from fleet_slip.regression.inference.standard_errors import noise_variance
 from fleet_slip.regression.shrinkage.mixture import (
     ChiSquareKernel,

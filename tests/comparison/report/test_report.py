@@ -33,7 +33,7 @@ from fleet_slip.comparison.report.judging import (
 from fleet_slip.comparison.report.kept_evaluation import blocks_won, difference
 from fleet_slip.comparison.report.page import render
 from fleet_slip.comparison.report.report_data import ReportData
-from fleet_slip.comparison.report.tables import tables
+from fleet_slip.comparison.report.report_tables import tables
 from fleet_slip.comparison.report.texts import TEXTS
 from fleet_slip.comparison.report.training_findings import ANGLE_DEG, held_out_coefficients
 from fleet_slip.errors import DataError

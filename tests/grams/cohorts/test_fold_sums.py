@@ -10,12 +10,12 @@ import pytest
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts import reader as gram_reader
+from fleet_slip.grams.cohorts import gram_reader
 from fleet_slip.grams.cohorts.day_sums import sum_days
 from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.folding import FoldCount, Folding, FoldKey
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.cohorts.reader import GramReader
+from fleet_slip.grams.cohorts.gram_reader import GramReader
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.model_list import load_model_list

@@ -20,7 +20,7 @@ from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.check_grams import grams_of
 from fleet_slip.grams.rows.course_sums import course_changes, find_fixes
 from fleet_slip.grams.rows.drive_rows import counts_of
-from fleet_slip.grams.rows.wide import wide_grams
+from fleet_slip.grams.rows.windowed_grams import wide_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 

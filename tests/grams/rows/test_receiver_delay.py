@@ -15,7 +15,7 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.car_numbers import DELAY
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.cohorts.reader import open_grams
+from fleet_slip.grams.cohorts.gram_reader import open_grams
 from fleet_slip.grams.rows.receiver_delay import (
     ReceiverDelay,
     receiver_delays,

@@ -16,11 +16,11 @@ import fleet_slip
 from fleet_slip.delta import Change
 from fleet_slip.errors import CohortError, FleetSlipError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts import cells, outweighing
+from fleet_slip.grams.cohorts import outweighing, rollup_cells
 from fleet_slip.grams.cohorts.day_sums import sum_days
 from fleet_slip.grams.cohorts.fold_sums import sum_cohort
 from fleet_slip.grams.cohorts.folding import EACH, FoldCount, Folding, FoldKey
-from fleet_slip.grams.cohorts.reader import GramReader
+from fleet_slip.grams.cohorts.gram_reader import GramReader
 from fleet_slip.grams.received.car_keys import KEYS_VARIABLE
 from fleet_slip.grams.rows import rollup
 from fleet_slip.grams.rows.gram_files import write_rows
@@ -174,7 +174,7 @@ def test_any_cohort_over_any_folds_is_the_same_with_rollups_and_without(
 ) -> None:
     by_cells = outcome(mixed, folding, condition), days_of(mixed, condition)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cells, "read_rollup", lambda *_: None)
+        patch.setattr(rollup_cells, "read_rollup", lambda *_: None)
         by_rows = outcome(mixed, folding, condition), days_of(mixed, condition)
     assert by_cells == by_rows
 
@@ -210,7 +210,7 @@ def test_a_selection_reads_no_row_of_a_file_whose_rollup_serves(
         stop = len(file.read_bytes()) // 2
         file.write_bytes(file.read_bytes()[:stop])  # the rows are gone, not what is before them
     assert fleet.cohort().select(models="table1").as_dict() == whole.as_dict()
-    monkeypatch.setattr(cells, "read_rollup", lambda *_: None)
+    monkeypatch.setattr(rollup_cells, "read_rollup", lambda *_: None)
     with pytest.raises(StorageError, match=r"was damaged|ended|damaged"):
         fleet.cohort().select(models="table1")
 
@@ -328,7 +328,7 @@ def test_versions_know_the_drives_of_rollups(
         manifests.append(
             [one.model_copy(update={"trained_on": t}) for one, t in zip(made, alike, strict=True)]
         )
-        monkeypatch.setattr(cells, "read_rollup", lambda *_: None)
+        monkeypatch.setattr(rollup_cells, "read_rollup", lambda *_: None)
     assert manifests[0] == manifests[1]
     for of_cells, of_rows in zip(*drives, strict=True):
         assert len(of_cells.files) > len(of_rows.files) == 0
@@ -386,5 +386,5 @@ def test_a_car_that_outweighs_the_others_is_left_out_of_files_with_rollups(
     assert (left_out.vehicle_id, left_out.drives) == ("LIAR", 1)
     found = outcome(fleet.warehouse, folding, "true")
     assert found == outcome(fleet.warehouse, folding, "vehicle_id <> 'LIAR'")
-    monkeypatch.setattr(cells, "read_rollup", lambda *_: None)
+    monkeypatch.setattr(rollup_cells, "read_rollup", lambda *_: None)
     assert found == outcome(fleet.warehouse, folding, "true")

@@ -24,7 +24,7 @@ from fleet_slip.grams.rows.aggregation import aggregate, by_sql
 from fleet_slip.grams.rows.check_grams import grams_of
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.grams.rows.statement import gram_statement
-from fleet_slip.grams.rows.wide import wide_grams
+from fleet_slip.grams.rows.windowed_grams import wide_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.can_frames import MOST_BYTES, Bytes, FrameBlock
+from fleet_slip.ingest.formats.can.can_frames import MOST_BYTES, Bytes, FrameBlock
 
 MAGIC = b"LOGG"
 _MARK, _OBJECT = b"LOBJ", struct.Struct("<4s4xII")

@@ -18,10 +18,10 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import ALL_DRIVES, LONGEST_PAUSE_S, TRAINING_DRIVES
 from fleet_slip.delta import Snapshot
 from fleet_slip.errors import DataError, NotComputedError
-from fleet_slip.grams.cohorts.cells import NO_CELLS, Cells, RollupReader
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
 from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.outweighing import Outweighing, find_outweighing
+from fleet_slip.grams.cohorts.rollup_cells import NO_CELLS, Cells, RollupReader
 from fleet_slip.grams.received.car_keys import CarKey, load_car_keys
 from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.grams.rows.receiver_delay import RECEIVER

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.blf_frames import read_blf_frames
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.can_bus import CanBus, parse_database
-from fleet_slip.ingest.formats.can_frames import (
+from fleet_slip.ingest.formats.can.blf_frames import read_blf_frames
+from fleet_slip.ingest.formats.can.can_bus import CanBus, parse_database
+from fleet_slip.ingest.formats.can.can_frames import (
     CanFrames,
     FrameBlock,
     is_possible,
@@ -31,7 +31,7 @@ from fleet_slip.ingest.formats.can_frames import (
     physical,
     raw_numbers,
 )
-from fleet_slip.ingest.formats.source import (
+from fleet_slip.ingest.formats.log_source import (
     OWN_TIME,
     Base,
     Channel,

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from fleet_slip.config import Config, Name, read_named_file
 from fleet_slip.errors import ConfigError, InputError
-from fleet_slip.ingest.formats.source import reading_with
+from fleet_slip.ingest.formats.log_source import reading_with
 from fleet_slip.words import shown
 
 FORMATS = {".dbc": "dbc", ".arxml": "arxml", ".kcd": "kcd", ".sym": "sym"}

@@ -1,0 +1,1 @@
+"""CAN traces: frames of one message at a time, and what a database of messages makes of them."""
