@@ -1,4 +1,4 @@
-"""Cars that are known to be none of what was forgotten, so that nobody has to hash their names.
+"""Cars that are known not to be forgotten, so that nobody has to hash their names again.
 
     cleared/7.txt   a line of JSON: the entries of `forgotten/` with which the cars below were
                     compared, and the SHA-256 of what follows; then their names, one a line

@@ -1,4 +1,4 @@
-"""The rule of a minimum cohort: the one place that decides what is told of how many cars.
+"""The minimum cohort: the one place that decides of how many cars a figure may be told.
 
 It is off unless `FLEET_SLIP_MIN_VEHICLES` is set. Every command that tells something of cars asks
 here, in one of three ways; `docs/edge.md` says what that promises and what it does not.

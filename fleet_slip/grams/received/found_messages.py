@@ -1,4 +1,4 @@
-"""Reads messages of cars that stand one behind the other, and says what is none.
+"""Reads the messages in a file from cars, and says which parts of it are no message.
 
 Those of one length are read at once, as an array.
 """

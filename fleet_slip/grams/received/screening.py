@@ -1,4 +1,4 @@
-"""Tells which messages of cars are of what was forgotten, and may not land.
+"""Keeps out messages of cars and drives that were forgotten.
 
 Names are compared with what was forgotten by slow hashes, and only those of cars that are not known
 to be cleared (`fleet_slip.warehouse.cleared_cars`); single drives only of cars that had one

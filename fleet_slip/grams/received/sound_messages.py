@@ -1,4 +1,4 @@
-"""Tells which messages of cars cannot be, by what they say, and puts those of a kind together."""
+"""Refuses messages of cars that contradict themselves, and groups the others by layout."""
 
 import re
 import time
