@@ -1,4 +1,4 @@
-"""What changes of the course tell of a car: a few figures, whose usual places are known.
+"""What changes of the course tell of a car: a few figures, whose usual values are known.
 
 Over some seconds the course changes by the integral of the yaw rate, `TURNED`, and by the change of
 the side-slip angle, which on roads is nearly that of a car whose rear axle is l behind the centre

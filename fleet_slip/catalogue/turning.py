@@ -1,4 +1,4 @@
-"""What tells which way a car turns."""
+"""Signals that tell which way a car turns."""
 
 from collections.abc import Mapping
 

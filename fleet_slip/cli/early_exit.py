@@ -1,4 +1,4 @@
-"""What is said where the program ends before its modules are imported, by nothing but Python."""
+"""Ends the program with a message before its modules are imported, by Python alone."""
 
 import contextlib
 import json

@@ -1,4 +1,4 @@
-"""Commits that meet: how one is told, and how it is tried again."""
+"""Commits in conflict: how one is recognised, and how it is tried again."""
 
 import random
 import re

@@ -1,4 +1,4 @@
-"""Takes drives out of the logs that give way to others, or that somebody takes back.
+"""Takes drives out of the logs that others replace, or that somebody withdraws.
 
 They may come again: their files' units are withdrawn. Their Gram rows go with the files.
 """

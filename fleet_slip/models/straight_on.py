@@ -1,4 +1,4 @@
-"""The intercept of a model that changes taught, which know none: cars that go straight do not slip.
+"""The intercept of a model learned from changes, which have none: no car slips straight on.
 
 A car's signals when it goes straight follow from the offsets of its gyroscope and accelerometer,
 which `calibrate` tells without a label: each signal is fitted as a plane in both over all rows of

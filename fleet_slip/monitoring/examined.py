@@ -1,4 +1,4 @@
-"""Which drives of a cohort are to train: those that were examined, and are in order.
+"""Which drives of a cohort may train a model: those that were examined and are in order.
 
 Drives are examined once: what was found is kept in the user's cache, as hashes of drives, as long
 as Gram rows and thresholds are what they were. Many drives are examined in pieces of whole days, so

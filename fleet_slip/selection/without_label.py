@@ -1,4 +1,4 @@
-"""How good a model is that changes of the course taught, where no sensor tells the angle.
+"""How good a model learned from changes of the course is, where no sensor measures the angle.
 
 The error of changes has the noise of two fixes in it, which changes of cars that go straight on
 show. These are fast, and fast cars have less of it: what is left is more than the angle's error

@@ -1,4 +1,4 @@
-"""The paper's Figure 8 over the noise of satellite navigation: from where its filter is better.
+"""The paper's Figure 8: below which noise of satellite navigation its filter is better.
 
 The GPS velocity of one test drive is drawn again from the true one, without outages, with white
 noise of several sizes. The filter is told each. The regression, which uses no GPS, stays the same.

@@ -1,4 +1,4 @@
-"""Measured drives with a label, estimated by all that compete, each part left out in turn.
+"""All estimators on measured drives with a label, each part of them held out in turn.
 
 Models are fitted, filters tuned and a car identified on the other parts; whatever is estimated was
 not seen. A part is a quarter of the drives, or of each drive's time where there are few.

@@ -1,4 +1,4 @@
-"""Identifies a car from drives with a label: what a department does that has no tyre measured.
+"""Identifies a car from drives with a label, as one does without measurements of its tyres.
 
 Given are what scales and a tape measure say: mass, axles, tracks and the wheels' radius. Fitted are
 yaw inertia, the roll stiffness' share in front, the axles' cornering stiffness and the tyres'

@@ -1,4 +1,4 @@
-"""The cells of rollups that are in a cohort: they serve instead of the Gram rows of their files.
+"""The cells of rollups that are in a cohort, which stand in for the Gram rows of their files.
 
 A rollup serves where its columns tell condition and folds of all rows, to the bit of the rows'
 sums; other files' rows are read.

@@ -1,4 +1,4 @@
-"""Takes from the Gram row of changes what a gyroscope's bias and scale do to it, drive by drive.
+"""Removes what a gyroscope's bias and scale do to the Gram rows of changes, drive by drive.
 
 The label has the bias times the time, and the scale error times the angle turned, both of a drive:
 they are fitted away by z = (1, turned), P_ab − P_az P_zz⁻¹ P_zb, in whole numbers, each a sum of

@@ -1,4 +1,4 @@
-"""A cohort that few reference sensors teach, and the course of all others: one weighted sum.
+"""Labels of few cars and the course of all others as one cohort: a weighted sum.
 
 Rows with the label count about their drive's mean, since changes have no constant either: it
 follows from cars that go straight on (`fleet_slip.models.straight_on`). Only these drives are

@@ -1,4 +1,4 @@
-"""By how much the course of each car is late, and which Gram rows were computed otherwise.
+"""How late the course of each car is, and which Gram rows were computed with another delay.
 
 The delay is a whole number of parts of a tick, a pure function of the Gram rows of the set `delay`:
 the same drives in any order give the same rows, and forgotten ones leave nothing.

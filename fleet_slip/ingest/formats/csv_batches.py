@@ -1,4 +1,4 @@
-"""Reads CSV in blocks of whole lines, each field as the text that it is, plain numbers as such."""
+"""Reads CSV in blocks of whole lines: fields as text, columns of plain numbers as numbers."""
 
 import csv
 from collections.abc import Iterator, Sequence, Set

@@ -1,4 +1,4 @@
-"""Knows a recording again that is in the logs: by its file's bytes, or by a drive's samples.
+"""Recognises a recording that is in the logs, by its file's bytes or by a drive's samples.
 
 A mark is a unit of work beside that of its file, in the same commit: two processes that land the
 same recording at once are in conflict, and one of them is told. Its name is a hash, of all bytes of

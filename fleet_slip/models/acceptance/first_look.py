@@ -1,4 +1,4 @@
-"""Looks at drives before they teach: what is wrong with all of them alike, no comparison tells.
+"""Examines drives before a model learns from them: a fault of all shows in no comparison.
 
 A first champion has only its data, and where these are wrong alike, such as a label with the other
 sign, no drive is unlike its peers. A label that is late on a new day hardly changes what Gram rows

@@ -1,4 +1,4 @@
-"""Whether the course that taught a model is one of cars, and came in time.
+"""Whether the course that a model learned from moves as cars do, and came in time.
 
 A late one looks like a side-slip angle, in all figures, and so does a heading.
 """

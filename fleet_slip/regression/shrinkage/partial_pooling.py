@@ -1,4 +1,4 @@
-"""Numbers of several members of a kind, each drawn towards the mean of the kind.
+"""Estimates for the members of a group, each drawn towards the group's mean.
 
 A member's number is the kind's mean, what the member differs by (variance A), and an error of known
 variance V. A is where A times its likelihood, of residuals about the mean, is largest: so it is
