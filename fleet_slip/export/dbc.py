@@ -2,7 +2,7 @@
 
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.export.c.c_names import different
-from fleet_slip.export.filling import fill_in_version
+from fleet_slip.export.fill_templates import fill_in_version
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from fleet_slip.export.filling import fill_in_version
+from fleet_slip.export.fill_templates import fill_in_version
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 

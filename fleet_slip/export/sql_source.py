@@ -5,7 +5,7 @@ DuckDB, SQLite and PostgreSQL do. What is used more than once is a column of a l
 
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.columns.sql_operations import PLAIN_SQL, SqlLayers, fact_sql
-from fleet_slip.export.filling import fill_in_version
+from fleet_slip.export.fill_templates import fill_in_version
 from fleet_slip.export.program import Program
 from fleet_slip.models.model_version import ModelVersion
 

@@ -10,6 +10,7 @@ The way of a row, in the order of its stations:
 5. `drives.open_drives` keeps the rows of a part until it has ended.
 6. `drives.measured_drives` brings a drive to ticks, by `drives.resampling`, and to counts.
 7. `drives.stream` goes through the steps above; it yields ended drives and refused rows.
+   `drives.file_totals` counts what became of all rows, and refuses a file that came to nothing.
 8. `landing.landing` leaves out what was forgotten, by `landing.allowed_rows`, passes the rest on to
    `landing.data_files`, and commits the files of a batch; `landing.ingest_job` goes through all
    batches.

@@ -27,7 +27,7 @@ from fleet_slip.export.c.c_names import field_names
 from fleet_slip.export.c.c_source import helper_texts, keep_lines, start_lines
 from fleet_slip.export.c.c_steps import StepWriter, state_fields
 from fleet_slip.export.c.on_board import OnBoard, lower
-from fleet_slip.export.filling import fill_template
+from fleet_slip.export.fill_templates import fill_template
 from fleet_slip.export.program import Steps
 from fleet_slip.grams.received.messages import (
     HEADER_BYTES,

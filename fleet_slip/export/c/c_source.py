@@ -16,7 +16,7 @@ from fleet_slip.export.c.c_names import (
     literal,
 )
 from fleet_slip.export.c.c_steps import StepWriter, ring_width, state_fields, sum_key
-from fleet_slip.export.filling import fill_in_version, read_source
+from fleet_slip.export.fill_templates import fill_in_version, read_source
 from fleet_slip.export.program import Program, Steps
 from fleet_slip.models.model_version import ModelVersion
 
