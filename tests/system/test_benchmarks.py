@@ -71,6 +71,7 @@ TINY = {
     "start": "--rounds 1",
     "statistics_figures": "{root} smoke",
     "store_history": "--sizes 10",
+    "strata": "{root} smoke --by drive --folds 2",
     "suggest": "",
     "validation": "",
     "wrong_labels": "{root}",
