@@ -66,6 +66,7 @@ TINY = {
     "search": "{root} --drives 10 --most 2 --rounds 1 --methods forward",
     "simulator": "--seconds 0.01 --threads 1",
     "simulator_profile": "--campaign smoke",
+    "slow_knowledge": "--folds 2 --drives 1",
     "soak": "--minutes 0.1",
     "stability_control": "--record 2 --trials 1",
     "start": "--rounds 1",
