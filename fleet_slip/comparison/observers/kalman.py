@@ -6,7 +6,7 @@ plus; (5b), from which it follows, and the mechanics ask for a minus, which stan
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field, FiniteFloat
@@ -24,7 +24,6 @@ from fleet_slip.comparison.observers.yaw_rate import YawRateNoise
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
-from fleet_slip.simulation.sensing.sensors import Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 
@@ -40,25 +39,6 @@ class FilterNoise(Config):
     gps_vx_std_mps: FiniteFloat = Field(default=0.05, gt=0)
     gps_vy_std_mps: FiniteFloat = Field(default=0.05, gt=0)
     yaw_rate: YawRateNoise = YawRateNoise()
-
-    @classmethod
-    def of(
-        cls,
-        sensors: Sensors,
-        car: VehicleParameters,
-        *,
-        bias_std_mps2: float,
-        gyro_bias_std_rad_s: float,
-    ) -> Self:
-        """Return the noise that the sensors of a car state, with the size of their biases."""
-        return cls(
-            ax_std_mps2=sensors.acceleration_std_mps2,
-            ay_std_mps2=sensors.acceleration_std_mps2,
-            bias_std_mps2=bias_std_mps2,
-            gps_vx_std_mps=sensors.gps.velocity_std_mps,
-            gps_vy_std_mps=sensors.gps.velocity_std_mps,
-            yaw_rate=YawRateNoise.of(sensors, car, gyro_bias_std_rad_s),
-        )
 
 
 TUNABLE = (

@@ -13,7 +13,6 @@ Wheels that brake in a corner slip more on the unloaded side: rows of braking gi
 """
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from pydantic import Field, FiniteFloat
@@ -23,7 +22,6 @@ from fleet_slip.comparison.observers.belief import belief_of, condition
 from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals, undriven_axle
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
-from fleet_slip.simulation.sensing.sensors import Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 INITIAL_STD_RAD_S = 1.0
@@ -44,16 +42,6 @@ class YawRateNoise(Config):
     """Of the yaw rate from wheel speeds: √2 R σ_ω / track with σ_ω of 0.02 rad/s."""
     yaw_acceleration_std_rad_s2: FiniteFloat = Field(default=0.5, gt=0)
     """How fast the yaw rate may change."""
-
-    @classmethod
-    def of(cls, sensors: Sensors, car: VehicleParameters, gyro_bias_std_rad_s: float) -> Self:
-        """Return the noise that the sensors of a car state."""
-        lever = np.sqrt(2) * car.tyre.rolling_radius_m / car.body.track_rear_m
-        return cls(
-            gyro_std_rad_s=sensors.yaw_rate_std_rad_s,
-            gyro_bias_std_rad_s=gyro_bias_std_rad_s,
-            wheel_yaw_rate_std_rad_s=lever * sensors.wheel_speed_std_rad_s,
-        )
 
 
 TUNABLE = (

@@ -1,4 +1,4 @@
-"""Least-angle regression, lasso and elastic-net paths from correlations alone.
+"""Least-angle regression and lasso paths from correlations alone.
 
 Efron, Hastie, Johnstone and Tibshirani (2004), Annals of Statistics 32:407.
 """
@@ -44,41 +44,25 @@ class LarsPath:
 
 def lars_path(gram: Gram, inputs: Sequence[str], label: str) -> LarsPath:
     """Return the path of least-angle regression. Raises `DataError` for dependent signals."""
-    return lars_path_of_moments(*_correlations(gram, inputs, label), inputs)
+    return path_of_moments(*_correlations(gram, inputs, label), inputs)
 
 
-def lasso_path(gram: Gram, inputs: Sequence[str], label: str, *, ridge: float = 0.0) -> LarsPath:
+def lasso_path(gram: Gram, inputs: Sequence[str], label: str) -> LarsPath:
     """Return the path of all minimisers of the lasso, |y - Xb|^2 / 2 + penalty |b|_1.
 
-    `ridge` adds ridge |b|^2 / 2 (elastic net, Zou and Hastie 2005, not rescaled). Ties enter in the
-    declared order. Raises `DataError` for constant or dependent signals.
+    Ties enter in the declared order. Raises `DataError` for constant or dependent signals.
     """
-    matrix, target = _correlations(gram, inputs, label)
-    return lasso_path_of_moments(matrix + ridge * np.eye(len(inputs)), target, inputs)
+    return path_of_moments(*_correlations(gram, inputs, label), inputs, drops=True)
 
 
-def lasso_path_of_moments(
-    matrix: FloatArray, target: FloatArray, inputs: Sequence[str]
+def path_of_moments(
+    matrix: FloatArray, target: FloatArray, inputs: Sequence[str], *, drops: bool = False
 ) -> LarsPath:
-    """Return the path for moments X'X, shape (k, k), and X'y, shape (k,), in their own units."""
-    return _follow(_Walk(matrix, target, drops=True), inputs)
+    """Return the path for moments X'X, shape (k, k), and X'y, shape (k,), in their own units.
 
-
-def lars_path_of_moments(matrix: FloatArray, target: FloatArray, inputs: Sequence[str]) -> LarsPath:
-    """Return the least-angle path for moments X'X, shape (k, k), and X'y, shape (k,)."""
-    return _follow(_Walk(matrix, target, drops=False), inputs)
-
-
-def _correlations(gram: Gram, inputs: Sequence[str], label: str) -> tuple[FloatArray, FloatArray]:
-    matrix = correlation_matrix(gram.restrict([*inputs, label]))
-    constant = [name for i, name in enumerate([*inputs, label]) if matrix[i, i] == 0]
-    if constant:
-        raise DataError(f"{', '.join(constant)} is constant: leave it out.")
-    k = len(inputs)
-    return matrix[:k, :k], matrix[:k, k]
-
-
-def _follow(walk: "_Walk", inputs: Sequence[str]) -> LarsPath:
+    Of least angles, or of the lasso, which `drops` signals again. Raises `DataError`.
+    """
+    walk = _Walk(matrix, target, drops=drops)
     try:
         while walk.step():
             pass
@@ -94,11 +78,18 @@ def _follow(walk: "_Walk", inputs: Sequence[str]) -> LarsPath:
     )
 
 
-def fit_lasso(
-    gram: Gram, inputs: Sequence[str], label: str, penalty: float, ridge: float = 0.0
-) -> LinearModel:
-    """Return the lasso (or elastic net) of counts; the penalty is in correlations, 0..1."""
-    path = lasso_path(gram, inputs, label, ridge=ridge)
+def _correlations(gram: Gram, inputs: Sequence[str], label: str) -> tuple[FloatArray, FloatArray]:
+    matrix = correlation_matrix(gram.restrict([*inputs, label]))
+    constant = [name for i, name in enumerate([*inputs, label]) if matrix[i, i] == 0]
+    if constant:
+        raise DataError(f"{', '.join(constant)} is constant: leave it out.")
+    k = len(inputs)
+    return matrix[:k, :k], matrix[:k, k]
+
+
+def fit_lasso(gram: Gram, inputs: Sequence[str], label: str, penalty: float) -> LinearModel:
+    """Return the lasso of counts; the penalty is in correlations, 0..1."""
+    path = lasso_path(gram, inputs, label)
     return from_standardised(gram, inputs, label, path.at(penalty))
 
 

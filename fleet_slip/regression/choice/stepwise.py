@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.regression.choice.lars import lars_path_of_moments
+from fleet_slip.regression.choice.lars import path_of_moments
 from fleet_slip.regression.exact.elimination import eliminate
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import moments
@@ -147,7 +147,7 @@ class _Search:
         matrix = self.matrix[np.ix_(at, at)].astype(np.float64)
         target = self.matrix[at, -1].astype(np.float64)
         names = [str(i) for i in at]
-        order = [int(name) for name in lars_path_of_moments(matrix, target, names).order]
+        order = [int(name) for name in path_of_moments(matrix, target, names).order]
         return [order[:size] for size in range(1, min(most, len(order)) + 1)]
 
     def _best_entry(

@@ -75,12 +75,9 @@ def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
     return [variance * (1 + form) / gram.n, *slopes]
 
 
-def infer_classically(fitted: Fit, scales: Scales, variance: Fraction | None = None) -> Inference:
-    """Return standard errors for independent rows, rounded once; `variance` is in counts^2.
-
-    Raises `DataError` if it is to be estimated and there are too few rows.
-    """
-    sigma2 = noise_variance(fitted) if variance is None else variance
+def infer_classically(fitted: Fit, scales: Scales) -> Inference:
+    """Return standard errors for independent rows, rounded once. Raises `DataError` for too few."""
+    sigma2 = noise_variance(fitted)
     units = _units(fitted, scales)
     errors = [
         exact_roots.sqrt(v * unit**2)
