@@ -10,20 +10,27 @@ def sqrt(value: Fraction) -> float:
     """Return the square root of a non-negative rational, correctly rounded to binary64."""
     if value < 0:
         raise ValueError(f"square root of {value}")
-    if value == 0:
+    return _root_of_ratio(value.numerator, value.denominator)
+
+
+def _root_of_ratio(numerator: int, denominator: int) -> float:
+    """Return the root of a ratio in any terms: to look for the lowest takes longer than the root."""
+    if numerator == 0:
         return 0.0
-    bits = value.numerator.bit_length() - value.denominator.bit_length()
+    bits = numerator.bit_length() - denominator.bit_length()
     shift = max(0, _BITS - bits) // 2 * 2
-    scaled = (value.numerator << shift) // value.denominator
-    root = math.isqrt(scaled)
+    shifted = numerator << shift
+    root = math.isqrt(shifted // denominator)
     # A trailing one stands for all that was cut off: rounding then sees "more than half".
-    sticky = int(root * root * value.denominator != value.numerator << shift)
-    return float(Fraction(2 * root + sticky, 1 << (shift // 2 + 1)))
+    sticky = int(root * root * denominator != shifted)
+    return (2 * root + sticky) / (1 << (shift // 2 + 1))
 
 
-def signed_ratio(product: Fraction, squares: Fraction) -> float:
+def signed_ratio(product: Fraction | int, squares: Fraction | int) -> float:
     """Return `product / sqrt(squares)`, correctly rounded: a correlation from exact sums."""
     if squares <= 0:
         return 0.0
-    magnitude = sqrt(product * product / squares)
+    magnitude = _root_of_ratio(
+        product.numerator**2 * squares.denominator, product.denominator**2 * squares.numerator
+    )
     return -magnitude if product < 0 else magnitude

@@ -177,16 +177,12 @@ def _relation(fitted: Fit) -> str:
 def correlation_matrix(gram: Gram) -> FloatArray:
     """Return all correlations, (k, k), each rounded once; zeros for a constant signal."""
     centred = gram.centred()
-    squares = [centred[i][i] for i in range(len(centred))]
-    return np.array(
-        [
-            [
-                exact_roots.signed_ratio(Fraction(product), Fraction(squares[i] * squares[j]))
-                for j, product in enumerate(row)
-            ]
-            for i, row in enumerate(centred)
-        ]
-    )
+    correlations = np.zeros((len(centred), len(centred)))
+    for i, row in enumerate(centred):
+        for j in range(i + 1):
+            correlation = exact_roots.signed_ratio(row[j], row[i] * centred[j][j])
+            correlations[i, j] = correlations[j, i] = correlation
+    return correlations
 
 
 def condition_number(gram: Gram, inputs: Sequence[str]) -> float:
