@@ -1,13 +1,15 @@
 """What every test gets: a warehouse, the command line as a user runs it, and the same examples."""
 
+import gc
 import os
 import shutil
 import signal
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, is_hypothesis_test, settings
 
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
@@ -23,12 +25,15 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 os.fsync = os.fstat  # type: ignore[assignment]
 
 # The same examples in every run, half as many as usual, and none that fails because the machine is
-# busy. The option --hypothesis-profile=search looks for new ones.
+# busy. `make test` tries a part of them; the option --hypothesis-profile=search looks for new ones.
 settings.register_profile("search", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile(
     "fixed", settings.get_profile("search"), derandomize=True, max_examples=50
 )
 settings.load_profile("fixed")
+
+QUICK = 3
+"""`make test` tries one example of so many; `make test-all` tries them all."""
 
 LEFT_OUT = pytest.StashKey[dict[str, int]]()
 """How many tests were left out because of each tool, or of the minutes that they take."""
@@ -52,10 +57,39 @@ def why_left_out(item: pytest.Item) -> list[str]:
     return [*tools_of(item), *(["minutes"] if item.get_closest_marker("long") else [])]
 
 
+def tries_examples(item: pytest.Item) -> bool:
+    """Whether a test is one of hypothesis, of which `make test` tries a part."""
+    return is_hypothesis_test(getattr(item, "obj", None))
+
+
+def try_fewer(test: Any) -> None:
+    """Let a test of hypothesis try one example of `QUICK`, but five if it has them."""
+    asked = test._hypothesis_internal_use_settings  # its own pytest plugin asks so, too
+    fewer = max(asked.max_examples // QUICK, min(asked.max_examples, 5))
+    test._hypothesis_internal_use_settings = settings(asked, max_examples=fewer)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Look through what all tests import neither while it grows nor once it is there."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     with_tools = config.getoption("--tools")
     left = [item for item in items if bool(why_left_out(item)) != with_tools]
-    items[:] = [item for item in items if bool(why_left_out(item)) == with_tools]
+    if with_tools:
+        left = [item for item in left if not tries_examples(item)]
+    elif settings.get_current_profile_name() == "fixed":
+        for test in {item.obj for item in items if tries_examples(item)}:  # type: ignore[attr-defined]
+            try_fewer(test)
+    out = set(left)
+    items[:] = [item for item in items if item not in out]
     config.hook.pytest_deselected(items=left)
     names = [name for item in left for name in why_left_out(item)]
     config.stash[LEFT_OUT] = {name: names.count(name) for name in sorted(set(names))}
@@ -72,6 +106,7 @@ def pytest_runtest_teardown(item: pytest.Item) -> None:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
+    gc.unfreeze()  # or DuckDB takes what is left at the end for leaks
     if hasattr(session.config, "workeroutput"):  # of pytest-xdist, for the process that reports
         session.config.workeroutput["left_out"] = session.config.stash.get(LEFT_OUT, {})
 

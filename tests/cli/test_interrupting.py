@@ -156,8 +156,13 @@ def processor_s() -> float:
     "query",
     [
         "SELECT length(bitstring('1', 2000000000))",
-        "SELECT sum(length(repeat('a', 100000000 + i::INT))) FROM range(50) t(i)",
-        "SELECT regexp_replace(repeat('ab', 100000000), '(a|b)*c', 'x')",
+        *(
+            pytest.param(query, marks=pytest.mark.long)
+            for query in (
+                "SELECT sum(length(repeat('a', 100000000 + i::INT))) FROM range(50) t(i)",
+                "SELECT regexp_replace(repeat('ab', 100000000), '(a|b)*c', 'x')",
+            )
+        ),
     ],
 )
 def test_a_query_that_cannot_be_stopped_ends_with_the_process(smoke_root: Path, query: str) -> None:

@@ -14,7 +14,7 @@ from fleet_slip.errors import AlarmError
 
 Shown = Callable[..., list[str]]
 
-WIDTHS = [80, 100, 160]
+WIDTHS = [80, *(pytest.param(width, marks=pytest.mark.long) for width in (100, 160))]
 COMMANDS = [
     "models",
     "show smoke",

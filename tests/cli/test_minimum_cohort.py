@@ -105,6 +105,16 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(MINIMUM_VARIABLE, "20")
 
 
+def first_and_further(lines_of: dict[str, list[str]]) -> list[Any]:
+    """Each command with its first way to be asked; with the others in `make test-all`."""
+    first = [pytest.param(lines[:1], id=name) for name, lines in lines_of.items()]
+    further = {name: lines[1:] for name, lines in lines_of.items() if lines[1:]}
+    return first + [
+        pytest.param(lines, id=f"{name}, further", marks=pytest.mark.long)
+        for name, lines in further.items()
+    ]
+
+
 def words_of(line: str) -> list[str]:
     return line.split("|") if "|" in line else line.split()
 
@@ -115,9 +125,9 @@ def test_every_command_is_known_to_ask_or_to_tell_nothing_of_cars() -> None:
 
 
 @pytest.mark.usefixtures("few")
-@pytest.mark.parametrize("command", ASK)
-def test_figures_of_few_cars_are_refused(root: Path, tmp_path: Path, command: str) -> None:
-    for line in ASK[command]:
+@pytest.mark.parametrize("lines", first_and_further(ASK))
+def test_figures_of_few_cars_are_refused(root: Path, tmp_path: Path, lines: list[str]) -> None:
+    for line in lines:
         done = run_on(root, *words_of(line), cwd=tmp_path)
         assert done.exit_code == FEW, (line, done.stderr)
         assert done.stdout == "", line
@@ -125,12 +135,12 @@ def test_figures_of_few_cars_are_refused(root: Path, tmp_path: Path, command: st
 
 
 @pytest.mark.usefixtures("few")
-@pytest.mark.parametrize("command", SILENT)
-def test_what_has_no_figures_names_no_car(root: Path, tmp_path: Path, command: str) -> None:
+@pytest.mark.parametrize("lines", first_and_further(SILENT))
+def test_what_has_no_figures_names_no_car(root: Path, tmp_path: Path, lines: list[str]) -> None:
     (tmp_path / "landing").mkdir()
     (tmp_path / "messages").write_bytes(message_of(gram_of(1), "VIN1"))
     before = {*tmp_path.iterdir()}
-    for line in SILENT[command]:
+    for line in lines:
         done = run_on(root, *words_of(line), cwd=tmp_path)
         assert done.exit_code in (0, 2, 3, 4, 5, 7, 10, FEW), (line, done.stderr)
         assert not NAME.search(done.stdout + done.stderr), line

@@ -3,7 +3,6 @@
 Known vulnerabilities are looked up by `pip-audit`, which needs a network; this does not.
 """
 
-import ast
 import re
 import sys
 import tomllib
@@ -25,6 +24,7 @@ GROUPS = PROJECT["dependency-groups"]
 LICENCES = re.compile(
     r"MIT|BSD|Apache|PSF|Python Software Foundation|ISC|MPL|Mozilla|Zlib|0BSD|CC0|LGPL", re.I
 )
+IMPORTED = re.compile(r"^\s*(?:from|import) (\w+)", re.MULTILINE)
 
 
 def pinned() -> dict[str, str]:
@@ -95,11 +95,8 @@ def test_what_is_imported_is_declared(folders: list[str], groups: list[str]) -> 
 
 
 def modules_of(file: Path) -> set[str]:
-    """The top-level modules that a file imports."""
-    nodes = list(ast.walk(ast.parse(file.read_text())))
-    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
-    names += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
-    return {name.partition(".")[0] for name in names}
+    """The top-level modules that a file imports, one a statement and one statement a line."""
+    return set(IMPORTED.findall(file.read_text()))
 
 
 def test_the_packages_fit_together() -> None:

@@ -73,7 +73,9 @@ def plain_changes(table: pa.Table, late: int = 0) -> dict[int, tuple[int, ...]]:
     return found
 
 
-@pytest.mark.parametrize("late", [0, -40, -11, -2, 1, 3, 34, 80])
+@pytest.mark.parametrize(
+    "late", [0, -11, 34, *(pytest.param(n, marks=pytest.mark.long) for n in (-40, -2, 1, 3, 80))]
+)
 def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers(late: int) -> None:
     table = hostile_drive("a", 6000, 7)
     plan = ColumnPlan.of_set(features(), "course")
@@ -91,7 +93,11 @@ def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers(late: int) -
 
 @pytest.mark.parametrize(
     ("name", "late"),
-    [("course", None), ("course", {"car-1": -11}), ("three", {"car-1": 34, "other": 1})],
+    [
+        ("course", None),
+        pytest.param("course", {"car-1": -11}, marks=pytest.mark.long),
+        ("three", {"car-1": 34, "other": 1}),
+    ],
 )
 def test_gram_rows_of_the_kernel_are_those_of_the_statement(
     warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, name: str, late: dict[str, int] | None

@@ -67,7 +67,9 @@ def late_fleet(tmp_path_factory: pytest.TempPathFactory) -> LateFleet:
     return fleet
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.087, 0.3])
+@pytest.mark.parametrize(
+    "delay_s", [0.087, *(pytest.param(s, marks=pytest.mark.long) for s in (0.0, 0.3))]
+)
 def test_the_delay_is_found_with_its_uncertainty(
     late_fleet: LateFleet, tmp_path: Path, delay_s: float
 ) -> None:
@@ -154,6 +156,7 @@ def corrected_rows(fleet: Fleet) -> list[tuple[Any, ...]]:
         return session.sql(CORRECTED).fetchall()
 
 
+@pytest.mark.long
 def test_a_late_course_teaches_what_one_in_time_does(late_fleet: LateFleet, tmp_path: Path) -> None:
     """From one command: the Gram rows that tell the delay are computed by it."""
     coefficients = []

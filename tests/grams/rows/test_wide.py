@@ -229,7 +229,10 @@ def hostile_drive(name: str, rows: int, seed: int, *, null: float = 0.1) -> pa.T
     return table.set_column(at, "tick", pa.array(ticks))
 
 
-@pytest.mark.parametrize("feature_set", ["windows", "bands", "blocks"])
+@pytest.mark.parametrize(
+    "feature_set",
+    ["bands", *(pytest.param(name, marks=pytest.mark.long) for name in ("windows", "blocks"))],
+)
 def test_gram_rows_of_the_kernel_are_those_of_the_statement(
     warehouse: Warehouse, feature_set: str
 ) -> None:
@@ -251,7 +254,7 @@ def test_gram_rows_of_the_kernel_are_those_of_the_statement(
     assert aggregate(warehouse, files, feature_set=feature_set).equals(kernel)
 
 
-@pytest.mark.parametrize("feature_set", ["windows", "bands"])
+@pytest.mark.parametrize("feature_set", ["windows", pytest.param("bands", marks=pytest.mark.long)])
 def test_products_of_many_columns_come_from_several_groupings(
     warehouse: Warehouse, feature_set: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
