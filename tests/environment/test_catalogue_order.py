@@ -39,6 +39,13 @@ def test_an_order_of_signals_is_no_damage(
     after = run_command("run", "--campaign", "smoke", "--json", env=other)
     assert not after.json["changed"], after.stderr
     assert after.json["publish"]["version"] == 1
+
+
+@pytest.mark.long
+def test_models_and_rewritten_files_do_not_depend_on_the_order(
+    run_command: RunCommand, other: dict[str, str], smoke_root: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(smoke_root, tmp_path / "data")
     chosen = [run_command("select", "--json", **given).json for given in ({}, {"env": other})]
     assert chosen[0]["models"] == chosen[1]["models"]
     assert run_command("compact", env=other).exit_code == 0

@@ -24,7 +24,7 @@ from fleet_slip.ingest.drafting.preview import preview_log
 from fleet_slip.ingest.formats import budget, matlab, mdf
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.log_source import reading_with
-from tests.support.measured import MeasuredLog, a_mapping, read_measured, ticks
+from tests.support.measured import MeasuredLog, a_mapping, failure, read_measured, ticks
 
 START = datetime(2024, 5, 31, 12, tzinfo=UTC)
 TIME_S = np.arange(100) / 100
@@ -39,15 +39,6 @@ def require_the_drive(log: MeasuredLog) -> None:
     assert log.drives["ax"].to_pylist() == AX_COUNTS
     assert log.drives["sideslip"].to_pylist() == BETA_COUNTS
     assert log.drives["day"].unique().to_pylist() == [START.date()]
-
-
-def failure(file: Path, mapping: Mapping) -> str:
-    with pytest.raises(InputError) as caught:
-        read_measured(file, mapping)
-    message = str(caught.value)
-    assert message.startswith(str(file))
-    assert "\n" not in message
-    return message
 
 
 def signals(ax: str, beta: str, **beta_keys: Any) -> dict[str, Any]:

@@ -13,11 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nptdms import ChannelObject, TdmsWriter
 
-from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats import matlab, tdms
 from fleet_slip.ingest.formats.log_source import OWN_TIME
 from fleet_slip.ingest.formats.reading import FileFormats, open_source
-from tests.support.measured import a_mapping, physical, read_measured, ticks
+from tests.support.measured import a_mapping, failure, physical, read_measured, ticks
 from tests.support.suggested import ENGLISH, Suggested, suggest, wrong_guesses
 from tests.support.textbook_car import Car
 
@@ -47,15 +46,6 @@ def read(file: Path, *columns: str) -> pl.DataFrame:
 
 def own_clock(**changes: Any) -> Any:
     return a_mapping(**{"time": OWN_CLOCK, "drive": {"day": None}, "signals": SIGNALS, **changes})
-
-
-def failure(file: Path, mapping: Any) -> str:
-    with pytest.raises(InputError) as caught:
-        read_measured(file, mapping)
-    message = str(caught.value)
-    assert message.startswith(str(file))
-    assert "\n" not in message
-    return message
 
 
 def test_groups_of_several_rates_are_one_drive(tmp_path: Path) -> None:

@@ -19,7 +19,10 @@ LARGEST_BYTES = 100_000
 DRIVES, ROWS = 4, 1739
 
 
-@pytest.fixture(params=ROOTS, ids=lambda file: file.name.removesuffix(".tar.gz"))
+@pytest.fixture(
+    params=[*ROOTS[:2], *(pytest.param(file, marks=pytest.mark.long) for file in ROOTS[2:])],
+    ids=lambda file: file.name.removesuffix(".tar.gz"),
+)
 def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Fleet:
     with tarfile.open(request.param) as archive:
         archive.extractall(tmp_path, filter="data")

@@ -1,6 +1,7 @@
 """A forgotten drive stays away when its recording comes again under other names."""
 
 import gzip
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,14 +35,22 @@ def write(folder: Path, columns: dict[str, Any], name: str = "monday.csv") -> Pa
     return file
 
 
-@pytest.fixture
-def forgotten(warehouse: Warehouse, tmp_path: Path) -> Warehouse:
-    """A data root where the drive of `recording` was forgotten."""
+@pytest.fixture(scope="module")
+def after_it_was_forgotten(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data root where the drive of `recording` was forgotten, to copy."""
+    tmp_path = tmp_path_factory.mktemp("forgotten")
+    warehouse = Warehouse(LocalFolder(tmp_path / "data"))
     ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
     (file,) = warehouse.logs.snapshot().files
     (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
     assert forget(warehouse, Forgettable("drive", name), now=True).drives == 1
-    return warehouse
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def forgotten(after_it_was_forgotten: Path, tmp_path: Path) -> Warehouse:
+    """Such a root of one's own."""
+    return Warehouse(LocalFolder(shutil.copytree(after_it_was_forgotten, tmp_path / "data")))
 
 
 def is_empty(warehouse: Warehouse) -> bool:

@@ -58,7 +58,13 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return patch
 
 
-@pytest.mark.parametrize("job", [compact, compact_and_vacuum, forget_now])
+@pytest.mark.parametrize(
+    "job",
+    [
+        forget_now,
+        *(pytest.param(job, marks=pytest.mark.long) for job in (compact, compact_and_vacuum)),
+    ],
+)
 @pytest.mark.parametrize("moment", ["find_gram_files", "aggregate", "stored_grams", "read_counts"])
 def test_a_check_beside_a_job_that_takes_files_away_finds_no_damage(
     job: Callable[[Warehouse], Any],
@@ -70,7 +76,9 @@ def test_a_check_beside_a_job_that_takes_files_away_finds_no_damage(
     assert check_grams(filled, 3).drives >= 2
 
 
-@pytest.mark.parametrize("job", [compact_and_vacuum, forget_now])
+@pytest.mark.parametrize(
+    "job", [forget_now, pytest.param(compact_and_vacuum, marks=pytest.mark.long)]
+)
 @pytest.mark.parametrize("moment", ["verify_files", "verify_drives", "verify_grams"])
 def test_a_verification_beside_a_job_that_takes_files_away_finds_no_damage(
     job: Callable[[Warehouse], Any],

@@ -87,7 +87,13 @@ def test_what_roads_and_loads_change_is_no_fault(warehouse: Warehouse) -> None:
     assert find_wrong_labels(load_cohort(warehouse)) == {}
 
 
-@pytest.mark.parametrize("change", [multiplied(2), multiplied(1 / 57.3), shifted(1)])
+@pytest.mark.parametrize(
+    "change",
+    [
+        multiplied(1 / 57.3),
+        *(pytest.param(change, marks=pytest.mark.long) for change in (multiplied(2), shifted(1))),
+    ],
+)
 def test_publishing_by_hand_leaves_the_day_out(
     warehouse: Warehouse, run_command: RunCommand, change: Callable[[Signals], None]
 ) -> None:

@@ -225,6 +225,7 @@ def test_no_name_of_an_object_leads_out_of_the_temporary_folder(
     assert not list(here.rglob("x.csv"))
 
 
+@pytest.mark.long
 def test_workers_of_a_cluster_fetch_for_themselves(here: Path, bucket: str) -> None:
     ingest(here / "local", str(here / "landing"))
     with dask_processes(here) as dask:

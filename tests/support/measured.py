@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pytest
 
+from fleet_slip.errors import InputError
 from fleet_slip.ingest import IngestCounts, Mapping
 from fleet_slip.ingest.drives.stream import open_measured
 from fleet_slip.ingest.landing.data_files import log_table
@@ -56,6 +58,16 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
         stream.look_alikes(),
         stream.digest,
     )
+
+
+def failure(file: Path, mapping: Mapping) -> str:
+    """Return why a file cannot be read: a line that begins with its name."""
+    with pytest.raises(InputError) as caught:
+        read_measured(file, mapping)
+    message = str(caught.value)
+    assert message.startswith(str(file))
+    assert "\n" not in message
+    return message
 
 
 def ingest_file(warehouse: Warehouse, file: Path, mapping: Mapping) -> IngestReport:

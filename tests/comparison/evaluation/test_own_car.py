@@ -1,8 +1,6 @@
 """`fleet-slip evaluate --cohort`: measured drives judge what was not fitted to them."""
 
 import json
-import math
-import random
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -24,27 +22,11 @@ from fleet_slip.comparison.observers.tuning import Tuned
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.commands import done_on, run_on
 from tests.support.drives import rolling_drive
-from tests.support.measured import csv_text
+from tests.support.own_logs import ingest_own
 
 ROWS = 400
 LINE = Design(ColumnPlan.of(("ay",), {}, {}), (1.0,))
 NO_SIGNALS = DriveSignals(*[np.full(ROWS, np.nan)] * 11)
-
-MAPPING = """
-name = "own"
-[time]
-column = "t"
-unit = "s"
-[drive]
-vehicle_id = { column = "car" }
-vehicle_model = "own"
-day = 2026-05-04
-[signals]
-ax = { column = "ax", unit = "m/s^2" }
-ay = { column = "ay", unit = "m/s^2" }
-yaw_rate = { column = "r", unit = "rad/s" }
-sideslip = { column = "beta", unit = "rad" }
-"""
 
 
 def a_drive(number: int, part: int, *, shifted_rad: float = 0.0) -> OwnDrive:
@@ -84,34 +66,12 @@ def test_an_acceleration_that_is_not_logged_is_made_of_the_wheels() -> None:
     assert accelerated(blind, car) is blind
 
 
-def own_log(folder: Path, cars: int) -> Path:
-    rng = random.Random(5)  # noqa: S311
-    ticks = [(car, tick) for car in range(cars) for tick in range(500)]
-    ay = [3 * math.sin(tick / 30) + rng.gauss(0, 0.05) for _, tick in ticks]
-    log = folder / "log.csv"
-    log.write_text(
-        csv_text(
-            {
-                "t": [tick / 100 for _, tick in ticks],
-                "car": [f"car-{car}" for car, _ in ticks],
-                "ax": [rng.gauss(0, 0.3) for _ in ticks],
-                "ay": ay,
-                "r": [value / 20 for value in ay],
-                "beta": [-value / 200 + rng.gauss(0, 0.0003) for value in ay],
-            }
-        )
-    )
-    return log
-
-
 @pytest.fixture(scope="module")
 def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data root with drives that no filter can serve, and a model of some of them."""
     folder = tmp_path_factory.mktemp("own_car")
-    (folder / "own.toml").write_text(MAPPING)
     root = folder / "data"
-    done_on(root, "ingest", own_log(folder, cars=6), "--mapping", folder / "own.toml")
-    done_on(root, "gram")
+    ingest_own(root, folder, cars=6)
     done_on(root, "publish", "own", "--cohort", "vehicle_id < 'car-4'")
     return root
 
