@@ -12,6 +12,7 @@ import importlib
 import json
 import os
 import pkgutil
+import select
 import shutil
 import signal
 import socket
@@ -116,16 +117,36 @@ def main(address: str) -> None:
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(address)
         listener.listen()
-        signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # those that wait for one command each
         _end_with_parent()
+        ended, wake = os.pipe()
+        os.set_blocking(wake, False)
+        signal.set_wakeup_fd(wake)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
         sys.stdout.write("ready\n")
         sys.stdout.flush()
+        running: dict[int, socket.socket] = {}
         while True:
+            ready, _, _ = select.select([listener, ended], [], [])
+            if ended in ready:
+                os.read(ended, 1 << 12)
+                _tell_ended(running)
+            if listener not in ready:
+                continue
             connection, _ = listener.accept()
-            if not os.fork():
-                listener.close()
-                return _attend(connection)
-            connection.close()
+            asked, streams = _received(connection)
+            process = os.fork()  # a hundredth of a second here, and one there
+            if not process:
+                signal.set_wakeup_fd(-1)
+                signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+                for descriptor in (ended, wake):
+                    os.close(descriptor)
+                for one in (listener, connection, *running.values()):
+                    one.close()
+                return _become(asked, streams)
+            for stream in streams:
+                os.close(stream)
+            running[process] = connection
+            connection.sendall(f"{process}\n".encode())
 
 
 def _modules() -> Iterator[str]:
@@ -146,22 +167,24 @@ def _end_with_parent() -> None:
         os._exit(0)
 
 
-def _attend(connection: socket.socket) -> None:
-    """Fork one command and tell how it ended; in the forked process, return."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+def _received(connection: socket.socket) -> tuple[dict[str, Any], list[int]]:
+    """Return what is asked, and the streams of the command."""
     begun, streams, *_ = socket.recv_fds(connection, 1 << 16, 2)
     size = int.from_bytes(begun[:4], "big")
     while len(begun) < 4 + size:
         begun += connection.recv(1 << 16)
-    asked = json.loads(begun[4:])
-    process = os.fork()
-    if not process:
-        connection.close()
-        return _become(asked, streams)
-    connection.sendall(f"{process}\n".encode())
-    _, status = os.waitpid(process, 0)
-    connection.sendall(f"{os.waitstatus_to_exitcode(status)}\n".encode())
-    os._exit(0)
+    asked: dict[str, Any] = json.loads(begun[4:])
+    return asked, streams
+
+
+def _tell_ended(running: dict[int, socket.socket]) -> None:
+    """Tell those who wait for commands that have ended how they did."""
+    while True:
+        process, status = os.waitpid(-1, os.WNOHANG)
+        if not process:
+            return
+        with running.pop(process) as connection, contextlib.suppress(OSError):
+            connection.sendall(f"{os.waitstatus_to_exitcode(status)}\n".encode())
 
 
 def _become(asked: dict[str, Any], streams: list[int]) -> None:
