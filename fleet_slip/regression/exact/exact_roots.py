@@ -14,7 +14,7 @@ def sqrt(value: Fraction) -> float:
 
 
 def _root_of_ratio(numerator: int, denominator: int) -> float:
-    """Return the root of a ratio in any terms: to look for the lowest takes longer than the root."""
+    """Return the root of a ratio in any terms: the lowest take longer to find than the root."""
     if numerator == 0:
         return 0.0
     bits = numerator.bit_length() - denominator.bit_length()
