@@ -126,11 +126,11 @@ def main(address: str) -> None:
         sys.stdout.flush()
         running: dict[int, socket.socket] = {}
         while True:
-            ready, _, _ = select.select([listener, ended], [], [])
+            ready, _, _ = select.select([listener.fileno(), ended], [], [])
             if ended in ready:
                 os.read(ended, 1 << 12)
                 _tell_ended(running)
-            if listener not in ready:
+            if listener.fileno() not in ready:
                 continue
             connection, _ = listener.accept()
             asked, streams = _received(connection)
