@@ -34,6 +34,11 @@ def nearest(a: int, b: int) -> int:
     return truncated(2 * a + (b if a >= 0 else -b), 2 * b)
 
 
+def nearest_sql(number: str, divisor: str) -> str:
+    """Return `nearest` as DuckDB has it, whose `//` truncates: half a divisor is added before."""
+    return f"(2 * ({number}) + sign({number}) * ({divisor})) // (2 * ({divisor}))"
+
+
 @dataclass(frozen=True)
 class Step:
     """One operation; its operands are numbers of earlier steps, a name or a constant."""

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 
+from fleet_slip.catalogue.arithmetic import nearest_sql
 from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S, catalogue
 
 COURSE, YAW_RATE = "course", "yaw_rate"
@@ -101,11 +102,6 @@ def split_late(late: int) -> tuple[int, int]:
     return whole, (late - whole * LATE_PARTS) * 4 * HALF_TURN // LATE_PARTS
 
 
-def rounded(number: str, divisor: int) -> str:
-    """Return SQL of an integer over another, to the nearest, halves away from zero."""
-    return f"(2 * ({number}) + sign({number}) * {divisor}) // {2 * divisor}"
-
-
 def _in_time(rows: str) -> str:
     """Return a subquery: each course on the tick that it is of, but for a rest, and `HIDDEN_LATE`.
 
@@ -161,14 +157,14 @@ def _changes(rows: str, columns: tuple[str, ...], ticks: int) -> str:
     left = f"({units.turn} * {HIDDEN[0]} - {2 * HALF_TURN} * {HIDDEN[1]} + {HIDDEN[2]})"
     gain = f"({HIDDEN_LATE} - {WHOLE_TICKS} * {LATE_PARTS}) * {4 * HALF_TURN // LATE_PARTS}"
     whole = 2 * HALF_TURN * units.turn
-    near = f"({left} - {whole} * ({rounded(left, whole)}))"
-    change = rounded(label, units.divisor)
+    near = f"({left} - {whole} * ({nearest_sql(left, str(whole))}))"
+    change = nearest_sql(label, str(units.divisor))
     slow = f"{HIDDEN[3]} <= {units.slow} AND abs({HIDDEN[1]}) <= {units.unturned}"
     straight = f"CASE WHEN {HIDDEN[1]} IS NOT NULL THEN ({slow})::BIGINT END"
     hidden = ", ".join((*HIDDEN, HIDDEN_LATE))
     return f"""(
         SELECT * EXCLUDE ({hidden}) REPLACE ({change} AS {label}),
-            {rounded(HIDDEN[1], COARSER)} AS {TURNED},
+            {nearest_sql(HIDDEN[1], str(COARSER))} AS {TURNED},
             {straight} AS {STRAIGHT},
             {straight} * ({change}) AS {STRAIGHT_COURSE}
         FROM (

@@ -7,7 +7,7 @@ from functools import cached_property
 
 from pydantic import Field, model_validator
 
-from fleet_slip.catalogue.arithmetic import parse
+from fleet_slip.catalogue.arithmetic import nearest_sql, parse
 from fleet_slip.catalogue.definitions import COUNT_BITS, Bits, integer_arithmetic, limit_of
 from fleet_slip.catalogue.signals import Identifier, SIUnit, catalogue
 from fleet_slip.config import Config
@@ -49,8 +49,7 @@ class Feature(Config):
         if self.divided_by is None:
             return counts
         divisor = _widened(self.divided_by)
-        # `//` truncates, so half a divisor with the sign of the dividend rounds to the nearest.
-        quotient = f"(2 * ({counts}) + sign({counts}) * ({divisor})) // (2 * ({divisor}))"
+        quotient = nearest_sql(counts, divisor)
         if self._divisor_is_number:
             return quotient
         return f"CASE WHEN {divisor} >= {self.at_least} THEN {quotient} END"

@@ -6,6 +6,7 @@ Null is a missing value. Integers have 64 bits.
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 
+from fleet_slip.catalogue.arithmetic import nearest_sql
 from fleet_slip.catalogue.definitions import LARGEST_FACT
 from fleet_slip.columns.lowering import CarFact
 from fleet_slip.columns.operations import (
@@ -46,7 +47,7 @@ PLAIN_SQL: Mapping[str, str] = {
 DUCKDB_SQL: Mapping[str, str] = {
     **PLAIN_SQL,
     "//": "({0} // {1})",
-    "nearest": "((2 * {0} + sign({0}) * {1}) // (2 * {1}))",
+    "nearest": f"({nearest_sql('{0}', '{1}')})",
     "sign": "sign({0})",
 }
 
