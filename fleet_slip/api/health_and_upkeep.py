@@ -54,13 +54,13 @@ class HealthAndUpkeep(JudgedModels):
         `cluster` is the address of a Dask scheduler. A few bytes are written to the root and
         deleted.
         """
-        from fleet_slip.monitoring.fitness import examine
+        from fleet_slip.monitoring.fitness import examine_fitness
 
         def count_workers() -> int:
             with open_workers(self.root, cluster) as executor:
                 return int(getattr(executor, "workers", 0))
 
-        return examine(self.root, count_workers if cluster else None)
+        return examine_fitness(self.root, count_workers if cluster else None)
 
     def quality(self, cohort: str = TRAINING_DRIVES) -> "QualityReport":
         """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors by drive.

@@ -57,7 +57,7 @@ class Fitness:
         return {"examined": [{**vars(one), "fit": one.fit} for one in self.examined]}
 
 
-def examine(root: Folder, count_workers: Callable[[], int] | None = None) -> Fitness:
+def examine_fitness(root: Folder, count_workers: Callable[[], int] | None = None) -> Fitness:
     """Look at the machine, at the data root and, where one is asked for, at a cluster.
 
     A probe of a few bytes is written to the root and deleted again. What fails is a finding;

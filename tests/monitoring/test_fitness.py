@@ -11,13 +11,15 @@ import pytest
 from fleet_slip.errors import ClusterError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.monitoring import fitness
-from fleet_slip.monitoring.fitness import examine
+from fleet_slip.monitoring.fitness import examine_fitness
 from tests.support.commands import RunCommand
 
 
 def found(root: Path, subject: str, **options: Any) -> fitness.Finding:
     [one] = [
-        one for one in examine(LocalFolder(root), **options).examined if one.subject == subject
+        one
+        for one in examine_fitness(LocalFolder(root), **options).examined
+        if one.subject == subject
     ]
     return one
 
