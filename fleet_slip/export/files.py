@@ -20,9 +20,9 @@ from fleet_slip.export.checks import Check, checks_csv, make_checks
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.dbc import dbc_text
 from fleet_slip.export.document import document_of, manifest_of
+from fleet_slip.export.fill_templates import fill_in_version
 from fleet_slip.export.fmu import fmu
 from fleet_slip.export.program import Program
-from fleet_slip.export.read_me import read_me
 from fleet_slip.export.sql_source import sql_macro, sql_statement
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.trained_drives import pack_hashes
@@ -72,7 +72,8 @@ def export_files(
     if to != "json":  # that says all of it itself
         prefix = c_prefix(version) if to == "c" else file_prefix(version)
         last = f"{prefix}_{to}_manifest.json"  # a folder may hold several formats
-        page = read_me(version, subject.program, to, prefix, [*files, last])
+        words = {"target": to, "stem": prefix, "names": [*files, last]}
+        page = fill_in_version("templates/README.md", version, subject.program, **words)
         files[f"{prefix}_{to}_README.md"] = page.encode("utf-8")
         manifest = manifest_of(version, subject.program, to, files)
         files[last] = render(manifest).encode("utf-8")

@@ -8,7 +8,7 @@ The tuned ones have the parameters that suit drives which the regression was tra
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -187,8 +187,7 @@ def filter_bank(
     for one in FILTERS:
         key = _key(one, one.starts(before), drives, car)
         kept = DocumentFolder(warehouse.root / "tuned" / one.module)
-        documents = (kept.read(number).content for number in reversed(kept.numbers()))
-        found = next((content for content in documents if content["key"] == key), None)
+        found = find_kept(kept, key)
         if found is None:
             try:
                 best = one.tune(drives.read(), car, executor, before)
@@ -227,6 +226,21 @@ def _key(
     }
 
 
+def find_kept(kept: DocumentFolder, key: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the newest document about what was asked; None if there is none."""
+    documents = (kept.read(number).content for number in reversed(kept.numbers()))
+    return next((content for content in documents if content["key"] == key), None)
+
+
+T = TypeVar("T")
+
+
+def choose_evenly(some: Sequence[T], at_most: int) -> list[T]:
+    """Return so many of some in their order, evenly apart, or all if they are fewer."""
+    places = np.linspace(0, len(some) - 1, min(at_most, len(some))).round()
+    return [some[int(place)] for place in places]
+
+
 TUNING_DRIVES = 24
 """Drives of the cohort that parameters are tuned on, evenly chosen."""
 
@@ -247,9 +261,7 @@ class TuningDrives:
         """Choose drives evenly, by name."""
         rows = cohort.drives.select(["drive_id", "vehicle_model", "mass_kg"]).to_pylist()
         one_each = {row["drive_id"]: row for row in rows}
-        names = sorted(one_each)
-        places = np.linspace(0, len(names) - 1, min(TUNING_DRIVES, len(names))).round()
-        chosen = [one_each[names[int(place)]] for place in places]
+        chosen = [one_each[name] for name in choose_evenly(sorted(one_each), TUNING_DRIVES)]
         return cls(
             warehouse,
             tuple(

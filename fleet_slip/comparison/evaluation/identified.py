@@ -4,17 +4,21 @@ It is what a department would build that has scales and a tape measure, labelled
 measured: of the simulator's parameters it is given none that these do not tell.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
-from fleet_slip.comparison.evaluation.filters import GROUP, TuningDrives, seen
+from fleet_slip.comparison.evaluation.filters import (
+    GROUP,
+    TuningDrives,
+    choose_evenly,
+    find_kept,
+    seen,
+)
 from fleet_slip.comparison.observers import ekf
 from fleet_slip.comparison.observers.drive_signals import LabelledDrive
 from fleet_slip.comparison.observers.identification import Identified, Measured, identify
@@ -69,8 +73,7 @@ def identified_estimate(
     """
     key = {"drives": drives.key(), "program": checksum_of_sources()}
     kept = DocumentFolder(warehouse.root / "tuned" / "identified")
-    documents = (kept.read(number).content for number in reversed(kept.numbers()))
-    found = next((content for content in documents if content["key"] == key), None)
+    found = find_kept(kept, key)
     if found is None:
         try:
             cars = {model: _dumped(one) for model, one in _identify(drives, executor).items()}
@@ -89,14 +92,11 @@ def _identify(drives: TuningDrives, executor: Executor) -> dict[str, Identified]
         if drive.car is not None:
             of_class.setdefault(model, []).append(replace(drive, car=None))
     return {
-        model: identify(Measured.of(load_vehicle(model)), _some(own), executor)
+        model: identify(
+            Measured.of(load_vehicle(model)), choose_evenly(own, DRIVES_AT_MOST), executor
+        )
         for model, own in sorted(of_class.items())
     }
-
-
-def _some(drives: Sequence[LabelledDrive]) -> Sequence[LabelledDrive]:
-    places = np.linspace(0, len(drives) - 1, min(DRIVES_AT_MOST, len(drives))).round()
-    return [drives[int(place)] for place in places]
 
 
 def _dumped(one: Identified) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from fleet_slip.comparison.evaluation.filters import (
     TUNING_DRIVES,
     TUNING_S,
     Filter,
+    choose_evenly,
     class_car,
 )
 from fleet_slip.comparison.evaluation.own_drives import (
@@ -103,10 +104,9 @@ def evaluate_own_car(
     """
     found = load_cohort(warehouse, condition).drives
     names = sorted({*found["drive_id"].to_pylist()})
-    places = np.linspace(0, len(names) - 1, min(DRIVES_AT_MOST, len(names))).round()
     vehicle = load_vehicle(file) if file else class_car(found["vehicle_model"][0].as_py(), None)
     designs = designs_of(warehouse, versions, condition)
-    drives = read_own_drives(warehouse, [names[int(place)] for place in places], designs)
+    drives = read_own_drives(warehouse, choose_evenly(names, DRIVES_AT_MOST), designs)
     estimates: dict[str, list[FloatArray]] = {}
     for name, design in designs.items():
         estimates[name] = fit_left_out(drives, name, design)
@@ -188,9 +188,8 @@ def _filtered(
         others = [one.without(left) for one in drives]
         others = [one for one in others if np.isfinite(one.sideslip_rad).any()]
         if len(drives) >= FOLDS:
-            places = np.linspace(0, len(others) - 1, min(TUNING_DRIVES, len(others))).round()
             begin = TUNING_S * SAMPLE_RATE_HZ
-            others = [others[int(place)].beginning(begin) for place in places]
+            others = [one.beginning(begin) for one in choose_evenly(others, TUNING_DRIVES)]
         ready = _tuned(vehicle, others, executor)
         for name, (knows, estimate) in ready.items():
             _, estimates = found.setdefault(

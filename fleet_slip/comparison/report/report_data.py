@@ -85,14 +85,6 @@ class TableSize:
 
 
 @dataclass(frozen=True)
-class ConfigHash:
-    """One configuration and the checksum of what it says."""
-
-    name: str
-    sha256: str
-
-
-@dataclass(frozen=True)
 class ReportData:
     """All that a report shows.
 
@@ -113,7 +105,7 @@ class ReportData:
         on_measured: its latest evaluation on measured drives; None if there is none.
         tables: of the warehouse.
         campaigns: of the drives that the model was trained on.
-        configs: checksums of what determines the results.
+        configs: checksums of what determines the results, by file.
         shipped: names of all shipped scenarios, evaluated or not.
     """
 
@@ -131,7 +123,7 @@ class ReportData:
     on_measured: Mapping[str, Any] | None
     tables: tuple[TableSize, ...]
     campaigns: tuple[str, ...]
-    configs: tuple[ConfigHash, ...]
+    configs: Mapping[str, str]
     shipped: tuple[str, ...]
 
     @property
@@ -195,11 +187,11 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
         on_measured=latest_on_measured(warehouse, version),
         tables=_tables(warehouse),
         campaigns=tuple(sorted(set(cohort.drives["campaign"].to_pylist()))),
-        configs=(
-            ConfigHash("configs/signals.toml", hashlib.sha256(signals_toml).hexdigest()),
-            ConfigHash(f"configs/models/{TABLE_ONE}.toml", load_model_list(TABLE_ONE).sha256),
-            *(_of_scenario(one) for one in scenarios),
-        ),
+        configs={
+            "configs/signals.toml": hashlib.sha256(signals_toml).hexdigest(),
+            f"configs/models/{TABLE_ONE}.toml": load_model_list(TABLE_ONE).sha256,
+            **{f"configs/scenarios/{one.name}.toml": _checksum_of(one) for one in scenarios},
+        },
         shipped=tuple(one.name for one in shipped),
     )
 
@@ -270,8 +262,7 @@ def _tables(warehouse: Warehouse) -> tuple[TableSize, ...]:
     return tuple(sizes)
 
 
-def _of_scenario(scenario: Scenario) -> ConfigHash:
+def _checksum_of(scenario: Scenario) -> str:
     """Return the checksum of all that determines a scenario's drive, and of its failures."""
     failures = [failure.model_dump(mode="json") for failure in scenario.failures]
-    text = canonical_json({"drive": scenario.batch().digest, "failures": failures})
-    return ConfigHash(f"configs/scenarios/{scenario.name}.toml", sha256_of(text))
+    return sha256_of(canonical_json({"drive": scenario.batch().digest, "failures": failures}))

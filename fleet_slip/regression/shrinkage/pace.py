@@ -111,19 +111,9 @@ def pace1(a: FloatArray, mixture: Mixture) -> FloatArray:
     return _leading(a, _contributions(a, mixture))
 
 
-def pace2(a: FloatArray) -> FloatArray:
-    """Do the same by the estimated mixture."""
-    return pace1(a, estimate_mixture(a))
-
-
 def pace3(a: FloatArray, mixture: Mixture) -> FloatArray:
     """Keep the dimensions whose expected contribution H(A) is positive."""
     return np.where(_contributions(a, mixture) > 0, a, 0.0)
-
-
-def pace4(a: FloatArray) -> FloatArray:
-    """Do the same by the estimated mixture."""
-    return pace3(a, estimate_mixture(a))
 
 
 def pace5(a: FloatArray, mixture: Mixture) -> FloatArray:
@@ -133,11 +123,6 @@ def pace5(a: FloatArray, mixture: Mixture) -> FloatArray:
     square = np.array([float(posterior_root(mixture, x) @ roots) ** 2 for x in size])
     square = np.where(a**2 > _CERTAIN_SQUARE, a**2, square)
     return np.where(square <= _NEGLIGIBLE_SQUARE, 0.0, np.sign(a) * np.sqrt(square))
-
-
-def pace6(a: FloatArray) -> FloatArray:
-    """Do the same by the estimated mixture."""
-    return pace5(a, estimate_mixture(a))
 
 
 def empirical_bayes(a: FloatArray) -> FloatArray:
@@ -187,8 +172,8 @@ def half_contributions(
 
 ESTIMATORS: dict[str, Estimator] = {
     "james-stein": james_stein,
-    "pace2": pace2,
-    "pace4": pace4,
-    "pace6": pace6,
+    "pace2": lambda a: pace1(a, estimate_mixture(a)),
+    "pace4": lambda a: pace3(a, estimate_mixture(a)),
+    "pace6": lambda a: pace5(a, estimate_mixture(a)),
     "eb": empirical_bayes,
 }

@@ -8,7 +8,7 @@ from scipy import stats
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.regression.shrinkage.mixture import ChiSquareKernel, Mixture, fit_mixture
-from fleet_slip.regression.shrinkage.pace import pace1, pace2, pace3, pace4, pace5, pace6
+from fleet_slip.regression.shrinkage.pace import ESTIMATORS, pace1, pace3, pace5
 
 EFFECTS = np.array([30, 8, 4, 2.5, 0.4, 0.2, -0.3, 0.1])
 """Four effects, and four that are noise."""
@@ -21,9 +21,9 @@ def weka_mixture(a: FloatArray) -> Mixture:
 
 
 def test_an_effect_of_four_standard_errors_is_kept() -> None:
-    assert (pace2(EFFECTS) == [30, 8, 4, 2.5, 0, 0, 0, 0]).all()
-    assert (pace4(EFFECTS) == [30, 8, 4, 2.5, 0, 0, 0, 0]).all()
-    assert pace6(EFFECTS)[2] == pytest.approx(4, abs=0.1)
+    assert (ESTIMATORS["pace2"](EFFECTS) == [30, 8, 4, 2.5, 0, 0, 0, 0]).all()
+    assert (ESTIMATORS["pace4"](EFFECTS) == [30, 8, 4, 2.5, 0, 0, 0, 0]).all()
+    assert ESTIMATORS["pace6"](EFFECTS)[2] == pytest.approx(4, abs=0.1)
 
 
 def test_weka_s_slip_drops_it() -> None:
@@ -70,7 +70,10 @@ def test_a_known_mixture_says_which_dimensions_to_keep() -> None:
     assert 0 < kept < 4
 
 
-@pytest.mark.parametrize(("known", "estimated"), [(pace1, pace2), (pace3, pace4), (pace5, pace6)])
+@pytest.mark.parametrize(
+    ("known", "estimated"),
+    [(pace1, ESTIMATORS["pace2"]), (pace3, ESTIMATORS["pace4"]), (pace5, ESTIMATORS["pace6"])],
+)
 def test_knowing_the_mixture_is_better_than_estimating_it(
     known: Procedure, estimated: Callable[[FloatArray], FloatArray]
 ) -> None:
