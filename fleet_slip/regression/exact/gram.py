@@ -4,6 +4,7 @@ Sums and products are integers, so Grams add and subtract without rounding: trai
 fold is, bit for bit, training on the rest.
 """
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -84,8 +85,8 @@ class Gram:
         return Gram(
             self.signals,
             self.n + other.n,
-            tuple(a + b for a, b in zip(self.sums, other.sums, strict=True)),
-            tuple(a + b for a, b in zip(self.products, other.products, strict=True)),
+            tuple(map(operator.add, self.sums, other.sums)),
+            tuple(map(operator.add, self.products, other.products)),
         )
 
     def __sub__(self, other: "Gram") -> "Gram":
@@ -94,8 +95,8 @@ class Gram:
         rest = Gram(
             self.signals,
             self.n - other.n,
-            tuple(a - b for a, b in zip(self.sums, other.sums, strict=True)),
-            tuple(a - b for a, b in zip(self.products, other.products, strict=True)),
+            tuple(map(operator.sub, self.sums, other.sums)),
+            tuple(map(operator.sub, self.products, other.products)),
         )
         squares = [rest.products[packed_position(i, i)] for i in range(len(self.signals))]
         if rest.n < 0 or min(squares, default=0) < 0:

@@ -99,11 +99,11 @@ def exact_sum(values: IntArray) -> list[int]:
 
     The int64 sum is right modulo 2^64; the float64 sum tells how often it wrapped around.
     """
-    wrapped = values.sum(axis=0).tolist()
-    if values.dtype == object:
-        return [int(total) for total in wrapped]
-    near = values.sum(axis=0, dtype=np.float64).tolist()
-    return [
-        remainder + round((total - remainder) / _MODULUS) * _MODULUS
-        for remainder, total in zip(wrapped, near, strict=True)
-    ]
+    wrapped = values.sum(axis=0)
+    totals: list[int] = [int(total) for total in wrapped.tolist()]
+    if values.dtype != object:
+        near = values.sum(axis=0, dtype=np.float64)
+        turns = np.rint((near - wrapped.astype(np.float64)) / _MODULUS)
+        for at in np.flatnonzero(turns).tolist():
+            totals[at] += int(turns[at]) * _MODULUS
+    return totals

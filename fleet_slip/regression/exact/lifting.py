@@ -1,7 +1,8 @@
 """Exact solution of large integer systems by p-adic lifting (Dixon 1982, Numer. Math. 40:137).
 
 It inverts once, modulo a prime, and finds the solution digit by digit with k^2 small products,
-where elimination multiplies huge numbers k^3 times. Solutions are proven by the equations.
+where elimination multiplies huge numbers k^3 times. Solutions are proven: they hold modulo a power
+of the prime that is greater than what the two sides of any equation could differ by.
 """
 
 import math
@@ -22,6 +23,11 @@ LIMB_BITS = 26
 MOST_EQUATIONS = 2**10
 
 FIRST_DIGITS = 64
+
+_BY_CHANCE = 32
+"""Bits by which a fraction that is right is shorter than its residue."""
+
+_MORE_THAN_HALF = 16
 
 GROWTH = 1.2
 """How many times more digits each attempt has than the one before."""
@@ -48,7 +54,8 @@ class _Lifting:
     ) -> None:
         self.matrix, self.right = matrix, right
         self.prime, self.inverse = prime, inverse
-        self.limbs = _limbs(matrix)
+        self.largest = max(abs(entry) for row in matrix for entry in row)
+        self.limbs = _limbs(matrix, self.largest)
         self.rest = np.array(right, dtype=object)
         self.digits: list[Integers] = []
 
@@ -58,15 +65,42 @@ class _Lifting:
         while True:
             self._lift(wanted)
             modulus = self.prime ** len(self.digits)
-            found = _fractions(_joined(self.digits, self.prime), modulus)
-            if found is not None:
-                numerators, denominator = found
-                if all(
-                    sum(a * x for a, x in zip(row, numerators, strict=True)) == denominator * b
-                    for row, b in zip(self.matrix, self.right, strict=True)
-                ):
+            (residue,) = _joined([digit[:1] for digit in self.digits], self.prime)
+            top, bottom = _fraction(residue, modulus, math.isqrt(modulus) >> 1)
+            # Else it is what chance gives, and to join the digits of all would be in vain.
+            if top.bit_length() + bottom.bit_length() + _BY_CHANCE < modulus.bit_length():
+                found = self._over(bottom) or self._fractions(modulus)
+                if found is not None:
                     return found
             wanted = int(wanted * GROWTH)
+
+    def _over(self, denominator: int) -> tuple[list[int], int] | None:
+        """Return the solution if all of it is over the first unknown's denominator.
+
+        Half of the digits tell the numerators then.
+        """
+        some = self.digits[: len(self.digits) // 2 + _MORE_THAN_HALF]
+        modulus = self.prime ** len(some)
+        numerators = []
+        for residue in _joined(some, self.prime):
+            scaled = residue * denominator % modulus
+            numerators.append(scaled if scaled * 2 <= modulus else scaled - modulus)
+        return self._proven(numerators, denominator, modulus)
+
+    def _fractions(self, modulus: int) -> tuple[list[int], int] | None:
+        found = _fractions(_joined(self.digits, self.prime), modulus)
+        return found and self._proven(*found, modulus)
+
+    def _proven(
+        self, numerators: list[int], denominator: int, modulus: int
+    ) -> tuple[list[int], int] | None:
+        """Return what solves the equations modulo a number if both sides are too small to differ.
+
+        Their difference is a multiple of the modulus, and smaller.
+        """
+        left = len(numerators) * self.largest * max(map(abs, numerators))
+        right = denominator * max(map(abs, self.right))
+        return (numerators, denominator) if left + right < modulus else None
 
     def _lift(self, wanted: int) -> None:
         size = len(self.matrix)
@@ -85,22 +119,25 @@ def _inverse(matrix: Sequence[Sequence[int]], prime: int) -> Integers | None:
     size = len(matrix)
     left = [[entry % prime for entry in row] for row in matrix]
     work = np.hstack([np.array(left, dtype=np.int64), np.eye(size, dtype=np.int64)])
+    furthest = 0
     for t in range(size):
         candidates = np.flatnonzero(work[t:, t])
         if not len(candidates):
             return None
         pivot = t + int(candidates[0])
+        furthest = max(furthest, pivot)
         work[[t, pivot]] = work[[pivot, t]]
-        work[t] = work[t] * pow(int(work[t, t]), -1, prime) % prime
-        factors = work[:, t].copy()
+        some = work[:, t : size + furthest + 1]  # before and behind them nothing changes
+        some[t] = some[t] * pow(int(some[t, 0]), -1, prime) % prime
+        factors = some[:, :1].copy()
         factors[t] = 0
-        work = (work - factors[:, None] * work[t]) % prime
+        some -= factors * some[t]
+        some %= prime
     return np.ascontiguousarray(work[:, size:])
 
 
-def _limbs(matrix: Sequence[Sequence[int]]) -> Integers:
+def _limbs(matrix: Sequence[Sequence[int]], largest: int) -> Integers:
     """Return the matrix as limbs with its signs, shape (limbs * k, k), lowest first."""
-    largest = max(abs(entry) for row in matrix for entry in row)
     mask = (1 << LIMB_BITS) - 1
     return np.array(
         [

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet_slip.regression.exact import eigenvalues
 from fleet_slip.regression.exact.eigenvalues import symmetric_eigenvalues
 
 
@@ -24,6 +25,14 @@ def test_they_are_those_of_second_differences() -> None:
     matrix = 2 * np.eye(k) - np.eye(k, k=1) - np.eye(k, k=-1)
     expected = [2 - 2 * math.cos(math.pi * i / (k + 1)) for i in range(1, k + 1)]
     assert symmetric_eigenvalues(matrix) == pytest.approx(expected, rel=1e-14)
+
+
+def test_compiled_they_have_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = np.random.default_rng(3).normal(size=(60, 25))
+    matrix = np.asarray(np.corrcoef((columns + 9 * columns[:, :1]).T))
+    plain = symmetric_eigenvalues(matrix)
+    monkeypatch.setattr(eigenvalues, "MANY", 25)
+    assert symmetric_eigenvalues(matrix) == plain
 
 
 @pytest.mark.parametrize("small", [1e-3, 1e-8, 1e-12])

@@ -43,6 +43,22 @@ def test_a_matrix_that_one_prime_divides_is_lifted_by_another(prime: int) -> Non
     assert lifted([[prime, 0, 1], [0, 3, 5], [1, 5, 0]]) == [Fraction(1, prime), Fraction(5, 3)]
 
 
+@given(st.integers(0, 10**6), st.integers(2, 9))
+def test_rows_change_places_where_a_pivot_is_zero(seed: int, size: int) -> None:
+    rng = np.random.default_rng(seed)
+    half = rng.integers(-3, 4, size=(size, size)) * rng.integers(0, 2, size=(size, size))
+    matrix = (half + half.T + 99 * np.eye(size, dtype=np.int64)[::-1]) * (1 - np.eye(size))
+    rows, right = matrix.astype(int).tolist(), list(range(1, size + 1))
+    found = solve_by_lifting(rows, right)
+    if found is None:
+        assert abs(np.linalg.det(matrix)) < 0.5
+        return
+    numerators, denominator = found
+    assert denominator > 0
+    for row, b in zip(rows, right, strict=True):
+        assert sum(a * x for a, x in zip(row, numerators, strict=True)) == denominator * b
+
+
 def test_zeros_negative_and_huge_solutions() -> None:
     huge = 7**500
     found = lifted([[1, 0, huge], [0, 2, -huge], [huge, -huge, 0]])
