@@ -22,6 +22,7 @@ TINY = {
     "billion": "--root {folder} --rows 3e4",
     "bound": "{root}",
     "calibration": "--campaign fleet --cars 2",
+    "changed_cars": "--campaigns fleet --cars 4 --days 4",
     "checksums": "--campaign smoke --repeat 1",
     "cluster": "--days 1 --workers 1",
     "columns": "{root} --most 4",

@@ -6,7 +6,7 @@ differ, is that of the whole fleet; how much a car's driving tells is its own. D
 same roads again, so that there is a limit to what more of them tell.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from math import sqrt
@@ -55,6 +55,10 @@ OF_A_DRIVE: Mapping[NumberName, float] = {"yaw_rate_offset_by_wheels": 0.002}
 to the other, and makes wheels slip to that side. Two drives on one circuit do not show it."""
 
 
+Piece = tuple[Mapping[NumberName, Telling], Mapping[str, slice]]
+"""Some drives of a car: what they tell, and where they stand by kind."""
+
+
 @dataclass(frozen=True)
 class CalibratedNumber:
     """One number of one car.
@@ -95,7 +99,7 @@ class CarEvidence:
         self.told = {car: whole.numbers for car, whole in self._whole.items()}
         offsets = [told["ay_offset"].value for told in self.told.values() if "ay_offset" in told]
         self.roads = roads_of(self._banked, offsets)
-        self.variances = self._variances()
+        self.variances = self.variances_of((self.told[car], self.slices(car)) for car in self.cars)
         self.variances_of_one = self._variances_of_one()
 
     def slices(self, car: str, first: int = 0, last: int | None = None) -> dict[str, slice]:
@@ -130,17 +134,18 @@ class CarEvidence:
         sums = DriveTermSums(self._moments[telling.kind][at], signals, telling.terms)
         return influence(telling.relation, sums, float(telling.noise), telling.gradient)
 
-    def _variances(self) -> dict[NumberName, float]:
+    def variances_of(self, pieces: Iterable[Piece]) -> dict[NumberName, float]:
         """Return the variance of residuals, as drives differ, of each number's plane.
 
-        A drive's shift, about its car's number, has the variance times its share times one less
-        the part of the share in the car's. Every drive counts the same: errors do not grow with
-        shares as noise does, and drives that tell little would decide for those that tell much.
+        A drive's shift, about the number of its piece, has the variance times its share times one
+        less the part of the share in the piece's. Every drive counts the same: errors do not grow
+        with shares as noise does, and drives that tell little would decide for those that tell
+        much.
         """
         ratios: dict[NumberName, list[float]] = {}
-        for car, told in self.told.items():
+        for told, slices in pieces:
             for name, telling in told.items():
-                found = self.influence(telling, self.slices(car)[telling.kind])
+                found = self.influence(telling, slices[telling.kind])
                 if found is None:
                     continue
                 expected = found.shares * (1 - found.shares / found.shares.sum())
@@ -177,30 +182,39 @@ class CarEvidence:
                 found[name] = float(telling.value), float(influence_of_it.shares.sum())
         return found
 
+    def scatter(
+        self, piece: Piece, variances: Mapping[NumberName, float], *, same_roads: bool = False
+    ) -> dict[NumberName, float]:
+        """Return the variances of what some drives tell, as drives differ.
+
+        With `same_roads`, of what they tell beside other drives on these roads: that they go over
+        them again is no error then.
+        """
+        told, slices = piece
+        own: dict[NumberName, float] = {}
+        for name, telling in told.items():
+            found = self.influence(telling, slices[telling.kind])
+            if found is None or name not in variances:
+                continue
+            drives = len(found.shares)
+            of_one = self.variances_of_one if drives == 1 else variances
+            again = 1 if same_roads else 1 + drives / ROADS
+            told_by_it = of_one.get(name, variances[name]) * float(found.shares.sum())
+            own[name] = told_by_it * again + OF_A_DRIVE.get(name, 0.0) ** 2 / drives
+        return own
+
     def uncertainties(
         self, told: Mapping[NumberName, Telling], slices: Mapping[str, slice]
     ) -> dict[NumberName, float]:
         """Return the standard errors of what some drives tell."""
-        own: dict[NumberName, float] = {}
-        for name, telling in told.items():
-            found = self.influence(telling, slices[telling.kind])
-            if found is not None and name in self.variances:
-                drives = len(found.shares)
-                of_one = self.variances_of_one if drives == 1 else self.variances
-                told_by_it = of_one.get(name, self.variances[name]) * float(found.shares.sum())
-                of_roads = OF_A_DRIVE.get(name, 0.0) ** 2 / drives
-                own[name] = told_by_it * (1 + drives / ROADS) + of_roads
+        own = self.scatter((told, slices), self.variances)
         for name in own:
             by_satellite = LASTING_BY_SATELLITE.get(told[name].kind, {})
             own[name] += {**LASTING[self._banked], **by_satellite}.get(name, 0.0) ** 2
         common = self.roads.uncertainty
         return {
-            name: sqrt(
-                variance
-                + sum(d**2 * own.get(n, 0.0) for n, d in told[name].also.items())
-                + (common * float(told[name].by_lean)) ** 2
-            )
-            for name, variance in own.items()
+            name: sqrt(variance + (common * float(told[name].by_lean)) ** 2)
+            for name, variance in with_others(told, own).items()
         }
 
     def level(self, telling: Telling) -> Fraction:
@@ -251,6 +265,16 @@ class CarEvidence:
             elif CAR_NUMBERS[name].count(self.level(whole.numbers[name])) is None:
                 found[name] = BEYOND
         return found
+
+
+def with_others(
+    told: Mapping[NumberName, Telling], own: Mapping[NumberName, float]
+) -> dict[NumberName, float]:
+    """Return variances of numbers with those of others that they depend on."""
+    return {
+        name: variance + sum(d**2 * own.get(n, 0.0) for n, d in told[name].also.items())
+        for name, variance in own.items()
+    }
 
 
 def _range(at: slice) -> Any:

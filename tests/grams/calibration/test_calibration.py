@@ -248,6 +248,22 @@ def test_a_number_that_changes_is_named_and_no_other() -> None:
     assert changed_numbers(found, DAY + timedelta(days=4)) == []
 
 
+def test_a_change_is_found_on_real_roads_in_half_of_the_cars() -> None:
+    rng = np.random.default_rng(14)
+    rows = []
+    for i in range(12):
+        for n in range(6):
+            after = NONE_OFF | {"yaw_rate_offset": 0.02 * (i < 6 and n >= 3)}
+            row = gram_row(f"car-{i:02d}", n, on_real_roads(rng, after))
+            rows.append(row | {"day": DAY + timedelta(days=n)})
+    found = evidence(rows)
+    assert found.roads.banked
+    changed = changed_numbers(found, DAY + timedelta(days=3))
+    by_ay = [one.car for one in changed if one.number == "yaw_rate_offset"]
+    assert by_ay == [f"car-{i:02d}" for i in range(6)]
+    assert {one.car for one in changed} == set(by_ay)
+
+
 def test_the_lean_of_roads_is_what_the_cars_do_not_explain() -> None:
     offsets = [Fraction(i - 10, 100) for i in range(21)]
     assert roads_of(True, offsets).lean == 0
