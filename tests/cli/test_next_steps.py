@@ -44,3 +44,22 @@ def test_they_are_said_once(told: tuple[Path, list[str]]) -> None:
     folder, _ = told
     again = run_prepared([COMMAND, "run", "--campaign", "smoke"], folder)
     assert "next:" not in again.stderr
+
+
+def test_it_says_in_how_many_drives_the_car_was_lost(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    """A model of drives in control is one command away."""
+    campaign = tmp_path / "ice.toml"
+    campaign.write_text(
+        'name = "ice"\ndescription = "Drives on ice"\nbase = "proving_ground"\nseed = 5\n'
+        "number_of_days = 1\ndrives_per_day = 12\n"
+        '[plan]\ntracks = ["switchback_1", "hill_2", "motorway_3"]\n'
+        "[plan.adhesion]\nusual = 0.15\nshare = 1.0\nmin = 0.12\nmax = 0.2\n",
+        encoding="utf-8",
+    )
+    done = run_command("run", "--campaign", str(campaign), root=tmp_path / "data")
+    assert done.exit_code == 0, done.stderr
+    assert " of 12 drives the car was lost" in done.stderr
+    line = next(one for one in done.stderr.splitlines() if "lost_control_s IS NULL" in one)
+    assert "publish ice --cohort \"campaign = 'ice' AND lost_control_s IS NULL\"" in line

@@ -71,8 +71,11 @@ def run(
         print_json(report)
     else:
         _print_report(report, everything)
-        if (made := report.publication) and made.new and made.version.version == 1:
-            model = made.version.reference.partition("@")[0]
+        if not ((made := report.publication) and made.new):
+            return
+        model = made.version.reference.partition("@")[0]
+        _say_of_lost(fleet, plan.name, model)
+        if made.version.version == 1:
             say("next:")
             for line in next_steps(fleet, plan.name, model):
                 say(f"  {line}")
@@ -109,6 +112,22 @@ def next_steps(fleet: Fleet, campaign: str, model: str) -> list[str]:
         lines.append(f'{begin} select --cohort "{cohort}"')
     lines.append(f"{begin} evaluate {model} && {begin} report {model}")
     return lines
+
+
+def _say_of_lost(fleet: Fleet, campaign: str, model: str) -> None:
+    """Say in how many drives the car was lost: the model learned from them, too."""
+    if not tells_single_cars():
+        return
+    query = "SELECT campaign, count(lost_control_s), count(*) FROM drives GROUP BY ALL"
+    counted = {name: (lost, drives) for name, lost, drives in fleet.sql(query).fetchall()}
+    lost, drives = counted.get(campaign, (0, 0))
+    if lost:
+        cohort = f"campaign = '{campaign}' AND lost_control_s IS NULL"
+        say(
+            f"in {lost:,} of {number_of(drives, 'drive')} the car was lost, and the model learned "
+            "from them, too. Without them:"
+        )
+        say(f'  {program()}{_root_option(fleet)} publish {model} --cohort "{cohort}"')
 
 
 def program() -> str:
