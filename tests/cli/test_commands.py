@@ -188,9 +188,13 @@ def test_publish_show_score_promote_and_roll_back(run_command: RunCommand, tmp_p
     assert "ax_mps2" in run_command("show", "smoke@2").stdout
 
 
+@pytest.mark.long
 def test_the_grams_agree_however_computed(run_command: RunCommand, smoke_root: Path) -> None:
     report = run_command("check", "--json", root=smoke_root).json
     assert report["drives"] >= report["files"] == report["drives_by_integers"] > 0
+
+
+def test_the_statement_of_the_gram_rows_is_shown(run_command: RunCommand) -> None:
     assert "sum(ax::INTEGER * ax::INTEGER)" in run_command("gram", "--sql").stdout
 
 
@@ -294,6 +298,7 @@ def test_a_changed_campaign_is_refused_and_changes_nothing(
     assert run_command("sql", "SELECT count(*) AS n FROM log", "--json").json == before
 
 
+@pytest.mark.long
 def test_two_runs_at_once_do_the_job_once(tmp_path: Path, smoke_root: Path) -> None:
     job = ["run", "--campaign", "smoke", "--json"]
     with ThreadPoolExecutor(3) as threads:

@@ -50,6 +50,7 @@ def land(snapshot: Snapshot, drive: str = "a") -> None:
     snapshot.commit(Change(add=[snapshot.table.write_file(drive, rows, DAY)]))
 
 
+@pytest.mark.long
 def test_a_run_needs_nothing_but_the_files(server: Server, files: Files) -> None:
     files(f"[default]\n{KEYS}", "[default]\nregion = us-east-1\nENDPOINT\n")
     root = f"{server.bucket()}/data"

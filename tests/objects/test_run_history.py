@@ -5,6 +5,8 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 
+import pytest
+
 from fleet_slip.files.folder import Folder
 from fleet_slip.maintenance.vacuum import vacuum
 from fleet_slip.monitoring.status import status_of
@@ -48,6 +50,7 @@ def test_gathered_records_are_one_object_and_the_same_history(root: Folder) -> N
     assert history(root)[0] == ("0", "gram", "done", 7)
 
 
+@pytest.mark.long
 def test_records_gathered_by_many_while_others_write_and_read(root: Folder, server: Server) -> None:
     root.put("other", b"")
     with server.misbehaving(failing=0.05, slow_s=0.005), ThreadPoolExecutor(8) as executor:

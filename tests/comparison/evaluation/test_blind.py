@@ -90,6 +90,7 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
     assert "silent@1 has no estimate on any of them" in " ".join(told.split())
 
 
+@pytest.mark.long
 def test_the_command_judges_and_writes_nothing(
     smoke_root: Path, tuned: Path, tmp_path: Path
 ) -> None:

@@ -242,6 +242,7 @@ def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None
     np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.long
 def test_rivals_run_on_the_same_drives(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -31,6 +31,7 @@ def test_who_cannot_be_tuned_says_so_in_a_line_and_competes(
     assert "nominal" in done.stdout
 
 
+@pytest.mark.long
 def test_the_report_has_what_is_left(evaluated: tuple[Path, Finished]) -> None:
     root, _ = evaluated
     done_on(root, "evaluate", "own", "--cohort", "source = 'measured'")
