@@ -197,9 +197,11 @@ def calibrate(before: Sequence[SimpleNamespace]) -> FloatArray:
 def simulated(fleet: bool, folds: int, drives: int) -> tuple[list[Part], tuple[str, ...]]:
     """Return what is known at each row of all drives, and the names of the columns."""
     known = features()
-    one = known.feature_set("gated")
-    scales = {name: float(input_scales()[name]) for name in (*one.signals, *one.windows)}
-    inputs = Inputs(scales, known.rows(()), known.definitions("gated"))
+    sets = ("gated", "gated_light")
+    names = dict.fromkeys(name for one in sets for name in known.feature_set(one).inputs)
+    windows = {name: one for each in sets for name, one in known.definitions(each).items()}
+    scales = {name: float(input_scales()[name]) for name in names}
+    inputs = Inputs(scales, known.rows(()), windows)
     found = []
     for fold, scenarios in cars(fleet, folds, drives):
         all_drives = simulate_drives(scenarios)

@@ -49,7 +49,7 @@ class Rows:
     def of(self, *gates: str) -> list[int]:
         """Return the places of the windows, and of the columns of some gates."""
         known = features()
-        shut = {one for gate in ("excess", "road", "cornering") for one in known.members(gate)}
+        shut = {one for gate in features().gates for one in known.members(gate)}
         shut -= {one for gate in gates for one in known.members(gate)}
         return [place for place, name in enumerate(self.names) if name not in shut]
 
@@ -63,12 +63,8 @@ class Rows:
         name: str,
         places: list[int],
         more: FloatArray | Callable[[int], FloatArray] | None = None,
-        weights: tuple[float, ...] = (1.0,) * len(KINDS),
     ) -> None:
-        """Fit without each fold, with more columns that may depend on it, and print the errors.
-
-        A row weighs as much as its kind does.
-        """
+        """Fit without each fold, with more columns that may depend on it, and print the errors."""
         squares, counts = np.zeros(len(KINDS)), np.zeros(len(KINDS))
         seen = self.columns
         grams: list[FloatArray] = []
@@ -81,8 +77,7 @@ class Rows:
                 seen = np.hstack([part.astype(np.float32) for part in parts])
                 grams = [(seen[rows].T @ seen[rows]).astype(np.float64) for rows in self.cells]
             here = range(fold * len(KINDS), (fold + 1) * len(KINDS))
-            others = [cell for cell in range(len(grams)) if cell not in here]
-            total = np.sum([weights[cell % len(KINDS)] * grams[cell] for cell in others], axis=0)
+            total = np.sum([one for cell, one in enumerate(grams) if cell not in here], axis=0)
             fitted = np.append(_solved(total[:-1, :-1], total[:-1, -1]), -1.0)
             for kind, cell in enumerate(here):
                 squares[kind] += np.sum((seen[self.cells[cell]] @ fitted) ** 2)
@@ -186,11 +181,11 @@ def print_table(rows: Rows, of: str) -> None:
     excess, known = rows.of("excess"), rows.known
     rows.judge("and `excess`", excess)
     rows.judge("all gates but `road`", rows.of("excess", "cornering"))
-    rows.judge("all gates", rows.of("excess", "road", "cornering"))
+    rows.judge("all gates of the set `gated`", rows.of("excess", "road", "cornering"))
+    rows.judge("`excess` and `surplus`, the set `gated_light`", rows.of("excess", "surplus"))
+    rows.judge("these and `cornering`", rows.of("excess", "surplus", "cornering"))
     if of == "fleet":
         rows.judge("`excess` and the car's own numbers", excess, rows.times(known["own"]))
-    weights = (1.0, 0.3, 0.3, 1.0, 2.0, 4.0, 1.0, 1.0)
-    rows.judge("`excess`, the rare weighed more", excess, None, weights)
     for name, more in candidates(rows):
         rows.judge(name, excess, more)
 
