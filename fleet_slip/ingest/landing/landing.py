@@ -35,7 +35,7 @@ from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit
-from fleet_slip.warehouse.recordings import Spots, find_spots
+from fleet_slip.warehouse.recordings import find_spots
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
 
 
@@ -110,7 +110,7 @@ def write_batch(
     snapshots = {name: table.snapshot() for name, table in tables_of(warehouse).items()}
     landed = {name: one.landed_among(len(files)) for name, one in snapshots.items()}
     same = SameRecordings(warehouse, snapshots["logs"], mapping.name, replace)
-    copies = LocalCopies(asked.file for asked in files)
+    copies, seen = LocalCopies(asked.file for asked in files), Spool()
     with copies, ThreadPoolExecutor(data_files.WRITERS) as threads:
         tables = {
             name: DataFiles(table, mapping, threads, partial(_has_landed, landed, name))
@@ -127,7 +127,7 @@ def write_batch(
                     ):
                         for name, stored in tables_of(warehouse).items():
                             landed[name] = stored.snapshot().landed_among(len(files))
-                    outcome, drive, rest = _write_file(stream, asked.file, tables, audit)
+                    outcome, drive, rest = _write_file(stream, asked.file, tables, audit, seen)
                     if outcome.is_new:
                         earlier = asked.earlier
                         if earlier and not landed["logs"](data_files.unit_of(earlier).name):
@@ -165,6 +165,7 @@ def _write_file(
     file: Log,
     tables: dict[TableName, DataFiles],
     audit: Audit,
+    seen: Spool,
 ) -> tuple[FileOutcome, MeasuredDrive | None, dict[TableName, Rows]]:
     """Read a file, write all but its last rows; return what it became, its longest drive, these."""
     is_new = tables["logs"].lacks(stream.digest)
@@ -173,15 +174,15 @@ def _write_file(
     refused, rest = _RefusedRows(stream), dict[TableName, Rows]()
     longest: MeasuredDrive | None = None
     left_out, vehicles, ticks = set[str](), set[str](), 0
-    spots: list[tuple[str, Spots]] = []
+    marks = FileMarks.of(stream.digest, stream.content, seen)
     for drives in _groups(_read_drives(stream, refused)):
         longest = max([*([longest] if longest else []), *drives], key=lambda one: one.ticks.size)
         kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), audit)
         left_out |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in kept}
         vehicles |= set(map(car_of, kept))
         ticks += _rows_of(kept)
-        if is_new:
-            spots += [(one.drive_id, find_spots(one.ticks, one.counts)) for one in kept]
+        for drive in kept if is_new else ():
+            marks.add(drive.drive_id, find_spots(drive.ticks, drive.counts))
         if not kept or "logs" not in lacking:
             continue
         if _rows_of(drives) >= data_files.FILE_ROWS:
@@ -205,7 +206,7 @@ def _write_file(
     outcome.vehicles, outcome.left_out = vehicles, len(left_out)
     outcome.suspicions = stream.suspicions()
     if ticks:
-        outcome.marks = FileMarks.of(stream.digest, stream.content, spots)
+        outcome.marks = marks
     return outcome, longest, rest
 
 

@@ -12,13 +12,14 @@ content and drive:
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
 from hashlib import sha256
 
 import numpy as np
 
 from fleet_slip.delta import WITHDRAWN, Unit
+from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.warehouse.recordings import Hashes, Spots
 
 FILES, PREFIX = "ingest/", "same/"
@@ -58,28 +59,35 @@ class Origin:
         return Origin(self.digest)
 
 
-@dataclass(frozen=True)
 class FileMarks:
     """What tells a file and its drives again.
 
     Attributes:
         units: that land with it.
-        seen: hashes of all samples that may be known, of each drive.
     """
 
-    units: dict[str, int] = field(default_factory=dict)
-    seen: tuple[Hashes, ...] = ()
+    def __init__(self, seen: Spool | None = None, key: str = "") -> None:
+        """Begin without any; what is seen of drives is kept under a key."""
+        self.units: dict[str, int] = {}
+        self._seen, self._key = seen or Spool(), key
 
     @classmethod
-    def of(cls, digest: str, content: str, drives: Iterable[tuple[str, Spots]]) -> "FileMarks":
-        """Return the marks of a file: its digest, that of its bytes alone, and its drives."""
-        units = {f"{PREFIX}{content[:16]}": _number(Origin.of(digest), 0)}
-        seen = []
-        for drive, spots in drives:
-            number = _number(Origin.of_drive(drive) or Origin.of(digest), len(spots.kept))
-            units.update((f"{PREFIX}{mark:016x}", number) for mark in spots.kept.tolist())
-            seen.append(spots.seen)
-        return cls(units, tuple(seen))
+    def of(cls, digest: str, content: str, seen: Spool) -> "FileMarks":
+        """Return the mark of a file: its digest, and that of its bytes alone."""
+        marks = cls(seen, digest)
+        marks.units[f"{PREFIX}{content[:16]}"] = _number(Origin.of(digest), 0)
+        return marks
+
+    def add(self, drive_id: str, spots: Spots) -> None:
+        """Add a drive of the file. Raises `InputError` if a temporary file has no room."""
+        number = _number(Origin.of_drive(drive_id) or Origin.of(self._key), len(spots.kept))
+        self.units.update((f"{PREFIX}{mark:016x}", number) for mark in spots.kept.tolist())
+        self._seen.add(self._key, spots.seen.tobytes())
+
+    def seen(self) -> Iterator[Hashes]:
+        """Yield the hashes of all samples that may be known, of each drive."""
+        for piece in self._seen.read(self._key):
+            yield np.frombuffer(piece, np.uint64)
 
 
 class KnownMarks:
@@ -107,7 +115,7 @@ class KnownMarks:
         """
         content = next(iter(marks.units), None)
         found = {_origin(n)[0] for n in [self._numbers.get(content or "")] if n is not None}
-        for seen in marks.seen:
+        for seen in marks.seen():
             there = seen[np.isin(seen, self._names)].tolist()
             many = Counter(self._numbers[f"{PREFIX}{one:016x}"] for one in there)
             for number, times in many.items():
