@@ -197,11 +197,8 @@ def calibrate(before: Sequence[SimpleNamespace]) -> FloatArray:
 def simulated(fleet: bool, folds: int, drives: int) -> tuple[list[Part], tuple[str, ...]]:
     """Return what is known at each row of all drives, and the names of the columns."""
     known = features()
-    sets = ("gated", "gated_light")
-    names = dict.fromkeys(name for one in sets for name in known.feature_set(one).inputs)
-    windows = {name: one for each in sets for name, one in known.definitions(each).items()}
-    scales = {name: float(input_scales()[name]) for name in names}
-    inputs = Inputs(scales, known.rows(()), windows)
+    scales = {name: float(input_scales()[name]) for name in known.feature_set("gated").inputs}
+    inputs = Inputs(scales, known.rows(()), known.definitions("gated"))
     found = []
     for fold, scenarios in cars(fleet, folds, drives):
         all_drives = simulate_drives(scenarios)

@@ -182,8 +182,6 @@ def print_table(rows: Rows, of: str) -> None:
     rows.judge("and `excess`", excess)
     rows.judge("all gates but `road`", rows.of("excess", "cornering"))
     rows.judge("all gates of the set `gated`", rows.of("excess", "road", "cornering"))
-    rows.judge("`excess` and `surplus`, the set `gated_light`", rows.of("excess", "surplus"))
-    rows.judge("these and `cornering`", rows.of("excess", "surplus", "cornering"))
     if of == "fleet":
         rows.judge("`excess` and the car's own numbers", excess, rows.times(known["own"]))
     for name, more in candidates(rows):

@@ -198,6 +198,18 @@ class FeatureCatalogue(Config):
             return tuple(self.windows[name].members(name))
         return tuple(self.gates[name].members(name)) if name in self.gates else (name,)
 
+    def families(self, signals: Iterable[str]) -> dict[str, int]:
+        """Return the names of signals, whole families of windows and gates by their own.
+
+        Beside a family is the number of its members, beside a signal 0.
+        """
+        shown = {name: (name, 0) for name in signals}
+        for family in (*self.windows, *self.gates):
+            members = self.members(family)
+            if shown.keys() >= set(members):
+                shown |= dict.fromkeys(members, (family, len(members)))
+        return dict(shown.values())
+
     def identity(self, name: str) -> str:
         """Return what the Gram rows of a set carry: its name and a checksum of its definition.
 

@@ -1,6 +1,6 @@
 """Model lists: the candidates that a selection compares, read from `configs/models/*.toml`."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -16,6 +16,9 @@ from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.resources import find_config
 from fleet_slip.selection.request import DEFAULT_MOST, Label
+
+MOST_TOLD = 30
+"""Inputs, or families of them, in a message."""
 
 
 class CandidateModel(Config):
@@ -35,7 +38,7 @@ class CandidateModel(Config):
         for name in self.signals:
             if name not in inputs:
                 raise ValueError(
-                    f"model {self.name!r}: {name!r} is not an input. Inputs: {', '.join(inputs)}"
+                    f"model {self.name!r}: {name!r} is not an input. Inputs: {_told(inputs)}"
                 )
         if len(set(self.signals)) < len(self.signals):
             raise ValueError(f"model {self.name!r} names a signal twice")
@@ -130,8 +133,15 @@ def require_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
     if unknown := [name for name in order if name not in known]:
         raise QuestionError(
             f"{','.join(order)}: {', '.join(unknown)} is not an input. Inputs of the feature set "
-            f"{feature_set}: {', '.join(known)}."
+            f"{feature_set}: {_told(known)}."
         )
     if len(set(order)) < len(order):
         raise UsageError(f"{','.join(order)}: an input stands twice.")
     return order
+
+
+def _told(inputs: Iterable[str]) -> str:
+    """Return names of inputs in a line, families by their own, and how many more there are."""
+    names = list(features().families(inputs))
+    more = f" and {len(names) - MOST_TOLD} more (fleet-slip features)"
+    return ", ".join(names[:MOST_TOLD]) + (more if len(names) > MOST_TOLD else "")

@@ -69,18 +69,18 @@ def rear_speed(row: Row) -> Fraction:
     return RADIUS_M * (row["wheel_rl"] + row["wheel_rr"]) / 2
 
 
-def surplus(row: Row, lever: int, halves: int, of_fourth: int) -> Fraction | None:
-    """The wheelbase and K of the file as whole numbers, K's first in halves; squares truncate."""
+def steering_surplus(row: Row) -> Fraction | None:
+    """2.63 m and K of the file in the whole numbers that stand for them; squares are truncated."""
     ay = 1000 * abs(row["ay"])
     load = 1 + Fraction(ay * ay // 100, 10_000)
     wheels = row["wheel_rl"] + row["wheel_rr"]
     if wheels * load < Fraction("19.35"):
         return None
-    wheelbase = Fraction(lever, 5_000_000)
+    wheelbase = Fraction(16_967_742, 5_000_000)
     steer = (row["steer_fl"] + row["steer_fr"]) / 2
     straight = steer - wheelbase * (row["wheel_rr"] - row["wheel_rl"]) / wheels
-    beyond = 5000 * row["ay"] * straight - Fraction(halves * ay * ay // 2, 10**6)
-    beyond -= Fraction(ay * (ay * ay // 65536) ** 2 // of_fourth, 10**6)
+    beyond = 5000 * row["ay"] * straight - Fraction(14 * ay * ay, 10**6)
+    beyond -= Fraction(ay * (ay * ay // 65536) ** 2 // 9, 10**6)
     coasting = int(row["ax"] > Fraction("-0.5")) + int(row["ax"] >= Fraction("-0.5"))
     return coasting * beyond / load / 10_000
 
@@ -106,8 +106,7 @@ PHYSICS: dict[str, Callable[[Row], Fraction | None]] = {
     "ay_speed": lambda row: row["ay"] * speed(row),
     "ay_ax": lambda row: row["ay"] * row["ax"],
     "steering_excess": lambda row: excess(row) if rear_speed(row) >= 3 else None,
-    "steering_surplus": lambda row: surplus(row, 16_967_742, 28, 9),
-    "road_surplus": lambda row: surplus(row, 17_570_968, 21, 12),
+    "steering_surplus": steering_surplus,
     "ay_size": lambda row: abs(row["ay"]),
     "rear_curvature": lambda row: rear_curvature(row) if rear_speed(row) >= 3 else None,
     "rear_ay": lambda row: rear_turn(row) * rear_speed(row),

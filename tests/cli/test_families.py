@@ -38,13 +38,3 @@ def test_the_small_gated_list_is_made_of_the_gated_set_without_its_long_ring() -
     assert len(sixty.signals) == 60
     assert set(sixty.signals) <= set(features().feature_set("gated").inputs)
     assert not set(sixty.signals) & set(features().members("road"))
-
-
-def test_the_light_gated_list_is_the_whole_set_and_has_no_long_ring() -> None:
-    (light,) = load_model_list("gated_light").model
-    known = features()
-    assert list(light.signals) == list(known.feature_set("gated_light").inputs)
-    definitions = known.definitions("gated_light").values()
-    opened_by = [one.gate.by for one in definitions if one.gate]
-    assert max(one.ticks for one in (*definitions, *opened_by)) <= 256
-    assert {one.over for one in opened_by} == {"mean", "running_mean"}

@@ -451,6 +451,31 @@ def test_a_cohort_is_divided_whose_files_alone_have_gram_rows_by_regime(
     assert "has not been computed for 2 of 4 log files" in refused.stderr
 
 
+def test_a_set_is_not_asked_of_drives_that_no_gram_row_names(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    root = tmp_path / "data"
+    assert run_command("simulate", "smoke", root=root).exit_code == 0
+    assert run_command("gram", "--features", "regimes", root=root).exit_code == 0
+    asked = ("select", "--features", "windows", "--nested", "ax,ay", "--cohort")
+    refused = run_command(*asked, "campaign = 'smoke'", root=root)
+    assert refused.exit_code == 5
+    assert "log files have no Gram rows yet. Run: fleet-slip gram &&" in refused.stderr
+    assert "no drive satisfies" not in refused.stderr
+
+
+def test_of_hundreds_of_inputs_a_message_names_families_and_how_many_more(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    asked = ("publish", "none", "--features", "gated", "--model", "beta")
+    refused = run_command(*asked, root=smoke_root)
+    assert "beta is not an input" in refused.stderr
+    assert " ay_mean," in refused.stderr
+    assert "ay_mean_16," not in refused.stderr
+    assert "more (fleet-slip features)" in " ".join(refused.stderr.split())
+    assert len(refused.stderr) < 800
+
+
 def test_single_drives_are_compared_by_rows_with_a_warning(
     run_command: RunCommand, smoke_root: Path
 ) -> None:

@@ -214,13 +214,9 @@ def in_families(signals: Sequence[str]) -> str:
     """Return the names of signals; of more than `MANY_SIGNALS`, whole families by their own."""
     if len(signals) <= MANY_SIGNALS:
         return " ".join(signals)
-    known = features()
-    shown = {name: name for name in signals}
-    for family in (*known.windows, *known.gates):
-        members = known.members(family)
-        if shown.keys() >= set(members):
-            shown |= dict.fromkeys(members, f"{family}({len(members)})")
-    return f"{len(signals)}: " + " ".join(dict.fromkeys(shown.values()))
+    families = features().families(signals).items()
+    told = (f"{name}({count})" if count else name for name, count in families)
+    return f"{len(signals)}: " + " ".join(told)
 
 
 def _worth(evidence: Evidence) -> str:

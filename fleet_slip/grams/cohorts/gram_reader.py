@@ -245,6 +245,11 @@ def _require_complete(
     if not backlog.missing and not backlog.stale:
         return
     files = opened().files(condition)
+    if not files and (unknown := find_backlog(logs, grams, features().identity(PLAIN)).missing):
+        raise NotComputedError(
+            f"which drives satisfy {condition.text!r} is not known: {len(unknown)} log files have "
+            f"no Gram rows yet. Run: fleet-slip gram && fleet-slip gram --features {feature_set}"
+        )
     missing = [file for file in backlog.missing if file.path in files]
     if missing or backlog.stale & files:
         everything = condition.text in {ALL_DRIVES, TRAINING_DRIVES}
