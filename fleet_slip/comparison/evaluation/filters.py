@@ -27,6 +27,7 @@ from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.words import number_of
 
 GROUP = "filters and observers"
 
@@ -189,6 +190,7 @@ def filter_bank(
         kept = DocumentFolder(warehouse.root / "tuned" / one.module)
         found = find_kept(kept, key)
         if found is None:
+            LOGGER.info("tuning %s on %s, once", one.name, number_of(len(drives.names), "drive"))
             try:
                 best = one.tune(drives.read(), car, executor, before)
                 found = {

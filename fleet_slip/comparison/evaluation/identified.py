@@ -75,6 +75,7 @@ def identified_estimate(
     kept = DocumentFolder(warehouse.root / "tuned" / "identified")
     found = find_kept(kept, key)
     if found is None:
+        LOGGER.info("identifying the car, once")
         try:
             cars = {model: _dumped(one) for model, one in _identify(drives, executor).items()}
         except DataError as error:
