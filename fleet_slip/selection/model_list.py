@@ -17,7 +17,7 @@ from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.resources import find_config
 from fleet_slip.selection.request import DEFAULT_MOST, Label
 
-MOST_TOLD = 30
+INPUTS_TOLD = 30
 """Inputs, or families of them, in a message."""
 
 
@@ -143,5 +143,5 @@ def require_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
 def _told(inputs: Iterable[str]) -> str:
     """Return names of inputs in a line, families by their own, and how many more there are."""
     names = list(features().families(inputs))
-    more = f" and {len(names) - MOST_TOLD} more (fleet-slip features)"
-    return ", ".join(names[:MOST_TOLD]) + (more if len(names) > MOST_TOLD else "")
+    more = f" and {len(names) - INPUTS_TOLD} more (fleet-slip features)"
+    return ", ".join(names[:INPUTS_TOLD]) + (more if len(names) > INPUTS_TOLD else "")

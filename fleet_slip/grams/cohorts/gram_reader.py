@@ -245,12 +245,14 @@ def _require_complete(
     if not backlog.missing and not backlog.stale:
         return
     files = opened().files(condition)
-    unknown = find_backlog(logs, grams, features().identity(PLAIN)).missing
-    if not files and unknown and feature_set != CALIBRATION:  # that may come from another root
-        raise NotComputedError(
-            f"which drives satisfy {condition.text!r} is not known: {len(unknown)} log files have "
-            f"no Gram rows yet. Run: fleet-slip gram && fleet-slip gram --features {feature_set}"
-        )
+    if not files and feature_set != CALIBRATION:  # that may come from another root
+        unknown = find_backlog(logs, grams, features().identity(PLAIN)).missing
+        if unknown:
+            raise NotComputedError(
+                f"which drives satisfy {condition.text!r} is not known: {len(unknown)} log files "
+                "have no Gram rows yet. Run: fleet-slip gram && fleet-slip gram "
+                f"--features {feature_set}"
+            )
     missing = [file for file in backlog.missing if file.path in files]
     if missing or backlog.stale & files:
         everything = condition.text in {ALL_DRIVES, TRAINING_DRIVES}

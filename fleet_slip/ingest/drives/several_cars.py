@@ -127,8 +127,6 @@ def _count_jumps(name: str, time_s: FloatArray, values: FloatArray) -> int:
     if np.count_nonzero(np.abs(np.diff(values)) > _LIMITS[name][0]) < FEWEST_JUMPS:
         return 0  # of most drives this tells it, at a third of the cost of all below
     jumps = _jumps(name, time_s, values)
-    if not jumps.any():
-        return 0
     if jumps.sum() < max(FEWEST_JUMPS, MOST_TOLD * jumps.size):  # values that are wrong alone
         alone = np.zeros(values.size, dtype=np.bool_)
         alone[1:-1] = jumps[:-1] & jumps[1:]
