@@ -121,6 +121,19 @@ def test_a_poor_log_of_one_car_is_of_one_car(
     assert said_of(rows, tmp_path, a_mapping(tmp_path, TABLE, time)) == []
 
 
+@pytest.mark.parametrize("jumps", [9, 10])
+def test_ten_jumps_within_a_minute_are_told_and_nine_are_not(tmp_path: Path, jumps: int) -> None:
+    """The steering wheel is turned there and back between two rows, and stays a while."""
+    turned = np.full(ROWS, 0.5)
+    for start in range(500, 500 + 400 * jumps, 400):
+        turned[start:] = 2.0 - turned[start]
+    rows = cars(1)[0].with_columns(steering_wheel=pl.Series(turned))
+    told = [
+        one for one in said_of(rows, tmp_path, a_mapping(tmp_path, TABLE)) if one.kind == "cars"
+    ]
+    assert [one.signals for one in told] == ([("steering_wheel",)] if jumps == 10 else [])
+
+
 def test_a_column_of_cars_that_no_mapping_uses_is_told(tmp_path: Path) -> None:
     """Cars that drive behind one another do as one car does: a column tells them apart."""
     convoy = [cars(1)[0].with_columns(vehicle=pl.lit(name)) for name in ("A", "B")]
