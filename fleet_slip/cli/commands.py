@@ -36,7 +36,6 @@ GROUPS = {
         "features": "data.features_command",
         "config": "data.config_command",
         "init": "data.init_command",
-        "shell": "data.shell_command",
     },
     "Models": {
         "models": "models.version_commands",

@@ -43,6 +43,16 @@ TABLE_FUNCTIONS = _words(
 """What may stand after FROM like a function, beside duckdb_tables() and its like."""
 
 
+def split_statements(database: duckdb.DuckDBPyConnection, text: str) -> list[str]:
+    """Return the statements of a text; the text itself where it has none, or is not valid SQL."""
+    if len(text) > LONGEST_QUERY:
+        return [text]
+    try:
+        return [one.query for one in database.extract_statements(text)] or [text]
+    except (UnicodeEncodeError, duckdb.Error):
+        return [text]
+
+
 def one_query(database: duckdb.DuckDBPyConnection, text: str) -> str:
     """Return the text if it is one statement that only reads. Raises `QuestionError`."""
     if len(text) > LONGEST_QUERY:

@@ -336,7 +336,6 @@ def test_help_teaches_and_version_is_told(run_command: RunCommand) -> None:
         "select",
         "publish",
         "sql",
-        "shell",
         "score",
     ):
         assert command in text

@@ -23,7 +23,7 @@ def complete(root: Path, *words: str) -> list[str]:
 @pytest.mark.parametrize(
     ("words", "found"),
     [
-        (["sh"], ["show", "shell", "shrink"]),
+        (["sh"], ["show", "shrink"]),
         (["show", "sm"], ["smoke"]),
         (["show", "smoke@"], ["smoke@champion", "smoke@1"]),
         (["simulate", "water"], ["waterford", "waterford_course"]),

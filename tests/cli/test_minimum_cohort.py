@@ -67,7 +67,6 @@ SILENT: dict[str, list[str]] = {
     "features": ["features"],
     "config": ["config"],
     "init": ["init project"],
-    "shell": ["shell"],
     "models": ["models", "models --json"],
     "diff": ["diff smoke@1 smoke@1"],
     "promote": ["promote smoke@1"],

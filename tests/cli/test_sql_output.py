@@ -76,3 +76,17 @@ def test_where_nothing_can_be_written_is_said(
     file = tmp_path / "missing" / "drives.csv"
     absent = run_command("sql", QUERY, "--output", str(file), root=smoke_root)
     assert (absent.exit_code, "No such file" in absent.stderr) == (6, True)
+
+
+def test_statements_on_stdin_are_answered_one_after_the_other(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    text = "SELECT 41 + 1 AS a;\n-- and\nSELECT 'é;' AS b;"
+    for words in (["sql", "--csv"], ["sql", "-", "--csv"]):
+        done = run_command(*words, root=smoke_root, input=text)
+        assert done.stdout == '"a"\n42\n"b"\n"é;"\n', done.stderr
+    done = run_command("sql", root=smoke_root, input="SELECT 42; DROP VIEW log; SELECT 43")
+    assert (done.exit_code, "42" in done.stdout, "43" in done.stdout) == (5, True, False)
+    assert "only queries are allowed" in done.stderr
+    assert run_command("sql", "SELECT 1; SELECT 2", root=smoke_root).exit_code == 5
+    assert run_command("sql", root=smoke_root, input="").exit_code == 5

@@ -24,6 +24,7 @@ from fleet_slip.api.session import Session
 from fleet_slip.cli.output import Json, cell, json_text, print_json, print_table, say
 from fleet_slip.errors import QuestionError, StorageError, UsageError
 from fleet_slip.warehouse.database import limit_memory
+from fleet_slip.warehouse.read_only_sql import split_statements
 from fleet_slip.words import number_of
 
 ROWS_SHOWN = 40
@@ -41,8 +42,12 @@ Scenarios = Annotated[
 def sql(
     context: typer.Context,
     query: Annotated[
-        str, typer.Argument(help='SQL, such as "FROM drives LIMIT 5". - reads it from stdin.')
-    ],
+        str,
+        typer.Argument(
+            help='SQL, such as "FROM drives LIMIT 5". - or nothing: statements from stdin.',
+            show_default=False,
+        ),
+    ] = "-",
     json: Json = False,
     csv: Annotated[bool, typer.Option("--csv", help="Print CSV on stdout.")] = False,
     exact: Annotated[
@@ -78,11 +83,13 @@ def sql(
     Every column is described in the view dictionary. Test drives are there with --scenarios, or
     if the query names the column source. A query can read the warehouse, and nothing else. A table
     shows what fits of columns and rows; --all shows all. --csv, --json and --output give numbers to
-    the last digit.
+    the last digit. Several statements on stdin are answered one after the other.
 
     Example: **fleet-slip sql "SELECT vehicle_id, count(*) AS drives FROM drives GROUP BY ALL"**
     """
     fleet: Fleet = context.obj
+    if query == "-" and sys.stdin is not None and sys.stdin.isatty():
+        raise UsageError('give a query: fleet-slip sql "FROM drives"; or pipe statements to it.')
     try:
         text = sys.stdin.read() if query == "-" else query
     except UnicodeDecodeError:
@@ -95,7 +102,9 @@ def sql(
             _write(session, text, output, limit, exact)
             return
         form = Form.JSON if json else Form.CSV if csv else Form.TABLE
-        answer(session, text, form, exact=exact, limit=limit, everything=everything)
+        several = query == "-" and not unsafe
+        for statement in split_statements(session.database, text) if several else [text]:
+            answer(session, statement, form, exact=exact, limit=limit, everything=everything)
 
 
 class Form(StrEnum):
