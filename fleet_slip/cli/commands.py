@@ -34,7 +34,6 @@ GROUPS = {
         "gram": "data.gram_commands",
         "check": "data.gram_commands",
         "features": "data.features_command",
-        "config": "data.config_command",
         "init": "data.init_command",
     },
     "Models": {

@@ -58,10 +58,10 @@ def test_own_features_and_lists_are_used_without_touching_the_package(
     assert scored["rows"] == found["rows"]
     assert abs(scored["rmse_deg"] / found["models"][0]["rmse_deg"] - 1) < 0.2
     by_environment = run_command(
-        "config", "--json", env={**os.environ, "FLEET_SLIP_CONFIG": str(own)}
+        "features", "--files", "--json", env={**os.environ, "FLEET_SLIP_CONFIG": str(own)}
     )
     assert by_environment.exit_code == 0
-    files = {one["file"]: one["from"] for one in by_environment.json["files"]}
+    files = {name: one["from"] for name, one in by_environment.json.items()}
     assert files["features.toml"] == files["models/few.toml"] == "own"
     assert files["signals.toml"] == "shipped"
 
@@ -84,7 +84,7 @@ def test_what_is_no_config_is_said_and_changes_nothing(
     file = tmp_path / "own" / name
     file.parent.mkdir(parents=True)
     file.write_text(text, encoding="utf-8")
-    done = run_command("--config", str(tmp_path / "own"), "config")
+    done = run_command("--config", str(tmp_path / "own"), "features", "--files")
     assert done.exit_code == 3
     assert message in done.stderr
 

@@ -24,7 +24,7 @@ COMMANDS = [
     "quality",
     "status",
     "features",
-    "config",
+    "features --files",
     "diagnose smoke",
 ]
 

@@ -65,7 +65,6 @@ SILENT: dict[str, list[str]] = {
     "gram": ["gram", "gram --json"],
     "check": ["check", "check --json"],
     "features": ["features"],
-    "config": ["config"],
     "init": ["init project"],
     "models": ["models", "models --json"],
     "diff": ["diff smoke@1 smoke@1"],

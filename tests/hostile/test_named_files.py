@@ -127,6 +127,6 @@ def test_the_list_of_configs_tells_of_a_link_that_leads_nowhere(
     own = tmp_path / "own"
     own.mkdir()
     (own / "publish.toml").symlink_to("nowhere")
-    done = run_command("--config", str(own), "config")
+    done = run_command("--config", str(own), "features", "--files")
     assert done.exit_code == ConfigError.exit_code
     assert "publish.toml: a link to a file that does not exist" in done.stderr

@@ -1,4 +1,4 @@
-"""The command that lists the features and feature sets: features."""
+"""The command that lists features, feature sets and the config files that define them: features."""
 
 from typing import Annotated
 
@@ -9,6 +9,8 @@ from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.cli.output import All, Json, print_json, print_table
 from fleet_slip.columns.column_sql import column_query
+from fleet_slip.config import read_named_file
+from fleet_slip.resources import config_files, folder, own_configs
 from fleet_slip.words import number_of
 
 
@@ -24,6 +26,9 @@ def features(
             show_default=False,
         ),
     ] = None,
+    files: Annotated[
+        bool, typer.Option("--files", help="List the config files in force, and whose they are.")
+    ] = False,
     everything: All = False,
     json: Json = False,
 ) -> None:
@@ -38,6 +43,8 @@ def features(
     known = known_features()
     if sql is not None:
         typer.echo(column_query(known, sql))
+    elif files:
+        _print_files(json)
     elif json:
         print_json(
             {
@@ -108,6 +115,20 @@ def _print_families(known: FeatureCatalogue) -> None:
         [[name, *told] for name, told in families.items()],
         left=3,
     )
+
+
+def _print_files(json: bool) -> None:
+    own = own_configs()
+    found = {name: file for name, file in config_files().items() if read_named_file(file)}
+    whose = {
+        name: "own" if own and str(file).startswith(str(own)) else "shipped"
+        for name, file in found.items()
+    }
+    if json:
+        print_json({name: {"from": whose[name], "path": str(file)} for name, file in found.items()})
+        return
+    heading = f"own configs: {own or 'none'}\nshipped ones: {folder('configs')}"
+    print_table(heading, ["file", "from"], [*map(list, whose.items())], left=2)
 
 
 def _parts(one: FeatureSet) -> str:
