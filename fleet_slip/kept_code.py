@@ -37,14 +37,6 @@ def keep(compiled: Any, function: Callable[..., Any]) -> None:
         compiled._cache = _NoFolder()
 
 
-def find_folder() -> str | None:
-    """Return where the code of this package's functions is kept; None if there is no folder."""
-    try:
-        return str(_KeptCode(find_folder).cache_path)
-    except RuntimeError:
-        return None
-
-
 class _KeptCode(FunctionCache):
     """Compiled code on disk. A full disk or a damaged file costs the time to compile, no more."""
 

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from fleet_slip.maintenance.verify_files import Verification
     from fleet_slip.models.model_version import ModelVersion
     from fleet_slip.monitoring.examined import Examined
-    from fleet_slip.monitoring.fitness import Fitness
     from fleet_slip.monitoring.monitor import Chart
     from fleet_slip.monitoring.quality import QualityReport
     from fleet_slip.monitoring.status import WarehouseStatus
@@ -47,20 +46,6 @@ class HealthAndUpkeep(JudgedModels):
         from fleet_slip.monitoring.status import status_of
 
         return status_of(self.warehouse, max_age_hours)
-
-    def examine(self, cluster: str | None = None) -> "Fitness":
-        """Tell whether this machine, the data root and a cluster are fit for the work.
-
-        `cluster` is the address of a Dask scheduler. A few bytes are written to the root and
-        deleted.
-        """
-        from fleet_slip.monitoring.fitness import examine_fitness
-
-        def count_workers() -> int:
-            with open_workers(self.root, cluster) as executor:
-                return int(getattr(executor, "workers", 0))
-
-        return examine_fitness(self.root, count_workers if cluster else None)
 
     def quality(self, cohort: str = TRAINING_DRIVES) -> "QualityReport":
         """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors by drive.

@@ -62,7 +62,6 @@ GROUPS = {
     "Operations": {
         "nightly": "operations.nightly_command",
         "status": "operations.status_commands",
-        "doctor": "operations.status_commands",
         "quality": "operations.quality_command",
         "calibrate": "operations.calibrate_command",
         "monitor": "operations.monitor_command",

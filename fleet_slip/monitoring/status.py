@@ -1,6 +1,8 @@
 """The health of a warehouse on one page: freshness, backlog, last runs, disk, champions."""
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from typing import Any
@@ -8,10 +10,11 @@ from typing import Any
 import pyarrow as pa
 
 from fleet_slip.delta import Snapshot
-from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
-from fleet_slip.files.folder import Folder
+from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
+from fleet_slip.files.folder import TEMPORARY_PREFIX, Folder
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.grams.rows.backlog import find_backlog
+from fleet_slip.limits import memory_bytes
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.thresholds import thresholds
 from fleet_slip.resources import read_sql
@@ -21,6 +24,8 @@ from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.tables import Warehouse
 
 SECONDS_PER_HOUR = 3600
+LEAST_MEMORY_BYTES = 2**30
+"""The largest command that was measured, `verify` of files of a million rows, takes 828 MiB."""
 _FULL = "the disk has {:.1%} left, less than {:.0%}"
 
 REMEMBERED = timedelta(days=366)
@@ -82,8 +87,8 @@ def status_of(
     """Examine a warehouse. Reads the Delta logs, the history of runs and the manifests.
 
     Data older than `max_age_hours`, and log files that old without Gram rows, are a problem; so are
-    a command whose last run failed or was killed, a disk that is nearly full, and a champion that
-    cannot be loaded. `jobs/last_runs.sql` says which failures are mere mistakes of a person. Raises
+    a command whose last run failed or was killed, a disk that is nearly full, a champion that
+    cannot be loaded, less than 1 GiB of memory, and an object store that lets a file be made twice. `jobs/last_runs.sql` says which failures are mere mistakes of a person. Raises
     `StorageError` if there is no data root.
     """
     now = now or datetime.now(UTC)
@@ -104,6 +109,7 @@ def status_of(
     problems = [
         *_stale(age, _oldest_hours(logs, {f.path for f in backlog}, now), max_age_hours),
         *_failed(last_runs),
+        *_unfit(warehouse.root),
         *([_FULL.format(free, least)] if free is not None and free < least else []),
         *damaged,
         *(
@@ -125,6 +131,23 @@ def status_of(
         champions=champions,
         problems=tuple(problems),
     )
+
+
+def _unfit(root: Folder) -> Iterator[str]:
+    """Yield what of this machine, or of an object store, is not fit for the jobs."""
+    if memory_bytes() < LEAST_MEMORY_BYTES:
+        yield "this process may have less than 1 GiB of memory, which large commands take"
+    if root.free_bytes() is not None:
+        return  # a local disk keeps a file from being made twice
+    probe = f"{TEMPORARY_PREFIX}probe-{uuid.uuid4().hex}"
+    try:
+        if root.create(probe, b"one") and root.create(probe, b"two"):
+            yield f"{root}: this store lets a file be made twice, so commits get lost. Use another"
+    except FleetSlipError:
+        return  # a monitor may have the right to read alone
+    finally:
+        with contextlib.suppress(FleetSlipError):
+            root.delete(probe)
 
 
 def _table(snapshot: Snapshot) -> TableStatus:

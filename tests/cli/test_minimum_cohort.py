@@ -80,7 +80,6 @@ SILENT: dict[str, list[str]] = {
         "nightly --landing landing --mapping unused --model smoke --json",
     ],
     "status": ["status", "status --json", "status --prometheus"],
-    "doctor": ["doctor"],
     "verify": ["verify --full --json"],
     "compact": ["compact --json"],
     "vacuum": ["vacuum"],

@@ -145,3 +145,17 @@ def test_the_command_tells_a_monitor(run_command: RunCommand, tmp_path: Path) ->
     assert bad.exit_code == 10
     assert "does not match its SHA-256" in bad.stderr
     assert "last runs" in bad.stdout
+
+
+def test_what_is_unfit_is_said(warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch) -> None:
+    land(warehouse, "a", log_rows("a", random_counts(np.random.default_rng(1), 50)))
+    root = path_of(warehouse.root)
+    before = sorted(root.rglob("*"))
+    monkeypatch.setattr(LocalFolder, "free_bytes", lambda self: None)
+    assert status_of(warehouse).problems == ()
+    assert sorted(root.rglob("*")) == before
+    monkeypatch.setattr(LocalFolder, "create", lambda *given: True)
+    monkeypatch.setattr("fleet_slip.monitoring.status.memory_bytes", lambda: 2**29)
+    memory, store = status_of(warehouse).problems
+    assert "less than 1 GiB" in memory
+    assert "lets a file be made twice" in store

@@ -1,4 +1,4 @@
-"""Commands that tell the health of the warehouse, and of the machine: status, doctor."""
+"""The command that tells the health of the warehouse: status."""
 
 import logging
 from collections.abc import Sequence
@@ -7,9 +7,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.cli.output import Json, cell, print_json, print_table, print_text, say
-from fleet_slip.cli.workers import Cluster
 from fleet_slip.errors import AlarmError, UsageError
-from fleet_slip.monitoring.fitness import Fitness
 from fleet_slip.monitoring.status import WarehouseStatus
 from fleet_slip.words import number_of
 
@@ -42,23 +40,6 @@ def status(
         print_json(found)
     else:
         _print_status(found)
-    _complain(found.problems)
-
-
-def doctor(context: typer.Context, cluster: Cluster = None, json: Json = False) -> None:
-    """Tell whether this machine, the data root and a cluster are fit for the work.
-
-    Writes a probe of a few bytes to the data root, and deletes it. Exit code 10 if something is not
-    fit; an extra that is not installed is no fault.
-
-    Example: **fleet-slip --root s3://BUCKET/PATH doctor**
-    """
-    found: Fitness = context.obj.examine(cluster)
-    if json:
-        print_json(found)
-    else:
-        rows = [[one.subject, "" if one.fit else "not fit", one.found] for one in found.examined]
-        print_table("", ["", "", "found"], rows, left=3)
     _complain(found.problems)
 
 
