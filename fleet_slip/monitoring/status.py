@@ -88,8 +88,9 @@ def status_of(
 
     Data older than `max_age_hours`, and log files that old without Gram rows, are a problem; so are
     a command whose last run failed or was killed, a disk that is nearly full, a champion that
-    cannot be loaded, less than 1 GiB of memory, and an object store that lets a file be made twice. `jobs/last_runs.sql` says which failures are mere mistakes of a person. Raises
-    `StorageError` if there is no data root.
+    cannot be loaded, less than 1 GiB of memory, and an object store that lets a file be made twice.
+    `jobs/last_runs.sql` says which failures are mere mistakes of a person. Raises `StorageError` if
+    there is no data root.
     """
     now = now or datetime.now(UTC)
     warehouse.require()
