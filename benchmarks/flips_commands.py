@@ -31,7 +31,6 @@ READING: tuple[tuple[str, ...], ...] = (
     ("quality", "--json"),
     ("diagnose", "smoke", "--json"),
     ("what-if", "smoke", "--noise", "ay=0.1", "--json"),
-    ("shrink", "--signals", "ay,yaw_rate", "--json"),
     ("monitor", "smoke", "--since", "2024-05-07", "--json"),
     ("diff", "smoke@1", "smoke@2", "--json"),
     ("status", "--json"),

@@ -6,9 +6,7 @@ from fleet_slip.api.calls import Rooted, open_workers, takes
 from fleet_slip.api.requests import (
     DiagnosisRequest,
     ExaminedRequest,
-    FoldedRequest,
     RegimesRequest,
-    ShrinkRequest,
     WhatIfRequest,
 )
 from fleet_slip.errors import UsageError
@@ -18,12 +16,10 @@ from fleet_slip.warehouse.tables import Warehouse
 if TYPE_CHECKING:
     from fleet_slip.api.examined_model import ExaminedModel
     from fleet_slip.comparison.observers.identification import Identified
-    from fleet_slip.grams.cohorts.folding import Folding
     from fleet_slip.grams.cohorts.gram_cohort import Cohort
     from fleet_slip.selection.diagnostics import Diagnosis
     from fleet_slip.selection.regimes import RegimeComparison
     from fleet_slip.selection.select_models import RequestedSelection
-    from fleet_slip.selection.shrinkage import Shrunk
     from fleet_slip.selection.what_if import WhatIf
 
 
@@ -109,6 +105,8 @@ class FleetCohort(Rooted):
         `fleet.gram("regimes")` makes. Raises `UsageError` for both a model and signals, and
         `DataError` for a feature set without such regimes.
         """
+        from fleet_slip.grams.cohorts.folding import Folding, make_folding
+        from fleet_slip.selection.model_list import WHOLE_SET, inputs_of
         from fleet_slip.selection.regimes import compare_regimes, divided_set
         from fleet_slip.selection.request import parse_worth
 
@@ -117,18 +115,10 @@ class FleetCohort(Rooted):
             version = self._examined(ExaminedRequest(request.model, signals=signals)).version
             signals = ",".join(version.manifest.signals) if version else None
         features = request.features or divided_set(signals)
-        return compare_regimes(*self._dealt(request, signals, features), request.over, gain)
-
-    @takes(ShrinkRequest)
-    def shrink(self, request: ShrinkRequest) -> "tuple[Shrunk, ...]":
-        """Compare least squares with ridge, lasso, James-Stein and Pace regression.
-
-        Penalties are chosen by cross-validation inside each training fold.
-        """
-        from fleet_slip.selection.shrinkage import compare_shrinkage
-
-        dealt = self._dealt(request, request.signals, request.features)
-        return compare_shrinkage(*dealt, naive=request.naive, cluster=request.cluster)
+        folding = make_folding(request.by, request.folds, Folding().count)
+        cohort = self._load(features)
+        inputs = inputs_of(cohort, signals or WHOLE_SET)
+        return compare_regimes(cohort, inputs, folding, request.over, gain)
 
     def identify(self, name: str, *, threads: int | None = None, **measured: float) -> "Identified":
         """Identify the tyres and the yaw inertia of the car that made the cohort's drives.
@@ -153,17 +143,6 @@ class FleetCohort(Rooted):
         from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 
         return load_cohort(self.warehouse, condition or self.condition, feature_set)
-
-    def _dealt(
-        self, request: FoldedRequest, signals: str | None, features: str
-    ) -> "tuple[Cohort, tuple[str, ...], Folding]":
-        """Return the cohort, the inputs that are asked for, and how it is dealt into folds."""
-        from fleet_slip.grams.cohorts.folding import Folding, make_folding
-        from fleet_slip.selection.model_list import WHOLE_SET, inputs_of
-
-        folding = make_folding(request.by, request.folds, Folding().count)
-        cohort = self._load(features)
-        return cohort, inputs_of(cohort, signals or WHOLE_SET), folding
 
     def _examined(self, request: ExaminedRequest) -> "ExaminedModel":
         from fleet_slip.api.examined_model import subject_of

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from typing_extensions import Doc
 
 from fleet_slip.api.calls import ShowProgress, ShowStep, Workers
-from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.errors import UsageError
 from fleet_slip.grams.cohorts.folding import FoldKey
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
-from fleet_slip.selection.request import CLUSTER, DEFAULT_MODELS, NAIVE, WORTH
+from fleet_slip.selection.request import CLUSTER, DEFAULT_MODELS, WORTH
 
 if TYPE_CHECKING:
     from fleet_slip.models.model_version import ModelVersion
@@ -171,8 +170,8 @@ class WhatIfRequest(ExaminedRequest):
 
 
 @dataclass(frozen=True)
-class FoldedRequest:
-    """Inputs of a feature set, and the folds that drives are dealt into."""
+class RegimesRequest:
+    """What `FleetCohort.regimes` takes."""
 
     signals: Annotated[str | None, SIGNALS] = None
     _: KW_ONLY
@@ -184,13 +183,6 @@ class FoldedRequest:
             "its own. Default: 5."
         ),
     ] = None
-
-
-@dataclass(frozen=True)
-class RegimesRequest(FoldedRequest):
-    """What `FleetCohort.regimes` takes."""
-
-    _: KW_ONLY
     model: Annotated[
         "str | ModelVersion | None",
         Doc(
@@ -207,13 +199,3 @@ class RegimesRequest(FoldedRequest):
         Doc("Feature set that divides rows by regimes. Default: the first with the signals."),
     ] = None
     worth: Annotated[str | None, WORTH] = None
-
-
-@dataclass(frozen=True)
-class ShrinkRequest(FoldedRequest):
-    """What `FleetCohort.shrink` takes."""
-
-    _: KW_ONLY
-    features: Annotated[str, Doc("Feature set that `signals` are of.")] = PLAIN
-    naive: Annotated[bool, NAIVE] = False
-    cluster: Annotated[ClusterUnit | None, CLUSTER] = None

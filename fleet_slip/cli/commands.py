@@ -56,7 +56,6 @@ GROUPS = {
         "explore": "accuracy.picture_commands",
         "diagnose": "accuracy.diagnose_command",
         "regimes": "accuracy.regimes_command",
-        "shrink": "accuracy.shrink_command",
         "what-if": "accuracy.what_if_command",
     },
     "Operations": {

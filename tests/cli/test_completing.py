@@ -23,7 +23,7 @@ def complete(root: Path, *words: str) -> list[str]:
 @pytest.mark.parametrize(
     ("words", "found"),
     [
-        (["sh"], ["show", "shrink"]),
+        (["sh"], ["show"]),
         (["show", "sm"], ["smoke"]),
         (["show", "smoke@"], ["smoke@champion", "smoke@1"]),
         (["simulate", "water"], ["waterford", "waterford_course"]),

@@ -48,7 +48,6 @@ ASK: dict[str, list[str]] = {
     "explore": ["explore --headless"],
     "diagnose": ["diagnose smoke", f"diagnose|smoke|--cohort|drive_id = '{DRIVE}'"],
     "regimes": ["regimes"],
-    "shrink": ["shrink --signals ay,yaw_rate"],
     "what-if": ["what-if smoke --noise ay=0.2"],
     "quality": ["quality", "quality --json", f"quality|--cohort|drive_id = '{DRIVE}'"],
     "calibrate": ["calibrate", "calibrate --json"],
@@ -168,7 +167,6 @@ OF_COHORT: dict[str, Callable[[FleetCohort], Any]] = {
     "diagnose": lambda cohort: cohort.diagnose("smoke"),
     "what_if": lambda cohort: cohort.what_if("smoke", noise={"ay": 0.2}),
     "regimes": lambda cohort: cohort.regimes(),
-    "shrink": lambda cohort: cohort.shrink("ay,yaw_rate"),
     "identify": lambda cohort: cohort.identify(
         "mine", mass_kg=1480.0, front_axle_m=1.11, rear_axle_m=1.67
     ),

@@ -20,7 +20,6 @@ from fleet_slip.api.requests import (
     NightRequest,
     RegimesRequest,
     RunRequest,
-    ShrinkRequest,
     WhatIfRequest,
 )
 from fleet_slip.cli.commands import COMMANDS, GROUPS, CommandGroup, load_command
@@ -139,7 +138,6 @@ def test_a_selections_options_stand_once_and_are_those_of_the_api() -> None:
         ("diagnose", DiagnosisRequest, FleetCohort),
         ("what-if", WhatIfRequest, FleetCohort),
         ("regimes", RegimesRequest, FleetCohort),
-        ("shrink", ShrinkRequest, FleetCohort),
     ],
 )
 def test_options_are_the_fields_of_a_request_with_their_words(

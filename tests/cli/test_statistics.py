@@ -261,16 +261,6 @@ def test_regimes_are_split_where_that_gains_what_it_is_worth(
     assert run_command(*asked, root=every_set).json["winner"] == winner
 
 
-def test_shrinkage_is_compared_with_least_squares(run_command: RunCommand, every_set: Path) -> None:
-    report = run_command("shrink", "--signals", "ay,ax,steer_fl", "--json", root=every_set).json
-    by_name = {method["name"]: method for method in report["methods"]}
-    assert set(by_name) >= {"least squares", "ridge", "lasso", "pace2", "pace6", "eb"}
-    plain = by_name["least squares"]["correlation"]
-    for method in by_name.values():
-        assert method["correlation"] == pytest.approx(plain, abs=0.05)
-    assert by_name["ridge"]["penalty"] > 0
-
-
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "message"),
     [
@@ -290,7 +280,6 @@ def test_shrinkage_is_compared_with_least_squares(run_command: RunCommand, every
         (["what-if", "smoke", "--signals", "ay", "--noise", "ay=1"], 2, "not both"),
         (["regimes", "--over", "mood"], 5, "it has speed, ay"),
         (["regimes", "--by", "row"], 5, "fold by drive"),
-        (["shrink", "--by", "row"], 5, "Fold by drive"),
         (["regimes", "--features", "motion"], 5, "Sets with regimes: regimes"),
         (["diagnose", "--signals", "ay,ay"], 2, "stands twice"),
         (["diagnose", "smoke", "--against", "speed_factor > 0.85"], 5, "AND NOT (speed_factor"),
@@ -332,7 +321,7 @@ def test_features_are_listed(run_command: RunCommand) -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        *(f"{command} --folds 1001" for command in ("select", "regimes", "shrink", "publish m")),
+        *(f"{command} --folds 1001" for command in ("select", "regimes", "publish m")),
         *(f"select --folds {folds}" for folds in ("1", "-3", "few", "each --by row")),
     ],
 )

@@ -1,44 +1,21 @@
-"""WEKA's LinearRegression and PaceRegression from a Gram, to compare with what WEKA finds.
+"""WEKA's LinearRegression from a Gram, to compare with what WEKA finds.
 
 The mathematics of WEKA 3.9 as observed. LinearRegression: a small ridge on standardised moments,
 removal of signals with a standardised coefficient above 1.5, and an Akaike rule relative to the
 first model. The removal is harmful for collinear signals such as four wheel speeds.
 """
 
-import math
 from collections.abc import Sequence
 from fractions import Fraction
 from typing import Literal
 
-import numpy as np
-
-from fleet_slip.arrays import FloatArray
-from fleet_slip.regression.choice.signal_orders import backward
 from fleet_slip.regression.exact import exact_roots
 from fleet_slip.regression.exact.figures import error_sums
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel
-from fleet_slip.regression.shrinkage.mixture import (
-    ChiSquareKernel,
-    Mixture,
-    NormalKernel,
-    fit_mixture,
-    posterior,
-    signed_density,
-)
-from fleet_slip.regression.shrinkage.pace import (
-    Estimator,
-    OrthogonalResponses,
-    empirical_bayes,
-    half_contributions,
-    pace5,
-)
 from fleet_slip.regression.shrinkage.ridge import fit_penalised
 
 Selection = Literal["none", "m5", "greedy"]
-
-NEGLIGIBLE_SQUARE = 0.5
-NEGLIGIBLE = 0.7
 
 COLLINEAR = 1.5
 """Standardised coefficients above this are taken for a sign of collinearity."""
@@ -111,66 +88,6 @@ def _smallest(gram: Gram, model: LinearModel) -> list[str]:
 
 def _each(gram: Gram, model: LinearModel) -> list[str]:
     return list(model.signals)
-
-
-def weka_pace(gram: Gram, inputs: Sequence[str], label: str, estimator: Estimator) -> LinearModel:
-    """Return the model of counts that WEKA's PaceRegression finds.
-
-    The constant takes part in the mixture and may be shrunk; subset does what nested does; and the
-    expected contributions of pace2 and pace4 are not those of the theory.
-    """
-    basis = OrthogonalResponses.of(gram, backward(gram, inputs, label), label)
-    return basis.model(estimator(basis.responses))
-
-
-def threshold(price: float) -> Estimator:
-    """Return the estimator that drops the dimensions with A_j below a price."""
-    return lambda a: np.where(np.abs(a) < math.sqrt(price), 0.0, a)
-
-
-def _leading(a: FloatArray, contributions: FloatArray) -> FloatArray:
-    """Keep the first dimension, the constant, in any case."""
-    kept = int(np.argmax(np.cumsum(contributions)))
-    return np.where(np.arange(len(a)) <= kept, a, 0.0)
-
-
-def _mixture(a: FloatArray) -> Mixture:
-    """Fit it as WEKA does, whose intervals above the data reach less far than those below."""
-    return fit_mixture(a**2, ChiSquareKernel(reach=0.5))
-
-
-def _pace2(a: FloatArray) -> FloatArray:
-    kept = _leading(a, half_contributions(a, _mixture(a), lambda points: points))
-    return np.where(kept**2 <= NEGLIGIBLE_SQUARE, 0.0, kept)
-
-
-def _pace4(a: FloatArray) -> FloatArray:
-    positive = half_contributions(a, _mixture(a), lambda points: points) > 0
-    return np.where(positive & (a**2 > NEGLIGIBLE_SQUARE), a, 0.0)
-
-
-def _normal_contributions(a: FloatArray) -> FloatArray:
-    """Return E[2 a a* - a^2 | a] under a normal mixture."""
-    mixture = fit_mixture(a, NormalKernel())
-    return np.array(
-        [float(posterior(mixture, x, signed_density) @ (2 * x * mixture.points - x * x)) for x in a]
-    )
-
-
-def _nested(a: FloatArray) -> FloatArray:
-    kept = _leading(a, _normal_contributions(a))
-    return np.where(np.abs(kept) <= NEGLIGIBLE, 0.0, kept)
-
-
-WEKA_ESTIMATORS: dict[str, Estimator] = {
-    "ols": lambda a: a,
-    "pace2": _pace2,
-    "pace4": _pace4,
-    "pace6": lambda a: pace5(a, _mixture(a)),
-    "eb": empirical_bayes,
-    "nested": _nested,
-    "subset": _nested,
-}
 
 
 def standardised_penalty(gram: Gram, inputs: Sequence[str], penalty: Fraction) -> list[Fraction]:

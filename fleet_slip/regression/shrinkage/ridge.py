@@ -8,16 +8,12 @@ import math
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 
-import numpy as np
-
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.exact.elimination import eliminate
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import (
     LinearModel,
     Scales,
-    correlation_matrix,
-    from_standardised,
     moments,
     through_means,
 )
@@ -62,15 +58,6 @@ def fit_errors_in_variables(
     """
     variances = _variances(gram, inputs, noise, scales)
     return fit_penalised(gram, inputs, label, [-variance for variance in variances])
-
-
-def fit_ridge(gram: Gram, inputs: Sequence[str], label: str, penalty: float) -> LinearModel:
-    """Return the ridge model of counts, the penalty added to the correlations C = Q diag(l) Q'."""
-    k = len(inputs)
-    matrix = correlation_matrix(gram.restrict([*inputs, label]))
-    eigenvalues, vectors = np.linalg.eigh(matrix[:k, :k])
-    in_eigenbasis = (vectors.T @ matrix[:k, k]) / (eigenvalues + penalty)
-    return from_standardised(gram, inputs, label, in_eigenbasis @ vectors.T)
 
 
 def _variances(
