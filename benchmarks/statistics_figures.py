@@ -97,7 +97,7 @@ def orders(training: TrainingFolds, fold: IntArray) -> None:
         order = rank(name, total, NINE, LABEL)
         models = cross_validate_nested(training, order, LABEL)
         print(f"  {name:<17} {' '.join(order)}")
-        if name in {"declared", "correlation", "backward", "lars"}:
+        if name in {"declared", "correlation", "backward"}:
             rmse = [model.pooled.rmse_deg for model in models]
             axes.plot(range(len(rmse)), rmse, marker="o", markersize=3, label=name)
     axes.set_xlabel("number of signals")

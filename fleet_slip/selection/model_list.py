@@ -52,7 +52,7 @@ class Search(Config):
     negligibly larger (`fleet_slip.regression.choice.winner`).
     """
 
-    method: Literal["forward", "backward", "exchange", "lars"] = "forward"
+    method: Literal["forward", "backward", "exchange"] = "forward"
     most: int = Field(default=DEFAULT_MOST, ge=1, le=200)
     rule: Literal["best", "worth"] = "worth"
 

@@ -1,13 +1,12 @@
 """Rankings: the predefined order on which nested models depend (Section II-B).
 
-All but LARS, which needs roots, decide exactly; ties go to the declared order.
+All decide exactly; ties go to the declared order.
 """
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.choice.lars import lars_path
 from fleet_slip.regression.exact.elimination import adjugate, eliminate
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import dependence, moments
@@ -87,12 +86,6 @@ def replacement_sets(gram: Gram, inputs: Sequence[str], label: str) -> list[froz
     return sets
 
 
-def lars(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Order of entry into the least-angle regression path (Efron et al. 2004)."""
-    _moments(gram, inputs, label)  # which requires that they are independent
-    return lars_path(gram, inputs, label).order
-
-
 RANKINGS: dict[str, Ranking] = {
     "declared": declared,
     "correlation": correlation,
@@ -101,7 +94,6 @@ RANKINGS: dict[str, Ranking] = {
     "backward": backward,
     "replacement": replacement,
     "pivoted-cholesky": pivoted_cholesky,
-    "lars": lars,
 }
 
 

@@ -1,9 +1,9 @@
-"""Choosing among many inputs: forward, backward, exchange, or the order of least angles.
+"""Choosing among many inputs: forward, backward, or exchange.
 
 Steps are taken in extended precision (`numpy.longdouble`); where the two best sums of squares
-differ by less than rounding could make, exact elimination decides. So but for least angles, which
-needs roots, an order is that of exact arithmetic. A column that others explain but for 10^-9 of its
-variance counts as dependent, and is left out.
+differ by less than rounding could make, exact elimination decides, so an order is that of exact
+arithmetic. A column that others explain but for 10^-9 of its variance counts as dependent, and is
+left out.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.regression.choice.lars import path_of_moments
 from fleet_slip.regression.exact.elimination import eliminate
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import moments
@@ -29,7 +28,7 @@ ROUNDING = 1e-6
 """Relative difference of two gains below which they are compared exactly: far above what 64-bit
 fractions lose where no column is dependent."""
 
-METHODS: Final = ("forward", "backward", "exchange", "lars")
+METHODS: Final = ("forward", "backward", "exchange")
 
 
 def stepwise_order(
@@ -47,7 +46,6 @@ def stepwise_order(
         "forward": search.forward,
         "backward": search.backward,
         "exchange": partial(search.forward, exchanging=True),
-        "lars": search.lars,
     }
     return tuple(tuple(inputs[i] for i in chosen) for chosen in steps[method](most))
 
@@ -141,14 +139,6 @@ class _Search:
             removed.append(worst)
         order = removed[::-1]
         return [order[:size] for size in range(1, most + 1)]
-
-    def lars(self, most: int) -> list[list[int]]:
-        at = self.usable
-        matrix = self.matrix[np.ix_(at, at)].astype(np.float64)
-        target = self.matrix[at, -1].astype(np.float64)
-        names = [str(i) for i in at]
-        order = [int(name) for name in path_of_moments(matrix, target, names).order]
-        return [order[:size] for size in range(1, min(most, len(order)) + 1)]
 
     def _best_entry(
         self, variance: LongArray, with_label: LongArray, chosen: Sequence[int]

@@ -8,15 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import integrate, stats
-from sklearn.linear_model import lars_path_gram
 
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.choice import criteria
-from fleet_slip.regression.choice.lars import (
-    lars_path,
-    lasso_path,
-    path_of_moments,
-)
 from fleet_slip.regression.choice.leaps import best_by_leaps
 from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.choice.signal_orders import RANKINGS, rank, replacement_sets
@@ -35,7 +29,6 @@ ORDERS = {
     "t": "tstat_order",
     "correlation": "corr_order",
     "pivoted-cholesky": "pivoted_cholesky_order",
-    "lars": "lars_order_sklearn",
 }
 
 
@@ -77,70 +70,6 @@ def test_diabetes_best_subsets(diabetes: tuple[Gram, dict[str, Any]]) -> None:
     adjusted = criteria.subset_values("adjusted-r2", evidence, rss, size)
     expected_adjusted = [row["adjr2"] for row in answers["best_subsets"]]
     assert np.argmin(adjusted) == np.argmax(expected_adjusted)
-
-
-def test_diabetes_lars_and_lasso_paths(diabetes: tuple[Gram, dict[str, Any]]) -> None:
-    gram, answers = diabetes
-    inputs = answers["names"]
-    length = np.sqrt(gram.restrict(["y"]).centred()[0][0] / gram.n)
-    path = lars_path(gram, inputs, "y")
-    np.testing.assert_allclose(
-        path.penalties * length / gram.n, answers["lars_alphas"], rtol=1e-9, atol=1e-12
-    )
-    lasso = lasso_path(gram, inputs, "y")
-    np.testing.assert_allclose(
-        lasso.penalties * length / gram.n,
-        answers["lasso_breakpoint_alphas_sklearn"],
-        rtol=1e-9,
-        atol=1e-12,
-    )
-    np.testing.assert_allclose(
-        lasso.coefficients.T * length,
-        answers["lasso_coef_path_sklearn_scaledX"],
-        rtol=1e-8,
-        atol=1e-8,
-    )
-
-
-@settings(max_examples=40)
-@given(st.integers(0, 10**6), st.booleans())
-def test_paths_meet_their_conditions(seed: int, lasso: bool) -> None:
-    gram = gram_of(np.concatenate(random_drives(seed, drives=2, inputs=5)))
-    matrix = correlation_matrix(gram)
-    path = (lasso_path if lasso else lars_path)(gram, names(5)[:-1], "y")
-    assert (np.diff(path.penalties) < 0).all()
-    assert sorted(path.order) == list(names(5)[:-1])
-    halfway = (path.penalties[1:] + path.penalties[:-1]) / 2
-    for penalty in [*path.penalties, *halfway]:
-        beta = path.at(penalty)
-        residual = matrix[:5, 5] - matrix[:5, :5] @ beta
-        assert (np.abs(residual) <= penalty + 1e-9).all()
-        used = beta != 0
-        np.testing.assert_allclose(np.abs(residual[used]), penalty, atol=1e-9)
-        if lasso:
-            assert (np.sign(residual[used]) == np.sign(beta[used]))[penalty > 1e-9].all()
-
-
-@settings(max_examples=25)
-@given(st.integers(0, 10**6))
-def test_lasso_equals_scikit_learn(seed: int) -> None:
-    gram = gram_of(np.concatenate(random_drives(seed, drives=2, inputs=5)))
-    matrix = correlation_matrix(gram)
-    path = lasso_path(gram, names(5)[:-1], "y")
-    alphas, _, coefficients = lars_path_gram(
-        matrix[:5, 5], matrix[:5, :5], n_samples=1, method="lasso"
-    )
-    for alpha, beta in zip(alphas, coefficients.T, strict=True):
-        np.testing.assert_allclose(path.at(alpha), beta, atol=1e-8)
-
-
-def test_the_lasso_path_of_r() -> None:
-    expected = evidence("subsets/lars_R_reference.json")
-    x, y = np.array(expected["X"]), np.array(expected["y"])
-    path = path_of_moments(x.T @ x, x.T @ y, [f"x{i}" for i in range(5)], drops=True)
-    np.testing.assert_allclose(
-        path.coefficients.T, expected["R_beta_columns_are_steps"], rtol=1e-6, atol=1e-6
-    )
 
 
 @settings(max_examples=20)
