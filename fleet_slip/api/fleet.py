@@ -80,9 +80,9 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
 
         It can be repeated at any time, and after any interruption: what is done is not done again.
         A second run of the campaign on this machine waits for the first; `waiting` is called once
-        before. A winner that is worse than the champion is no error: the report says so. `sign_key`
-        is the private key to sign with. Progress is in rows of each step. Raises what `simulate`,
-        `gram`, `FleetCohort.select` and `publish` raise.
+        before. A winner that is worse than the champion is no error: the report says so. Progress
+        is in rows of each step. Raises what `simulate`, `gram`, `FleetCohort.select` and `publish`
+        raise.
         """
         from fleet_slip.api.run_report import RunReport, Training
         from fleet_slip.catalogue.features import features
@@ -121,9 +121,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
                     for name_of_set in (CALIBRATION, DELAY):
                         self.gram(name_of_set, cohort=condition, workers=executor)
             refusal, selection = "", None
-            training = Training(
-                model_name, condition, request.models, request.worth, request.sign_key
-            )
+            training = Training(model_name, condition, request.models, request.worth)
             publication = training.made_already(self)
             if publication is None:
                 with step("select"):
@@ -152,8 +150,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         champion's error, train again without the faulty drives, and verify some log files, the next
         ones on the next night. The winner becomes champion if it is not worse, else a candidate. A
         night that was killed and is given again ends where it would have ended. A second one of the
-        model on this machine waits for the first; `waiting` is called once before. `sign_key` is
-        the private key to sign with.
+        model on this machine waits for the first; `waiting` is called once before.
 
         What goes wrong in a step is in the report, whose `problem` is what a command fails with;
         later steps go on where they can. Raises `UsageError` for an invalid name or worth, and

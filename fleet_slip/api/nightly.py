@@ -71,7 +71,7 @@ class Night:
 
     def __post_init__(self) -> None:
         one = self.asked
-        self.training = Training(one.name, one.cohort, one.models, one.worth, one.sign_key)
+        self.training = Training(one.name, one.cohort, one.models, one.worth)
         self.night = date_of(one.night, "night") or date.today()
 
     def run(self) -> NightReport:
@@ -255,14 +255,14 @@ class Night:
         if made := self.training.made_already(self.fleet):
             return "done", f"{made.version.reference} is up to date."
         selection = self.training.select(self.fleet)
-        name, key = self.training.name, self.training.sign_key
+        name = self.training.name
         publication, refusal = None, ""
         if not self.asked.candidate:
             publication, refusal = self.training.publish_if_not_worse(
                 self.fleet, selection, replace_marked=False
             )
         if publication is None:
-            publication = self.fleet.publish(name, selection, candidate=True, sign_key=key)
+            publication = self.fleet.publish(name, selection, candidate=True)
         cars = selection.cohort.outweighing
         why, which = "they would outweigh the others", number_of(len(cars), "car")
         left_out = _left_out((one.drives for one in cars), which, why)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from fleet_slip.api.calls import Rooted, record_call
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.errors import RefusedError, UsageError
+from fleet_slip.errors import RefusedError
 from fleet_slip.models.aliases import CHAMPION
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.model_version import ModelVersion
@@ -64,23 +64,21 @@ class PublishedModels(Rooted):
         *,
         force: bool = False,
         candidate: bool = False,
-        sign_key: Path | None = None,
     ) -> "Publication":
         """Make a selection's winner the next version of a model, and its champion.
 
         `choice` is what `FleetCohort.select` returned; or a cohort, None for that of before, on
         which the model is trained as it was before, or from the usual list. A winner that is worse
         than the champion on the same cohort and folds needs `force`. A `candidate` waits for
-        `promote`, and so does any winner while the champion is held. `sign_key` is the private key
-        to sign with.
+        `promote`, and so does any winner while the champion is held.
 
         Raises `RefusedError` for a worse winner, a late or false course, or first measured drives
-        that contradict any car; `UsageError` for an invalid name, `ConfigError` for an unusable
-        key, and what `FleetCohort.select` raises.
+        that contradict any car; `UsageError` for an invalid name, and
+        what `FleetCohort.select` raises.
         """
         from fleet_slip.models.publish import publish
 
-        registry = self.registry(sign_key)
+        registry = self.registry()
         manifest, selection = self._challenger(name, choice, force=force, candidate=candidate)
         return publish(registry, manifest, selection, force=force, candidate=candidate)
 
@@ -91,12 +89,11 @@ class PublishedModels(Rooted):
         *,
         force: bool = False,
         candidate: bool = False,
-        sign_key: Path | None = None,
     ) -> "DryRun":
         """Tell what `publish` of the same would come to, a refusal too; nothing is written."""
         from fleet_slip.models.publish import DryRun, would_publish
 
-        registry = self.registry(sign_key)
+        registry = self.registry()
         try:
             manifest, selection = self._challenger(name, choice, force=force, candidate=candidate)
             return would_publish(registry, manifest, selection, force=force, candidate=candidate)
@@ -180,31 +177,17 @@ class PublishedModels(Rooted):
 
         return compare_versions(self.registry(), self.resolve(one), self.resolve(other))
 
-    def sign(self, reference: str, key: Path) -> ModelVersion:
-        """Sign the version `NAME@VERSION`, which was published without a signature; return it.
-
-        Raises `UsageError` for another reference, `ConfigError` for an unusable key, and as
-        `model`.
-        """
-        name, _, version = reference.partition("@")
-        if not (version.isascii() and version.isdigit() and len(version) < 10):
-            raise UsageError(f"{reference!r}: name one version, such as sideslip@3.")
-        registry = self.registry(key)
-        registry.sign(name, int(version))
-        return registry.load(name, int(version))
-
     @record_call
-    def import_model(self, file: Path, *, sign_key: Path | None = None) -> ModelVersion:
+    def import_model(self, file: Path) -> ModelVersion:
         """Bring a version in that another data root exported to JSON; return it.
 
         It becomes its model's next version, with its origin and no alias; the latest is returned if
-        it is the same estimator. `sign_key` signs it. Raises `InputError` for no such export, or a
-        changed one, `RefusedError` if a signal means something else here, `ConfigError` for an
-        unusable key.
+        it is the same estimator. Raises `InputError` for no such export, or a changed one,
+        `RefusedError` if a signal means something else here.
         """
         from fleet_slip.export.importing import import_version
 
-        return import_version(self.registry(sign_key), file)
+        return import_version(self.registry(), file)
 
     def estimator(
         self, model: str | ModelVersion, car: Mapping[str, Any] | None = None
@@ -255,9 +238,9 @@ class PublishedModels(Rooted):
 
         return log_version(self.resolve(model), self.warehouse, uri)
 
-    def registry(self, sign_key: Path | None = None) -> Registry:
-        """Return the registry of models; it signs new versions with a private key, if given one."""
-        return Registry.of(self.warehouse, sign_key)
+    def registry(self) -> Registry:
+        """Return the registry of models."""
+        return Registry.of(self.warehouse)
 
     def resolve(self, model: str | ModelVersion | None) -> ModelVersion:
         """Return the version that a reference names; a version is returned as it is."""

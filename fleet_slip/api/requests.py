@@ -41,7 +41,6 @@ class RunRequest:
     name: Annotated[str | None, Doc("Name of the model. Default: the campaign's.")] = None
     models: Annotated[str, MODELS] = DEFAULT_MODELS
     worth: Annotated[str | None, WORTH] = None
-    sign_key: Path | None = None
     workers: Workers = None
     progress: ShowStep | None = None
     waiting: Callable[[], None] = lambda: None
@@ -72,7 +71,6 @@ class NightRequest:
     night: Annotated[date | str | None, Doc("Date of the night, YYYY-MM-DD. Default: today.")] = (
         None
     )
-    sign_key: Path | None = None
     workers: Workers = None
     progress: ShowStep | None = None
     waiting: Callable[[], None] = lambda: None

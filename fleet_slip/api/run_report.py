@@ -1,7 +1,6 @@
 """What `Fleet.run` did; and training again by itself, as runs and nights do."""
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fleet_slip.errors import RefusedError
@@ -54,13 +53,12 @@ class RunReport:
 
 @dataclass(frozen=True)
 class Training:
-    """What trains a model every night: cohort, model list, `worth` of a signal, key that signs."""
+    """What trains a model every night: cohort, model list, `worth` of a signal."""
 
     name: str
     cohort: str
     models: str
     worth: str | None
-    sign_key: Path | None = None
 
     def made_already(self, fleet: "Fleet") -> "Publication | None":
         """Return the champion if a selection would come to it again, whatever it looks at."""
@@ -96,7 +94,7 @@ class Training:
             and champion.reference in marked_models(fleet.root)
         )
         try:
-            published = fleet.publish(self.name, selection, force=force, sign_key=self.sign_key)
+            published = fleet.publish(self.name, selection, force=force)
         except RefusedError as error:
             return None, str(error)
         return published, ""

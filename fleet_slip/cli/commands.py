@@ -44,8 +44,6 @@ GROUPS = {
         "pin": "models.version_commands",
         "unpin": "models.version_commands",
         "export": "models.export_command",
-        "keygen": "models.signing_commands",
-        "sign": "models.signing_commands",
     },
     "Accuracy": {
         "score": "accuracy.evaluate_commands",

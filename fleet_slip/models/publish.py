@@ -101,7 +101,6 @@ def would_publish(
     found = _decide(registry, manifest, selection, force=force, candidate=candidate)
     if found.stays:
         return DryRun(manifest.name, False, found.reason)
-    registry.require_key()
     if not found.waits:
         return DryRun(manifest.name, True, found.reason)
     waiting = registry.history(manifest.name).pointed_at(CANDIDATE)

@@ -7,7 +7,6 @@ models/<name>/history/1.json, 2.json, ...      every move of an alias, with its 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -22,7 +21,6 @@ from fleet_slip.models.aliases import CHAMPION, AliasHistory
 from fleet_slip.models.drives_of_files import GramDrives, read_files, tree_name
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.signing import require_signature, require_signing_key, sign_version
 from fleet_slip.models.trained_drives import DriveRecord, TrainedDrives, read_listed
 
 if TYPE_CHECKING:
@@ -35,19 +33,15 @@ _NONE = "none yet; publish one with: fleet-slip publish NAME"
 
 @dataclass(frozen=True)
 class Registry:
-    """All models below a folder, which are made of some Gram rows.
-
-    New versions are signed with a private key, if there is one.
-    """
+    """All models below a folder, which are made of some Gram rows."""
 
     folder: Folder
-    signing_key: Path | None = None
     grams: "Table | None" = None
 
     @classmethod
-    def of(cls, warehouse: "Warehouse", signing_key: Path | None = None) -> "Registry":
+    def of(cls, warehouse: "Warehouse") -> "Registry":
         """Return the models of a data root."""
-        return cls(warehouse.root / "models", signing_key, warehouse.grams)
+        return cls(warehouse.root / "models", warehouse.grams)
 
     def names(self) -> list[str]:
         """Return the names of all models, sorted."""
@@ -68,23 +62,7 @@ class Registry:
         return self._versions(name).numbers()
 
     def load(self, name: str, version: int) -> ModelVersion:
-        """Return a version. Raises `StorageError` if changed, `RefusedError` if unsigned."""
-        loaded = self._read(name, version)
-        require_signature(self._versions(name).folder, version, name, loaded.sha256)
-        return loaded
-
-    def require_key(self) -> None:
-        """Raise `ConfigError` if there is a private key that cannot be used."""
-        if self.signing_key is not None:
-            require_signing_key(self.signing_key)
-
-    def sign(self, name: str, version: int) -> None:
-        """Sign a version, if there is a key to sign with."""
-        if self.signing_key is not None:
-            loaded = self._read(name, version)
-            sign_version(self.folder_of(name), version, name, loaded.sha256, self.signing_key)
-
-    def _read(self, name: str, version: int) -> ModelVersion:
+        """Return a version. Raises `StorageError` if it was changed."""
         if not _IDENTIFIER.fullmatch(name):
             self.require(name)
         try:
@@ -179,20 +157,18 @@ class Registry:
         If the latest is the same estimator from the same rows, it is used: another process added
         it.
         """
-        self.require_key()  # before anything is written
         name, versions = manifest.name, self._versions(manifest.name)
         if drives is not None:
             self._keep_drives(name, drives)
 
         def next_version(latest: int) -> int | None:
-            if latest and self._read(name, latest).manifest.same_estimator(manifest):
+            if latest and self.load(name, latest).manifest.same_estimator(manifest):
                 return latest
             document = versions.create(latest + 1, manifest.model_dump(mode="json"))
             return document.number if document else None
 
         version = versions.after_newest(next_version)
-        self.sign(name, version)
-        return self._read(name, version)
+        return self.load(name, version)
 
     def make_champion(self, version: ModelVersion, *, after: int, best: int | None = None) -> bool:
         """Point the champion at a version, and at the `best`; False if an alias moved since."""
@@ -258,7 +234,7 @@ class Registry:
         published = {move.version: move.at for move in reversed(moves)}
         rows: list[Mapping[str, Any]] = []
         for number in self.versions(name):
-            version = self._read(name, number)
+            version = self.load(name, number)
             manifest = version.manifest
             figures, trained = manifest.cross_validation, manifest.trained_on
             own = {

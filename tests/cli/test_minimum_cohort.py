@@ -72,8 +72,6 @@ SILENT: dict[str, list[str]] = {
     "pin": ["pin smoke"],
     "unpin": ["unpin smoke"],
     "export": [f"export smoke --to {to} --output out" for to in ("json", "c", "sql", "dbc")],
-    "keygen": ["keygen key"],
-    "sign": ["sign smoke@1 --sign-key missing"],
     "nightly": [
         "nightly --landing landing --mapping unused --model smoke --output night",
         "nightly --landing landing --mapping unused --model smoke --json",
@@ -172,7 +170,7 @@ OF_COHORT: dict[str, Callable[[FleetCohort], Any]] = {
     ),
 }
 OF_NO_CAR = {
-    *("models", "model", "promote", "rollback", "pin", "unpin", "diff", "sign", "import_model"),
+    *("models", "model", "promote", "rollback", "pin", "unpin", "diff", "import_model"),
     *("estimator", "export", "log_to_mlflow", "registry", "resolve", "simulate", "receive"),
     *("ingest", "preview", "gram", "check", "migrate", "status", "examine", "verify", "repair"),
     *("compact", "vacuum", "preview_vacuum", "forget", "allow", "retain", "nightly", "cohort"),

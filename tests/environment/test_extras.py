@@ -97,7 +97,6 @@ def test_querying_and_selecting_need_the_core_alone(root: Path) -> None:
         ("compiled", ["export", "smoke", "--to", "c"]),
         ("report", ["report", "smoke"]),
         ("objects", ["--root", "s3://bucket/data", "status"]),
-        ("signing", ["keygen", "key.pem"]),
     ],
 )
 def test_what_needs_more_says_which_extra(root: Path, extra: str, words: list[str]) -> None:

@@ -5,7 +5,6 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +21,11 @@ from fleet_slip.maintenance.verify import verify_models
 from fleet_slip.maintenance.verify_files import Verification
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.recipe import is_up_to_date
-from fleet_slip.models.signing import VERIFY_VARIABLE, make_keys
 from fleet_slip.monitoring.monitor import monitor
 from tests.export.models import model_of
 from tests.support.commands import PATIENCE_S
 
 Document = dict[str, Any]
-
-needs_signing = pytest.mark.skipif(
-    find_spec("cryptography") is None, reason="signatures need the extra 'signing'"
-)
 
 
 @pytest.fixture(scope="module")
@@ -218,32 +212,6 @@ def test_imports_at_once_are_versions_of_their_own(tmp_path: Path) -> None:
     report = Verification()
     verify_models(fleet.warehouse, {}, report)
     assert report.findings == []
-
-
-@needs_signing
-def test_where_versions_must_be_signed_an_import_is_signed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file, public = small_export(tmp_path, Fraction(1, 3)), make_keys(tmp_path / "key")
-    monkeypatch.setenv(VERIFY_VARIABLE, str(public))
-    away = fleet_slip.open(tmp_path / "away")
-    brought = away.import_model(file, sign_key=tmp_path / "key")
-    assert away.model("small@1").sha256 == brought.sha256
-
-
-@needs_signing
-def test_an_import_that_is_not_signed_is_not_used_until_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file, public = small_export(tmp_path, Fraction(1, 3)), make_keys(tmp_path / "key")
-    away = fleet_slip.open(tmp_path / "away")
-    monkeypatch.setenv(VERIFY_VARIABLE, str(public))
-    away.import_model(file)
-    for use in (away.model, away.promote):
-        with pytest.raises(RefusedError, match=r"small@1 is not signed.* fleet-slip sign small@1"):
-            use("small@1")
-    away.sign("small@1", tmp_path / "key")
-    assert away.model("small@1").manifest.name == "small"
 
 
 def test_a_file_that_is_not_there_or_not_json_is_said(tmp_path: Path) -> None:

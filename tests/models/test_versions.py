@@ -60,6 +60,13 @@ def test_a_changed_version_is_refused(tmp_path: Path, change: str) -> None:
         Registry(LocalFolder(tmp_path)).load("sideslip", 1)
 
 
+def test_a_signature_of_an_earlier_release_is_ignored(tmp_path: Path) -> None:
+    publish(Registry(LocalFolder(tmp_path)), manifest())
+    (tmp_path / "sideslip" / "versions" / "1.sig").write_bytes(b"AAAA")
+    assert Registry(LocalFolder(tmp_path)).versions("sideslip") == [1]
+    assert publish(Registry(LocalFolder(tmp_path)), manifest(Fraction(2))).version == 2
+
+
 def test_aliases_move_and_go_back(tmp_path: Path) -> None:
     registry = Registry(LocalFolder(tmp_path))
     for number in (1, 2, 3):

@@ -7,7 +7,6 @@ import typer
 from fleet_slip.cli.begin.selection_tables import print_selection
 from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.left_out import examine_before_publishing
-from fleet_slip.cli.models.signing_commands import SignKey, signing_key
 from fleet_slip.cli.options import RESAMPLING, Unexamined, request_options
 from fleet_slip.cli.output import All, Json, print_json, say
 from fleet_slip.cli.record_runs import record_run
@@ -49,7 +48,6 @@ def publish(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be published, and publish nothing.")
     ] = False,
-    sign_key: SignKey = None,
     mlflow: Annotated[
         str | None, typer.Option(help="Also register the version in the MLflow server of this URI.")
     ] = None,
@@ -74,11 +72,8 @@ def publish(
         cohort = examine_before_publishing(context.obj, cohort)
     with step("select"):
         selection = answer_request(context.obj.warehouse, recipe.request, cohort)
-    key = signing_key(sign_key)
     if dry_run:
-        told = context.obj.would_publish(
-            name, selection, force=force, candidate=candidate, sign_key=key
-        )
+        told = context.obj.would_publish(name, selection, force=force, candidate=candidate)
         if json:
             print_json(told)
         else:
@@ -88,9 +83,7 @@ def publish(
         if not json:
             _print_dry_run(told)
         return
-    publication = context.obj.publish(
-        name, selection, force=force, candidate=candidate, sign_key=key
-    )
+    publication = context.obj.publish(name, selection, force=force, candidate=candidate)
     number = context.obj.log_to_mlflow(publication.version, mlflow) if mlflow else None
     if json:
         print_json(publication)

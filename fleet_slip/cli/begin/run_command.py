@@ -15,7 +15,6 @@ from fleet_slip.api.run_report import RunReport
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.cli.begin.publish_command import print_publication
 from fleet_slip.cli.begin.selection_tables import print_selection
-from fleet_slip.cli.models.signing_commands import signing_key
 from fleet_slip.cli.options import request_options
 from fleet_slip.cli.output import All, Json, print_json, say
 from fleet_slip.cli.progress_bar import progress_of_steps
@@ -61,7 +60,6 @@ def run(
         options = {
             **vars(request),
             "campaign": plan,
-            "sign_key": signing_key(None),
             "workers": executor,
             "progress": tell,
             "waiting": lambda: say(f"{plan.name}: waiting for another run"),

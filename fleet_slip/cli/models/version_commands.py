@@ -10,7 +10,6 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.cli.completing import complete_model
 from fleet_slip.cli.model_argument import OnlyModel
-from fleet_slip.cli.models.signing_commands import signing_key
 from fleet_slip.cli.output import All, Json, print_json, print_table, print_text, say
 from fleet_slip.cli.record_runs import record_run
 from fleet_slip.errors import UsageError
@@ -104,7 +103,7 @@ def _print_models(rows: Sequence[Mapping[str, Any]], everything: bool) -> None:
 def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> None:
     if word != "import":
         raise UsageError(f"{word!r}: a file is for import. Run: fleet-slip models import {file}")
-    version = fleet.import_model(file, sign_key=signing_key(None))
+    version = fleet.import_model(file)
     origin = version.manifest.imported_from
     if json:
         told = origin.model_dump() if origin else None

@@ -8,7 +8,6 @@ import typer
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.requests import NightRequest
-from fleet_slip.cli.models.signing_commands import SignKey, signing_key
 from fleet_slip.cli.options import request_options
 from fleet_slip.cli.output import Json, print_json, print_text, say
 from fleet_slip.cli.progress_bar import progress_of_steps
@@ -30,7 +29,6 @@ def nightly(
             show_default=False,
         ),
     ] = None,
-    sign_key: SignKey = None,
     threads: Threads = None,
     cluster: Cluster = None,
     json: Json = False,
@@ -50,7 +48,6 @@ def nightly(
     ):
         options = {
             **vars(request),
-            "sign_key": signing_key(sign_key),
             "workers": executor,
             "progress": show,
             "waiting": lambda: say(f"{request.name}: waiting for another night"),
