@@ -1,6 +1,5 @@
 """Where a drive comes from, as the column `source` says it, and which drives may train a model."""
 
-import re
 from typing import Final
 
 SCENARIO: Final = "scenario"
@@ -12,16 +11,8 @@ RECEIVED: Final = "received"
 RECEIVED_FILES: Final = "received/"
 """What stands before a digest in the column `file` of Gram rows without a log file."""
 
-_RECEIVED_DRIVE: Final = re.compile(r"([A-Za-z0-9._-]{1,16})-[0-9]{8}T[0-9]{6}Z")
-
 LONGEST_PAUSE_S: Final = 600
 """A pause that is longer begins another trip: road, load and warmth of the tyres may be others."""
 
 ALL_DRIVES: Final = "true"
 TRAINING_DRIVES: Final = f"source <> '{SCENARIO}'"
-
-
-def sender_of(drive_id: str) -> str | None:
-    """Return the only car that can send a message of a drive of this name; None if none can."""
-    found = _RECEIVED_DRIVE.fullmatch(drive_id)
-    return found[1] if found else None

@@ -4,9 +4,11 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import date
 
+import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from fleet_slip.catalogue.counts import digest_drive
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
@@ -19,7 +21,6 @@ from fleet_slip.models.drives_of_files import keep_drives_of
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.database import open_database, reading_files
-from fleet_slip.warehouse.recordings import Recording, record_drive
 from fleet_slip.warehouse.tables import Warehouse
 
 FILES_PER_QUERY = 256
@@ -186,13 +187,6 @@ def locate(grams: Snapshot, subject: Forgettable) -> Located:
     return Located(frozenset(known), {path: frozenset(names) for path, names in drives.items()})
 
 
-def cars_with_rows(warehouse: Warehouse) -> set[str]:
-    """Return the cars that have Gram rows."""
-    grams = warehouse.grams.snapshot()
-    each = (grams.table.read(file.path, ["vehicle_id"])["vehicle_id"] for file in grams.files)
-    return {name for cars in each for name in cars.unique().to_pylist() if name is not None}
-
-
 def drives_by_file(
     logs: Snapshot, subject: Forgettable, located: Located
 ) -> dict[str, frozenset[str]]:
@@ -217,10 +211,8 @@ def drives_by_file(
     return found
 
 
-def recordings_of(
-    warehouse: Warehouse, subject: Forgettable, located: Located
-) -> Iterator[Recording]:
-    """Yield what tells a subject's drives again, file by file of the logs."""
+def digests_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> Iterator[str]:
+    """Yield what tells a subject's drives by their counts, file by file of the logs."""
     logs = warehouse.logs.snapshot()
     drives = drives_by_file(logs, subject, located)
     for file in logs.files:
@@ -233,4 +225,5 @@ def recordings_of(
             mine = rows.filter(pc.equal(ids, name)).combine_chunks()
             [batch] = mine.to_batches()
             counts = {signal: batch[signal] for signal in signals}
-            yield record_drive(str(batch["vehicle_id"][0]), str(file.day), batch["tick"], counts)
+            car, ticks = str(batch["vehicle_id"][0]), pl.Series(batch["tick"]).to_numpy()
+            yield digest_drive(car, str(file.day), ticks, counts)

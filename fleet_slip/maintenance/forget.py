@@ -9,7 +9,6 @@ logs. What such jobs have written is deleted by them or here.
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal, TypeAlias
 
 import pyarrow as pa
@@ -20,12 +19,11 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.grams.rows.gram_job import reconcile
 from fleet_slip.maintenance.find_drives import (
     Located,
-    cars_with_rows,
+    digests_of,
     drives_by_file,
     locate,
     quarantined_of,
     read_old_files,
-    recordings_of,
     remove_old_files,
 )
 from fleet_slip.maintenance.marked_models import models_trained_on, newest_versions
@@ -40,7 +38,6 @@ from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.history import runs_under_way
 from fleet_slip.views import connect
 from fleet_slip.warehouse.audit import ALLOWED, Audit, Forgettable
-from fleet_slip.warehouse.cleared_cars import ClearedCars
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -93,8 +90,8 @@ def forget(
     models = audit.models_of(subject)
     if state == ALLOWED or (drives and state != "begun"):
         models = _begin(warehouse, audit, subject, drives, located, source_file)
-    cleared, present = ClearedCars(warehouse.root), partial(cars_with_rows, warehouse)
-    cleared.forget(audit, subject, present)
+    for name in (cleared := warehouse.root / "cleared").names():
+        cleared.delete(name)  # releases up to 0.2 listed cars there that were not forgotten
     for table in (warehouse.quarantine, warehouse.logs):
         if drives or state:
             table.fence()
@@ -102,7 +99,6 @@ def forget(
     if not landed <= drives:  # they landed before the fence
         drives |= landed
         models = _begin(warehouse, audit, subject, drives, located, source_file)
-        cleared.forget(audit, subject, present)
     _forget_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
     if not audit.names_are_exact:
@@ -112,7 +108,6 @@ def forget(
     rows += forget_received(warehouse, subject)
     uncommitted = remove_old_files(warehouse, subject, replaced=False)
     reconcile(warehouse)
-    cleared.keep(present)
     old = remove_old_files(warehouse, subject, replaced=now)
     if drives or state in ("begun", ALLOWED):
         audit.end(subject, warehouse.grams.snapshot().version)
@@ -139,9 +134,8 @@ def _begin(
 ) -> list[str]:
     judged = newest_versions(warehouse.root)
     models = models_trained_on(warehouse, drives)
-    known = () if subject.kind == "before" else recordings_of(warehouse, subject, located)
-    kept = [one.kept() for one in known]
-    audit.begin(subject, len(drives), models, judged, kept, source_file)
+    known = () if subject.kind == "before" else digests_of(warehouse, subject, located)
+    audit.begin(subject, len(drives), models, judged, set(known), source_file)
     return models
 
 

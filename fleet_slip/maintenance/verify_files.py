@@ -17,7 +17,6 @@ from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.progress import Progress
 from fleet_slip.warehouse.audit import Audit
-from fleet_slip.warehouse.cleared_cars import ClearedCars
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
@@ -178,12 +177,10 @@ def _null_counts(metadata: pq.FileMetaData) -> dict[str, int]:
 def verify_names(
     warehouse: Warehouse, read: Mapping[str, Sequence[ReadFile]], report: Verification, full: bool
 ) -> None:
-    """Look for forgotten cars; for forgotten drives too with `full`, 40 ms for each name."""
+    """Look for forgotten cars; for forgotten drives too with `full`."""
     unused = frozenset(name for one in _all(read) for name in _unused(one))
     cars, drives = (_used(_all(read), column) for column in ("vehicle_id", "drive_id"))
     audit = Audit(warehouse.root)
-    if (cleared := ClearedCars(warehouse.root).read()) and cleared.entries >= audit.begun():
-        cars -= cleared.names
     barred = audit.barred(cars | unused, (drives if full else frozenset()) | unused, ended=True)
     wrong = {"vehicle_id": barred.vehicles, "drive_id": barred.drives}
     for table, files in read.items():

@@ -1,13 +1,14 @@
 """What was forgotten: recorded without the data.
 
-The name of a car or drive stands there as a salted hash only, so that the question "was this one
-forgotten?" can be answered by who knows the name, and by no other.
+The name of a car or drive stands there as a hash only, keyed with a secret of the data root. So the
+question "was this one forgotten?" can be answered by who has the root and knows the name.
 
     forgotten/1.json, 2.json, ...   "begun" before anything is changed, "done" after all of it,
                                     "allowed" where a car or drive may come back
 
-"begun" of a drive has the hash of the only car that can send a message of it, too; and that of a
-car or a drive has what tells the recordings again (`fleet_slip.warehouse.recordings`).
+"begun" of a car or a drive has the digests of the drives' counts too, which tell a drive that comes
+again under another name. Releases up to 0.2 hashed names with scrypt, 40 ms each, and kept other
+hashes of samples: their names still count, their samples do not.
 
 Who lands rows asks `barred` between looking at the table and committing to it. Who forgets writes
 "begun" and then fences the table (`Table.fence`). So a commit either began after the fence, and its
@@ -19,15 +20,12 @@ import functools
 import hashlib
 import secrets
 from collections.abc import Collection, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Literal, TypeAlias, cast
+from typing import Any, Literal, TypeAlias
 
-from fleet_slip.catalogue.sources import sender_of
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.files.folder import Folder
-from fleet_slip.warehouse.recordings import KnownRecordings
 
 FOLDER = "forgotten"
 ALLOWED = "allowed"
@@ -48,44 +46,34 @@ class Forgettable:
         return {"vehicle": "vehicle_id", "drive": "drive_id", "before": "day"}[self.kind]
 
     @property
-    def sender(self) -> str | None:
-        """The only car, if any, whose messages it can be of; None for a time."""
-        return {"vehicle": self.value, "drive": sender_of(self.value), "before": None}[self.kind]
-
-    @property
     def condition(self) -> str:
         """SQL condition with the parameter `$value`."""
         if self.kind == "before":
             return "day < $value::DATE"
         return f"{self.column} = $value"
 
-    def digest(self, salt: str) -> str:
-        """Return the salted hash of the name, slow on purpose: names of cars can be listed."""
-        return _digest(f"{self.kind}:{self.value}", salt)
+    def digest(self, key: str) -> str:
+        """Return the keyed hash of the name."""
+        return _digest(f"{self.kind}:{self.value}", key)
+
+
+_SCRYPT = "scrypt:"
 
 
 @functools.lru_cache(300_000)
-def _digest(text: str, salt: str) -> str:
+def _digest(text: str, key: str) -> str:
     name = text.encode("utf-8", "surrogatepass")
-    return hashlib.scrypt(name, salt=bytes.fromhex(salt), n=2**14, r=8, p=1, dklen=32).hex()
+    if key.startswith(_SCRYPT):
+        salt = bytes.fromhex(key.removeprefix(_SCRYPT))
+        return hashlib.scrypt(name, salt=salt, n=2**14, r=8, p=1, dklen=32).hex()
+    return hashlib.blake2b(name, key=bytes.fromhex(key), digest_size=32).hexdigest()
 
 
 @functools.lru_cache(100_000)
 def _entry(folder: DocumentFolder, number: int) -> Mapping[str, Any]:
     """Return an entry, which never changes; a night reads each once."""
-    return folder.read(number).content
-
-
-@functools.lru_cache(1)
-def _known(kept: tuple[str, ...]) -> KnownRecordings:
-    return KnownRecordings(kept)
-
-
-def _digests(kind: Kind, names: Collection[str], salt: str) -> dict[str, str]:
-    """Return the hash of each name, computed on all processors."""
-    with ThreadPoolExecutor() as threads:  # scrypt lets others run
-        found = threads.map(lambda name: Forgettable(kind, name).digest(salt), names)
-        return dict(zip(names, found, strict=True))
+    entry = folder.read(number).content
+    return entry if "key" in entry else {**entry, "key": f"{_SCRYPT}{entry['salt']}"}
 
 
 @dataclass(frozen=True)
@@ -120,61 +108,41 @@ class Audit:
         """Return which of some cars and drives were forgotten: no row of theirs may land.
 
         `ended` leaves out what is still being forgotten, or was interrupted: its rows are there.
-        Each name takes some 40 ms to look up, once in a process, where a car, or a drive, was ever
-        forgotten; nothing where none was.
         """
         last = self._last_events()
         free = (ALLOWED, "begun") if ended else (ALLOWED,)
-        found: dict[str, set[str]] = {"vehicle": set(), "drive": set()}
+        found: dict[str, frozenset[str]] = {}
         for kind, names in (("vehicle", vehicles), ("drive", drives)):
-            for salt in {key[1] for key in last if key[0] == kind}:
-                for name, digest in _digests(cast(Kind, kind), names, salt).items():
-                    if last.get((kind, salt, digest), ALLOWED) not in free:
-                        found[kind].add(name)
-        return Barred(frozenset(found["vehicle"]), frozenset(found["drive"]))
+            keys = {key for each, key, _ in last if each == kind}
+            found[kind] = frozenset(
+                name
+                for name in (names if keys else ())
+                for key in keys
+                if last.get((kind, key, _digest(f"{kind}:{name}", key)), ALLOWED) not in free
+            )
+        return Barred(found["vehicle"], found["drive"])
 
-    def recordings(self) -> KnownRecordings | None:
-        """Return the recordings of cars and drives that were forgotten; None without any."""
+    def barred_counts(self) -> frozenset[str]:
+        """Return the digests of the counts of drives that were forgotten."""
         last = self._last_events()
-        kept = tuple(
-            recording
-            for e in self.entries()
-            if last[e["kind"], e["salt"], e["subject"]] != ALLOWED
-            for recording in e.get("recordings", ())
+        return frozenset(
+            digest
+            for entry in self.entries()
+            if last[_subject_of(entry)] != ALLOWED
+            for digest in entry.get("counts", ())
         )
-        return _known(kept) if kept else None
 
-    def with_forgotten_drives(self, cars: Collection[str]) -> frozenset[str]:
-        """Return which of some cars can send a message of a drive that was forgotten.
-
-        All of them, where an earlier version forgot a drive, which did not keep whose it is. As
-        slow as `barred`.
-        """
-        last = self._last_events()
-        begun = [e for e in self.entries() if (e["kind"], e["event"]) == ("drive", "begun")]
-        left = [e for e in begun if last["drive", e["salt"], e["subject"]] != ALLOWED]
-        if any("sender" not in entry for entry in left):
-            return frozenset(cars)
-        senders = {(e["salt"], e["sender"]) for e in left if e["sender"] is not None}
-        found: set[str] = set()
-        for salt in {salt for salt, _ in senders}:
-            hashed = _digests("vehicle", cars, salt)
-            found.update(name for name, digest in hashed.items() if (salt, digest) in senders)
-        return frozenset(found)
-
-    def begun(self, subject: Forgettable | None = None) -> frozenset[int]:
-        """Return the numbers of the entries that bar a car or a drive, or only a subject."""
-        digests = {e["salt"]: subject.digest(e["salt"]) for e in self.entries()} if subject else {}
+    def begun(self) -> frozenset[int]:
+        """Return the numbers of the entries that bar a car or a drive."""
         return frozenset(
             number
             for number, entry in enumerate(self.entries(), 1)
             if entry["event"] == "begun" and entry["kind"] != "before"
-            if subject is None or entry["subject"] == digests[entry["salt"]]
         )
 
     def _last_events(self) -> dict[tuple[str, str, str], str]:
-        """Return the last event of each subject, by its kind, salt and hash."""
-        return {(e["kind"], e["salt"], e["subject"]): e["event"] for e in self.entries()}
+        """Return the last event of each subject, by its kind, key and hash."""
+        return {_subject_of(entry): entry["event"] for entry in self.entries()}
 
     def state(self, subject: Forgettable) -> Literal["begun", "done", "allowed"] | None:
         """Return how far forgetting a subject got; None if it was never begun."""
@@ -192,17 +160,17 @@ class Audit:
         drives: int,
         models: Collection[str],
         judged: Mapping[str, int] | None = None,
-        recordings: Collection[str] = (),
+        counts: Collection[str] = (),
         source_file: str | None = None,
     ) -> None:
         """Record what is about to be forgotten.
 
         `models` were trained on it, of all versions up to the `judged` number of each model.
-        `recordings` are those of its drives, as `Recording.kept` returns them. `source_file` is
-        the file by whose name it is forgotten.
+        `counts` are the digests of its drives' counts. `source_file` is the file by whose name it
+        is forgotten.
         """
         known = {"drives": drives, "models": sorted(models), "judged": dict(judged or {})}
-        begun = {"event": "begun", **known, "recordings": sorted(recordings)}
+        begun = {"event": "begun", **known, "counts": sorted(counts)}
         self._append(subject, begun, source_file)
 
     def end(self, subject: Forgettable, grams_version: int | None = None) -> None:
@@ -231,34 +199,33 @@ class Audit:
         """
         last, found = self._last_events(), dict[str, str]()
         for entry in self.entries():
-            name = _digest(f"source_file:{source_file}", entry["salt"])
-            if entry.get("source_file") != name:
+            if entry.get("source_file") != _digest(f"source_file:{source_file}", entry["key"]):
                 continue
-            key = entry["kind"], entry["salt"], entry["subject"]
-            found[entry["subject"]] = last[key]
-            if last[key] == "done":
+            subject = _subject_of(entry)
+            found[entry["subject"]] = last[subject]
+            if last[subject] == "done":
                 at = datetime.now(UTC).isoformat(timespec="seconds")
-                told = dict(zip(("kind", "salt", "subject"), key, strict=True))
+                told = dict(zip(("kind", "key", "subject"), subject, strict=True))
                 self._folder.append({**told, "at": at, "event": ALLOWED})
-                last[key] = ALLOWED
+                last[subject] = ALLOWED
         return found
 
     def _of(self, subject: Forgettable) -> list[Mapping[str, Any]]:
-        entries = self.entries()
-        # One salt, or more if several processes made the first entries at once.
-        digests = {salt: subject.digest(salt) for salt in {entry["salt"] for entry in entries}}
-        return [entry for entry in entries if entry["subject"] == digests[entry["salt"]]]
+        return [e for e in self.entries() if e["subject"] == subject.digest(e["key"])]
 
     def _append(
         self, subject: Forgettable, content: Mapping[str, Any], source_file: str | None = None
     ) -> None:
-        entries = self.entries()
-        salt = entries[0]["salt"] if entries else secrets.token_hex(16)
-        if subject.kind == "drive" and content["event"] == "begun":
-            car = Forgettable("vehicle", subject.sender) if subject.sender else None
-            content = {**content, "sender": car.digest(salt) if car else None}
+        # One key, or more if several processes made the first entries at once.
+        keys = [entry["key"] for entry in self._of(subject)]
+        keys += [e["key"] for e in self.entries() if not e["key"].startswith(_SCRYPT)]
+        key = keys[0] if keys else secrets.token_hex(32)
         if source_file is not None:
-            content = {**content, "source_file": _digest(f"source_file:{source_file}", salt)}
+            content = {**content, "source_file": _digest(f"source_file:{source_file}", key)}
         at = datetime.now(UTC).isoformat(timespec="seconds")
-        known = {"kind": subject.kind, "subject": subject.digest(salt), "salt": salt, "at": at}
+        known = {"kind": subject.kind, "subject": subject.digest(key), "key": key, "at": at}
         self._folder.append({**known, **content})
+
+
+def _subject_of(entry: Mapping[str, Any]) -> tuple[str, str, str]:
+    return entry["kind"], entry["key"], entry["subject"]

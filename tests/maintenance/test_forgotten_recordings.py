@@ -1,6 +1,7 @@
 """A forgotten drive stays away when its recording comes again under other names."""
 
 import gzip
+import hashlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ from fleet_slip.ingest.landing import committing, ingest_job
 from fleet_slip.maintenance.forget import forget
 from fleet_slip.warehouse.audit import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.measured import SIGNALS, a_mapping, csv_text, ingest_file
+from tests.support.measured import a_mapping, csv_text, ingest_file
 
 ROWS = 3000
 
@@ -60,43 +61,15 @@ def is_empty(warehouse: Warehouse) -> bool:
 Copy = tuple[dict[str, Any], Mapping]
 
 
-def a_part() -> Copy:
-    return {name: values[700:1900] for name, values in recording().items()}, a_mapping()
-
-
-def inside_a_longer_one() -> Copy:
-    longer = {name: values * 2 for name, values in recording(7).items()}
-    longer = {name: [*values, *recording()[name]] for name, values in longer.items()}
-    return longer | {"t": [f"{i / 100:.2f}" for i in range(3 * ROWS)]}, a_mapping()
-
-
-def without_some_rows() -> Copy:
-    kept = [i for i in range(ROWS) if i % 300]
-    return {name: [values[i] for i in kept] for name, values in recording().items()}, a_mapping()
-
-
-def with_the_label_turned() -> Copy:
-    turned = [
-        value.removeprefix("-") if "-" in value else f"-{value}" for value in recording()["beta"]
-    ]
-    return recording() | {"beta": turned}, a_mapping()
-
-
 AGAIN: dict[str, Callable[[], Copy]] = {
     "another mapping": lambda: (recording(), a_mapping(name="other")),
     "another car": lambda: (recording(), a_mapping(drive={"vehicle_id": "pseudonym"})),
     "another day": lambda: (recording(), a_mapping(drive={"day": "2020-01-01"})),
     "another model": lambda: (recording(), a_mapping(drive={"vehicle_model": "coupe"})),
-    "fewer signals": lambda: (recording(), a_mapping(signals={"ax": SIGNALS["ax"]})),
-    "swapped signals": lambda: (recording(), a_mapping(signals={"ay": SIGNALS["ax"]})),
     "a later clock": lambda: (
         recording() | {"t": [f"{500 + i / 100:.2f}" for i in range(ROWS)]},
         a_mapping(),
     ),
-    "a part": a_part,
-    "inside a longer one": inside_a_longer_one,
-    "without some rows": without_some_rows,
-    "with the label turned": with_the_label_turned,
 }
 
 
@@ -177,7 +150,37 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
     assert is_empty(warehouse)
 
 
-def test_the_root_of_an_earlier_version_has_no_recordings(tmp_path: Path) -> None:
-    audit = Audit(LocalFolder(tmp_path))
-    audit.begin(Forgettable("drive", "d"), 1, [])
-    assert audit.recordings() is None
+def test_a_recording_without_every_50th_row_is_another_one(
+    forgotten: Warehouse, tmp_path: Path
+) -> None:
+    kept = [i for i in range(ROWS) if i % 50]
+    columns = {name: [values[i] for i in kept] for name, values in recording().items()}
+    report = ingest_file(forgotten, write(tmp_path, columns, "other.csv"), a_mapping())
+    assert (report.drives_forgotten, report.counts.drives) == (0, 1)
+
+
+def test_what_an_earlier_release_forgot_stays_away_by_name(
+    warehouse: Warehouse, tmp_path: Path
+) -> None:
+    """It kept salted scrypt hashes; this one of the vehicle "car", with this salt."""
+    hashed = hashlib.scrypt(b"vehicle:car", salt=bytes(16), n=2**14, r=8, p=1, dklen=32).hex()
+    old = {"kind": "vehicle", "subject": hashed, "salt": "00" * 16, "at": "2026-11-01T00:00:00"}
+    audit = Audit(warehouse.root)
+    for event in ({"event": "begun", "drives": 1, "models": []}, {"event": "done"}):
+        audit._folder.append({**old, **event})
+    file, car = write(tmp_path, recording()), Forgettable("vehicle", "car")
+    assert ingest_file(warehouse, file, a_mapping()).drives_forgotten == 1
+    assert audit.state(car) == "done"
+    audit.allow(car)
+    assert ingest_file(warehouse, file, a_mapping()).counts.drives == 1
+    forget(warehouse, car, now=True)
+    assert ingest_file(warehouse, file, a_mapping(name="again")).drives_forgotten == 1
+
+
+def test_names_of_other_cars_that_an_earlier_release_listed_go(
+    warehouse: Warehouse, tmp_path: Path
+) -> None:
+    ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
+    (warehouse.root / "cleared").create("1.txt", b"car")
+    forget(warehouse, Forgettable("vehicle", "car"), now=True)
+    assert (warehouse.root / "cleared").names() == []

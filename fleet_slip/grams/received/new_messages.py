@@ -35,7 +35,7 @@ class NewMessages:
         superseded: drives whose unsigned rows go, since the key of their car signed others.
         duplicates, forgotten: the file of each row that it has, and that is of a car or a drive
             that was forgotten.
-        screened: what of all that was forgotten, and which cars were found to be none of it.
+        screened: what of all that was forgotten.
     """
 
     grams: Snapshot

@@ -226,7 +226,6 @@ def _receive_batch(warehouse: Warehouse, batch: dict[Path, bytes]) -> list[Recei
         return new
 
     new = retry_conflicts(attempt)
-    new.screened.remember(warehouse.root, new.new)
     for report, (_, one) in zip(fresh, found, strict=True):
         report.messages = one.count
     _tell(fresh, new)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.counts import round_chunks
+from fleet_slip.catalogue.counts import digest_drive, round_chunks
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import LONGEST_PAUSE_S
 from fleet_slip.errors import InputError
@@ -63,6 +63,12 @@ class MeasuredDrive:
     def num_rows(self) -> int:
         """Number of its rows, as a table has it."""
         return self.ticks.size
+
+    @cached_property
+    def counts_digest(self) -> str:
+        """What tells it by its counts."""
+        car, day = str(self.metadata["vehicle_id"]), str(self.metadata["day"])
+        return digest_drive(car, day, self.ticks, self.counts)
 
 
 def drive_id(prefix: str, group: int, stretch: int = 1) -> str:

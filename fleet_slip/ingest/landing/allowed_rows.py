@@ -5,22 +5,20 @@ from collections.abc import Collection, Sequence
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.catalogue.counts import as_arrow
 from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
 from fleet_slip.warehouse.audit import Audit
-from fleet_slip.warehouse.recordings import Recording, record_drive
 
 
 def keep_drives(drives: Sequence[MeasuredDrive], audit: Audit) -> list[MeasuredDrive]:
     """Return the drives that were not forgotten under any name, nor their cars."""
     barred = audit.barred(set(map(car_of, drives)), {drive.drive_id for drive in drives})
-    known = audit.recordings()
+    counts = audit.barred_counts()
     return [
         drive
         for drive in drives
         if drive.drive_id not in barred.drives
         and car_of(drive) not in barred.vehicles
-        and not (known is not None and known.has(_recording_of(drive)))
+        and not (counts and drive.counts_digest in counts)
     ]
 
 
@@ -45,11 +43,6 @@ def keep_refused(refused: pa.Table, audit: Audit, left_out: Collection[str] = ()
 def car_of(drive: MeasuredDrive) -> str:
     """Return the name of the car of a drive."""
     return str(drive.metadata["vehicle_id"])
-
-
-def _recording_of(drive: MeasuredDrive) -> Recording:
-    ticks = as_arrow(drive.ticks)
-    return record_drive(car_of(drive), str(drive.metadata["day"]), ticks, drive.counts)
 
 
 def names_in(rows: pa.Table, column: str) -> frozenset[str]:

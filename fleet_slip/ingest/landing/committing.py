@@ -42,7 +42,7 @@ def land_batch(
         landed = snapshot.landed_among(len(written.parts[name].units))
         if any(landed(unit.name) for unit in written.parts[name].units):
             return True
-        new = [one for one in written.outcomes if one.marks.units] if name == "logs" else []
+        new = [one for one in written.outcomes if one.marks] if name == "logs" else []
         known = KnownMarks(snapshot.units if new else {})
         return any(known.find(one.marks) - one.found.origins for one in new)
 
@@ -58,7 +58,7 @@ def land_batch(
         gone = Change()
         if written.replaced and superseding and written.parts["logs"].files:
             gone = superseding.without(name, snapshot, written.replaced)
-        marks = [mark for one in written.outcomes for mark in one.marks.units.items()]
+        marks = [mark for one in written.outcomes for mark in one.marks.items()]
         units = {unit.name: unit for unit in (*gone.units, *part.units)}
         if name == "logs":
             units |= {mark: Unit(mark, number) for mark, number in marks}

@@ -23,7 +23,7 @@ from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
 from fleet_slip.ingest.landing import data_files
 from fleet_slip.ingest.landing.allowed_rows import car_of, keep_drives, keep_refused, names_in
 from fleet_slip.ingest.landing.data_files import DataFiles, Part, Rows, TableName, digest_of
-from fleet_slip.ingest.landing.marks import FileMarks, Origin
+from fleet_slip.ingest.landing.marks import Origin, mark_drive, mark_file
 from fleet_slip.ingest.landing.same_recordings import (
     RecordingInLogs,
     Replace,
@@ -35,7 +35,6 @@ from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.ingest.mapping.mapping import Mapping
 from fleet_slip.progress import Progress, no_progress
 from fleet_slip.warehouse.audit import Audit
-from fleet_slip.warehouse.recordings import find_spots
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
 
 
@@ -64,7 +63,7 @@ class FileOutcome:
     suspicions: tuple[Suspicion, ...] = ()
     vehicles: set[str] = field(default_factory=set)
     left_out: int = 0
-    marks: FileMarks = field(default_factory=FileMarks)
+    marks: dict[str, int] = field(default_factory=dict)
     found: RecordingInLogs = field(default_factory=RecordingInLogs)
 
 
@@ -110,7 +109,7 @@ def write_batch(
     snapshots = {name: table.snapshot() for name, table in tables_of(warehouse).items()}
     landed = {name: one.landed_among(len(files)) for name, one in snapshots.items()}
     same = SameRecordings(warehouse, snapshots["logs"], mapping.name, replace)
-    copies, seen = LocalCopies(asked.file for asked in files), Spool()
+    copies = LocalCopies(asked.file for asked in files)
     with copies, ThreadPoolExecutor(data_files.WRITERS) as threads:
         tables = {
             name: DataFiles(table, mapping, threads, partial(_has_landed, landed, name))
@@ -127,7 +126,7 @@ def write_batch(
                     ):
                         for name, stored in tables_of(warehouse).items():
                             landed[name] = stored.snapshot().landed_among(len(files))
-                    outcome, drive, rest = _write_file(stream, asked.file, tables, audit, seen)
+                    outcome, drive, rest = _write_file(stream, asked.file, tables, audit)
                     if outcome.is_new:
                         earlier = asked.earlier
                         if earlier and not landed["logs"](data_files.unit_of(earlier).name):
@@ -165,7 +164,6 @@ def _write_file(
     file: Log,
     tables: dict[TableName, DataFiles],
     audit: Audit,
-    seen: Spool,
 ) -> tuple[FileOutcome, MeasuredDrive | None, dict[TableName, Rows]]:
     """Read a file, write all but its last rows; return what it became, its longest drive, these."""
     is_new = tables["logs"].lacks(stream.digest)
@@ -174,7 +172,7 @@ def _write_file(
     refused, rest = _RefusedRows(stream), dict[TableName, Rows]()
     longest: MeasuredDrive | None = None
     left_out, vehicles, ticks = set[str](), set[str](), 0
-    marks = FileMarks.of(stream.digest, stream.content, seen)
+    marks = mark_file(stream.digest, stream.content)
     for drives in _groups(_read_drives(stream, refused)):
         longest = max([*([longest] if longest else []), *drives], key=lambda one: one.ticks.size)
         kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), audit)
@@ -182,7 +180,7 @@ def _write_file(
         vehicles |= set(map(car_of, kept))
         ticks += _rows_of(kept)
         for drive in kept if is_new else ():
-            marks.add(drive.drive_id, find_spots(drive.ticks, drive.counts))
+            marks |= mark_drive(drive.drive_id, drive.counts_digest)
         if not kept or "logs" not in lacking:
             continue
         if _rows_of(drives) >= data_files.FILE_ROWS:

@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 from fleet_slip.delta import WITHDRAWN, Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.errors import RepeatedError
 from fleet_slip.ingest.landing.known_files import WITHDRAWALS
-from fleet_slip.ingest.landing.marks import FILES, MEASURED, FileMarks, KnownMarks, Origin
+from fleet_slip.ingest.landing.marks import FILES, MEASURED, KnownMarks, Origin
 from fleet_slip.ingest.logs.log_files import Log
 from fleet_slip.warehouse.audit import ALLOWED, Audit, Forgettable
 from fleet_slip.warehouse.table_views import connect_tables
@@ -51,7 +51,7 @@ class SameRecordings:
         return KnownMarks(self._logs.units)
 
     def judge(
-        self, file: Log, name: str, digest: str, marks: FileMarks, earlier: str | None
+        self, file: Log, name: str, digest: str, marks: Mapping[str, int], earlier: str | None
     ) -> RecordingInLogs:
         """Return what the logs have of a file.
 
@@ -79,7 +79,7 @@ class SameRecordings:
         )
         if drives and not gives_way:
             raise RepeatedError(_sentence(file, drives, there, changed=changed))
-        self._batch.update(marks.units)
+        self._batch.update(marks)
         self._files[Origin.of(digest).digest] = file
         return RecordingInLogs(origins, replaced if drives else frozenset(), len(drives))
 
