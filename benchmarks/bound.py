@@ -45,7 +45,7 @@ UNKNOWN = (0.1, 0.15, 0.3)
 TOLD = (1e-9, 1e-9, 1e-9)
 
 STEP = 1e-4
-SHOWN = ("ekf_told_tuned", "ekf_identified", "ekf_class_tuned", "luenberger_tuned")
+SHOWN = ("ekf_told_tuned", "ekf_identified", "ekf_class_tuned")
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""Steps per second of the Kalman filter and its rivals, over drives on threads.
+"""Steps per second of both Kalman filters, over drives on threads.
 
     python -m benchmarks.observers [--rows 30000] [--drives 64]
 
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.comparison.observers import ekf, kalman, luenberger, sliding_mode
+from fleet_slip.comparison.observers import ekf, kalman
 from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 
@@ -25,8 +25,6 @@ REPEATS = 5
 ESTIMATORS: dict[str, Callable[..., Any]] = {
     "kalman": partial(kalman.estimate, noise=kalman.FilterNoise()),
     "ekf": partial(ekf.estimate, noise=ekf.EkfNoise()),
-    "luenberger": partial(luenberger.estimate, poles=luenberger.ObserverPoles()),
-    "sliding_mode": partial(sliding_mode.estimate, gains=sliding_mode.SlidingGains()),
 }
 
 

@@ -14,7 +14,6 @@ from fleet_slip.models.model_version import ModelVersion
 
 if TYPE_CHECKING:
     from fleet_slip.comparison.evaluation.blind import BlindRow
-    from fleet_slip.comparison.evaluation.evaluate import TrainRivals
     from fleet_slip.comparison.report.page import Written
     from fleet_slip.files.documents import Document
     from fleet_slip.models.estimates.score import Score
@@ -49,17 +48,16 @@ class JudgedModels(PublishedModels):
         others: Sequence[str | ModelVersion] = (),
         *,
         scenarios: Sequence[str] = (),
-        rivals: bool = False,
         threads: int | None = None,
         progress: ShowProgress | None = None,
     ) -> "Document":
         """Evaluate models on the paper's test drives and on others; simulate those missing.
 
         Models of Table I are fitted on the cohort of each and evaluated beside it. `scenarios` are
-        names or paths, by default all that ship. `rivals` trains networks, trees and neuro-fuzzy
-        rules too, with scikit-learn. Progress is in simulated rows. Returns the document kept below
-        `evaluations/`. Raises `ConfigError` for an invalid scenario, `RefusedError` for one that
-        changed since it was simulated, `DataError`, and what `model` raises.
+        names or paths, by default all that ship. Progress is in simulated rows. Returns the
+        document kept below `evaluations/`. Raises `ConfigError` for an invalid scenario,
+        `RefusedError` for one that changed since it was simulated, `DataError`, and what `model`
+        raises.
         """
         from fleet_slip.comparison.evaluation.evaluate import evaluate, evaluations_of, keep
         from fleet_slip.comparison.evaluation.scenario_runs import simulate_scenarios
@@ -71,7 +69,7 @@ class JudgedModels(PublishedModels):
         with open_workers(self.root, threads) as executor:
             told = count_from_start(progress)
             simulate_scenarios(self.warehouse, chosen, executor, told)
-            found = evaluate(self.warehouse, chosen, first, rest, executor, _rivals_if(rivals))
+            found = evaluate(self.warehouse, chosen, first, rest, executor)
         content = found.as_dict()
         kept = keep(evaluations_of(self.warehouse), content)
         return Document(kept.number, content, kept.sha256)
@@ -113,7 +111,6 @@ class JudgedModels(PublishedModels):
         model: str | ModelVersion | None = None,
         others: Sequence[str | ModelVersion] = (),
         *,
-        rivals: bool = False,
         threads: int | None = None,
     ) -> "tuple[BlindRow, ...]":
         """Judge models, and all that `evaluate` trains beside them, on drives of the first.
@@ -127,7 +124,7 @@ class JudgedModels(PublishedModels):
 
         first, *rest = [self.resolve(one) for one in (model, *others)]
         with open_workers(self.root, threads) as executor:
-            trained = train_competitors(self.warehouse, first, rest, executor, _rivals_if(rivals))
+            trained = train_competitors(self.warehouse, first, rest, executor)
         return judge_blindly(first.sha256, trained.estimators)
 
     def report(
@@ -188,11 +185,3 @@ class JudgedModels(PublishedModels):
             frames = drive_frames(self.warehouse, what, version)
         writers[output.suffix](frames.part(from_s, until_s), output)
         return output
-
-
-def _rivals_if(wanted: bool) -> "TrainRivals | None":
-    if not wanted:
-        return None
-    from fleet_slip.comparison.rivals import compare  # an optional extra
-
-    return compare.train_rivals

@@ -8,7 +8,7 @@ import numpy as np
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals, LabelledDrive
-from fleet_slip.comparison.observers.single_track import SingleTrack
+from fleet_slip.comparison.observers.single_track import loaded_axles
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.drives import simulate_batch
 from fleet_slip.vehicle.parameters import VehicleParameters
@@ -121,11 +121,17 @@ def without_fixes(drive: DriveSignals, lost: BoolArray) -> DriveSignals:
     )
 
 
-def steady_sideslip_rad(car: SingleTrack, vx_mps: float, yaw_rate_rad_s: float) -> float:
+def axle_stiffness_n(car: VehicleParameters) -> tuple[float, float]:
+    """Return the cornering stiffness of both axles at rest, per unit of slip."""
+    front, rear, *_ = loaded_axles(car, np.zeros(1), np.zeros(1), adhesion=1.0)[:, 0]
+    return float(front), float(rear)
+
+
+def steady_sideslip_rad(car: VehicleParameters, vx_mps: float, yaw_rate_rad_s: float) -> float:
     """Return β of steady cornering, arctan(b r / vx − a m vx r / (Cr L))."""
-    wheelbase = car.front_m + car.rear_m
-    slip = car.front_m * car.mass_kg * vx_mps / (car.stiffness_rear_n * wheelbase)
-    return float(np.arctan(yaw_rate_rad_s * (car.rear_m / vx_mps - slip)))
+    body, rear_n = car.body, axle_stiffness_n(car)[1]
+    slip = body.front_axle_m * body.mass_kg * vx_mps / (rear_n * body.wheelbase_m)
+    return float(np.arctan(yaw_rate_rad_s * (body.rear_axle_m / vx_mps - slip)))
 
 
 TUNNEL_S = 20.0

@@ -34,7 +34,6 @@ TINY = {
     "drift_days": "{root} --drives 1 --training 5 --deals 2",
     "encoding": "--root {root} --campaign smoke --copies 1",
     "features": "{root} 15",
-    "fleet": "{root} --no-rivals --exact",
     "few_cars": "--draws 2",
     "flips": "--flips 1",
     "fuzz": "--cases 10 --target config",
@@ -47,7 +46,6 @@ TINY = {
     "ingest_folder": "--files 3 --rows 100",
     "interleave": "--schedules 2 --first gram --second simulate",
     "label_delay": "{root} --drives 1",
-    "learners": "{root} smoke --rows 2000 --learners trees --drives nominal",
     "mutants": "--show --each 1 --folder delta",
     "nights": "{root} --nights 2 --output {folder}",
     "observers": "--rows 500 --drives 2",
@@ -62,12 +60,11 @@ TINY = {
     "receiver_delay": "--cars 6 --drives 2 --types",
     "receive": "--cars 3 --drives 1",
     "refit": "{root} true",
-    "reservoir": "{root} smoke --rows 2000 --neurons 10 --drives nominal",
     "reliability": "--writers 2 --commits 2 --bits 2",
+    "rivals": "{root} smoke --rows 2000 --rivals regression_8,luenberger --drives nominal",
     "search": "{root} --drives 10 --most 2 --rounds 1 --methods forward",
     "simulator": "--seconds 0.01 --threads 1",
     "simulator_profile": "--campaign smoke",
-    "slow_knowledge": "--folds 2 --drives 1",
     "soak": "--minutes 0.1",
     "stability_control": "--record 2 --trials 1",
     "start": "--rounds 1",
@@ -135,7 +132,7 @@ def programs() -> set[str]:
         for path in BENCHMARKS.glob("*.py")
         if '__name__ == "__main__"' in path.read_text(encoding="utf-8")
     }
-    return (modules | {"fuzz", "fuzz.guided"}) - PARTS
+    return (modules | {"fuzz", "fuzz.guided", "rivals"}) - PARTS
 
 
 def named_in(page: Path) -> set[str]:
@@ -167,7 +164,7 @@ def test_make_bench_runs_what_is_there() -> None:
 
 
 def test_no_test_imports_a_benchmark() -> None:
-    """What both need lies in tests/support; a benchmark may take it from there."""
-    pattern = re.compile(r"^\s*(?:from|import) benchmarks\b", re.M)
+    """What both need lies in tests/support; the rivals are a small package of their own."""
+    pattern = re.compile(r"^\s*(?:from|import) benchmarks\b(?!\.rivals)", re.M)
     tests = (HERE / "tests").rglob("*.py")
     assert [str(path) for path in tests if pattern.search(path.read_text("utf-8"))] == []

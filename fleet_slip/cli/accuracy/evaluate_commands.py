@@ -103,14 +103,6 @@ def evaluate(
     model: OnlyModel = None,
     fleet: FleetModels = None,
     scenario: Scenarios = None,
-    rivals: Annotated[
-        bool,
-        typer.Option(
-            "--rivals",
-            help="Also train networks, trees and neuro-fuzzy rules, on the model's columns too. "
-            "Takes minutes, and needs scikit-learn.",
-        ),
-    ] = False,
     blind: Annotated[
         bool,
         typer.Option(
@@ -153,10 +145,10 @@ def evaluate(
     """
     model = model or context.obj.registry().only()
     if cohort is not None or vehicle is not None:
-        if scenario or blind or rivals or cohort is None:
+        if scenario or blind or cohort is None:
             raise UsageError(
                 "--cohort judges measured drives, for filters in the car of --vehicle: leave out "
-                "--scenario, --blind and --rivals, and name a cohort."
+                "--scenario and --blind, and name a cohort."
             )
         measured = context.obj.evaluate_measured(
             model, cohort, fleet or (), vehicle=vehicle, threads=threads
@@ -170,7 +162,7 @@ def evaluate(
     if blind:
         if scenario:
             raise UsageError("--blind has drives of its own: leave out --scenario.")
-        rows = context.obj.evaluate_blind(model, fleet or (), rivals=rivals, threads=threads)
+        rows = context.obj.evaluate_blind(model, fleet or (), threads=threads)
         if json:
             print_json({"blind": [row.as_dict() for row in rows]})
         else:
@@ -181,7 +173,6 @@ def evaluate(
             model,
             fleet or (),
             scenarios=scenario or (),
-            rivals=rivals,
             threads=threads,
             progress=show,
         )

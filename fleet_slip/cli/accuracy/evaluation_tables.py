@@ -27,7 +27,6 @@ def print_evaluation(content: dict[str, Any]) -> None:
     _print_sections(content)
     _print_checks(content["checks"])
     _print_comparisons(content["comparisons"])
-    _print_rivals(content["rivals"])
 
 
 def _print_group(
@@ -206,30 +205,6 @@ def _pair(row: dict[str, Any] | None) -> str:
     first, second = f"{row['one_car_rmse_deg']:.3f}", f"{row['fleet_rmse_deg']:.3f}"
     better = row["better"] == row["one_car"]
     return f"{first}* {second} " if better else f"{first}  {second}*"
-
-
-def _print_rivals(rivals: Sequence[dict[str, Any]]) -> None:
-    if not rivals:
-        return
-    print_table(
-        f"\nlearned rivals, on {number_of(rivals[0]['rows'], 'row')} of the training drives, "
-        "cross-validated",
-        ["rival", "learner", "correlation", "std deg", "training s", "bytes", "one us", "each us"],
-        [
-            [
-                rival["name"],
-                rival["learner"],
-                f"{rival['cross_validated']['correlation']:.4f}",
-                f"{rival['cross_validated']['error_std_deg']:.4f}",
-                f"{rival['training_s']:.2f}",
-                f"{rival['size_bytes']:,}",
-                f"{rival['one_estimate_us']:.1f}",
-                f"{rival['each_of_many_us']:.3f}",
-            ]
-            for rival in rivals
-        ],
-        left=2,
-    )
 
 
 def print_summary(content: Mapping[str, Any], model: str) -> None:

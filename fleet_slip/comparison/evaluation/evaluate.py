@@ -1,8 +1,8 @@
 """An evaluation from end to end, and the JSON document that keeps it, `evaluations/1.json`."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from importlib.metadata import version as package_version
 from typing import Any
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from fleet_slip.comparison.evaluation.estimators import Estimate, TrainedModels, train_models
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
-from fleet_slip.comparison.evaluation.filters import Bank, FilterEstimate, filter_bank
+from fleet_slip.comparison.evaluation.filters import FilterEstimate, filter_bank
 from fleet_slip.comparison.evaluation.gps_noise import GpsSweep, sweep_gps_noise
 from fleet_slip.comparison.evaluation.identified import NAME as IDENTIFIED
 from fleet_slip.comparison.evaluation.identified import identified_estimate
 from fleet_slip.comparison.evaluation.ranking import FleetComparison, Ranking, compare_fleets, rank
-from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures, EvaluatedScenario, run_all
+from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario, run_all
 from fleet_slip.comparison.evaluation.targets import (
     TargetCheck,
     check_filter_targets,
@@ -23,9 +23,7 @@ from fleet_slip.comparison.evaluation.targets import (
 )
 from fleet_slip.comparison.evaluation.unstable import find_stretches, rear_compliance
 from fleet_slip.files.documents import Document, DocumentFolder, checksum
-from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.models.estimates.predictor import Predictor
-from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 from fleet_slip.warehouse.tables import Warehouse
@@ -113,59 +111,11 @@ def keep(documents: DocumentFolder, content: Mapping[str, Any]) -> Document:
 
 
 @dataclass(frozen=True)
-class Rival:
-    """A rival that was trained, with what it reaches and costs.
-
-    Attributes:
-        name: among the estimators.
-        learner: what was fitted, in words.
-        estimate: fitted to the whole sample, what estimates side-slip in rad of a drive; NaN where
-            an input is null.
-        signals: its inputs.
-        cross_validated: figures on drives that it was not fitted on, pooled over the folds.
-        rows: rows of the sample.
-        training_s: time to fit the whole sample.
-        size_bytes: what a car would have to carry.
-        one_estimate_us: time of one estimate by itself, as on board; the median of many.
-        each_of_many_us: time of each of many estimates at once.
-        told: what a document says of it besides.
-    """
-
-    name: str
-    learner: str
-    estimate: Estimate
-    signals: tuple[str, ...]
-    cross_validated: ErrorFigures
-    rows: int
-    training_s: float
-    size_bytes: int
-    one_estimate_us: float
-    each_of_many_us: float
-    told: Mapping[str, Any] = field(default_factory=dict)
-
-    def description(self) -> dict[str, Any]:
-        """Return what a document says of it as an estimator."""
-        return {"kind": "rival", "group": "rivals", "signals": list(self.signals), **self.told}
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a document says of its accuracy and cost."""
-        left_out = ("estimate", "told", "cross_validated", "signals")
-        plain = {name: value for name, value in vars(self).items() if name not in left_out}
-        figures = self.cross_validated.as_dict()
-        return {**plain, "signals": list(self.signals), "cross_validated": figures}
-
-
-TrainRivals = Callable[[Warehouse, Cohort, Manifest, Bank], Sequence[Rival]]
-"""Trains the rivals on the rows of a cohort, also on the columns of a published model."""
-
-
-@dataclass(frozen=True)
 class Competitors:
     """All estimators that compete, by name, and what a document says of each."""
 
     one_car: TrainedModels
     fleets: tuple[TrainedModels, ...]
-    rivals: tuple[Rival, ...]
     estimators: Mapping[str, Estimate]
     descriptions: Mapping[str, Mapping[str, Any]]
 
@@ -202,7 +152,6 @@ class Evaluation:
             grams_version=cohort.grams_version,
             checks=[check.as_dict() for check in self.checks],
             comparisons=[comparison.as_dict() for comparison in self.comparisons],
-            rivals=[rival.as_dict() for rival in self.competitors.rivals],
             ranking=self.ranking.as_dict(),
             gps_noise=self.gps_noise.as_dict() if self.gps_noise else None,
         )
@@ -213,9 +162,8 @@ def train_competitors(
     one_car: ModelVersion,
     fleets: Sequence[ModelVersion],
     executor: Executor,
-    train_rivals: TrainRivals | None,
 ) -> Competitors:
-    """Fit, tune and train all that compete; filters and rivals get the one-car model's drives."""
+    """Fit and tune all that compete; filters get the one-car model's drives."""
     first = train_models(warehouse, one_car)
     others = tuple(train_models(warehouse, version) for version in fleets)
     estimators: dict[str, Estimate] = {}
@@ -231,15 +179,11 @@ def train_competitors(
     if identified is not None:
         estimators[IDENTIFIED] = identified
         descriptions[IDENTIFIED] = identified.description()
-    learned = train_rivals(warehouse, cohort, one_car.manifest, bank) if train_rivals else ()
     return Competitors(
         one_car=first,
         fleets=others,
-        rivals=tuple(learned),
-        estimators=estimators | bank.estimators | {one.name: one.estimate for one in learned},
-        descriptions=(
-            descriptions | bank.descriptions | {one.name: one.description() for one in learned}
-        ),
+        estimators=estimators | bank.estimators,
+        descriptions=descriptions | bank.descriptions,
     )
 
 
@@ -249,10 +193,9 @@ def evaluate(
     one_car: ModelVersion,
     fleets: Sequence[ModelVersion],
     executor: Executor,
-    train_rivals: TrainRivals | None = None,
 ) -> Evaluation:
     """Evaluate a model and all that competes with it on scenarios that are in the logs."""
-    competitors = train_competitors(warehouse, one_car, fleets, executor, train_rivals)
+    competitors = train_competitors(warehouse, one_car, fleets, executor)
     runs = run_all(warehouse, scenarios, competitors.estimators)
     first = competitors.one_car
     return Evaluation(

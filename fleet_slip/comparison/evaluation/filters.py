@@ -1,4 +1,4 @@
-"""The Kalman filter and the observers as rivals of the regression, as they are and tuned.
+"""The Kalman filters as rivals of the regression, as they are and tuned.
 
 All know the sensors' stated noise, and the class of the car that they are in, by its file; they
 take the road for dry and the load for the usual one. `ekf_told` is told the very car and the road.
@@ -15,9 +15,9 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
-from fleet_slip.comparison.observers import ekf, ekf_bank, kalman, luenberger, sliding_mode
+from fleet_slip.comparison.observers import ekf, kalman
 from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive, read_drive
-from fleet_slip.comparison.observers.tuning import Estimator, Tuned, checksum_of_sources, tune
+from fleet_slip.comparison.observers.tuning import Tuned, checksum_of_sources, tune
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.files.documents import DocumentFolder
@@ -52,34 +52,18 @@ class Filter:
     told: bool = False
     other_starts: tuple[Config, ...] = ()
     """Where the search for parameters begins besides."""
-    filters: str | None = None
-    """The module whose tuned parameters are its own; it tunes what it has besides."""
-
-    def starts(self, tuned: Mapping[str, Config]) -> tuple[Config, ...]:
-        """Return where the search begins, from what other modules were tuned to."""
-        if self.filters is None or self.filters not in tuned:
-            return (self.parameters, *self.other_starts)
-        own = self.parameters.model_copy(update=dict(tuned[self.filters]))
-        return (own,)
 
     def tune(
-        self,
-        drives: Sequence[LabelledDrive],
-        car: VehicleParameters,
-        executor: Executor,
-        tuned: dict[str, Config],
+        self, drives: Sequence[LabelledDrive], car: VehicleParameters, executor: Executor
     ) -> Tuned[Config]:
-        """Return the best that any start leads to, and add its parameters to what was tuned."""
-        estimate: Estimator[Config] = (
-            ekf_bank.remembering() if self.module == "ekf_bank" else self.estimate
+        """Return the best that any start leads to."""
+        return min(
+            (
+                tune(self.estimate, start, self.tunable, drives, car, executor)
+                for start in (self.parameters, *self.other_starts)
+            ),
+            key=lambda one: one.rmse_rad,
         )
-        found = [
-            tune(estimate, start, self.tunable, drives, car, executor)
-            for start in self.starts(tuned)
-        ]
-        best = min(found, key=lambda one: one.rmse_rad)
-        tuned[self.module] = best.parameters
-        return best
 
 
 LOOSE_EKF = ekf.EkfNoise(
@@ -95,18 +79,6 @@ FILTERS = (
     Filter(
         "ekf_told", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, told=True,
         other_starts=(LOOSE_EKF,),
-    ),
-    Filter(
-        "ekf_bank", "ekf_bank", ekf_bank.estimate, ekf_bank.BankNoise(), ekf_bank.TUNABLE,
-        filters="ekf",
-    ),
-    Filter(
-        "luenberger", "luenberger", luenberger.estimate, luenberger.ObserverPoles(),
-        luenberger.TUNABLE,
-    ),
-    Filter(
-        "sliding_mode", "sliding_mode", sliding_mode.estimate, sliding_mode.SlidingGains(),
-        sliding_mode.TUNABLE,
     ),
 )  # fmt: skip
 
@@ -186,13 +158,13 @@ def filter_bank(
     bank = Bank(drives, {}, {})
     before: dict[str, Config] = {}
     for one in FILTERS:
-        key = _key(one, one.starts(before), drives, car)
+        key = _key(one, drives, car)
         kept = DocumentFolder(warehouse.root / "tuned" / one.module)
         found = find_kept(kept, key)
         if found is None:
             LOGGER.info("tuning %s on %s, once", one.name, number_of(len(drives.names), "drive"))
             try:
-                best = one.tune(drives.read(), car, executor, before)
+                best = one.tune(drives.read(), car, executor)
                 found = {
                     "key": key,
                     "parameters": best.parameters.model_dump(mode="json"),
@@ -214,13 +186,11 @@ def filter_bank(
     return bank
 
 
-def _key(
-    one: Filter, starts: Sequence[Config], drives: "TuningDrives", car: VehicleParameters
-) -> dict[str, Any]:
+def _key(one: Filter, drives: "TuningDrives", car: VehicleParameters) -> dict[str, Any]:
     """Return what tuned parameters depend on."""
     return {
         "for_lowest": "rmse_deg",
-        "starts": [start.model_dump(mode="json") for start in starts],
+        "starts": [start.model_dump(mode="json") for start in (one.parameters, *one.other_starts)],
         "tunable": list(one.tunable),
         "drives": drives.key(),
         "car": car.model_dump(mode="json"),

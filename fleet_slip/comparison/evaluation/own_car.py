@@ -36,7 +36,6 @@ from fleet_slip.comparison.observers.identification import FOLDS, IDENTIFIED, Me
 from fleet_slip.comparison.observers.single_track import follow, measured_speed_mps
 from fleet_slip.comparison.observers.yaw_rate import YawRateNoise
 from fleet_slip.comparison.observers.yaw_rate import estimate as estimate_yaw_rate
-from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import DocumentFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
@@ -211,7 +210,6 @@ def _tuned(
         "kinematic": ("geometry", lambda signals: _rolling(signals, vehicle))
     }
     cars = {} if vehicle.description == IDENTIFIED else {"tuned": vehicle}
-    before: dict[str, dict[str, Config]] = {"tuned": {}}
     try:
         identified = identify(Measured.of(vehicle), others, executor)
     except DataError as error:
@@ -219,7 +217,6 @@ def _tuned(
         cars["tuned"] = vehicle
     else:
         cars["identified"] = identified.car
-        before["identified"] = {"ekf": identified.noise}
         ready["ekf_identified"] = (
             "geometry, and a car identified from the other parts",
             lambda signals: ekf.estimate(signals, identified.car, identified.noise),
@@ -231,7 +228,7 @@ def _tuned(
             if one.told or name in ready or (one.gps and not navigated):
                 continue
             try:
-                ready[name] = (_knows(how), _in_car(one, car, others, executor, before[how]))
+                ready[name] = (_knows(how), _in_car(one, car, others, executor))
             except DataError as error:
                 LOGGER.warning("%s does not compete: %s", name, error)
     return ready
@@ -248,9 +245,8 @@ def _in_car(
     car: VehicleParameters,
     others: Sequence[LabelledDrive],
     executor: Executor,
-    tuned: dict[str, Config],
 ) -> Callable[[DriveSignals], FloatArray]:
-    parameters = one.tune(others, car, executor, tuned).parameters
+    parameters = one.tune(others, car, executor).parameters
     return lambda signals: one.estimate(signals, car, parameters)
 
 

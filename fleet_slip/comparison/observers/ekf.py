@@ -16,7 +16,6 @@ a bend: at first the rear wheels are taken to roll without slip, vy = b r. From 
 tyres would slide there, where their force has no slope that leads back.
 """
 
-from math import log
 from typing import NamedTuple
 
 import numpy as np
@@ -121,21 +120,12 @@ def update(
     axles: Axles,
     c: Chassis,
     v: Variances,
-) -> float:
-    """Take in wheel speed, yaw rate and lateral acceleration, whose noises are independent.
-
-    Returns the logarithm of the likelihood of yaw rate and lateral acceleration before they were
-    taken in, but for a constant. That of the wheels' speed is of the bias of ax.
-    """
+) -> None:
+    """Take in wheel speed, yaw rate and lateral acceleration, whose noises are independent."""
     condition(x, (1.0, 0.0, 0.0, 0.0), vx - x.mean[0], v.r_vx)
-    off_r = yaw_rate - x.mean[2]
-    var_r = condition(x, (0.0, 0.0, 1.0, 0.0), off_r, v.r_r)
+    condition(x, (0.0, 0.0, 1.0, 0.0), yaw_rate - x.mean[2], v.r_r)
     d = rates(x.mean[0], x.mean[1], x.mean[2], steer, axles, c)
-    off_ay = ay - d.ay - x.mean[3]
-    var_ay = condition(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), off_ay, v.r_ay)
-    squares = off_r**2 / var_r + off_ay**2 / var_ay
-    likelihood: float = -0.5 * (squares + log(var_r * var_ay))
-    return likelihood
+    condition(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), ay - d.ay - x.mean[3], v.r_ay)
 
 
 @kernel
@@ -146,22 +136,19 @@ def _filter(
     vx: FloatArray,
     steer: FloatArray,
     loaded: FloatArray,
-    model_noise: FloatArray,
     first_mean: Row,
     first_variances: Row,
     c: Chassis,
     v: Variances,
 ) -> FloatArray:
-    found = np.empty((3, len(ax)))
+    found = np.empty((2, len(ax)))
     x = belief_of(first_mean, first_variances)
     for k in range(len(ax)):
         axles = Axles(loaded[0, k], loaded[1, k], loaded[2, k], loaded[3, k])
         if k > 0:
-            noise = model_noise[k]
-            w = Variances(v.q_vx, noise * v.q_vy, noise * v.q_r, v.r_vx, v.r_r, v.r_ay)
-            predict(x, ax[k], steer[k], STEP_S, axles, c, w)
-        found[2, k] = update(x, vx[k], yaw_rate[k], ay[k], steer[k], axles, c, v)
-        found[:2, k] = x.mean[:2]
+            predict(x, ax[k], steer[k], STEP_S, axles, c, v)
+        update(x, vx[k], yaw_rate[k], ay[k], steer[k], axles, c, v)
+        found[:, k] = x.mean[:2]
     return found
 
 
@@ -193,35 +180,39 @@ def axles_of(
     return axles
 
 
-def estimate(
-    drive: DriveSignals,
-    car: VehicleParameters,
-    noise: EkfNoise,
-    model_noise: FloatArray | None = None,
-) -> FloatArray:
-    """Estimate side-slip in rad by row; `model_noise`, (rows,), scales the model's variances."""
-    vx_mps, vy_mps, _ = velocity(drive, car, noise, model_noise)
+def estimate(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> FloatArray:
+    """Estimate side-slip in rad by row. Raises `DataError` without a sensor."""
+    vx_mps, vy_mps = _filter(*inputs_of(drive, car, noise))
     return sideslip_angle(vx_mps, vy_mps)
 
 
-def velocity(
-    drive: DriveSignals,
-    car: VehicleParameters,
-    noise: EkfNoise,
-    model_noise: FloatArray | None = None,
-) -> FloatArray:
-    """Return vx, vy and the log likelihood of what was measured, (3, rows)."""
+class Inputs(NamedTuple):
+    """What the filter reads: measurements by row, what axles can do, how it begins, the car."""
+
+    ax_mps2: FloatArray
+    ay_mps2: FloatArray
+    yaw_rate_rad_s: FloatArray
+    vx_mps: FloatArray
+    steer_rad: FloatArray
+    axles: FloatArray
+    first_mean: Row
+    first_variances: Row
+    chassis: Chassis
+    variances: Variances
+
+
+def inputs_of(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Inputs:
+    """Return what the filter reads of a drive, gaps bridged. Raises `DataError`."""
     turning = yaw_rate.estimate(drive, car, noise.yaw_rate).yaw_rate_rad_s
     vx_mps = measured_speed_mps(drive, car)
     ax_mps2, ay_mps2 = hold_last(drive.ax_mps2, "ax"), hold_last(drive.ay_mps2, "ay")
-    return _filter(
+    return Inputs(
         ax_mps2,
         ay_mps2,
         turning,
         vx_mps,
         measured_steer_rad(drive),
         axles_of(car, ax_mps2, ay_mps2, noise),
-        np.ones(len(drive)) if model_noise is None else model_noise,
         (vx_mps[0], car.body.rear_axle_m * turning[0], turning[0], 0.0),  # vy: rear wheels roll
         (*(std**2 for std in INITIAL_STD), noise.ay_bias_std_mps2**2),
         chassis(car),

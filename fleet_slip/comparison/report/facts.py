@@ -89,20 +89,6 @@ class Facts:
             "costs": describe_costs(version.manifest),
         }
 
-    def learned(self) -> dict[str, Any]:
-        """Return the best learned rival, and least squares on the same columns and rows."""
-        rivals = self._evaluated.rows("rivals")
-        ours = max(
-            (one for one in rivals if one["name"].startswith("regression")),
-            key=lambda one: len(one["signals"]),
-            default=None,
-        )
-        others = [o for o in rivals if ours and o["signals"] == ours["signals"] and o != ours]
-        if not others:
-            raise NotEvaluatedError("learned rivals")
-        best = min(others, key=lambda one: float(one["cross_validated"]["rmse_deg"]))
-        return {"best": best, "ours": ours}
-
     def training(self) -> dict[str, Any]:
         """Return the training rows, and how the models of Table I do on them."""
         selection = self.data.trained.selection

@@ -79,7 +79,7 @@ def judge(claim: Claim, facts: Facts) -> Judged:
     except NotEvaluatedError as lacking:
         return not_testable(
             f"The evaluation has no {lacking}. Run: fleet-slip evaluate "
-            f"{evaluated.group} --fleet NAME --rivals"
+            f"{evaluated.group} --fleet NAME"
         )
     status = Status.REPRODUCED if held else Status.NOT_REPRODUCED
     return Judged(claim, criterion, status, figure, why)

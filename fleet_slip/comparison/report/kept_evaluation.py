@@ -41,7 +41,7 @@ class Evaluated:
         """What the document says of each scenario, by name, in its order."""
         return {one["name"]: one for one in self.document.content["scenarios"]}
 
-    def rows(self, key: Literal["checks", "comparisons", "rivals"]) -> Sequence[Mapping[str, Any]]:
+    def rows(self, key: Literal["checks", "comparisons"]) -> Sequence[Mapping[str, Any]]:
         """Return one of the document's lists."""
         rows: Sequence[Mapping[str, Any]] = self.document.content[key]
         return rows
@@ -62,7 +62,7 @@ class Evaluated:
         }
 
     def of_kind(self, kind: str) -> list[str]:
-        """Return the names of the estimators of a kind: regression, filter or rival."""
+        """Return the names of the estimators of a kind: regression or filter."""
         return [name for name, about in self.estimators.items() if about["kind"] == kind]
 
     def figures(self, scenario: str, estimator: str) -> ErrorFigures | None:

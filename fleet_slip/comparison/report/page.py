@@ -22,7 +22,7 @@ SECTIONS = {"paper": "figure-", "memory": "memory-", "roads": "road-", "fleet": 
 TABLES_IN = {
     "tables": ("table-1", "table-2", "distances", "targets", "targets-filter"),
     "further": (
-        "without-label", "own-car", "scenarios", "standings", "limits", "fleets", "rivals",
+        "without-label", "own-car", "scenarios", "standings", "limits", "fleets",
     ),
     "coefficients": ("coefficients",),
     "storage": ("storage",),
@@ -130,7 +130,6 @@ def _commands(data: ReportData) -> list[str]:
         row["fleet"].rpartition("/")[0] for row in data.evaluated.rows("comparisons")
     )
     options = "".join(f" --fleet {name}" for name in fleets)
-    options += " --rivals" if data.evaluated.rows("rivals") else ""
     return [
         *(f"fleet-slip run --campaign {name}" for name in data.campaigns),
         f"fleet-slip evaluate {reference}{options}",

@@ -160,7 +160,7 @@ def _words(data: ReportData) -> dict[str, Any]:
             },
         },
         "compared": compared(data),
-        "own": [one for one in compared(data) if one not in evaluated.of_kind("rival")],
+        "own": compared(data),
         "bounds": BOUNDS,
         "bounded": [one for one in evaluated.scenarios if one in BOUNDS],
         "least_coverage": LEAST_COVERAGE,
@@ -169,7 +169,6 @@ def _words(data: ReportData) -> dict[str, Any]:
         "times_bound": times_bound,
         "won": won(data),
         "fleets": _fleets(data),
-        "rivals": evaluated.rows("rivals"),
         "signals": catalogue().signals,
         "number_of": number_of,
     }

@@ -95,7 +95,7 @@ def test_a_model_that_saw_none_of_the_drives_is_judged_as_it_is(own: Path) -> No
 
 @pytest.mark.parametrize(
     "words",
-    [("--vehicle", "suv"), ("--cohort", "true", "--blind"), ("--cohort", "true", "--rivals")],
+    [("--vehicle", "suv"), ("--cohort", "true", "--blind")],
 )
 def test_what_does_not_go_together_is_refused(own: Path, words: tuple[str, ...]) -> None:
     done = run_on(own, "evaluate", "own", *words)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.rivals.observers import ObserverPoles, SlidingGains, luenberger, sliding_mode
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.observers import ekf, kalman, luenberger, sliding_mode
+from fleet_slip.comparison.observers import ekf, kalman
 from fleet_slip.comparison.observers.drive_signals import LabelledDrive
 from fleet_slip.errors import DataError
 from fleet_slip.vehicle.parameters import load_vehicle
@@ -20,8 +21,8 @@ CAR = load_vehicle("d_class_sedan")
 ESTIMATORS: dict[str, tuple[Callable[..., FloatArray], Any]] = {
     "kalman": (kalman.estimate, kalman.FilterNoise()),
     "ekf": (ekf.estimate, ekf.EkfNoise()),
-    "luenberger": (luenberger.estimate, luenberger.ObserverPoles()),
-    "sliding_mode": (sliding_mode.estimate, sliding_mode.SlidingGains()),
+    "luenberger": (luenberger, ObserverPoles()),
+    "sliding_mode": (sliding_mode, SlidingGains()),
 }
 ALL = pytest.mark.parametrize("name", ESTIMATORS)
 OBSERVERS = pytest.mark.parametrize("name", ["ekf", "luenberger", "sliding_mode"])

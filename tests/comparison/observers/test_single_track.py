@@ -9,26 +9,29 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from benchmarks.rivals.observers import (
+    ObserverPoles,
+    SlidingGains,
+    gains,
+    luenberger,
+    sliding_mode,
+    state_space,
+)
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.observers import luenberger, sliding_mode
 from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals
-from fleet_slip.comparison.observers.luenberger import ObserverPoles
-from fleet_slip.comparison.observers.single_track import SingleTrack, state_space
-from fleet_slip.comparison.observers.sliding_mode import SlidingGains
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.support.drives import rolling_drive, steady_sideslip_rad
+from tests.support.drives import axle_stiffness_n, rolling_drive, steady_sideslip_rad
 
 CAR = load_vehicle("d_class_sedan")
-TRACK = SingleTrack.of(CAR)
 OBSERVERS: list[tuple[Callable[..., FloatArray], Any]] = [
-    (luenberger.estimate, ObserverPoles()),
-    (sliding_mode.estimate, SlidingGains()),
+    (luenberger, ObserverPoles()),
+    (sliding_mode, SlidingGains()),
 ]
 
 
 def steady_state(vx: float, steer: float) -> tuple[float, float]:
     """Return vy and r of steady cornering."""
-    s = state_space(TRACK, np.array([vx]))
+    s = state_space(CAR, np.array([vx]))
     a = np.array([[s.a11[0], s.a12[0]], [s.a21[0], s.a22[0]]])
     vy, rate = np.linalg.solve(a, -steer * np.array([s.b1[0], s.b2[0]]))
     return float(vy), float(rate)
@@ -36,7 +39,7 @@ def steady_state(vx: float, steer: float) -> tuple[float, float]:
 
 def linear_drive(vx: FloatArray, steer: FloatArray) -> tuple[DriveSignals, FloatArray]:
     """Return what exact sensors read of the linear model, and its side-slip."""
-    s = state_space(TRACK, vx)
+    s = state_space(CAR, vx)
     vy, rate = np.zeros(len(vx)), np.zeros(len(vx))
     vy[0], rate[0] = steady_state(vx[0], steer[0])
     for k in range(len(vx) - 1):
@@ -49,12 +52,12 @@ def linear_drive(vx: FloatArray, steer: FloatArray) -> tuple[DriveSignals, Float
 @given(vx=st.floats(6, 45), steer=st.floats(-0.1, 0.1))
 def test_steady_sideslip_of_the_model_is_the_textbook_one(vx: float, steer: float) -> None:
     vy, rate = steady_state(vx, steer)
-    assert np.arctan2(vy, vx) == pytest.approx(steady_sideslip_rad(TRACK, vx, rate), abs=1e-12)
+    assert np.arctan2(vy, vx) == pytest.approx(steady_sideslip_rad(CAR, vx, rate), abs=1e-12)
     # The kinematic radius, stretched by the understeer gradient.
-    wheelbase = TRACK.front_m + TRACK.rear_m
-    front = TRACK.rear_m / TRACK.stiffness_front_n
-    rear = TRACK.front_m / TRACK.stiffness_rear_n
-    understeer = TRACK.mass_kg * (front - rear) / wheelbase
+    body, (front_n, rear_n) = CAR.body, axle_stiffness_n(CAR)
+    wheelbase = body.wheelbase_m
+    front, rear = body.rear_axle_m / front_n, body.front_axle_m / rear_n
+    understeer = body.mass_kg * (front - rear) / wheelbase
     assert rate == pytest.approx(vx * steer / (wheelbase + understeer * vx**2), rel=1e-9, abs=1e-12)
 
 
@@ -65,19 +68,11 @@ def test_left_turn_has_the_signs_of_the_conventions() -> None:
     assert steady_state(6.0, 0.02)[0] > 0, "slow: the rear wheels cut the corner"
 
 
-def test_model_of_the_car_carries_its_weight_on_two_axles() -> None:
-    grip = TRACK.grip_front_n + TRACK.grip_rear_n
-    assert grip == pytest.approx(TRACK.mass_kg * 9.81, rel=0.05)
-    softer = SingleTrack.of(CAR, stiffness_factor=0.8)
-    assert softer.stiffness_rear_n == pytest.approx(0.8 * TRACK.stiffness_rear_n)
-    assert softer.mass_kg == TRACK.mass_kg
-
-
 @given(vx=st.floats(0, 60), p1=st.floats(0.1, 100), p2=st.floats(0.1, 100))
 def test_gains_place_the_poles_at_every_speed(vx: float, p1: float, p2: float) -> None:
-    s = state_space(TRACK, np.array([vx]))
+    s = state_space(CAR, np.array([vx]))
     poles = ObserverPoles(lateral_velocity_1ps=p1, yaw_rate_1ps=p2)
-    gain = luenberger.gains(s, poles)[:, 0].reshape(2, 2)
+    gain = gains(s, poles)[:, 0].reshape(2, 2)
     a = np.array([[s.a11[0], s.a12[0]], [s.a21[0], s.a22[0]]])
     c = np.array([[0, 1], [s.a11[0], s.c2[0]]])
     scale = np.abs(a).max() + p1 + p2
@@ -90,7 +85,7 @@ def test_error_of_the_luenberger_observer_decays_with_its_pole(p1: float) -> Non
     constant = np.ones(800)
     drive, truth = linear_drive(15.0 * constant, 0.03 * constant)
     poles = ObserverPoles(lateral_velocity_1ps=p1)
-    vy_error = 15.0 * (np.tan(luenberger.estimate(drive, CAR, poles)) - np.tan(truth))
+    vy_error = 15.0 * (np.tan(luenberger(drive, CAR, poles)) - np.tan(truth))
     decay = vy_error[60] / vy_error[20]
     assert decay == pytest.approx((1 - p1 * STEP_S) ** 40, rel=0.05)
 
@@ -102,7 +97,7 @@ def test_converges_to_steady_cornering(
 ) -> None:
     constant = np.ones(3000)
     drive, _ = linear_drive(vx * constant, 0.02 * constant)
-    expected = steady_sideslip_rad(TRACK, vx, drive.yaw_rate_rad_s[-1])
+    expected = steady_sideslip_rad(CAR, vx, drive.yaw_rate_rad_s[-1])
     assert estimate(drive, CAR, parameters)[-1] == pytest.approx(expected, abs=1e-5)
 
 
@@ -121,9 +116,7 @@ def test_sliding_correction_is_bounded_by_its_gain() -> None:
     constant = np.ones(100)
     drive, truth = linear_drive(15.0 * constant, 0.05 * constant)
     weak, none = (
-        sliding_mode.estimate(
-            drive, CAR, SlidingGains(lateral_gain_mps2=gain, lateral_layer_mps=0.01)
-        )
+        sliding_mode(drive, CAR, SlidingGains(lateral_gain_mps2=gain, lateral_layer_mps=0.01))
         for gain in (0.5, 1e-9)
     )
     first_step = 15.0 * (np.tan(weak[0]) - np.tan(none[0]))
@@ -140,7 +133,7 @@ def test_gain_that_overshoots_its_layer_is_refused() -> None:
 @settings(max_examples=30)
 @given(vx=st.floats(0, 4.9))
 def test_slip_is_finite_at_rest_and_continuous_at_the_slowest_speed(vx: float) -> None:
-    s = state_space(TRACK, np.array([vx, 5.0 - 1e-9, 5.0 + 1e-9]))
+    s = state_space(CAR, np.array([vx, 5.0 - 1e-9, 5.0 + 1e-9]))
     for row in (s.a11, s.a12, s.a21, s.a22, s.b1, s.b2):
         assert np.isfinite(row).all()
         assert row[1] == pytest.approx(row[2], rel=1e-6)

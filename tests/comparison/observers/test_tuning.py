@@ -9,7 +9,7 @@ import pytest
 from pydantic import Field
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.observers import ekf, kalman, luenberger, sliding_mode
+from fleet_slip.comparison.observers import ekf, kalman
 from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive
 from fleet_slip.comparison.observers.kalman import FilterNoise
 from fleet_slip.comparison.observers.tuning import checksum_of_sources, rmse_rad, tune
@@ -83,8 +83,6 @@ def test_tuning_makes_up_for_wrong_noise_and_never_makes_worse(executor: Executo
     [
         (kalman.TUNABLE, kalman.FilterNoise()),
         (ekf.TUNABLE, ekf.EkfNoise()),
-        (luenberger.TUNABLE, luenberger.ObserverPoles()),
-        (sliding_mode.TUNABLE, sliding_mode.SlidingGains()),
     ],
 )
 def test_what_is_tunable_exists_and_is_positive(names: tuple[str, ...], parameters: Config) -> None:

@@ -7,7 +7,6 @@ signals into kinds of driving, and each kind has error covariances of its own. H
 variance of the model's errors in each of its leaves is then sought like every other parameter.
 """
 
-import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -15,27 +14,27 @@ from typing import Any
 
 import numpy as np
 from pydantic import Field, FiniteFloat
+from sklearn.tree import DecisionTreeRegressor
 
+from benchmarks.rivals.learners import SEED
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.comparison.evaluation.estimators import Signals
-from fleet_slip.comparison.evaluation.evaluate import Rival
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
 from fleet_slip.comparison.evaluation.filters import FilterEstimate, seen
-from fleet_slip.comparison.evaluation.scenario_runs import error_figures
 from fleet_slip.comparison.observers import ekf
-from fleet_slip.comparison.observers.drive_signals import DriveSignals, LabelledDrive, hold_last
-from fleet_slip.comparison.observers.single_track import follow, measured_speed_mps
+from fleet_slip.comparison.observers.belief import belief_of
+from fleet_slip.comparison.observers.drive_signals import (
+    STEP_S,
+    DriveSignals,
+    LabelledDrive,
+    hold_last,
+    sideslip_angle,
+)
+from fleet_slip.comparison.observers.single_track import Axles, follow, measured_speed_mps
 from fleet_slip.comparison.observers.tuning import tune
-from fleet_slip.comparison.rivals.learner import SEED, scikit_learn
+from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.vehicle.parameters import VehicleParameters
-
-NAME = "ekf_tree"
-BASE = "ekf_class_tuned"
-"""The filter whose noise the tree changes."""
-
-FOLDS = 4
-"""Into so many parts the drives are divided; each is judged by a tree that has not seen it."""
 
 LEAVES = 6
 LEAST_SHARE = 0.01
@@ -43,9 +42,6 @@ LEAST_SHARE = 0.01
 
 LAG = 0.05
 """Share of a new sample in the inertial signals that the tree sees: they follow within 0.2 s."""
-
-SIGNALS = ("ax", "ay", "yaw_rate", "wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr", "steer_fl",
-           "steer_fr")  # fmt: skip
 
 
 class LeafNoise(Config):
@@ -62,6 +58,23 @@ class LeafNoise(Config):
     def factors(self) -> FloatArray:
         """The leaves' factors, shape (leaves,)."""
         return np.array(list(self.model_dump().values()))
+
+
+@kernel
+def _filter(given: ekf.Inputs, factors: FloatArray) -> FloatArray:
+    """Return vx and vy as `ekf` does, the model's variances of each row times a factor."""
+    ax, ay, yaw_rate, vx, steer, loaded, mean, spread, c, v = given
+    found = np.empty((2, len(ax)))
+    x = belief_of(mean, spread)
+    for k in range(len(ax)):
+        axles = Axles(loaded[0, k], loaded[1, k], loaded[2, k], loaded[3, k])
+        if k > 0:
+            q_vy, q_r = factors[k] * v.q_vy, factors[k] * v.q_r
+            w = ekf.Variances(v.q_vx, q_vy, q_r, v.r_vx, v.r_r, v.r_ay)
+            ekf.predict(x, ax[k], steer[k], STEP_S, axles, c, w)
+        ekf.update(x, vx[k], yaw_rate[k], ay[k], steer[k], axles, c, v)
+        found[:, k] = x.mean[:2]
+    return found
 
 
 def kinds(drive: DriveSignals, car: VehicleParameters) -> FloatArray:
@@ -102,7 +115,7 @@ class TreeFilter:
         """Estimate side-slip in rad at every row, with these factors."""
         factors = noise.factors[self.leaf(drive, car)]
         parameters = ekf.EkfNoise.model_validate(self.base.parameters.model_dump())
-        return ekf.estimate(drive, car, parameters, factors)
+        return sideslip_angle(*_filter(ekf.inputs_of(drive, car, parameters), factors))
 
     @property
     def size_bytes(self) -> int:
@@ -113,7 +126,7 @@ class TreeFilter:
 def fit_tree_filter(
     base: FilterEstimate, drives: Sequence[LabelledDrive], executor: Executor
 ) -> TreeFilter:
-    """Fit the tree to the filter's squared errors, and the leaves' factors. Raises `ExtraError`."""
+    """Fit the tree to the filter's squared errors, and the leaves' factors."""
     cars = [drive.car or base.car for drive in drives]
     pairs = list(zip(drives, cars, strict=True))
     seen_kinds = np.concatenate([kinds(drive.signals, car) for drive, car in pairs])
@@ -122,7 +135,7 @@ def fit_tree_filter(
         [ekf.estimate(one.signals, car, parameters) - one.sideslip_rad for one, car in pairs]
     )
     known = np.isfinite(errors)
-    tree = scikit_learn("tree").DecisionTreeRegressor(
+    tree = DecisionTreeRegressor(
         max_leaf_nodes=LEAVES, min_samples_leaf=LEAST_SHARE, random_state=SEED
     )
     tree.fit(seen_kinds[known], errors[known] ** 2)
@@ -131,48 +144,3 @@ def fit_tree_filter(
     names = [f"leaf_{number}" for number in range(len(leaves))]
     found = tune(start.estimate, start.noise, names, drives, base.car, executor)
     return replace(start, noise=found.parameters)
-
-
-def train_tree_filter(
-    base: FilterEstimate, drives: Sequence[LabelledDrive], executor: Executor
-) -> Rival:
-    """Fit the filter with a tree to drives, and to all but each of them; measure it."""
-    started = time.perf_counter()
-    fitted = fit_tree_filter(base, drives, executor)
-    training_s = time.perf_counter() - started
-    started = time.perf_counter()
-    for drive in drives:
-        fitted.estimate(drive.signals, drive.car or base.car, fitted.noise)
-    rows = sum(len(drive.signals) for drive in drives)
-    step_s = (time.perf_counter() - started) / rows
-    held_out = [drives[fold::FOLDS] for fold in range(min(FOLDS, len(drives)))]
-    estimates = [_held_out(base, drives, some, executor) for some in held_out]
-    truth = np.concatenate([drive.sideslip_rad for some in held_out for drive in some])
-    figures = error_figures(np.concatenate(estimates), truth, np.isfinite(truth))
-    return Rival(
-        name=NAME,
-        learner=f"Kalman filter with a decision tree of {LEAVES} leaves",
-        estimate=fitted,
-        signals=SIGNALS,
-        cross_validated=figures,
-        rows=rows,
-        training_s=training_s,
-        size_bytes=fitted.size_bytes,
-        one_estimate_us=step_s * 1e6,
-        each_of_many_us=step_s * 1e6,
-        told={"told": "class", "factors": fitted.noise.model_dump()},
-    )
-
-
-def _held_out(
-    base: FilterEstimate,
-    drives: Sequence[LabelledDrive],
-    some: Sequence[LabelledDrive],
-    executor: Executor,
-) -> FloatArray:
-    """Return the estimates of some drives by a filter that was fitted without them."""
-    others = [one for one in drives if all(one is not other for other in some)] or drives
-    fitted = fit_tree_filter(base, others, executor)
-    return np.concatenate(
-        [fitted.estimate(one.signals, one.car or base.car, fitted.noise) for one in some]
-    )

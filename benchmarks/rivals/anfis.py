@@ -15,16 +15,10 @@ least squares for the conclusions, then a step down the gradient for centres and
 from dataclasses import dataclass
 
 import numpy as np
+from sklearn.cluster import KMeans
 
+from benchmarks.rivals.learners import SEED, FittedLearner, Names, Scaling, hold_back
 from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.rivals.learner import (
-    SEED,
-    FittedLearner,
-    Names,
-    Scaling,
-    hold_back,
-    scikit_learn,
-)
 
 RULES = 9
 PREMISES = 3
@@ -103,7 +97,7 @@ def infer(share: FloatArray, x: FloatArray, conclusions: FloatArray) -> FloatArr
 
 def scatter(z: FloatArray) -> Premises:
     """Return rules where the rows of premises are, as wide as their neighbours are far."""
-    means = scikit_learn("cluster").KMeans(min(RULES, len(z)), n_init=3, random_state=SEED)
+    means = KMeans(min(RULES, len(z)), n_init=3, random_state=SEED)
     centre: FloatArray = means.fit(z).cluster_centers_.astype(np.float64)
     apart = np.sqrt(((centre[:, None] - centre[None]) ** 2).sum(axis=2))
     apart[np.diag_indices_from(apart)] = np.inf

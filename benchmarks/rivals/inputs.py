@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.rivals.learners import Fit, FittedLearner, Names, one_thread
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.catalogue.signals import catalogue
@@ -14,7 +15,7 @@ from fleet_slip.columns.blocks.column_plan import ColumnPlan
 from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts, as_counts
 from fleet_slip.comparison.evaluation.estimators import Signals
 from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
-from fleet_slip.comparison.rivals.learner import FittedLearner, Names, one_thread
+from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures, error_figures
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.expansion import CarCounts
 from fleet_slip.grams.cohorts.folding import assign_folds
@@ -131,9 +132,19 @@ class RowSample:
         """Return some of the inputs, shape (rows, inputs)."""
         return self.inputs[:, [self.names.index(name) for name in names]]
 
-    def folds(self, count: int) -> FoldAssignment:
+    def folds(self) -> FoldAssignment:
         """Divide the rows as the regression's cross-validation divides the drives."""
-        return assign_folds(self.trip.tolist(), "drive", count)
+        return assign_folds(self.trip.tolist(), "drive", 5)
+
+    def cross_validated(self, fit: Fit, names: tuple[str, ...]) -> ErrorFigures:
+        """Return the figures of a learner on rows that each fold's fit has not seen."""
+        inputs, folds = self.of(names), self.folds()
+        estimates = np.full(len(inputs), np.nan)
+        for fold in range(len(folds.names)):
+            test = folds.fold == fold
+            fitted = fit(inputs[~test], self.sideslip_rad[~test], self.trip[~test])
+            estimates[test] = fitted.predict(inputs[test])
+        return error_figures(estimates, self.sideslip_rad, np.ones(len(inputs), dtype=np.bool_))
 
 
 def draw_sample(

@@ -1,21 +1,79 @@
 """The learners: how each is fitted to a sample, and how much a car would have to carry of it."""
 
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from sklearn.ensemble import HistGradientBoostingRegressor
+from sklearn.neural_network import MLPRegressor
+from threadpoolctl import threadpool_limits
 
-from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.rivals.anfis import fit_anfis
-from fleet_slip.comparison.rivals.learner import (
-    SEED,
-    FittedLearner,
-    Learner,
-    Names,
-    Scaling,
-    hold_back,
-    scikit_learn,
-)
+from fleet_slip.arrays import BoolArray, FloatArray
 
+SEED = 0
+
+Names = NDArray[np.str_]
+"""The drive of each row, shape (rows,)."""
+
+
+@dataclass(frozen=True)
+class FittedLearner:
+    """A fitted learner: (rows, columns) to side-slip in rad, and the bytes of its parameters."""
+
+    predict: Callable[[FloatArray], FloatArray]
+    size_bytes: int
+
+
+Fit = Callable[[FloatArray, FloatArray, Names], FittedLearner]
+"""A way to fit inputs (rows, columns) of some drives to side-slip angles (rows,)."""
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Maps columns to mean 0 and standard deviation 1."""
+
+    mean: FloatArray
+    std: FloatArray
+
+    @classmethod
+    def of(cls, values: FloatArray) -> "Scaling":
+        """Return the scaling of a sample."""
+        return cls(values.mean(axis=0), np.maximum(values.std(axis=0), np.finfo(float).tiny))
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        """Return the scaled values."""
+        return (values - self.mean) / self.std
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of mean and standard deviation."""
+        return int(np.asarray(self.mean).nbytes + np.asarray(self.std).nbytes)
+
+
+HELD_BACK = 8
+"""Every so many drives one is held back, by which a learner sees when to stop."""
+
+
+def hold_back(trip: Names) -> BoolArray:
+    """Return which rows to stop by: those of whole drives; with one drive its last tenth."""
+    drives = np.unique(trip)
+    if len(drives) > 1:
+        every = min(HELD_BACK, len(drives))
+        return np.isin(trip, drives[every // 2 :: every])
+    return np.arange(len(trip)) >= 0.9 * len(trip)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep numerical libraries to one thread, as on board."""
+    with threadpool_limits(limits=1):
+        yield
+
+
+BLOCK = 2048
 LAYERS = (64, 64)
 BATCH_ROWS = 256
 RATES = (3e-3, 1e-3, 3e-4, 1e-4)
@@ -28,7 +86,7 @@ PASSES = 60
 
 def fit_perceptron(inputs: FloatArray, label: FloatArray, trip: Names) -> FittedLearner:
     """Fit two hidden layers of 64 neurons by Adam; keep the weights best on drives held back."""
-    network = scikit_learn("neural_network").MLPRegressor(
+    network = MLPRegressor(
         hidden_layer_sizes=LAYERS, activation="tanh", batch_size=BATCH_ROWS,
         max_iter=PASSES_AT_ONCE, tol=0.0, warm_start=True, random_state=SEED,
     )  # fmt: skip
@@ -93,9 +151,6 @@ def fit_general_regression(inputs: FloatArray, label: FloatArray, trip: Names) -
     )
 
 
-BLOCK = 2048
-
-
 def kernel_mean(
     rows: FloatArray, centres: FloatArray, labels: FloatArray, width: float
 ) -> FloatArray:
@@ -128,7 +183,7 @@ MOST_TREES = 500
 
 def fit_trees(inputs: FloatArray, label: FloatArray, trip: Names) -> FittedLearner:
     """Fit gradient-boosted trees of at most 31 leaves, as many as drives held back ask for."""
-    trees = scikit_learn("ensemble").HistGradientBoostingRegressor(
+    trees = HistGradientBoostingRegressor(
         learning_rate=0.1, max_iter=MOST_TREES, early_stopping=True, n_iter_no_change=20,
         tol=0.0, random_state=SEED,
     )  # fmt: skip
@@ -137,16 +192,3 @@ def fit_trees(inputs: FloatArray, label: FloatArray, trip: Names) -> FittedLearn
     # scikit-learn shows the nodes of these trees nowhere else.
     nodes = sum(tree.nodes.nbytes for stage in trees._predictors for tree in stage)
     return FittedLearner(trees.predict, int(nodes))
-
-
-REGRESSION = Learner("regression", "ordinary least squares", fit_regression)
-PERCEPTRON = Learner("mlp", "multilayer perceptron, 2 layers of 64", fit_perceptron)
-TREES = Learner("trees", "gradient-boosted trees", fit_trees)
-ANFIS = Learner("anfis", "adaptive neuro-fuzzy inference system", fit_anfis)
-GENERAL = Learner("grnn", "general regression network", fit_general_regression)
-
-LEARNERS = (REGRESSION, PERCEPTRON, TREES, ANFIS, GENERAL)
-"""All learners, on signals of one instant."""
-
-OF_WINDOWS = (REGRESSION, PERCEPTRON, TREES, ANFIS)
-"""The learners that also get the published model's columns: a mean of neighbours is lost there."""

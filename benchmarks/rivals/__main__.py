@@ -1,0 +1,162 @@
+"""The paper's other systems on the test drives: networks, trees, neuro-fuzzy rules, observers.
+
+    python -m benchmarks.rivals ROOT MODEL [--rivals mlp_8,luenberger] [--rows 60000]
+        [--drives nominal,car_suv]
+
+Learners are fitted to rows of the drives that the published model learned from, observers are tuned
+on 24 of them. They see 2 signals, 8, or `windows`: the 8 and all columns of the model. The table
+has the bytes that a car carries, the seconds of training, the microseconds of each of many
+estimates, and root mean square errors in degrees: cross-validated, and on each test drive.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import fleet_slip
+from benchmarks.rivals.anfis import fit_anfis
+from benchmarks.rivals.inputs import Inputs, LearnedEstimate, RowSample, draw_sample
+from benchmarks.rivals.learners import (
+    Fit,
+    fit_general_regression,
+    fit_perceptron,
+    fit_regression,
+    fit_trees,
+    one_thread,
+)
+from benchmarks.rivals.observers import (
+    GAINS_TUNABLE,
+    POLES_TUNABLE,
+    ObserverPoles,
+    SlidingGains,
+    luenberger,
+    sliding_mode,
+)
+from benchmarks.rivals.tree_filter import fit_tree_filter
+from fleet_slip.comparison.evaluation.estimators import TABLE_ONE, Estimate, published_estimate
+from fleet_slip.comparison.evaluation.evaluated_drives import simulate_drives
+from fleet_slip.comparison.evaluation.filters import FILTERS, Filter, FilterEstimate, TuningDrives
+from fleet_slip.comparison.evaluation.scenario_runs import evaluate_drive
+from fleet_slip.grams.calibration.calibration import calibrate
+from fleet_slip.grams.cohorts.gram_cohort import load_cohort
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.simulation.scenario import load_scenario
+
+DRIVES = (
+    "nominal", "noise_doubled", "melbourne", "mass_1740", "adhesion_0_7", "adhesion_0_4",
+    "style_sporty", "style_limit", "biases_of_another_car", "car_suv", "imperfect",
+)  # fmt: skip
+TWO_SIGNALS = ("ay", "yaw_rate")
+"""The inputs of the first neural network that the paper cites, [5]."""
+
+LEARNERS: dict[str, Fit] = {
+    "regression": fit_regression,
+    "mlp": fit_perceptron,
+    "trees": fit_trees,
+    "anfis": fit_anfis,
+    "grnn": fit_general_regression,
+}
+OBSERVERS = (
+    Filter("luenberger", "luenberger", luenberger, ObserverPoles(), POLES_TUNABLE),
+    Filter("sliding_mode", "sliding_mode", sliding_mode, SlidingGains(), GAINS_TUNABLE),
+)
+TREE = "ekf_tree"
+T = TypeVar("T")
+
+
+class Rival(NamedTuple):
+    """What was trained, and what is known of it beside its errors on test drives."""
+
+    estimate: Estimate
+    size_bytes: int | None = None
+    training_s: float | None = None
+    each_us: float | None = None
+    cross_validated_deg: float | None = None
+
+
+def all_signals() -> tuple[str, ...]:
+    """Return the signals of model 4 of Table I, which the paper settles on."""
+    return next(one.signals for one in load_model_list(TABLE_ONE).model if one.name == "4")
+
+
+def timed(work: Callable[[], T]) -> tuple[T, float]:
+    started = time.perf_counter()
+    return work(), time.perf_counter() - started
+
+
+def learn(fit: Fit, sample: RowSample, inputs: Inputs) -> Rival:
+    """Fit and cross-validate a learner."""
+    rows = sample.of(inputs.names)
+    fitted, training_s = timed(lambda: fit(rows, sample.sideslip_rad, sample.trip))
+    _, many_s = timed(lambda: fitted.predict(rows[:10_000]))
+    found = sample.cross_validated(fit, inputs.names)
+    each_us = 1e6 * many_s / len(rows[:10_000])
+    estimate = LearnedEstimate(inputs, fitted)
+    return Rival(estimate, fitted.size_bytes, training_s, each_us, found.rmse_deg)
+
+
+def train(
+    fleet: fleet_slip.Fleet, manifest: Manifest, rows: int, wanted: Callable[[str], bool]
+) -> Iterator[tuple[str, Rival]]:
+    """Yield each rival by name."""
+    yield manifest.name, Rival(published_estimate(manifest), 8 * (len(manifest.terms) + 1))
+    cohort = load_cohort(fleet.warehouse, manifest.trained_on.cohort)
+    windows = Inputs.of_model(manifest, all_signals())
+    numbers = calibrate(fleet.warehouse).counts() if windows.plan.numbers else None
+    sample = draw_sample(fleet.warehouse, cohort, windows, rows, numbers)
+    sets = {"2": Inputs.of_signals(TWO_SIGNALS), "8": Inputs.of_signals(all_signals())}
+    for suffix, inputs in {**sets, "windows": windows}.items():
+        for name, fit in LEARNERS.items():
+            if wanted(f"{name}_{suffix}"):
+                yield f"{name}_{suffix}", learn(fit, sample, inputs)
+    car = load_scenario("nominal").car
+    drives = TuningDrives.of(fleet.warehouse, cohort, weighed=False)
+    base = next(one for one in FILTERS if one.name == "ekf_class")
+    with ThreadPoolExecutor(1) as executor:
+        for one in (*OBSERVERS, base):
+            if not wanted(one.name) and not (one is base and wanted(TREE)):
+                continue
+            best, took_s = timed(partial(one.tune, drives.read(), car, executor))
+            estimate = FilterEstimate(one, best.parameters, car)
+            yield one.name, Rival(estimate, training_s=took_s)
+            if one is base and wanted(TREE):
+                tree, took_s = timed(partial(fit_tree_filter, estimate, drives.read(), executor))
+                yield TREE, Rival(tree, tree.size_bytes, took_s)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("root", type=Path)
+    parser.add_argument("model")
+    parser.add_argument("--rivals", default="", help="by default all")
+    parser.add_argument("--rows", type=int, default=60_000)
+    parser.add_argument("--drives", default=",".join(DRIVES))
+    given = parser.parse_args()
+    names, asked = given.drives.split(","), given.rivals.split(",")
+    fleet = fleet_slip.open(given.root)
+    manifest = fleet.model(given.model).manifest
+    drives = simulate_drives([load_scenario(name) for name in names])
+
+    def show(*cells: Any) -> None:
+        texts = (
+            "" if one is None else f"{one:.4g}" if isinstance(one, float) else one for one in cells
+        )
+        print("|", " | ".join(map(str, texts)), "|", flush=True)
+
+    show("rival", "bytes", "training s", "us each", "cross-validated", *names)
+    show(*["---"] * (5 + len(names)))
+    with one_thread():
+        for name, (estimate, *costs) in train(
+            fleet, manifest, given.rows, lambda name: not given.rivals or name in asked
+        ):
+            runs = [evaluate_drive(drive, {name: estimate}) for drive in drives]
+            show(name, *costs, *(run.results[name].whole.rmse_deg for run in runs))
+
+
+if __name__ == "__main__":
+    main()
