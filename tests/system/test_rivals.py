@@ -63,7 +63,7 @@ def test_whole_drives_are_held_back() -> None:
 def test_a_rival_sees_on_a_drive_what_it_was_trained_on(smoke_root: Path) -> None:
     """Its estimate is the window itself: the same number in a sample and on a drive."""
     names = ("ay", "ay_mean_16")
-    definition = {"ay_mean_16": features().definition("ay_mean_16")}
+    definition = {"ay_mean_16": features().time_columns["ay_mean_16"].definition}
     scale = float(catalogue()["ay"].scale)
     inputs = Inputs({"ay": scale, "ay_mean_16": scale / 16}, {}, definition)
     warehouse = Warehouse(LocalFolder(smoke_root))
