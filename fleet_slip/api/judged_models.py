@@ -1,4 +1,4 @@
-"""The part of a `Fleet` that judges models: scores, evaluations, the report and films of drives."""
+"""The part of a `Fleet` that judges models: scores, evaluations, the report, pages of drives."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -158,23 +158,18 @@ class JudgedModels(PublishedModels):
         until_s: float | None = None,
         threads: int | None = None,
     ) -> Path:
-        """Write a drive as a page that plays, or as a film: .html, .mp4 or .gif; return the file.
+        """Write a drive as a page that plays, `.html`; return the file.
 
         `what` is a scenario's name or path, simulated if missing, or a drive of the logs, shown
         from `from_s` until `until_s`. Raises `UsageError` for another suffix or an empty part,
         `QuestionError` for an unknown drive, `ExtraError` without the extra `watch`, and what
         `model` raises.
         """
-        with needed("watch", "a page or a film of a drive"):
+        with needed("watch", "a page of a drive"):
             from fleet_slip.comparison.watch.drive_frames import drive_frames, is_scenario
-            from fleet_slip.comparison.watch.playing import write_film, write_page
-
-            if output.suffix == ".mp4":  # said at once: to estimate a drive takes seconds
-                import imageio_ffmpeg  # noqa: F401
-
-        writers = {".html": write_page, ".mp4": write_film, ".gif": write_film}
-        if output.suffix not in writers:
-            raise UsageError(f"{output}: the suffix says the format: {', '.join(writers)}.")
+            from fleet_slip.comparison.watch.playing import write_page
+        if output.suffix != ".html":
+            raise UsageError(f"{output}: a drive is shown as a page, which ends with .html.")
         version = self.resolve(model)
         if is_scenario(what):
             from fleet_slip.comparison.watch.scenario_frames import scenario_frames
@@ -183,5 +178,5 @@ class JudgedModels(PublishedModels):
                 frames = scenario_frames(self.warehouse, what, version, executor)
         else:
             frames = drive_frames(self.warehouse, what, version)
-        writers[output.suffix](frames.part(from_s, until_s), output)
+        write_page(frames.part(from_s, until_s), output)
         return output

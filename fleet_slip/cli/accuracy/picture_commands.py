@@ -53,9 +53,9 @@ def watch(
         ),
     ],
     model: OnlyModel = None,
-    output: Annotated[
-        Path, typer.Option(help="File: .html plays in a browser, .mp4 and .gif are films.")
-    ] = Path("watch.html"),
+    output: Annotated[Path, typer.Option(help="The page, .html, which plays in a browser.")] = Path(
+        "watch.html"
+    ),
     begin: Annotated[float, typer.Option("--from", help="First second that is shown.")] = 0.0,
     until: Annotated[
         float | None, typer.Option(help="Last second. Default: the last.", show_default=False)

@@ -1,1 +1,1 @@
-"""A drive to look at: as a page that plays, and as a film."""
+"""A drive to look at: as a page that plays."""

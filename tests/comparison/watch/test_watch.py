@@ -1,23 +1,19 @@
-"""A drive as a page that plays, and as a film."""
+"""A drive as a page that plays."""
 
 import json
 import math
 import re
-import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import fleet_slip
-from fleet_slip.comparison.watch.drive_frames import FRAMES_PER_S, DriveFrames, drive_frames
+from fleet_slip.comparison.watch.drive_frames import DriveFrames, drive_frames
 from fleet_slip.comparison.watch.playing import render_watch
-from fleet_slip.errors import ExtraError, QuestionError, UsageError
-from tests.support.commands import run
+from fleet_slip.errors import QuestionError, UsageError
 
 DRIVE = "smoke-2024-05-01-0000"
 
@@ -90,60 +86,9 @@ def test_a_part_is_a_part(frames: DriveFrames) -> None:
         frames.part(1e6, None)
 
 
-def test_a_film_moves(smoke_root: Path, tmp_path: Path) -> None:
-    fleet = fleet_slip.open(shutil.copytree(smoke_root, tmp_path / "data"))
-    film = fleet.watch(DRIVE, "smoke", tmp_path / "film.gif", from_s=5.0, until_s=5.3)
-    with Image.open(film) as image:
-        shown = getattr(image, "n_frames", 1)
-        first = np.asarray(image.convert("L"), dtype=int)
-        image.seek(shown - 1)
-        last = np.asarray(image.convert("L"), dtype=int)
-    assert shown == 4
-    assert (abs(first - last) > 50).sum() > 100
-
-
-def test_an_mp4_needs_an_extra_that_is_named(
-    root_to_fail_in: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    fleet = fleet_slip.open(root_to_fail_in)
-    with pytest.raises(ExtraError, match=r"fleet-slip\[watch\]"):
-        fleet.watch(DRIVE, "smoke", tmp_path / "film.mp4", from_s=5.0, until_s=5.1)
-    with pytest.raises(ExtraError):  # before a drive is looked for, which may take long
-        fleet.watch("nobody's", "smoke", tmp_path / "film.mp4")
-    assert list(tmp_path.iterdir()) == []
-
-
-READ_BACK = """
-import sys
-import fleet_slip
-from pathlib import Path
-from imageio_ffmpeg import read_frames
-root, drive, file = sys.argv[1:]
-film = fleet_slip.open(root).watch(drive, "smoke", Path(file), from_s=5.0, until_s=5.5)
-about, *pictures = read_frames(str(film))
-print(about["codec"], about["fps"], *about["size"], len(pictures), len({*pictures}))
-"""
-
-
-@pytest.mark.tools("marimo")
-def test_an_mp4_plays_as_long_as_the_drive(smoke_root: Path, tmp_path: Path) -> None:
-    """In the environment of the notebook, which has an encoder."""
-    root = shutil.copytree(smoke_root, tmp_path / "data")
-    program = shutil.which("marimo")
-    assert program
-    python = Path(program).resolve().parent / "python"
-    done = run([str(python), "-c", READ_BACK, str(root), DRIVE, str(tmp_path / "film.mp4")])
-    assert done.exit_code == 0, done.stderr
-    codec, rate, width, height, pictures, different = done.stdout.split()
-    assert (codec, float(rate)) == ("h264", FRAMES_PER_S)
-    assert (int(width), int(height)) == (800, 448)
-    assert int(pictures) == int(different) == round(0.5 * FRAMES_PER_S) + 1
-
-
 def test_what_cannot_be_shown_is_told(root_to_fail_in: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(root_to_fail_in)
-    with pytest.raises(UsageError, match="suffix"):
-        fleet.watch(DRIVE, "smoke", tmp_path / "film.avi")
+    with pytest.raises(UsageError, match="shown as a page"):
+        fleet.watch(DRIVE, "smoke", tmp_path / "film.mp4")
     with pytest.raises(QuestionError, match="no drive of the logs, and no scenario"):
-        fleet.watch("nobody's", "smoke", tmp_path / "film.html")
+        fleet.watch("nobody's", "smoke", tmp_path / "page.html")
