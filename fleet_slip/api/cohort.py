@@ -1,5 +1,6 @@
 """Drives that satisfy a condition, and what Gram rows tell of them."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import Rooted, open_workers, takes
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from fleet_slip.api.examined_model import ExaminedModel
     from fleet_slip.comparison.observers.identification import Identified
     from fleet_slip.grams.cohorts.gram_cohort import Cohort
+    from fleet_slip.monitoring.examined import Examined
     from fleet_slip.selection.diagnostics import Diagnosis
     from fleet_slip.selection.regimes import RegimeComparison
     from fleet_slip.selection.select_models import RequestedSelection
@@ -31,23 +33,41 @@ class FleetCohort(Rooted):
     `RefusedError` for drives of evaluation scenarios.
     """
 
-    def __init__(self, warehouse: Warehouse, condition: str) -> None:
+    def __init__(self, warehouse: Warehouse, condition: str, unexamined: bool = False) -> None:
         super().__init__(warehouse)
         self.condition = condition
+        self.unexamined = unexamined
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.root)!r}, {self.condition!r})"
+
+    def examine(self) -> "Examined":
+        """Return the drives that may train a model; raises as `Fleet.quality`.
+
+        Simulated drives are passed over; what was found is kept while the data stay. Gram rows of
+        `signals` that are missing are made. Raises `UnexaminedError` if that takes more than
+        seconds.
+        """
+        from fleet_slip.monitoring.examined import Examined, find_trainable
+
+        if self.unexamined:
+            return Examined(self.condition)
+        return find_trainable(self.warehouse, self.condition)
 
     @takes(SelectionRequest)
     def select(self, request: SelectionRequest) -> "RequestedSelection":
         """Compare models by cross-validation and choose one; `Fleet.publish` takes the answer.
 
-        Raises `UsageError` for options that do not go together or an invalid list, and `DataError`
-        if no model can be fitted.
+        Drives that are not in order are left out: see `examine`, and `examined` of the answer.
+        Raises what `examine` raises, `UsageError` for options that do not go together or an invalid
+        list, and `DataError` if no model can be fitted.
         """
         from fleet_slip.selection.answer_request import answer_request
 
-        return answer_request(self.warehouse, request, self.condition)
+        examined = self.examine()
+        with examined.explaining():
+            answer = answer_request(self.warehouse, request, examined.cohort)
+        return replace(answer, examined=str(examined))
 
     @takes(DiagnosisRequest)
     def diagnose(self, request: DiagnosisRequest) -> "Diagnosis":

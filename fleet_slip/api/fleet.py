@@ -69,9 +69,12 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         require_many_cars()
         return Session(connect_unlocked(self.root, query, scenarios=scenarios), any_statement)
 
-    def cohort(self, condition: str = TRAINING_DRIVES) -> FleetCohort:
-        """Return the drives of an SQL condition, by default all but evaluation scenarios."""
-        return FleetCohort(self.warehouse, condition)
+    def cohort(self, condition: str = TRAINING_DRIVES, *, unexamined: bool = False) -> FleetCohort:
+        """Return the drives of an SQL condition, by default all but evaluation scenarios.
+
+        Measured drives whose sensors are not in order train no model, unless `unexamined`.
+        """
+        return FleetCohort(self.warehouse, condition, unexamined)
 
     @record_call
     @takes(RunRequest)

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from fleet_slip.maintenance.vacuum import VacuumReport
     from fleet_slip.maintenance.verify_files import Verification
     from fleet_slip.models.model_version import ModelVersion
-    from fleet_slip.monitoring.examined import Examined
     from fleet_slip.monitoring.monitor import Chart
     from fleet_slip.monitoring.quality import QualityReport
     from fleet_slip.monitoring.status import WarehouseStatus
@@ -56,15 +55,6 @@ class HealthAndUpkeep(JudgedModels):
         from fleet_slip.monitoring.quality import examine_drives
 
         return examine_drives(self.warehouse, cohort)
-
-    def leave_out_faulty(self, cohort: str = TRAINING_DRIVES) -> "Examined":
-        """Return the condition of a cohort's drives that are in order; raises as `quality`.
-
-        Simulated drives with logs are passed over; what was found is kept while the data stay.
-        """
-        from fleet_slip.monitoring.examined import leave_out_faulty
-
-        return leave_out_faulty(self.warehouse, cohort)
 
     def calibrate(self, cohort: str = ALL_DRIVES) -> "Calibration":
         """Return how the sensors of every car are off, and what else its drives tell of it.

@@ -17,29 +17,57 @@ if TYPE_CHECKING:
     from fleet_slip.comparison.report.page import Written
     from fleet_slip.files.documents import Document
     from fleet_slip.models.estimates.score import Score
+    from fleet_slip.monitoring.examined import Examined
+    from fleet_slip.warehouse.condition import Condition
 
 
 class JudgedModels(PublishedModels):
     """How good published models are. A model is given as `PublishedModels` has it."""
 
-    def score(self, model: str | ModelVersion | None = None, cohort: str | None = None) -> "Score":
+    def score(
+        self,
+        model: str | ModelVersion | None = None,
+        cohort: str | None = None,
+        *,
+        unexamined: bool = False,
+    ) -> "Score":
         """Evaluate a model on the rows of a cohort; angles are in degrees.
 
-        By default on all drives that it was not trained on, or all if there are no others. Raises
-        `DataError` if no row has the model's signals, `QuestionError` for an invalid condition, and
-        what `model` raises.
+        By default on all drives that it was not trained on, or all if there are no others. Drives
+        that may train no model are left out as in `FleetCohort.select`. Raises `DataError` if no
+        row has the model's signals, `QuestionError` for an invalid condition, and what `model`
+        raises.
         """
         from fleet_slip.models.estimates.score import score
         from fleet_slip.models.seen_drives import find_seen
 
         manifest = self.resolve(model).manifest
-        asked = ALL_DRIVES if cohort is None else cohort
-        seen = find_seen(self.warehouse, self.registry(), manifest, asked)
-        found = score(self.warehouse, manifest, asked if cohort else seen.others)
+        rows, examined = self.scored_rows(cohort, unexamined=unexamined)
+        with examined.explaining():
+            seen = find_seen(self.warehouse, self.registry(), manifest, rows)
+            found = score(self.warehouse, manifest, rows if cohort else seen.others)
         without = 0 if cohort or seen.trained == seen.drives else seen.trained or 0
         return replace(
-            found, drives=seen.drives, drives_trained=seen.trained, drives_left_out=without
+            found,
+            drives=seen.drives,
+            drives_trained=seen.trained,
+            drives_left_out=without,
+            examined=str(examined),
         )
+
+    def scored_rows(
+        self, cohort: str | None = None, *, unexamined: bool = False
+    ) -> "tuple[Condition, Examined]":
+        """Return the rows of a cohort without drives that are not in order, and which these are."""
+        from fleet_slip.models.estimates.score import cohort_of_rows
+        from fleet_slip.monitoring.examined import Examined, leave_out_faulty
+
+        asked = ALL_DRIVES if cohort is None else cohort
+        rows = cohort_of_rows(asked)
+        if unexamined:
+            return rows, Examined(asked)
+        examined = leave_out_faulty(self.warehouse, asked)
+        return replace(rows, sql=cohort_of_rows(examined.cohort).sql), examined
 
     @record_call
     def evaluate(

@@ -23,7 +23,7 @@ from fleet_slip.models.aliases import CANDIDATE
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.monitoring.night_report import NightReport, NightStep, State
 from fleet_slip.runs.log import step
-from fleet_slip.runs.nights import Beginning, Nights, hash_drive, without_drives
+from fleet_slip.runs.nights import Beginning, Nights, hash_drive
 from fleet_slip.selection.model_list import load_model_list
 from fleet_slip.warehouse.minimum_cohort import UNNAMED, tells_single_cars
 from fleet_slip.warehouse.table_views import connect_tables, gram_snapshots
@@ -218,15 +218,14 @@ class Night:
         return "done", f"Of {number_of(self._now().drives, 'drive')}."
 
     def _quality(self) -> Told:
-        found = self.fleet.quality(self.training.cohort)
-        self.faults = found.findings
-        hashes = [hash_drive(self.training.name, one.drive_id) for one in self.faults]
-        cohort = without_drives(self.training.cohort, self.training.name, hashes)
-        self.training = replace(self.training, cohort=cohort)
-        new = len(set(hashes) - self.before.known)
+        found = self.fleet.cohort(self.training.cohort).examine()
+        self.faults = found.findings(self.fleet.warehouse)
+        self.training = replace(self.training, cohort=found.cohort)
+        hashes = {hash_drive(self.training.name, one.drive_id) for one in self.faults}
+        new = len(hashes - self.before.known)
         told = (
             f"{number_of(found.drives, 'drive')} examined: {new} newly not in order, "
-            f"{len(hashes)} in all, which train no model.{_revoked(found.revoked)}"
+            f"{len(hashes)} in all, which train no model."
         )
         return "attention" if new else "done", told
 

@@ -133,14 +133,14 @@ class PublishedModels(Rooted):
         self, name: str, choice: "RequestedSelection | FleetCohort | None"
     ) -> "RequestedSelection":
         from fleet_slip.models.recipe import recipe_for
-        from fleet_slip.selection.answer_request import answer_request
         from fleet_slip.selection.request import SelectionRequest
 
         if choice is not None and not isinstance(choice, FleetCohort):
             return choice
-        condition = choice.condition if choice else None
+        condition, unexamined = (choice.condition, choice.unexamined) if choice else (None, False)
         recipe = recipe_for(self.registry(), name, SelectionRequest(), condition)
-        return answer_request(self.warehouse, recipe.request, recipe.cohort)
+        cohort = FleetCohort(self.warehouse, recipe.cohort, unexamined)
+        return cohort.select(**vars(recipe.request))
 
     @record_call
     def promote(self, reference: str, alias: str = CHAMPION) -> ModelVersion:

@@ -75,8 +75,9 @@ class Training:
         return Publication(champion, False, "The champion was made from the same data and list.")
 
     def select(self, fleet: "Fleet") -> "RequestedSelection":
-        """Compare the models of the list on the cohort."""
-        return fleet.cohort(self.cohort).select(models=self.models, worth=self.worth)
+        """Compare the models of the list on the cohort, which a night has examined."""
+        cohort = fleet.cohort(self.cohort, unexamined=True)
+        return cohort.select(models=self.models, worth=self.worth)
 
     def publish_if_not_worse(
         self, fleet: "Fleet", selection: "RequestedSelection", *, replace_marked: bool

@@ -1,53 +1,14 @@
 """Says which drives of a cohort what was computed leaves out."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
-from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.output import say
-from fleet_slip.cli.progress_bar import progress
-from fleet_slip.errors import UnexaminedError
 from fleet_slip.regression.inference.influential import Influential
 from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE, tells_single_cars
 from fleet_slip.words import number_of
 
-if TYPE_CHECKING:
-    from fleet_slip.monitoring.examined import Examined
-
-
 TELLING = 0.01
 """Part of a cohort's rows without the label or a signal that is worth a remark."""
-
-READ_ON_THE_WAY = 20_000_000
-"""Rows of logs that are read for their Gram rows before drives are examined: seconds."""
-
-
-def examine_cohort(fleet: Fleet, cohort: str) -> str:
-    """Return a cohort without the drives that are not in order, and say which were left out."""
-    return _without_faulty(fleet.leave_out_faulty(cohort))
-
-
-def examine_before_publishing(fleet: Fleet, cohort: str) -> str:
-    """Return a cohort like `examine_cohort`, with Gram rows made first if these are missing.
-
-    Raises `UnexaminedError` if that takes more than seconds.
-    """
-    examined = fleet.leave_out_faulty(cohort)
-    if examined.missing and examined.missing_rows <= READ_ON_THE_WAY:
-        drives = number_of(examined.missing, "measured drive")
-        with progress("examining", "rows") as show:
-            fleet.gram(progress=show)
-        say(f"made the Gram rows of {drives} that were not there, to examine them.")
-        examined = fleet.leave_out_faulty(cohort)
-    if examined.missing:
-        raise UnexaminedError(f"{examined.lacking}; or publish again with --unexamined")
-    return _without_faulty(examined)
-
-
-def _without_faulty(examined: "Examined") -> str:
-    if told := str(examined):
-        say(told)
-    return examined.cohort
 
 
 def say_without_log(drives: int, feature_set: str) -> None:
@@ -100,3 +61,9 @@ def say_without_information(rows: int, of: int) -> None:
             f"{rows:,} of {number_of(of, 'row')} tell nothing: the label or a signal of the model "
             "is missing there."
         )
+
+
+def say_examined(told: str) -> None:
+    """Say which drives were left out since they are not in order, if there are any."""
+    if told:
+        say(told)

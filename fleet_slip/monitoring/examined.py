@@ -3,13 +3,14 @@
 Drives are examined once: what was found is kept in the user's cache, as hashes of drives, as long
 as Gram rows and thresholds are what they were. Many drives are examined in pieces of whole days, so
 that a night costs its own piece. Simulated drives are not examined: what is wrong in them is meant.
+Whatever trains, scores or publishes asks here, so that all have the same answer.
 """
 
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import date
 from hashlib import sha256
@@ -23,17 +24,32 @@ from fleet_slip.canonical import canonical_json
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import RECEIVED
 from fleet_slip.delta import Snapshot, TableFile
+from fleet_slip.errors import DataError, NotComputedError, UnexaminedError
 from fleet_slip.grams.cohorts.folding import EACH, Folding
 from fleet_slip.grams.cohorts.gram_reader import GramReader
 from fleet_slip.grams.rows.backlog import find_backlog
+from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.ingest.drives.measured_drives import SOURCE
 from fleet_slip.ingest.landing.known_files import cache_folder
-from fleet_slip.monitoring.quality import examine_drives
+from fleet_slip.monitoring.plausibility import Fault
+from fleet_slip.monitoring.quality import SensorFault, examine_drives
 from fleet_slip.monitoring.thresholds import thresholds
 from fleet_slip.runs.nights import hash_drive, without_drives
-from fleet_slip.warehouse.condition import Condition, asking, parse_condition
-from fleet_slip.warehouse.table_views import gram_snapshots, lock, open_tables, views_in
+from fleet_slip.warehouse.condition import (
+    Condition,
+    asking,
+    drive_columns,
+    parse_condition,
+    row_columns,
+)
+from fleet_slip.warehouse.table_views import (
+    connect_tables,
+    gram_snapshots,
+    lock,
+    open_tables,
+    views_in,
+)
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
@@ -43,6 +59,9 @@ NAME = "drive"
 PIECE = 100_000
 """Drives that are compared with one another, or a quarter more: some 10 s and 600 MiB."""
 
+READ_ON_THE_WAY = 20_000_000
+"""Rows of logs that are read for their Gram rows before drives are examined: seconds."""
+
 
 @dataclass(frozen=True)
 class Examined:
@@ -51,16 +70,23 @@ class Examined:
     Attributes:
         cohort: the condition without the drives that are not in order.
         drives: how many were long enough to be examined.
-        faults: how many drives have each fault, such as `reversed sideslip`.
+        found: the fault of each drive that is not in order, by its hash.
         missing: how many measured drives were not, since they have no Gram rows.
         missing_rows: how many rows of the logs are to be read for these.
+        made: how many drives' Gram rows were made to examine them.
     """
 
     cohort: str
     drives: int = 0
-    faults: Mapping[str, int] = field(default_factory=dict)
+    found: Mapping[str, Fault] = field(default_factory=dict)
     missing: int = 0
     missing_rows: int = 0
+    made: int = 0
+
+    @property
+    def faults(self) -> Mapping[str, int]:
+        """How many drives have each fault, such as `reversed sideslip`."""
+        return Counter(" ".join((one.kind, *one.signals)) for one in self.found.values())
 
     @property
     def lacking(self) -> str:
@@ -74,15 +100,48 @@ class Examined:
 
     def __str__(self) -> str:
         """Return what is left out, and what was not examined; nothing if all are in order."""
-        if not self.faults:
-            return self.lacking
-        told = ", ".join(f"{number:,} {fault}" for fault, number in self.faults.items())
-        out = number_of(sum(self.faults.values()), "drive")
-        left_out = (
-            f"{out} of {self.drives:,} left out, not in order: {told}. See fleet-slip quality; "
-            "--unexamined takes them all the same."
-        )
-        return f"{left_out} {self.lacking}".strip()
+        told = []
+        if self.made:
+            drives = number_of(self.made, "measured drive")
+            told.append(f"made the Gram rows of {drives} that were not there, to examine them.")
+        if self.found:
+            out = number_of(len(self.found), "drive")
+            told.append(
+                f"{out} of {self.drives:,} left out, not in order: {self._told_faults}. See "
+                "fleet-slip quality; --unexamined takes them all the same."
+            )
+        return " ".join([*told, self.lacking]).strip()
+
+    @property
+    def _told_faults(self) -> str:
+        return ", ".join(f"{number:,} {fault}" for fault, number in self.faults.items())
+
+    @contextmanager
+    def explaining(self) -> Iterator[None]:
+        """Say in the error of a cohort without a drive that all were left out, if they were."""
+        try:
+            yield
+        except DataError as error:
+            if (
+                len(self.found) < self.drives
+                or not self.found
+                or isinstance(error, NotComputedError)
+            ):
+                raise
+            raise DataError(
+                f"none of {number_of(self.drives, 'drive')} is in order: {self._told_faults}. "
+                "See fleet-slip quality; --unexamined takes them all the same."
+            ) from None
+
+    def findings(self, warehouse: Warehouse) -> tuple[SensorFault, ...]:
+        """Return the drives that are not in order by name, by day and drive."""
+        if not self.found:
+            return ()
+        query = "SELECT DISTINCT drive_id, vehicle_id, day FROM grams ORDER BY day, drive_id"
+        with connect_tables(warehouse, query) as database:
+            rows = database.execute(query).fetchall()
+        named = ((hash_drive(NAME, drive), (drive, car, day)) for drive, car, day in rows)
+        return tuple(SensorFault(*row, self.found[one]) for one, row in named if one in self.found)
 
 
 @dataclass(frozen=True)
@@ -104,45 +163,69 @@ class _Piece:
 def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
     """Examine the drives of a cohort like `quality`; return it without those not in order.
 
-    Drives without Gram rows of `signals` are not examined, and counted. Raises what
-    `examine_drives` raises; where no drive is measured there is nothing to examine.
+    Drives without Gram rows of `signals` are not examined, and counted. Of a condition on rows all
+    drives are examined. Raises what `examine_drives` raises; where no drive is measured there is
+    nothing to examine.
     """
     measured = parse_condition(f"source IN ('{SOURCE}', '{RECEIVED}')")
-    condition = parse_condition(cohort) & measured
+    asked = parse_condition(cohort, row_columns())
+    condition = measured if asked.columns - set(drive_columns()) else asked & measured
     grams, logs = gram_snapshots(warehouse)
     missing, missing_rows = _lacking(warehouse, grams, logs, condition)
-    found: list[Mapping[str, Any]] = []
+    parts: list[Mapping[str, Any]] = []
     for piece in _pieces(warehouse, condition) if grams.rows else []:
-        about = {"cohort": cohort, "from": piece.days[0], "root": warehouse.root.uri}
+        about = {"cohort": condition.text, "from": piece.days[0], "root": warehouse.root.uri}
         limits = thresholds().quality.model_dump(mode="json")
         state = [list(piece.rows), sha256(canonical_json(limits).encode()).hexdigest()]
         name = sha256(canonical_json({k: str(v) for k, v in about.items()}).encode()).hexdigest()
         kept = cache_folder("examined") / f"{name[:32]}.json"
-        found.append(_known(kept, state) or _examine(warehouse, condition & piece.condition))
-        _keep(kept, {**found[-1], "state": state})
-    hashes = {name for one in found for name in one["drives"]}
-    faults = sum((Counter(one["faults"]) for one in found), Counter[str]())
-    examined = sum(one["examined"] for one in found)
-    kept_cohort = without_drives(cohort, NAME, hashes)
-    return Examined(kept_cohort, examined, dict(faults), missing, missing_rows)
+        parts.append(_known(kept, state) or _examine(warehouse, condition & piece.condition))
+        _keep(kept, {**parts[-1], "state": state})
+    found = {
+        name: Fault(kind, tuple(signals), figure)
+        for one in parts
+        for name, (kind, signals, figure) in one["found"].items()
+    }
+    kept_cohort = without_drives(cohort, NAME, found)
+    examined = sum(one["examined"] for one in parts)
+    return Examined(kept_cohort, examined, found, missing, missing_rows)
+
+
+def find_trainable(warehouse: Warehouse, cohort: str) -> Examined:
+    """Return a cohort like `leave_out_faulty`, with Gram rows made first if these are missing.
+
+    Raises `UnexaminedError` if that takes more than seconds.
+    """
+    examined = leave_out_faulty(warehouse, cohort)
+    if not examined.missing:
+        return examined
+    made = examined.missing
+    if examined.missing_rows <= READ_ON_THE_WAY:
+        update_grams(warehouse)
+        examined = leave_out_faulty(warehouse, cohort)
+    if examined.missing:
+        raise UnexaminedError(f"{examined.lacking}; or take them all the same, unexamined")
+    return replace(examined, made=made)
 
 
 def _examine(warehouse: Warehouse, condition: Condition) -> Mapping[str, Any]:
     report = examine_drives(warehouse, condition)
-    hashes = sorted(hash_drive(NAME, one.drive_id) for one in report.findings)
-    faults = Counter(" ".join((one.fault.kind, *one.fault.signals)) for one in report.findings)
-    return {"drives": hashes, "examined": report.drives, "faults": faults}
+    found = {
+        hash_drive(NAME, one.drive_id): [one.fault.kind, list(one.fault.signals), one.fault.figure]
+        for one in report.findings
+    }
+    return {"found": found, "examined": report.drives}
 
 
 def _known(kept: Path, state: list[Any]) -> Mapping[str, Any] | None:
     with suppress(OSError, ValueError, KeyError, TypeError):
         known = json.loads(kept.read_bytes())
         if known["state"] == state:
-            return {
-                "drives": [str(one) for one in known["drives"]],
-                "examined": int(known["examined"]),
-                "faults": {str(fault): int(many) for fault, many in known["faults"].items()},
+            found = {
+                str(name): [str(kind), [str(one) for one in signals], str(figure)]
+                for name, (kind, signals, figure) in known["found"].items()
             }
+            return {"found": found, "examined": int(known["examined"])}
     return None
 
 

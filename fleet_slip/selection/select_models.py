@@ -203,6 +203,7 @@ class RequestedSelection(Selection[Any]):
         label_noise_deg: of the label, which every error has in it; None where it is not known.
         request, asked: what was asked for, and of which drives.
         remark: why another list than the usual one was compared.
+        examined: which drives were left out since they are not in order, as a sentence.
     """
 
     model_list: str
@@ -213,6 +214,7 @@ class RequestedSelection(Selection[Any]):
     request: SelectionRequest = field(default_factory=SelectionRequest)
     asked: str = TRAINING_DRIVES
     remark: str = ""
+    examined: str = ""
 
     @property
     def beyond_label_noise_deg(self) -> float | None:
@@ -232,8 +234,8 @@ class RequestedSelection(Selection[Any]):
             "label_noise_deg": self.label_noise_deg,
         }
         course = {"without_label": self.without_label.as_dict()} if self.without_label else {}
-        remark = {"remark": self.remark} if self.remark else {}
-        return {**document, **course, **remark}
+        said = {"remark": self.remark, "examined": self.examined}
+        return {**document, **course, **{name: text for name, text in said.items() if text}}
 
     @classmethod
     def of(

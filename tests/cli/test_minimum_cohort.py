@@ -174,7 +174,7 @@ OF_NO_CAR = {
     *("estimator", "export", "log_to_mlflow", "registry", "resolve", "simulate", "receive"),
     *("ingest", "preview", "gram", "check", "migrate", "status", "examine", "verify", "repair"),
     *("compact", "vacuum", "preview_vacuum", "forget", "allow", "retain", "nightly", "cohort"),
-    *("take_back", "leave_out_faulty"),
+    *("take_back", "scored_rows"),
 }
 """Calls without figures of cars in the warehouse: of versions, of jobs, of files that are given."""
 

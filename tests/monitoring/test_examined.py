@@ -10,9 +10,8 @@ from typer.testing import CliRunner
 import fleet_slip
 from fleet_slip import Fleet
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli import left_out
 from fleet_slip.cli.app import app
-from fleet_slip.errors import RefusedError, UnexaminedError
+from fleet_slip.errors import DataError, RefusedError, UnexaminedError
 from fleet_slip.grams.cohorts.rollup_cells import NO_CELLS, RollupReader
 from fleet_slip.grams.rows import rollup
 from fleet_slip.models.acceptance import champion_rules
@@ -58,14 +57,14 @@ def fleet(landed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Flee
 def test_drives_that_are_not_in_order_train_nothing_by_hand(
     fleet: Fleet, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = fleet.leave_out_faulty()
+    found = fleet.cohort().examine()
     assert (found.drives, found.faults) == (6, {"stuck ay": 2})
 
     def examine_again(*_: object) -> None:
         raise AssertionError("examined again")
 
     monkeypatch.setattr(examined, "examine_drives", examine_again)
-    assert fleet.leave_out_faulty() == found
+    assert fleet.cohort().examine() == found
     monkeypatch.undo()
     told = run_command("select", "--models", "table1")
     assert told.exit_code == 0
@@ -74,6 +73,17 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
     assert "6 drives" in run_command("select", "--models", "table1", "--unexamined").stdout
     assert run_command("publish", "m", "--models", "table1").exit_code == 0
     assert fleet.model("m").manifest.trained_on.drives == 4
+    by_hand = fleet.cohort().select(models="table1")
+    assert by_hand.as_dict()["examined"] == str(found)
+    assert fleet.publish("m", by_hand).reason == "The champion is this very model."
+    scored = run_command("score", "m")
+    assert "2 drives of 6 left out, not in order: 2 stuck ay" in scored.stderr
+    assert (fleet.score("m").drives, fleet.score("m", unexamined=True).drives_left_out) == (4, 4)
+
+
+def test_a_cohort_of_which_no_drive_is_in_order_says_so(fleet: Fleet) -> None:
+    with pytest.raises(DataError, match="none of 2 drives is in order: 2 stuck ay"):
+        fleet.cohort("day = DATE '2026-10-06'").select(models="table1")
 
 
 def test_a_first_champion_of_a_label_that_is_turned_in_all_drives_is_refused(
@@ -170,12 +180,12 @@ def test_many_drives_are_examined_in_pieces_of_days_and_each_piece_once(
 
     monkeypatch.setattr(examined, "examine_drives", counted)
     monkeypatch.setattr(examined, "PIECE", 4)
-    found = fleet.leave_out_faulty()
+    found = fleet.cohort().examine()
     assert (found.drives, found.faults, len(asked)) == (6, {"stuck ay": 2}, 2)
     landing = Landing(landed / "landing", landed)
     fleet.ingest(sorted(landing.folder.glob("late*")), str(landing.mapping))
     fleet.gram()
-    found = fleet.leave_out_faulty()
+    found = fleet.cohort().examine()
     assert (found.drives, found.faults, len(asked)) == (8, {"stuck ay": 2, "stuck yaw_rate": 2}, 3)
     assert "2026-10-06" in asked[-1] and "2026-10-05" not in asked[-1]
 
@@ -198,12 +208,12 @@ def test_rows_of_whole_files_are_not_read_to_tell_that_they_are_known(
         path = tmp_path / f"day-{day}"
         path.write_bytes(messages_of(150, START_S + 86_400 * day, seed=day))
         fleet.receive(path)
-        fleet.leave_out_faulty()
+        fleet.cohort().examine()
         assert len(asked) == day + 1
         assert f"2024-05-0{day + 1}" in asked[-1]
     # Their cells tell the days: no row of theirs is in the connection.
     monkeypatch.setattr(RollupReader, "cells", lambda *_: NO_CELLS)
-    fleet.leave_out_faulty()
+    fleet.cohort().examine()
     assert len(asked) == 6
 
 
@@ -213,11 +223,12 @@ def test_drives_without_gram_rows_are_reduced_and_examined_before_they_train(
     """As after `gram --features`, where the rows that are examined may not be there."""
     shutil.rmtree(Path(str(fleet.root)) / "grams")
     fleet.gram("calibration")
-    told = str(fleet.leave_out_faulty())
+    told = str(examined.leave_out_faulty(fleet.warehouse, TRAINING_DRIVES))
     assert told.startswith("6 measured drives not examined: ") and "Run: fleet-slip gram" in told
-    monkeypatch.setattr(left_out, "READ_ON_THE_WAY", 100)
-    with pytest.raises(UnexaminedError, match=r"6 measured drives .* with --unexamined"):
-        left_out.examine_before_publishing(fleet, TRAINING_DRIVES)
+    with monkeypatch.context() as patch:
+        patch.setattr(examined, "READ_ON_THE_WAY", 100)
+        with pytest.raises(UnexaminedError, match=r"6 measured drives .* unexamined"):
+            fleet.publish("m")
     done = run_command("publish", "m", "--models", "table1")
     assert done.exit_code == 0, done.stderr
     assert "made the Gram rows of 6 measured drives" in done.stderr

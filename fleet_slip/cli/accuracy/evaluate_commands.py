@@ -8,9 +8,10 @@ from fleet_slip.catalogue.sources import ALL_DRIVES
 from fleet_slip.cli.accuracy.evaluation_tables import print_evaluation, print_summary
 from fleet_slip.cli.accuracy.judgement_tables import print_blind, print_own_car
 from fleet_slip.cli.completing import complete_config
-from fleet_slip.cli.left_out import say_without_information
+from fleet_slip.cli.left_out import say_examined, say_without_information
 from fleet_slip.cli.model_argument import OnlyModel
 from fleet_slip.cli.models.diff_command import score_against
+from fleet_slip.cli.options import Unexamined
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.progress_bar import progress
 from fleet_slip.cli.record_runs import record_run
@@ -49,6 +50,7 @@ def score(
         str | None,
         typer.Option(help="Another version of the model, such as champion, on the same rows."),
     ] = None,
+    unexamined: Unexamined = False,
     json: Json = False,
 ) -> None:
     """Evaluate a model on the rows of a cohort: also the largest error and percentiles.
@@ -62,9 +64,12 @@ def score(
     if against is not None:
         name = against if "@" in against else f"{version.manifest.name}@{against}"
         other = context.obj.model(name)
-        score_against(context.obj.warehouse, version, other, cohort or ALL_DRIVES, json)
+        rows, examined = context.obj.scored_rows(cohort, unexamined=unexamined)
+        say_examined(str(examined))
+        score_against(context.obj.warehouse, version, other, rows, json)
         return
-    found: Score = context.obj.score(version, cohort)
+    found: Score = context.obj.score(version, cohort, unexamined=unexamined)
+    say_examined(found.examined)
     result = found.as_dict()
     if json:
         print_json({"model": version.reference, "cohort": cohort or ALL_DRIVES, **result})

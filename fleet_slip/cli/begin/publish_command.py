@@ -6,7 +6,7 @@ import typer
 
 from fleet_slip.cli.begin.selection_tables import print_selection
 from fleet_slip.cli.completing import complete_model
-from fleet_slip.cli.left_out import examine_before_publishing
+from fleet_slip.cli.left_out import say_examined
 from fleet_slip.cli.options import RESAMPLING, Unexamined, request_options
 from fleet_slip.cli.output import All, Json, print_json, say
 from fleet_slip.cli.record_runs import record_run
@@ -15,7 +15,6 @@ from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import DryRun, Publication
 from fleet_slip.models.recipe import recipe_for
 from fleet_slip.runs.log import step
-from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 
 
@@ -67,11 +66,10 @@ def publish(
     recipe = recipe_for(context.obj.registry(), name, request, cohort)
     if recipe.told:
         say(f"{name}: {recipe.told}")
-    cohort = recipe.cohort
-    if not unexamined:
-        cohort = examine_before_publishing(context.obj, cohort)
+    drives = context.obj.cohort(recipe.cohort, unexamined=unexamined)
     with step("select"):
-        selection = answer_request(context.obj.warehouse, recipe.request, cohort)
+        selection = drives.select(**vars(recipe.request))
+    say_examined(selection.examined)
     if dry_run:
         told = context.obj.would_publish(name, selection, force=force, candidate=candidate)
         if json:

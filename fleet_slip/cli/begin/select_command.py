@@ -28,12 +28,10 @@ def select(
     Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
     """
     from fleet_slip.cli.begin.selection_tables import print_selection  # noqa: PLC0415 - takes a while
-    from fleet_slip.cli.left_out import examine_cohort  # noqa: PLC0415 - takes a while
-    from fleet_slip.selection.answer_request import answer_request  # noqa: PLC0415 - takes a while
+    from fleet_slip.cli.left_out import say_examined  # noqa: PLC0415 - takes a while
 
-    if not unexamined:
-        cohort = examine_cohort(context.obj, cohort)
-    selection = answer_request(context.obj.warehouse, request, cohort)
+    selection = context.obj.cohort(cohort, unexamined=unexamined).select(**vars(request))
+    say_examined(selection.examined)
     if json:
         print_json(selection)
     else:

@@ -7,10 +7,9 @@ import typer
 from fleet_slip.cli.models.version_commands import Reference
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.models.diff import Difference, Term
-from fleet_slip.models.estimates.score import cohort_of_rows
 from fleet_slip.models.estimates.score import score as score_rows
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.warehouse.condition import parse_condition, row_columns
+from fleet_slip.warehouse.condition import Condition, parse_condition, row_columns
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
@@ -71,18 +70,18 @@ def _shown(value: Any) -> str:
 
 
 def score_against(
-    warehouse: Warehouse, one: ModelVersion, other: ModelVersion, cohort: str, json: bool
+    warehouse: Warehouse, one: ModelVersion, other: ModelVersion, rows: Condition, json: bool
 ) -> None:
     """Print the figures of two versions on the rows that have the signals of both."""
     needed = {*one.manifest.columns, *other.manifest.columns}
     complete = " AND ".join(f"{name} IS NOT NULL" for name in sorted(needed))
-    both = cohort_of_rows(cohort) & parse_condition(complete, row_columns())
+    both = rows & parse_condition(complete, row_columns())
     first, second = (
         score_rows(warehouse, version.manifest, both).as_dict() for version in (one, other)
     )
     if json:
         models = {one.reference: first, other.reference: second}
-        print_json({"cohort": cohort, "models": models})
+        print_json({"cohort": rows.text, "models": models})
         return
     print_table(
         f"{one.reference} and {other.reference} on the same {number_of(first['rows'], 'row')}",

@@ -59,6 +59,8 @@ class Score:
     """How many of these are not scored, since no cohort was asked for."""
     rows_without: int = 0
     """Of the cohort, that tell nothing of the model: the label or a signal is missing."""
+    examined: str = ""
+    """Which drives were left out since they are not in order, as a sentence."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `score --json` prints."""
