@@ -64,7 +64,6 @@ ROUGH_GROUPS: dict[str, tuple[str, ...]] = {
     "aligning torque": ("aligning_compliance_deg_per_knm",),
     "roll of the body alone": ("roll_gradient_deg_per_g",),
     "... and camber by roll": ("roll_gradient_deg_per_g", "camber_per_roll"),
-    "stability control": ("esc_brake_n", "esc_threshold_deg_s"),
     "biases that drift": ("acceleration_drift_mps2", "yaw_rate_drift_rad_s", "drift_s"),
     "lever of the label": ("label_x_m",),
     "noise of the label by 1 / v": ("label_velocity_std_mps",),

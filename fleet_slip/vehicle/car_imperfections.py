@@ -55,10 +55,6 @@ class CarImperfections(Config):
     """How far the front wheels give way to an aligning torque of each of their tyres."""
     camber_per_roll: FiniteFloat = added(0.0, ge=-1, le=1)
     """Angle by which wheels lean out of the bend over the body's roll."""
-    esc_brake_n: FiniteFloat = added(0.0, ge=0, le=10_000)
-    """Force of the brake with which stability control holds one wheel; 0: there is none."""
-    esc_threshold_deg_s: FiniteFloat = added(4.0, gt=0, le=45)
-    """How far the yaw rate departs from what steering asks for until it brakes."""
 
 
 PERFECT = CarImperfections()
@@ -95,10 +91,6 @@ class Traits(NamedTuple):
     """Tangent of the road wheels' angle lost per aligning torque of both front tyres."""
     lean: float
     """Slip angle as which the wheels' camber acts, per lateral acceleration."""
-    brake: float
-    """Force of the brake of stability control, in N."""
-    threshold: float
-    """Departure of the yaw rate from which on it brakes, in rad/s."""
 
 
 def traits(vehicle: VehicleParameters, flaws: CarImperfections, sample_s: float) -> Traits:
@@ -127,6 +119,4 @@ def traits(vehicle: VehicleParameters, flaws: CarImperfections, sample_s: float)
         wind_moment=pressure * flaws.yawing_moment_volume_m3 / body.yaw_inertia_kgm2,
         aligning=math.radians(flaws.aligning_compliance_deg_per_knm) / 2000,
         lean=CAMBER_PER_SLIP * flaws.camber_per_roll * roll,
-        brake=flaws.esc_brake_n,
-        threshold=math.radians(flaws.esc_threshold_deg_s),
     )

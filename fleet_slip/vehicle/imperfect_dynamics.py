@@ -19,9 +19,8 @@ from fleet_slip.vehicle.wheels import (
     Loads,
     WheelForce,
     WheelForces,
-    braked_spins,
     direction_of,
-    driver_brakes,
+    driven_spins,
     in_car_frame,
     transferred_loads,
 )
@@ -41,11 +40,6 @@ class Around(NamedTuple):
     """Speed of the air across the car to the left, in m/s."""
     stiffness: float
     """Cornering stiffness over that of warm tyres."""
-    brake_fl: float = 0.0
-    """Force of stability control at a wheel, in N."""
-    brake_fr: float = 0.0
-    brake_rl: float = 0.0
-    brake_rr: float = 0.0
 
 
 class Give(NamedTuple):
@@ -174,14 +168,7 @@ def imperfect_derivative(
         still.vy + t.wind_force * push + around.gravity_y,
         still.yaw_rate + t.wind_moment * push,
     )
-    front, rear = driver_brakes(x, c)
-    each = (
-        front + around.brake_fl,
-        front + around.brake_fr,
-        rear + around.brake_rl,
-        rear + around.brake_rr,
-    )
-    return rates_of(x, u, motion, braked_spins(x, force, load, each, c), c), give_rates
+    return rates_of(x, u, motion, driven_spins(x, force, load, motion, c), c), give_rates
 
 
 @equation

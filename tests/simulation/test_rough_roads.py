@@ -124,4 +124,3 @@ def test_blind_drives_can_be_of_another_campaign() -> None:
     content = load_toml(config_file("blind.toml"))
     rough = BlindSet.model_validate({**content, "campaign": "fleet_rough"}).scenarios(7)
     assert all(one.imperfections.road.roughness_cm3 > 0 for one in rough)
-    assert all(one.imperfections.car.esc_brake_n > 0 for one in rough)

@@ -1,8 +1,8 @@
 """What was simulated before stays what it was: the bits of rows and the digests of batches.
 
-The sums were taken before cars, roads and sensors had imperfections; those of
-`proving_ground` and of drives with imperfections before roads were rough and stability control
-braked. Digests name files and tell a changed campaign, so that they must not change either.
+The sums were taken before cars, roads and sensors had imperfections; those of `proving_ground` and
+of drives with imperfections before roads were rough. Digests name files and tell a changed
+campaign, so that they must not change either.
 """
 
 from hashlib import sha256

@@ -66,7 +66,6 @@ TINY = {
     "simulator": "--seconds 0.01 --threads 1",
     "simulator_profile": "--campaign smoke",
     "soak": "--minutes 0.1",
-    "stability_control": "--record 2 --trials 1",
     "start": "--rounds 1",
     "statistics_figures": "{root} smoke",
     "store_history": "--sizes 10",

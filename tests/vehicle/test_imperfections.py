@@ -23,7 +23,6 @@ from fleet_slip.vehicle.integration import SECOND_ORDER
 from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
 from fleet_slip.vehicle.lanes.road import Road, Surface
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, constants, load_vehicle
-from fleet_slip.vehicle.stability_control import controlled_brakes
 from fleet_slip.vehicle.state import Controls, State
 from tests.support.whole_drives import Truth, simulate_drives
 
@@ -321,39 +320,3 @@ def test_wheels_that_lean_outwards_slip_more_at_both_axles() -> None:
     expected_deg = CAMBER_PER_SLIP * 0.8 * 5.0 * end(plain.ay_mps2) / GRAVITY_MPS2
     turned_deg = np.degrees(end(plain.sideslip_rad) - end(leaning.sideslip_rad))
     assert turned_deg == pytest.approx(expected_deg, rel=0.1)
-
-
-def control(steering: float, yaw_rate: float) -> tuple[float, ...]:
-    flaws = CarImperfections(esc_brake_n=2000.0, esc_threshold_deg_s=4.0)
-    state = State(20.0, 0.0, yaw_rate, steering, *7 * (0.0,))
-    c = constants(SEDAN, 1.0)
-    return controlled_brakes(state, FINE, handling(SEDAN), c, traits(SEDAN, flaws, SAMPLE_S))
-
-
-def test_stability_control_brakes_the_outer_front_wheel_and_the_inner_rear_one() -> None:
-    """To the left: a car that turns too fast is held at fr, one that turns too slowly at rl."""
-    assert control(0.0, 0.0) == (0.0, 0.0, 0.0, 0.0)
-    assert control(0.0, np.radians(3.0)) == (0.0, 0.0, 0.0, 0.0)
-    assert np.flatnonzero(control(0.0, 0.3)).tolist() == [1]
-    assert np.flatnonzero(control(1.0, 0.05)).tolist() == [2]
-    assert np.flatnonzero(control(0.0, -0.3)).tolist() == [0]
-    assert np.flatnonzero(control(-1.0, -0.05)).tolist() == [3]
-
-
-def test_stability_control_holds_a_car_that_would_spin() -> None:
-    """300 kg behind the rear axle, braked in a bend on a wet road."""
-    car = SEDAN.with_sprung_mass(1620.0, -1.9)
-    road = circle(60.0, 1.0)
-    speed_mps = np.linspace(19.0, 22.0, len(road.speed_mps))
-    faster = road._replace(speed_mps=speed_mps, closed=False, length_m=road.length_m)
-    faster = faster._replace(
-        curvature_1pm=np.append(road.curvature_1pm, road.curvature_1pm[0]),
-        speed_mps=np.append(speed_mps, 22.0),
-    )
-    plain, held = simulate_drives(
-        [
-            LaneDrive(car, faster, 0.75, 1.0, flaws, felt=True)
-            for flaws in (PERFECT, CarImperfections(esc_brake_n=3000.0, esc_threshold_deg_s=3.0))
-        ]
-    )
-    assert np.abs(held.sideslip_rad).max() < 0.8 * np.abs(plain.sideslip_rad).max()

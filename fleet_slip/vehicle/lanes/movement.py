@@ -5,7 +5,6 @@ from typing import Any
 
 from fleet_slip.compiling import equation
 from fleet_slip.vehicle.car_imperfections import Traits
-from fleet_slip.vehicle.driver import Handling
 from fleet_slip.vehicle.dynamics import derivative
 from fleet_slip.vehicle.imperfect_dynamics import (
     Around,
@@ -35,7 +34,6 @@ from fleet_slip.vehicle.lanes.lane_memory import (
     FORCE,
     GIVE,
     GIVE_SLOPES,
-    HANDLING,
     LANES,
     NOBODY,
     ORDER,
@@ -53,7 +51,6 @@ from fleet_slip.vehicle.lanes.lane_memory import (
     write,
 )
 from fleet_slip.vehicle.parameters import Constants
-from fleet_slip.vehicle.stability_control import controlled_brakes
 from fleet_slip.vehicle.state import Controls, State
 
 
@@ -82,9 +79,6 @@ def look_around(memory: Any, book: Any, routes: Any, surfaces: Any, truth: Any) 
                 memory[(AROUND + column) * LANES + lane] = before + share * (after - before)
             memory[(AROUND + 5) * LANES + lane] = 1.0 + (near.stiffness - 1.0) * t.cooling
             c = read(memory, CAR, lane, Constants)
-            if t.brake > 0.0:
-                h = read(memory, HANDLING, lane, Handling)
-                write(memory, AROUND + 6, lane, controlled_brakes(x, near, h, c, t))
             give = read(memory, GIVE, lane, Give)
             left, right = _wheel_tangents(give, c, t)
             sample = book[TICK, lane] - book[FIRST, lane]
