@@ -30,12 +30,9 @@ COMMANDS = (
     "start",
     "simulator",
     "simulator_profile",
-    "work_precision",
     "pipeline",
     "gram_variants",
-    "encoding --copies 1",
     "cluster",
-    "observers",
     "reliability",
     "crash --kills 30",
 )

@@ -19,13 +19,16 @@ from pathlib import Path
 from typing import Any
 
 import duckdb
+import pyarrow as pa
+import pyarrow.compute as pc
 
-from benchmarks.search import repeat_drives
 from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change, absent_columns
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
+from fleet_slip.grams.rows.gram_files import write_rows
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.grams.rows.statement import gram_statement
 from fleet_slip.selection.model_list import load_model_list
@@ -163,6 +166,36 @@ def incremental(warehouse: Warehouse) -> None:
         line("Gram job, everything", whole_s, rows)
         line("  1 % new rows", new_s, rows // 100, f"{new_s / whole_s:.3f} of everything")
         line("  nothing new", best(lambda: update_grams(copy)), rows)
+
+
+AT_ONCE = 1000
+
+
+def repeat_drives(root: Path, drives: int, feature_set: str) -> Warehouse:
+    """Give a root Gram rows of so many drives of a set, by repeating those that it has."""
+    warehouse = Warehouse(LocalFolder(root))
+    grams = warehouse.grams.snapshot()
+    identity = features().identity(feature_set)
+    parts = [grams.table.read(file.path) for file in grams.files]
+    usual = grams.table.usual_schema  # without what few files have
+    rows = pa.concat_tables(part.select(usual.names).cast(usual) for part in parts)
+    known = rows.filter(pc.equal(rows["feature_set"], identity))
+    at = known.schema.get_field_index("drive_id")
+
+    def renamed(copy: int) -> pa.Table:
+        names = pc.binary_join_element_wise(known["drive_id"].cast(pa.string()), str(copy), "-")
+        return known.set_column(at, known.schema.field(at), names.cast(known.schema.field(at).type))
+
+    left, copy = drives - len(known), 0
+    while left > 0:
+        parts = []
+        while left > 0 and sum(map(len, parts)) < AT_ONCE:
+            copy += 1
+            parts.append(renamed(copy).slice(0, left))
+            left -= len(parts[-1])
+        change = Change(add=write_rows(warehouse, parts), note={"job": "gram"})
+        warehouse.grams.snapshot().commit(change)
+    return warehouse
 
 
 def selection(warehouse: Warehouse, gram_rows: int) -> None:
