@@ -126,7 +126,7 @@ def loops(assembly: str) -> list[list[str]]:
 
 def compiled_assembly() -> str:
     """Return the kernel's assembly on this machine."""
-    fresh = numba.njit(nogil=True, error_model="numpy")(lane_kernel.build_kernel("not kept"))
+    fresh = numba.njit(nogil=True, error_model="numpy")(lane_kernel.build_kernel())
     usual, lane_kernel.simulate = lane_kernel.simulate, fresh
     try:
         fleet = load_campaign("fleet")

@@ -4,9 +4,11 @@ import functools
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
+from fleet_slip.caches import code_folder
 from fleet_slip.extras import missing
 
 try:
+    import llvmlite
     import numba
 except ModuleNotFoundError:  # of an extra: what is compiled says so when it is called
     numba = None  # type: ignore[assignment]
@@ -41,6 +43,8 @@ additions, multiplications, divisions, roots, comparisons. Divisions by zero do 
 inner_loop = _compiler(nogil=True, error_model="numpy")
 """Compiles a loop that compiled code calls, to the same bits as an equation."""
 
+_kept_loop = _compiler(nogil=True, error_model="numpy", cache=True)
+
 exact_loop = _compiler(nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
 """Compiles a loop over integers below 2^53, products and sums too: exact in any order."""
 
@@ -48,12 +52,17 @@ exact_loop = _compiler(nogil=True, error_model="numpy", fastmath={"reassoc", "co
 def kernel(function: Function) -> Function:
     """Compile a function that is called from Python, without the GIL.
 
-    The code is kept in $NUMBA_CACHE_DIR, beside the source or in the user's cache, else compiled
-    anew with a remark; never in a data root, where others may write what would be executed.
+    numba keeps the code in a folder that this user alone can write, if there is one (`caches`).
     """
-    compiled = inner_loop(function)
-    if numba:
-        from fleet_slip.kept_code import keep  # noqa: PLC0415 - it needs numba
-
-        keep(compiled, function)
-    return compiled
+    folder = code_folder(f"{numba.__version__} {llvmlite.__version__}") if numba else None
+    if folder is None:
+        return inner_loop(function)
+    config: Any = numba.config
+    usual = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
+    config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = str(folder), "UserProvidedCacheLocator"
+    try:
+        return _kept_loop(function)
+    except RuntimeError:  # of no source file, as those that are typed
+        return inner_loop(function)
+    finally:
+        config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = usual

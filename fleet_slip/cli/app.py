@@ -119,7 +119,7 @@ def run_app() -> int:
     """Run the command line; an expected error becomes one line on stderr and the exit code."""
     streams = Streams()
     configure_logs(LogFormat.AUTO)
-    _choose_code_folder()
+    _choose_font_folder()
     exit_code = _exit_code_of_app()
     if reason := streams.unprinted():
         say(
@@ -172,12 +172,8 @@ def _end_interrupted(error: BaseException | None) -> int:
     return INTERRUPTED
 
 
-def _choose_code_folder() -> None:
-    """Keep compiled code, and what matplotlib knows of fonts, in the cache folder of a service.
-
-    systemd makes it; a service has no home.
-    """
+def _choose_font_folder() -> None:
+    """Keep what matplotlib knows of fonts in the cache folder of a service, which has no home."""
     folder = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
     if folder:
-        os.environ.setdefault("NUMBA_CACHE_DIR", folder)
         os.environ.setdefault("MPLCONFIGDIR", folder)

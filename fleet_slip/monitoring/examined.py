@@ -20,6 +20,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from fleet_slip.caches import cache_folder
 from fleet_slip.canonical import canonical_json
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import RECEIVED
@@ -31,7 +32,6 @@ from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.grams.rows.gram_job import update_grams
 from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.ingest.drives.measured_drives import SOURCE
-from fleet_slip.ingest.landing.known_files import cache_folder
 from fleet_slip.monitoring.plausibility import Fault
 from fleet_slip.monitoring.quality import SensorFault, examine_drives
 from fleet_slip.monitoring.thresholds import thresholds

@@ -1,17 +1,14 @@
 """How functions are compiled, and where the compiled code is kept."""
 
-import logging
+import json
+import os
 import sys
-from importlib import util
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
-import fleet_slip.vehicle.tyre
-from fleet_slip import kept_code
-from fleet_slip.vehicle.lanes import lane_kernel as lanes
-from tests.support.commands import run
+from fleet_slip import caches
+from tests.support.commands import Finished, run
 
 SOURCE = """
 from fleet_slip.compiling import kernel
@@ -19,41 +16,124 @@ from fleet_slip.compiling import kernel
 @kernel
 def half(x):
     return x / 2
+
+assert half(3.0) == 1.5
+print(*half.stats.cache_hits.values())
 """
 
 
-@pytest.fixture(autouse=True)
-def remarks_of_this_test(monkeypatch: pytest.MonkeyPatch) -> None:
-    kept_code._remark.cache_clear()
-    monkeypatch.setattr(logging.getLogger("fleet_slip"), "propagate", True)
+def halve(folder: Path, cache: Path, **environment: str) -> Finished:
+    """Compile a function in another process, or read its code; it prints 1 if that was kept."""
+    (folder / "halving.py").write_text(SOURCE)
+    given = {**os.environ, "NUMBA_CACHE_DIR": str(cache), **environment}
+    done = run(
+        [sys.executable, str(folder / "halving.py")], env=given, cwd=Path(__file__).parents[2]
+    )
+    assert done.exit_code == 0, done.stderr
+    return done
 
 
-def load(folder: Path, name: str = "halving") -> ModuleType:
-    """Import a new module with one kernel, which numba keeps beside it."""
-    (folder / f"{name}.py").write_text(SOURCE)
-    spec = util.spec_from_file_location(name, folder / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
+def kept(cache: Path, suffix: str) -> Path:
+    (file,) = cache.glob(f"{caches.PREFIX}*/*/*{suffix}")
+    return file
 
 
-def kept(folder: Path) -> list[Path]:
-    return sorted((folder / "__pycache__").glob("halving.half*"))
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    """A folder of this user, with the code of a function."""
+    folder = tmp_path / "cache"
+    halve(tmp_path, folder)
+    return folder
 
 
-def test_compiled_code_is_kept_and_found(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    first = load(tmp_path).half
-    assert (first(3.0), first(4.0)) == (1.5, 2.0)
-    again = load(tmp_path).half
-    assert again(3.0) == 1.5
-    assert sum(again.stats.cache_hits.values()) == 1
-    assert not caplog.messages
+def test_compiled_code_is_kept_and_found(cache: Path, tmp_path: Path) -> None:
+    again = halve(tmp_path, cache)
+    assert (again.stdout.strip(), again.stderr) == ("1", "")
+    kept(cache, ".nbc").unlink()
+    assert halve(tmp_path, cache).stdout.strip() == ""
+    assert halve(tmp_path, cache).stdout.strip() == "1"
 
 
-KEYS = """
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+@pytest.mark.parametrize("damage", ["torn", "flipped"])
+def test_damaged_code_is_compiled_anew(
+    cache: Path, tmp_path: Path, suffix: str, damage: str
+) -> None:
+    """A power cut leaves files empty or torn: numba renames them without flushing."""
+    file = kept(cache, suffix)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content if damage == "flipped" else b"")
+    assert halve(tmp_path, cache).stdout.strip() == ""
+    assert halve(tmp_path, cache).stdout.strip() == "1"
+
+
+def run_if_unpickled(cache: Path, mark: Path) -> None:
+    """Plant what makes a file when numba reads the code, and its checksum."""
+    file = kept(cache, ".nbi")
+    file.write_bytes(f"cos\nsystem\n(S'touch {mark}'\ntR.".encode())
+    folder = file.parents[1]
+    sums = json.dumps(caches._checksums(folder))
+    (folder / caches.CHECKSUMS).write_text(sums)
+
+
+def test_code_that_others_may_have_written_is_not_read(cache: Path, tmp_path: Path) -> None:
+    mark = tmp_path / "ran"
+    run_if_unpickled(cache, mark)
+    for mode in (0o777, 0o770):
+        cache.chmod(mode)
+        done = halve(tmp_path, cache)
+        assert done.stdout.strip() == ""
+        assert f"others than this user can write {cache}" in done.stderr
+        assert "Set NUMBA_CACHE_DIR" in done.stderr
+    assert not mark.exists()
+    cache.chmod(0o700)
+    (tmp_path / "link").symlink_to(cache)
+    tmp_path.chmod(0o777)
+    assert f"can write {tmp_path}" in halve(tmp_path, tmp_path / "link").stderr
+    tmp_path.chmod(0o700)
+    assert not mark.exists()
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
+def test_nor_is_code_in_a_folder_of_another_user(cache: Path, tmp_path: Path) -> None:
+    mark = tmp_path / "ran"
+    run_if_unpickled(cache, mark)
+    (own,) = cache.iterdir()
+    for folder in (own, cache):
+        os.chown(folder, 12345, 12345)
+        assert f"can write {folder}" in halve(tmp_path, cache).stderr
+        os.chown(folder, 0, 0)
+    assert not mark.exists()
+
+
+def test_beside_others_a_folder_of_this_user_is_safe_where_nobody_else_can_rename_it(
+    cache: Path, tmp_path: Path
+) -> None:
+    cache.chmod(0o1777)
+    assert halve(tmp_path, cache).stdout.strip() == "1"
+
+
+def test_where_nothing_can_be_kept_a_kernel_compiles_and_says_so_once(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    done = halve(tmp_path, tmp_path / "file")
+    assert done.stderr.count("there is no folder where compiled code can be kept") == 1
+
+
+def test_a_change_of_any_source_and_of_the_compiler_takes_another_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kernel has constants and functions of other modules in it."""
+    monkeypatch.setattr(caches, "PACKAGE", tmp_path)
+    (tmp_path / "vehicle").mkdir()
+    digests = set()
+    for text in ("one", "other"):
+        (tmp_path / "vehicle" / "pose.py").write_text(text)
+        digests |= {caches.digest_sources(version) for version in ("1", "2")}
+    assert len(digests) == 4
+
+
+LANES = """
 from fleet_slip.vehicle.lanes.lane_kernel import simulate, simulate_imperfect
 
 for kernel in (simulate, simulate_imperfect):
@@ -62,106 +142,6 @@ for kernel in (simulate, simulate_imperfect):
 
 
 def test_another_process_finds_the_code_of_the_lanes_by_the_same_key() -> None:
-    one, other = (run([sys.executable, "-c", KEYS]) for _ in range(2))
+    one, other = (run([sys.executable, "-c", LANES]) for _ in range(2))
     assert len(set(one.stdout.splitlines())) == 2
     assert other.stdout == one.stdout
-
-
-def test_where_nothing_can_be_kept_a_kernel_compiles_and_says_so_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Neither beside the source nor below the home can a folder be made: files are in the way."""
-    (tmp_path / "__pycache__").write_text("")
-    monkeypatch.setenv("HOME", str(tmp_path / "__pycache__"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "__pycache__"))
-    assert load(tmp_path).half(3.0) == 1.5
-    assert load(tmp_path, "other").half(3.0) == 1.5
-    assert len(caplog.messages) == 1
-    assert "Set NUMBA_CACHE_DIR" in caplog.text
-
-
-@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
-@pytest.mark.parametrize("left", [0, 100])
-def test_damaged_code_is_compiled_anew(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, suffix: str, left: int
-) -> None:
-    """A power cut leaves files empty or torn: numba renames them without flushing."""
-    load(tmp_path).half(3.0)
-    (torn,) = (file for file in kept(tmp_path) if file.suffix == suffix)
-    torn.write_bytes(torn.read_bytes()[:left])
-    assert load(tmp_path).half(3.0) == 1.5
-    assert "damaged" in caplog.text
-    mended = load(tmp_path).half
-    assert mended(3.0) == 1.5
-    assert sum(mended.stats.cache_hits.values()) == 1
-
-
-def test_code_with_a_flipped_bit_is_not_executed(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """It would compute something else, or end the process."""
-    half = load(tmp_path).half
-    half(3.0)
-    for file in kept(tmp_path):
-        content = file.read_bytes()
-        for bit in range(0, 8 * len(content), 997):
-            flipped = bytearray(content)
-            flipped[bit // 8] ^= 1 << bit % 8
-            file.write_bytes(flipped)
-            with pytest.raises(kept_code._DamagedCodeError):
-                half._cache._cache_file._load_data(file.name)
-    assert load(tmp_path).half(3.0) == 1.5
-    assert "damaged" in caplog.text
-
-
-def test_a_full_disk_keeps_nothing_and_fails_nothing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    half = load(tmp_path).half
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(half._cache._cache_file, "save", full)
-    assert half(3.0) == 1.5
-    assert "cannot be kept (No space left on device)" in caplog.text
-
-
-def test_a_change_of_any_source_changes_the_key_of_the_kept_code(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The equations stand in the folder above the kernel's."""
-    folder = tmp_path / "vehicle" / "lanes"
-    folder.mkdir(parents=True)
-    kernel, tyre = folder / "lane_kernel.py", folder.parent / "tyre.py"
-    for file in (kernel, tyre):
-        file.write_text("one")
-    assert Path(lanes.__file__).parents[1] == Path(fleet_slip.vehicle.tyre.__file__).parent
-    monkeypatch.setattr(lanes, "__file__", str(kernel))
-    before = lanes._source_digest()
-    assert lanes._source_digest() == before
-    tyre.write_text("other")
-    assert lanes._source_digest() != before
-
-
-def test_code_is_kept_no_longer_where_what_it_calls_in_another_folder_has_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Brakes and receivers, of the simulation, call equations of the vehicle."""
-    package = tmp_path / "fleet_slip"
-    for name, text in {
-        "simulation/environment.py": "from fleet_slip.vehicle import (\n    tyre,\n)\n",
-        "vehicle/tyre.py": "from fleet_slip.vehicle.pose import turn\n",
-        "vehicle/pose.py": "one",
-        "vehicle/driver.py": "",
-    }.items():
-        (package / name).parent.mkdir(parents=True, exist_ok=True)
-        (package / name).write_text(text)
-    monkeypatch.setattr(kept_code, "PACKAGE", package)
-    stamp = kept_code._sources_stamp.__wrapped__
-    braking = str(package / "simulation" / "environment.py")
-    before = stamp(braking)
-    (package / "vehicle" / "driver.py").write_text("not imported")
-    assert stamp(braking) == before
-    (package / "vehicle" / "pose.py").write_text("other")
-    assert stamp(braking) != before

@@ -269,7 +269,7 @@ def test_impossible_adhesion_is_refused() -> None:
 
 def test_the_inner_loop_is_vector_instructions_without_fused_operations() -> None:
     """On x86-64 with AVX: the physics divides in whole vectors, and no operation is fused."""
-    fresh = numba.njit(nogil=True, error_model="numpy")(lane_kernel.build_kernel("not kept"))
+    fresh = numba.njit(nogil=True, error_model="numpy")(lane_kernel.build_kernel())
     on = circle(50.0, 15.0)
     usual, lane_kernel.simulate = lane_kernel.simulate, fresh
     try:

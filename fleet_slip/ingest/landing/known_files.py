@@ -15,6 +15,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from fleet_slip.caches import cache_folder
 from fleet_slip.delta import Snapshot
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.ingest.landing.data_files import unit_of
@@ -127,10 +128,3 @@ def _state_of(log: Log) -> tuple[int, int | str] | None:
     except OSError:
         return None
     return found.st_size, found.st_mtime_ns
-
-
-def cache_folder(name: str) -> Path:
-    """Return a folder of this user for what can be lost."""
-    service = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
-    return Path(service or Path(home, "fleet-slip"), name)

@@ -4,13 +4,10 @@ At every sample the scalar part looks up the road and records; driver and physic
 lanes, vector instructions. When a block is full or its drive ends, the caller takes it.
 """
 
-import hashlib
 import math
 from collections.abc import Callable
-from pathlib import Path as FilePath
 from typing import Any
 
-from fleet_slip import compiling
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.vehicle.driver import (
     SAMPLE_S,
@@ -165,11 +162,11 @@ def _finish(truth: Any, book: Any, ended: Any, cars: Any, imperfect: bool) -> No
                 fill_angles(wheel, left, right, vx, vy, slip, cars[drive])
 
 
-def build_kernel(sources: str, imperfect: bool = False) -> Callable[..., None]:
+def build_kernel(imperfect: bool = False) -> Callable[..., None]:
     """Return the kernel, not yet compiled: of cars as in the textbook, or with imperfections.
 
-    Its closure, and so numba's key on disk, has a digest of the `sources`: changes compile again. A
-    compiled function in it would have another identity in each process, and never be found.
+    Its closure is part of numba's key on disk. A compiled function in it would have another
+    identity in each process, and never be found.
     """
 
     def simulate(
@@ -189,7 +186,6 @@ def build_kernel(sources: str, imperfect: bool = False) -> Callable[..., None]:
         `Traits` in rows; a sample takes `steps` steps; `truth` is of `empty_blocks`; `ended` gets
         each drive's number of samples and tick of loss.
         """
-        _ = sources
         complete = 0
         while complete == 0:
             _look(memory, book, routes, roads, truth, ended)
@@ -207,15 +203,6 @@ def build_kernel(sources: str, imperfect: bool = False) -> Callable[..., None]:
     return simulate
 
 
-def _source_digest() -> str:
-    """Return a digest of all sources concerned, so that a change of any recompiles the kernel."""
-    digest = hashlib.sha256()
-    vehicle = FilePath(__file__).parents[1]
-    for file in [*sorted(vehicle.rglob("*.py")), FilePath(compiling.__file__)]:
-        digest.update(file.read_bytes())
-    return digest.hexdigest()
+simulate = kernel(build_kernel())
 
-
-simulate = kernel(build_kernel(_source_digest()))
-
-simulate_imperfect = kernel(build_kernel(_source_digest(), imperfect=True))
+simulate_imperfect = kernel(build_kernel(imperfect=True))
