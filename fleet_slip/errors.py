@@ -148,12 +148,6 @@ class ClusterError(FleetSlipError):
     exit_code = 11
 
 
-class CohortError(FleetSlipError):
-    """The answer would be of fewer cars than the rule of a minimum cohort allows."""
-
-    exit_code = 14
-
-
 class UnexaminedError(FleetSlipError):
     """What is to train a model could not be examined first."""
 

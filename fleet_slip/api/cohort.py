@@ -146,14 +146,11 @@ class FleetCohort(Rooted):
         `measured` is what scales and a tape measure say, in the words of
         `fleet_slip.comparison.observers.identification.Measured`. The extended Kalman filter in the
         car is fitted to the labels of up to 24 drives; its error on drives that were left out
-        stands beside. Raises `CohortError` where a minimum cohort is asked for, and `DataError` if
-        the drives lack the label or what the filter needs.
+        stands beside. Raises `DataError` if the drives lack the label or what the filter needs.
         """
         from fleet_slip.comparison.evaluation.filters import TuningDrives
         from fleet_slip.comparison.observers.identification import Measured, identify_held_out
-        from fleet_slip.warehouse.minimum_cohort import require_single_cars
 
-        require_single_cars("identifying a car", "Select a model instead.")
         car = Measured.model_validate({"name": name, **measured})
         chosen = TuningDrives.of(self.warehouse, self._load("signals"), weighed=False)
         with open_workers(self.root, threads) as executor:

@@ -49,12 +49,9 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         With a `query`, only those that it names, which is faster. For `scenarios` see `sql`. Raises
         `StorageError` without a data root.
         """
-        from fleet_slip.api.session import Session, query_of_many
+        from fleet_slip.api.session import Session
         from fleet_slip.views import connect
-        from fleet_slip.warehouse.minimum_cohort import VIEWS_WITHOUT_CARS, tells_single_cars
 
-        if not tells_single_cars():
-            return Session(connect(self.root, query=" ".join(VIEWS_WITHOUT_CARS)), query_of_many)
         opened = connect(self.root, threads=threads, query=query, scenarios=scenarios)
         return Session(opened)
 
@@ -63,10 +60,9 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
 
         Only for SQL that you trust: it can overwrite the warehouse. Else like `session`.
         """
-        from fleet_slip.api.session import Session, any_statement, require_many_cars
+        from fleet_slip.api.session import Session, any_statement
         from fleet_slip.views import connect_unlocked
 
-        require_many_cars()
         return Session(connect_unlocked(self.root, query, scenarios=scenarios), any_statement)
 
     def cohort(self, condition: str = TRAINING_DRIVES, *, unexamined: bool = False) -> FleetCohort:

@@ -61,13 +61,11 @@ class HealthAndUpkeep(JudgedModels):
 
         Offsets of gyroscope, accelerometer and steering with uncertainties, label or not, from the
         Gram rows of `calibration`. Raises `DataError` without these or without drives,
-        `QuestionError` for an invalid condition, and `CohortError` where a minimum cohort holds.
+        and `QuestionError` for an invalid condition.
         """
         from fleet_slip.grams.calibration.calibration import calibrate
         from fleet_slip.warehouse.condition import parse_cohort
-        from fleet_slip.warehouse.minimum_cohort import require_single_cars
 
-        require_single_cars("a calibration", "Unset it to calibrate cars.")
         return calibrate(self.warehouse, parse_cohort(cohort))
 
     def monitor(

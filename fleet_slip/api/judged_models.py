@@ -118,15 +118,13 @@ class JudgedModels(PublishedModels):
         other, or of their time, is left out. `vehicle` names the car's file, of which mass and
         geometry suffice for a car that is identified; without it no filter competes, unless a file
         ships for the drives' class. Returns the document kept below `evaluations/measured/`.
-        Raises `DataError` without a label, `CohortError` where a minimum cohort holds,
-        `ConfigError` for an unknown car, and what `model` raises.
+        Raises `DataError` without a label, `ConfigError` for an unknown
+        car, and what `model` raises.
         """
         from fleet_slip.comparison.evaluation.evaluate import keep
         from fleet_slip.comparison.evaluation.own_car import evaluate_own_car, own_car_evaluations
         from fleet_slip.files.documents import Document
-        from fleet_slip.warehouse.minimum_cohort import require_single_cars
 
-        require_single_cars("evaluating on drives of the logs", "Evaluate on test drives.")
         versions = [self.resolve(one) for one in (model, *others)]
         with open_workers(self.root, threads) as executor:
             found = evaluate_own_car(self.warehouse, versions, cohort, vehicle, executor)
@@ -161,13 +159,9 @@ class JudgedModels(PublishedModels):
         """Write one page that lays our figures beside the paper's, from the latest evaluation.
 
         `output` is a folder, by default `report` in the root. Raises `DataError` without an
-        evaluation on today's data, `CohortError` where a minimum cohort holds, and what `model`
-        raises.
+        evaluation on today's data, and what `model` raises.
         """
         from fleet_slip.files.local_folder import LocalFolder
-        from fleet_slip.warehouse.minimum_cohort import require_single_cars
-
-        require_single_cars("the report", "Ask evaluate, of drives that are simulated.")
 
         with needed("report", "the report"):
             from fleet_slip.comparison.report.page import write_report

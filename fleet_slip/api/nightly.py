@@ -25,7 +25,6 @@ from fleet_slip.monitoring.night_report import NightReport, NightStep, State
 from fleet_slip.runs.log import step
 from fleet_slip.runs.nights import Beginning, Nights, hash_drive
 from fleet_slip.selection.model_list import load_model_list
-from fleet_slip.warehouse.minimum_cohort import UNNAMED, tells_single_cars
 from fleet_slip.warehouse.table_views import connect_tables, gram_snapshots
 from fleet_slip.words import number_of
 
@@ -197,7 +196,7 @@ class Night:
             return "attention", f"{told} Left out: {again}"
         alike = {name for one in reports for names in one.look_alikes for name in names}
         if alike:
-            names = f": {', '.join(sorted(alike))}" if tells_single_cars() else ""
+            names = f": {', '.join(sorted(alike))}"
             return "attention", f"{told} Names that look the same{names}."
         if wrong := {str(found): one.file for one in reports for found in one.suspicions}:
             found, file = next(iter(wrong.items()))
@@ -240,8 +239,6 @@ class Night:
             return "left out", str(error)
         new = [day for day in self.chart.days if not day.training]
         left_out = _revoked(self.chart.drives_revoked)
-        if untold := self.chart.days_untold:
-            left_out = f" {number_of(untold, 'day')} of too few cars left out.{left_out}"
         if drives := self.chart.drives_left_out:
             left_out = f" {number_of(drives, 'drive')} without a log left out.{left_out}"
         told = f"{champion} on {number_of(len(new), 'new day')}: "
@@ -288,7 +285,7 @@ class Night:
 
 def _revoked(drives: Mapping[str, int]) -> str:
     """Return the sentence on drives that do not count, since a revoked key signed them."""
-    cars = number_of(len(drives), "car") if tells_single_cars() else UNNAMED
+    cars = number_of(len(drives), "car")
     return _left_out(drives.values(), cars, "a key of theirs was revoked")
 
 

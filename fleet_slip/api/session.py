@@ -9,11 +9,9 @@ import duckdb
 import pyarrow as pa
 
 from fleet_slip.errors import QueryGoesOnError, QuestionError
-from fleet_slip.views import VIEWS, add_calibration
+from fleet_slip.views import add_calibration
 from fleet_slip.warehouse.database import database_errors, interruptible, reading_files
-from fleet_slip.warehouse.minimum_cohort import VIEWS_WITHOUT_CARS, require_single_cars
 from fleet_slip.warehouse.read_only_sql import one_query
-from fleet_slip.warehouse.table_views import views_in
 
 Result = TypeVar("Result")
 
@@ -75,16 +73,3 @@ class Session:
 def any_statement(_database: duckdb.DuckDBPyConnection, text: str) -> str:
     """Return a text as it is: what an unlocked session may be asked."""
     return text
-
-
-def query_of_many(database: duckdb.DuckDBPyConnection, text: str) -> str:
-    """Return a query that names no view of single cars. Raises `CohortError`."""
-    if views_in(text, VIEWS - set(VIEWS_WITHOUT_CARS) - {"dictionary"}):
-        require_many_cars()
-    return one_query(database, text)
-
-
-def require_many_cars() -> None:
-    """Raise `CohortError` if SQL may not tell of single cars."""
-    there = " and ".join(VIEWS_WITHOUT_CARS)
-    require_single_cars("SQL", f"Ask the views {there}, or select, which counts the cars.")

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 
 from fleet_slip.cli.output import say
 from fleet_slip.regression.inference.influential import Influential
-from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE, tells_single_cars
 from fleet_slip.words import number_of
 
 TELLING = 0.01
@@ -35,22 +34,10 @@ def say_outweighing(drives: Mapping[str, int]) -> None:
 
 def say_influential(cars: Mapping[str, Influential], what: str) -> None:
     """Say which cars have an influence that no honest car has, and what becomes of them."""
-    if cars and not tells_single_cars():
-        say(f"{number_of(len(cars), 'car')} of unusual influence {what}.")
-        return
     for car, one in cars.items():
         say(
             f"{car} {what}: its influence on the model is {one.times:.0f} times the median one, "
             f"by what its rows give it ({one.rows:.1%} of all)."
-        )
-
-
-def say_untold(many: int, what: str) -> None:
-    """Say how many days, or sets of signals, too few cars have for a minimum cohort."""
-    if many:
-        say(
-            f"{number_of(many, what)} left out: fewer cars have them than "
-            f"${MINIMUM_VARIABLE} asks for."
         )
 
 

@@ -87,7 +87,6 @@ class Chart:
         drives_left_out: drives of the cohort without Gram rows of the model's feature set, since
             their cars sent no log.
         drives_revoked: how many drives of a car are left out, since a revoked key signed them.
-        days_untold: days that are left out, since too few cars drove on them for a minimum cohort.
     """
 
     model: str
@@ -98,7 +97,6 @@ class Chart:
     feature_set: str = PLAIN
     drives_left_out: int = 0
     drives_revoked: Mapping[str, int] = field(default_factory=dict)
-    days_untold: int = 0
 
     @property
     def alarms(self) -> tuple[Day, ...]:
@@ -153,7 +151,6 @@ def monitor(
         feature_set,
         sums.left_out,
         sums.revoked,
-        sums.untold,
     )
 
 

@@ -70,7 +70,7 @@ def _steps(report: NightReport) -> ReportTable:
 
 
 def _faults(report: NightReport) -> ReportTable | None:
-    if not report.named_faults:
+    if not report.new_faults:
         return None
     rows: list[list[str | Cell]] = [
         [
@@ -80,7 +80,7 @@ def _faults(report: NightReport) -> ReportTable | None:
             " ".join(one.fault.signals),
             one.fault.figure,
         ]
-        for one in report.named_faults
+        for one in report.new_faults
     ]
     head = ["drive", "car", "fault", "signals", "what shows it"]
     return table("night-faults", "Sensors not in order since this night", head, rows, left=5)

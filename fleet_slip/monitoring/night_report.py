@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from fleet_slip.errors import AlarmError, FleetSlipError, printable
 from fleet_slip.runs.nights import Beginning, PastNight, hash_drive
-from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
@@ -46,7 +45,7 @@ class NightReport:
     Attributes:
         before: what the root had when the night first began.
         faults: the drives whose sensors are not in order; `new_faults` came with this night. The
-            summary names them, unless a minimum cohort is asked for.
+            summary names them.
         chart: the errors of the champion of before on the days since it was trained, if there are
             enough days to tell what is usual.
         past: the nights before, the newest first.
@@ -74,11 +73,6 @@ class NightReport:
         return tuple(
             one for one in self.faults if hash_drive(self.model, one.drive_id) not in known
         )
-
-    @property
-    def named_faults(self) -> "tuple[SensorFault, ...]":
-        """The newly faulty drives that the summary may name."""
-        return self.new_faults if tells_single_cars() else ()
 
     @property
     def problem(self) -> FleetSlipError | None:
@@ -137,7 +131,7 @@ class NightReport:
             *(f"  {one.name:<{wide}}  {mark[one.state]:<6}  {one.told}" for one in self.steps),
             *(
                 f"  {one.drive_id}: {one.fault.kind} {' '.join(one.fault.signals)}"
-                for one in self.named_faults
+                for one in self.new_faults
             ),
         ]
         return "\n".join(printable(line).rstrip() for line in lines)
@@ -162,8 +156,8 @@ class NightReport:
             "champion_before": self.before.champion,
             "candidate": self.candidate,
             "steps": [step.as_dict() for step in self.steps],
-            "faults": [one.as_dict() for one in self.faults] if tells_single_cars() else [],
-            "new_faults": [one.drive_id for one in self.named_faults],
+            "faults": [one.as_dict() for one in self.faults],
+            "new_faults": [one.drive_id for one in self.new_faults],
             "alarms": [str(day.day) for day in self.chart.alarms] if self.chart else [],
             "seconds": self.seconds,
         }

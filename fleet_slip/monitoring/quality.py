@@ -1,6 +1,5 @@
 """Faulty sensors, drive by drive, from Gram rows alone."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import date
@@ -38,7 +37,6 @@ from fleet_slip.monitoring.thresholds import QualityThresholds, thresholds
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.warehouse.condition import Condition, asking, parse_cohort, parse_condition
 from fleet_slip.warehouse.database import sql_text
-from fleet_slip.warehouse.minimum_cohort import require_vehicles, tells_single_cars
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -76,22 +74,13 @@ class QualityReport:
     findings: tuple[SensorFault, ...]
     revoked: Mapping[str, int] = field(default_factory=dict)
 
-    def by_fault(self) -> dict[tuple[str, str], int]:
-        """Return how many drives have each fault of each signals: what is told without names."""
-        return Counter((one.fault.kind, " ".join(one.fault.signals)) for one in self.findings)
-
     def as_dict(self) -> dict[str, Any]:
-        """Return the report for a JSON document; without drives where single cars are not told."""
+        """Return the report for a JSON document."""
         return {
             "drives": self.drives,
             "compared": self.compared,
             "drives_revoked": dict(self.revoked),
-            "findings": [finding.as_dict() for finding in self.findings]
-            if tells_single_cars()
-            else [
-                {"kind": kind, "signals": signals.split(), "drives": drives}
-                for (kind, signals), drives in self.by_fault().items()
-            ],
+            "findings": [finding.as_dict() for finding in self.findings],
         }
 
 
@@ -102,7 +91,7 @@ def examine_drives(
 ) -> QualityReport:
     """Examine the drives that satisfy a condition: labels beside all others, then model by model.
 
-    Each drive is examined, whatever signals it has: the minimum cohort asks for enough cars in all.
+    Each drive is examined, whatever signals it has.
     Raises like `fleet_slip.grams.cohorts.gram_cohort.load_cohort`.
     """
     drives = parse_cohort(condition)
@@ -159,12 +148,11 @@ def _vehicle_models(reader: GramReader, condition: Condition) -> list[Condition]
     opened = reader.opened(PLAIN, condition)
     cohort = opened.statement("cohort.sql", condition)
     with asking(opened.database, condition):
-        statement = f"SELECT DISTINCT vehicle_model, source, vehicle_id FROM ({cohort}\n)"
+        statement = f"SELECT DISTINCT vehicle_model, source FROM ({cohort}\n)"
         rows = opened.database.sql(statement).fetchall()
     if not rows:
         raise empty_cohort_error(opened, condition)
-    require_vehicles(len({car for *_, car in rows}), f"the cohort {condition.text!r}")
-    found = {(model, source) for model, source, _ in rows}
+    found = set(rows)
     require_training({source for _, source in found}, condition)
     models = sorted({model for model, _ in found}, key=str)
     return [

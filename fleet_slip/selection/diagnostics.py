@@ -35,7 +35,6 @@ from fleet_slip.regression.inference.standard_errors import (
 )
 from fleet_slip.regression.shrinkage.ridge import fit_errors_in_variables
 from fleet_slip.selection.influence import influential_cars
-from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.words import number_of
 
 
@@ -102,7 +101,7 @@ class Diagnosis:
             "by_rows": [asdict(estimate) for estimate in self.naive.estimates],
             "by_clusters": [asdict(estimate) for estimate in self.robust.estimates],
         }
-        if self.influential and tells_single_cars():
+        if self.influential:
             document["influential"] = {
                 car: {"times": one.times, "rows": one.rows} for car, one in self.influential.items()
             }
@@ -212,10 +211,9 @@ def _compare(
     inputs, label = fitted.model.signals, fitted.model.label
     shared = {*here.drives["drive_id"].to_pylist()} & {*there.drives["drive_id"].to_pylist()}
     if shared:
-        such = f", such as {min(shared)}" if tells_single_cars() else ""
         raise QuestionError(
-            f"the two cohorts share {number_of(len(shared), 'drive')}{such}: a "
-            f"comparison needs different drives. Add to the cohort: AND NOT ({condition})"
+            f"the two cohorts share {number_of(len(shared), 'drive')}, such as {min(shared)}: "
+            f"a comparison needs different drives. Add to the cohort: AND NOT ({condition})"
         )
     intercept = fitted.has_intercept
     other_moments = clustered_moments(there, moments.unit, _cars(here, there), intercept=intercept)

@@ -4,16 +4,11 @@ from collections.abc import Collection
 
 import numpy as np
 
-from fleet_slip.canonical import sha256_of
 from fleet_slip.grams.cohorts.gram_cohort import Served
 from fleet_slip.regression.inference.drive_moments import DriveMoments
 from fleet_slip.regression.inference.influential import Influential, find_influential
 from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.database import sql_text
-from fleet_slip.warehouse.minimum_cohort import tells_single_cars
-
-HASH_CHARACTERS = 16
-"""Of the SHA-256 of a car's name."""
 
 
 def influential_cars(served: Served, moments: DriveMoments) -> dict[str, Influential]:
@@ -25,13 +20,9 @@ def influential_cars(served: Served, moments: DriveMoments) -> dict[str, Influen
 
 
 def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Condition:
-    """Return a condition without some cars, named, or hashed where a minimum cohort holds."""
+    """Return a condition without some cars."""
     if not vehicles:
         return condition
-    tell, names = "vehicle_id", sorted(vehicles)
-    if not tells_single_cars():
-        tell = f"left(sha256(vehicle_id), {HASH_CHARACTERS})"
-        names = sorted(sha256_of(name)[:HASH_CHARACTERS] for name in vehicles)
-    quoted = ", ".join(map(sql_text, names))
-    others = f"(vehicle_id IS NULL OR {tell} NOT IN ({quoted}))"
+    quoted = ", ".join(map(sql_text, sorted(vehicles)))
+    others = f"(vehicle_id IS NULL OR vehicle_id NOT IN ({quoted}))"
     return parse_condition(f"{condition.sql} AND {others}")

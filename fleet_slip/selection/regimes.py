@@ -20,7 +20,6 @@ from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel, fit
 from fleet_slip.regression.inference.drive_moments import require_serving_drives
 from fleet_slip.regression.validation.crossval import held_out_errors
-from fleet_slip.warehouse.minimum_cohort import has_enough, require_vehicles
 
 ROWS_PER_COEFFICIENT = 100
 """A regime with fewer training rows, one second of driving a coefficient, uses the pooled model."""
@@ -151,7 +150,7 @@ def compare_regimes(
     """
     if folding.by in (ROW_FOLDS, PARTS):
         raise QuestionError("rows are divided by regime already: fold by drive, or by vehicle.")
-    cohort, names = _of_enough_cars(cohort, regime_names(cohort, over))
+    names = regime_names(cohort, over)
     order = band_order(cohort, names)
     regime = np.array([order.index(name) for name in names], dtype=np.int64)
     assignment = assign_folds(
@@ -204,18 +203,6 @@ def compare_regimes(
         rmse_gain_standard_error=_standard_error([a.rmse - b.rmse for a, b in pairs]),
         worth=worth,
     )
-
-
-def _of_enough_cars(cohort: Cohort, names: Sequence[str]) -> tuple[Cohort, list[str]]:
-    """Return a cohort without the regimes of too few cars, lest differences tell of them."""
-    cars: dict[str, set[str]] = {}
-    for name, car in zip(names, cohort.drives["vehicle_id"].to_pylist(), strict=True):
-        cars.setdefault(name, set()).add(car)
-    told = np.array([has_enough(len(cars[name])) for name in names])
-    if not told.any():
-        require_vehicles(0, f"each regime of the cohort {cohort.condition.text!r}")
-    kept = [name for name, yes in zip(names, told, strict=True) if yes]
-    return cohort.part(told), kept
 
 
 @dataclass(frozen=True)

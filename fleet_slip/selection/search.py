@@ -42,7 +42,6 @@ from fleet_slip.regression.validation.crossval import (
 from fleet_slip.regression.validation.folds import Folds
 from fleet_slip.selection.model_list import Search
 from fleet_slip.selection.request import SelectionRequest
-from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 ALL_SUBSETS = "all-subsets"
 """Instead of a ranking: the best subset of every size."""
@@ -81,7 +80,7 @@ class SearchChoice:
             document["subsets"] = [result.as_dict() for result in self.subsets]
             document["picks"] = self.picks
         if self.honest is not None:
-            document["honest"] = told_figures(self.honest)
+            document["honest"] = self.honest.as_dict()
         return document
 
 
@@ -182,11 +181,6 @@ def _winner(models: Sequence[CrossValidation], size: int, rule: Rule, evidence: 
         f"{evidence.kind} for independent."
     )
     return Winner(models[size - 1], best, reason)
-
-
-def told_figures(model: CrossValidation) -> dict[str, Any]:
-    """Return a model's figures for a JSON document, without those of folds: one may be one car."""
-    return model.as_dict() if tells_single_cars() else {**model.as_dict(), "folds": []}
 
 
 @dataclass(frozen=True)

@@ -28,11 +28,9 @@ from fleet_slip.selection.search import (
     SearchedModels,
     choose_by,
     search_models,
-    told_figures,
 )
 from fleet_slip.selection.uncertainty import Uncertainty
 from fleet_slip.selection.without_label import WithoutLabel
-from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 AnyCohort = TypeVar("AnyCohort", bound=Cohort | SummedCohort, default=Cohort)
 
@@ -92,14 +90,12 @@ class Selection(Generic[AnyCohort]):
 
     def _gram_rows(self, model: CrossValidation) -> dict[str, str]:
         """Return which Gram rows a model is made of, for SQL; it may name cars."""
-        if not tells_single_cars():
-            return {}
         return {"gram_rows": self.cohort.gram_condition(model.signals)}
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `select --json` prints."""
         document: dict[str, Any] = {
-            "models": [{**told_figures(model), **self._gram_rows(model)} for model in self.models],
+            "models": [{**model.as_dict(), **self._gram_rows(model)} for model in self.models],
             "winner": self.winner.model.name,
             "reason": self.winner.reason,
             "cohort": self.cohort.condition.text,
@@ -111,7 +107,6 @@ class Selection(Generic[AnyCohort]):
             "drives_left_out": self.cohort.left_out,
             "drives_revoked": dict(self.cohort.revoked),
             "drives_outweighing": drives_by_car(self.cohort.outweighing),
-            "signal_sets_untold": self.cohort.untold,
             "intercept": self.intercept,
             "folds": {
                 "by": self.folds.by,
@@ -226,8 +221,7 @@ class RequestedSelection(Selection[Any]):
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `select --json` prints."""
-        told = self.left_out.items() if tells_single_cars() else ()
-        named = {car: one.times for car, one in told}
+        named = {car: one.times for car, one in self.left_out.items()}
         document = {
             **super().as_dict(),
             "vehicles_left_out": named,

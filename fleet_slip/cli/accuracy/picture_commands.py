@@ -13,7 +13,6 @@ from fleet_slip.cli.output import Json, print_json, say
 from fleet_slip.cli.workers import Threads
 from fleet_slip.extras import needed
 from fleet_slip.resources import folder
-from fleet_slip.warehouse.minimum_cohort import require_single_cars
 
 
 def report(
@@ -92,7 +91,6 @@ def explore(
 
     Example: **fleet-slip explore --headless**
     """
-    require_single_cars("the notebook", "Ask select, which counts the cars.")
     with needed("explore", "the notebook"):
         import altair  # noqa: F401, PLC0415 - an extra
         import marimo  # noqa: F401, PLC0415

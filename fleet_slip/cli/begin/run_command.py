@@ -22,7 +22,6 @@ from fleet_slip.cli.record_runs import record_run
 from fleet_slip.cli.workers import Cluster, Threads
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.data_root import data_root
-from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.words import number_of
 
 
@@ -114,8 +113,6 @@ def next_steps(fleet: Fleet, campaign: str, model: str) -> list[str]:
 
 def _say_of_lost(fleet: Fleet, campaign: str, model: str) -> None:
     """Say in how many drives the car was lost: the model learned from them, too."""
-    if not tells_single_cars():
-        return
     query = "SELECT campaign, count(lost_control_s), count(*) FROM drives GROUP BY ALL"
     counted = {name: (lost, drives) for name, lost, drives in fleet.sql(query).fetchall()}
     lost, drives = counted.get(campaign, (0, 0))
@@ -150,8 +147,6 @@ def _root_option(fleet: Fleet) -> str:
 
 def _faster_half(fleet: Fleet, campaign: str) -> str | None:
     """Return a condition that about half of the campaign's drives satisfy; None if none is told."""
-    if not tells_single_cars():
-        return None
     medians = fleet.sql("SELECT campaign, median(speed_factor) FROM drives GROUP BY ALL").fetchall()
     speed = dict(medians).get(campaign)
     return None if speed is None else f"speed_factor > {speed:.2f}"

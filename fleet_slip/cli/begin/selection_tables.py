@@ -9,7 +9,6 @@ from fleet_slip.cli.left_out import (
     say_influential,
     say_outweighing,
     say_revoked,
-    say_untold,
     say_without_information,
     say_without_log,
 )
@@ -24,7 +23,6 @@ from fleet_slip.selection.search import SearchChoice
 from fleet_slip.selection.select_models import RequestedSelection, Selection
 from fleet_slip.selection.uncertainty import Uncertainty
 from fleet_slip.selection.without_label import WithoutLabel
-from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.words import number_of
 
 MANY_SIGNALS = 30
@@ -56,7 +54,7 @@ def print_selection(selection: Selection[Any], everything: bool = False) -> None
             f"a change of the course has {selection.cohort.weight} times the weight of a row with "
             "the label; the figures are of the angle about its mean in each drive with the label."
         )
-    if selection.folds.by in (PARTS, BANDS) and tells_single_cars():
+    if selection.folds.by in (PARTS, BANDS):
         _print_folds(selection.winner.model)
     if selection.folds.by == ROW_FOLDS:
         say(
@@ -178,7 +176,6 @@ def _say_left_out(selection: Selection[Any]) -> None:
     say_without_log(selection.cohort.left_out, selection.cohort.feature_set)
     say_revoked(selection.cohort.revoked)
     say_outweighing(drives_by_car(selection.cohort.outweighing))
-    say_untold(selection.cohort.untold, "signal set")
     if isinstance(selection, RequestedSelection):
         say_influential(selection.left_out, "left out")
         if selection.remark:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.left_out import say_revoked, say_untold, say_without_log
+from fleet_slip.cli.left_out import say_revoked, say_without_log
 from fleet_slip.cli.model_argument import OnlyModel
 from fleet_slip.cli.output import Json, print_json, print_table
 from fleet_slip.dates import date_of
@@ -51,7 +51,6 @@ def monitor(
         _print_chart(chart)
         say_without_log(chart.drives_left_out, chart.feature_set)
         say_revoked(chart.drives_revoked)
-        say_untold(chart.days_untold, "day")
     if chart.alarms:
         days = ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in chart.alarms)
         raise AlarmError(f"the error of {chart.model} is beyond its limits on {days}")

@@ -9,7 +9,6 @@ from fleet_slip.cli.left_out import say_revoked
 from fleet_slip.cli.output import Json, print_json, print_table, print_text
 from fleet_slip.errors import AlarmError
 from fleet_slip.monitoring.quality import QualityReport
-from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.words import number_of
 
 
@@ -47,10 +46,6 @@ def _print_quality(found: QualityReport) -> None:
     if not found.findings:
         order = "all are in order" if found.drives else "none is long enough"
         print_text(f"{examined}: {order}")
-        return
-    if not tells_single_cars():
-        rows = [[kind, signals, f"{many:,}"] for (kind, signals), many in found.by_fault().items()]
-        print_table(examined, ["fault", "signals", "drives"], rows, left=2)
         return
     print_table(
         examined,

@@ -15,7 +15,6 @@ from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.resources import config_names
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.views import connect
-from fleet_slip.warehouse.minimum_cohort import require_single_cars
 from fleet_slip.warehouse.tables import Warehouse
 
 FRAMES_PER_S = 25
@@ -79,8 +78,7 @@ def is_scenario(what: str) -> bool:
 
 
 def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> DriveFrames:
-    """Return the frames of a drive of the logs. Raises `QuestionError` and `CohortError`."""
-    require_single_cars("a drive of the logs", "Watch a scenario, which is simulated.")
+    """Return the frames of a drive of the logs. Raises `QuestionError`."""
     names = [one.column for one in catalogue().signals.values()]
     query = f"SELECT time_s, track, vehicle_model, mass_kg, {', '.join(names)} FROM log"
     with connect(warehouse.root, query=query, scenarios=True) as database:

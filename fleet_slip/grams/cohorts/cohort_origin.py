@@ -20,7 +20,6 @@ class CohortOrigin:
         left_out: drives of the condition that have no such Gram rows: their cars sent no log.
         revoked: how many drives of a car are left out, since a revoked key signed them.
         outweighing: which are, since their cars would outweigh the others with them.
-        untold: sets of signals left out, of fewer cars than the minimum cohort.
     """
 
     condition: Condition
@@ -30,7 +29,6 @@ class CohortOrigin:
     left_out: int = 0
     revoked: Mapping[str, int] = field(default_factory=dict)
     outweighing: tuple[Outweighing, ...] = ()
-    untold: int = 0
 
     def inputs_among(self, names: Iterable[str]) -> tuple[str, ...]:
         """Return the inputs that are among some columns, in the order of the feature set."""

@@ -1,7 +1,7 @@
 """The sums of a cohort over each day, from rollups, and from Gram rows read batch by batch."""
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 
@@ -21,7 +21,6 @@ from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.inference.drive_moments import missing_signals_error
 from fleet_slip.warehouse.condition import Condition, parse_cohort
-from fleet_slip.warehouse.minimum_cohort import require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -32,7 +31,6 @@ class DailySums:
     Attributes:
         left_out: drives of the condition that have no such Gram rows: their cars sent no log.
         revoked: how many drives of a car are left out, since a revoked key signed them.
-        untold: days left out, of fewer cars with the signals than the minimum cohort.
     """
 
     days: tuple[date, ...]
@@ -40,7 +38,6 @@ class DailySums:
     drives: tuple[int, ...]
     left_out: int
     revoked: Mapping[str, int]
-    untold: int
 
 
 def sum_days(
@@ -79,22 +76,19 @@ def sum_days(
             raise empty_cohort(source, condition, feature_set)
     if not days:
         raise missing_signals_error(signals)
-    told = {day: kinds for day in sorted(days) if (kinds := days[day].members.told())}
-    if not told:
-        require_vehicles(0, f"the cohort {condition.text!r}, on {min(days)} or any other day,")
+    ordered = [days[day] for day in sorted(days)]
     return DailySums(
-        tuple(told),
-        tuple(days[day].total(kinds) for day, kinds in told.items()),
-        tuple(days[day].members.count_drives(kinds) for day, kinds in told.items()),
+        tuple(sorted(days)),
+        tuple(day.total() for day in ordered),
+        tuple(day.members.count_drives(day.grams) for day in ordered),
         left_out,
         revoked,
-        len(days) - len(told),
     )
 
 
 @dataclass
 class _Day:
-    """What a day comes to: its Grams, drives and cars by the signals of the Gram rows."""
+    """What a day comes to: its Grams and drives by the signals of the Gram rows."""
 
     grams: dict[str, Gram] = field(default_factory=dict)
     members: Members = field(default_factory=Members)
@@ -104,9 +98,9 @@ class _Day:
         self.grams[names] = self.grams[names] + gram if names in self.grams else gram
         self.members.add(names, drives, vehicles)
 
-    def total(self, kinds: Collection[str]) -> Gram:
-        """Return the sum of the Grams of some sets of signals."""
-        first, *others = (self.grams[names] for names in sorted(kinds))
+    def total(self) -> Gram:
+        """Return the sum of its Grams."""
+        first, *others = (self.grams[names] for names in sorted(self.grams))
         return sum(others, first)
 
 

@@ -34,7 +34,6 @@ from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.warehouse.condition import Condition, asking, parse_cohort
-from fleet_slip.warehouse.minimum_cohort import require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -93,14 +92,9 @@ def sum_cohort(
         origin = opened.origin(condition)
         if not sums.tables:
             raise empty_cohort(warehouse, condition, feature_set)
-    found, told = len(sums.tables), sums.members.told()
-    if not told:
-        require_vehicles(0, f"the cohort {condition.text!r}, with any one set of signals,")
-    sums.tables = {signals: sums.tables[signals] for signals in sums.tables if signals in told}
     members = sums.members
-    members.keep(told)
     return SummedCohort(
-        **{**vars(origin), "untold": found - len(told)},
+        **vars(origin),
         folding=folding,
         sums=sums.of_folds(),
         rows=sum(gram.n for grams in sums.tables.values() for gram in grams),

@@ -9,7 +9,6 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError, QuestionError, UsageError
 from fleet_slip.regression.validation.folds import FoldAssignment, by_band, by_hash, by_value
-from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 
 FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "speed", "part", "row"]
 
@@ -98,10 +97,6 @@ def _require_row_folds(feature_set: str, count: FoldCount) -> None:
 
 def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssignment:
     """Assign Gram rows to folds by a key's values. Raises `DataError` for one fold, or too many."""
-    of_their_own = len({*values}) <= (MOST_FOLDS if count == EACH else count)
-    if by in ("drive", "vehicle") and of_their_own and not tells_single_cars():
-        place = {name: i for i, name in enumerate(sorted({*values} - {None}), 1)}
-        values = [place.get(name) for name in values]
     if count == EACH:
         if (number := len(set(values))) > MOST_FOLDS:
             raise DataError(

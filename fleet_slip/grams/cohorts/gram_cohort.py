@@ -30,7 +30,6 @@ from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.inference.drive_moments import serving_drives
 from fleet_slip.regression.validation.folds import CohortFolds
 from fleet_slip.warehouse.condition import Condition, asking, parse_cohort
-from fleet_slip.warehouse.minimum_cohort import has_enough, require_vehicles
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
@@ -136,10 +135,9 @@ def load_cohort(
 ) -> Cohort:
     """Read the Gram rows of the drives that satisfy a condition.
 
-    For `training`, what outweighs others is left out and, where a minimum cohort holds, sets of
-    signals of few cars: raises `CohortError` if none is left. Who asks for all counts the cars.
-    Raises `QuestionError` for an invalid condition, `DataError` if no drive satisfies it or the set
-    was not computed for all logs, `RefusedError` for drives of evaluation scenarios.
+    For `training`, what outweighs others is left out. Raises `QuestionError` for an invalid
+    condition, `DataError` if no drive satisfies it or the set was not computed for all logs,
+    `RefusedError` for drives of evaluation scenarios.
     """
     condition = parse_cohort(condition)
     with open_grams(warehouse, feature_set, condition, training=training) as opened:
@@ -155,17 +153,10 @@ def load_cohort(
     if not parts:  # of changes, and there are none
         raise empty_cohort(warehouse, condition, feature_set)
     # Rows whose calibrated columns are not the same are apart now: their metadata follows them.
-    told = [
-        one
-        for one in parts
-        if not training or has_enough(len(rows["vehicle_id"].filter(pa.array(one[2])).unique()))
-    ]
-    if not told:
-        require_vehicles(0, f"the cohort {condition.text!r}, with any one set of signals,")
-    order = np.concatenate([np.flatnonzero(here) for _, _, here in told])
+    order = np.concatenate([np.flatnonzero(here) for _, _, here in parts])
     return Cohort(
-        **{**vars(origin), "untold": len(parts) - len(told)},
-        tables=tuple(table for _, table, _ in told),
+        **vars(origin),
+        tables=tuple(table for _, table, _ in parts),
         drives=rows.drop_columns(["sums", "products"]).take(order),
     )
 

@@ -29,7 +29,6 @@ from fleet_slip.grams.rows.same_drives import has_received
 from fleet_slip.regression.exact.gram import packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.condition import Condition, asking
-from fleet_slip.warehouse.minimum_cohort import UNNAMED, tells_single_cars
 from fleet_slip.warehouse.table_views import gram_snapshots, lock, open_tables
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -64,14 +63,13 @@ class OpenedGrams:
         return read_sql("jobs", name).format(**values)
 
     def revoked(self, condition: Condition) -> dict[str, int]:
-        """Return a cohort's drives by car (or `UNNAMED`) that are left out for a revoked key."""
+        """Return a cohort's drives by car that are left out for a revoked key."""
         some = [key.condition for key in _revoked_keys()]
         if not some:
             return {}
         sql = f"{condition.sql} AND ({' OR '.join(some)})"
         statement = read_sql("jobs", "count_revoked.sql").format(condition=sql)
-        found: dict[str, int] = dict(self._rows(statement, condition))
-        return found if tells_single_cars() or not found else {UNNAMED: sum(found.values())}
+        return dict(self._rows(statement, condition))
 
     def origin(self, condition: Condition) -> CohortOrigin:
         """Return which Gram rows a cohort is made of."""

@@ -12,7 +12,6 @@ import pyarrow.compute as pc
 from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.sources import RECEIVED
 from fleet_slip.grams.rows.rollup import FileDrives, Hashes, Places, join_places
-from fleet_slip.warehouse.minimum_cohort import minimum_vehicles
 
 AT_ONCE = 2**21
 """So many hashes of cars, most of them again and again, are looked through at once."""
@@ -24,7 +23,6 @@ class Hashed:
 
     parts: tuple[Callable[[], Hashes], ...]
     once: int | None = None
-    least: int = 0
 
     @classmethod
     def of(cls, hashes: Hashes, *, once: bool = False) -> "Hashed":
@@ -38,7 +36,7 @@ class Hashed:
 
     def __add__(self, other: "Hashed") -> "Hashed":
         both = None if self.once is None or other.once is None else self.once + other.once
-        return Hashed(self.parts + other.parts, both, max(self.least, other.least))
+        return Hashed(self.parts + other.parts, both)
 
 
 @dataclass(frozen=True)
@@ -54,12 +52,6 @@ class Members:
         for known, more in zip(vars(self).values(), new, strict=False):
             if more is not None:
                 known[signals] = known[signals] + more if signals in known else more
-
-    def keep(self, kinds: Collection[str]) -> None:
-        """Keep those of some sets of signals alone."""
-        for known in vars(self).values():
-            for signals in known.keys() - kinds:
-                del known[signals]
 
     def __add__(self, other: "Members") -> "Members":
         both = Members(*(dict(known) for known in vars(self).values()))
@@ -104,18 +96,6 @@ class Members:
     def count_vehicles_with(self, signals: Collection[str]) -> int:
         """Return the number of cars that have all of some signals."""
         return _count(self.vehicles, _kinds_with(self.vehicles, signals))
-
-    def told(self) -> frozenset[str]:
-        """Return the sets of signals of enough cars (`fleet_slip.warehouse.minimum_cohort`).
-
-        Each is counted alone: differences of models would tell of a set that few cars have.
-        """
-        least = minimum_vehicles() or 0
-        return frozenset(
-            names
-            for names, cars in self.vehicles.items()
-            if cars.least >= least or _count(self.vehicles, frozenset({names})) >= least
-        )
 
 
 def received_among(rows: pa.Table | pa.RecordBatch) -> BoolArray:

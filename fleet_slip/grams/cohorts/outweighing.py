@@ -21,7 +21,6 @@ from fleet_slip.grams.cohorts.rollup_cells import Cells
 from fleet_slip.grams.rows.rollup import BUCKETS, hash_numbers
 from fleet_slip.warehouse.condition import Condition, asking
 from fleet_slip.warehouse.database import sql_text
-from fleet_slip.warehouse.minimum_cohort import UNNAMED, tells_single_cars
 
 if TYPE_CHECKING:
     from fleet_slip.grams.cohorts.gram_reader import OpenedGrams
@@ -113,7 +112,5 @@ def _rows_of_groups(cars: pa.Table, cells: Cells) -> IntArray:
 
 
 def drives_by_car(outweighing: Sequence[Outweighing]) -> dict[str, int]:
-    """Return how many drives of each car are left out; of all together, if none may be named."""
-    if outweighing and not tells_single_cars():
-        return {UNNAMED: sum(one.drives for one in outweighing)}
+    """Return how many drives of each car are left out."""
     return {one.vehicle_id: one.drives for one in outweighing}

@@ -77,7 +77,7 @@ class Cells:
             return self.rollups[place].vehicles(cells.filter(pc.equal(cells["rollup"], place)))
 
         parts = tuple(partial(part, place) for place in cells["rollup"].unique().to_pylist())
-        return Hashed(parts, least=pc.max(cells["cars"]).as_py())
+        return Hashed(parts)
 
     def received(self, cells: pa.Table) -> Hashed | None:
         """Return the drives of some cells whose cars sent them; None if there are none."""

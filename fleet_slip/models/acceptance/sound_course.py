@@ -18,7 +18,6 @@ from fleet_slip.grams.rows.course_delays import GRAIN_S
 from fleet_slip.grams.rows.receiver_delay import ReceiverDelay, receiver_delays
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.warehouse.condition import parse_cohort, parse_condition
-from fleet_slip.warehouse.minimum_cohort import tells_single_cars
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
@@ -114,7 +113,7 @@ def require_sound_course(
     raise RefusedError(
         f"{manifest.name} was not published: the course of {len(faults)} of "
         f"{number_of(len(cars), 'car')} is not that of a car "
-        f"({named + more if tells_single_cars() else first.figure}). {first.remedy} Then ingest "
+        f"({named}{more}). {first.remedy} Then ingest "
         "again, or choose other cars; fleet-slip quality names the drives. To publish all the "
         f"same: fleet-slip publish {manifest.name} --label course --force"
     )

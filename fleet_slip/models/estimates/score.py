@@ -23,14 +23,8 @@ from fleet_slip.runs.log import log_event
 from fleet_slip.warehouse.condition import (
     Condition,
     asking,
-    drive_columns,
     parse_cohort,
     row_columns,
-)
-from fleet_slip.warehouse.minimum_cohort import (
-    require_single_cars,
-    require_vehicles,
-    tells_single_cars,
 )
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.tables import Warehouse
@@ -135,8 +129,7 @@ def _si_rows(rows: str, computed: Sequence[str] = ()) -> str:
 def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) -> Score:
     """Score a model on the rows of `log` that satisfy a condition.
 
-    Raises like `score_statement`, `DataError` if no row has the model's signals, and `CohortError`
-    where a minimum cohort holds, for a condition on rows or too few cars.
+    Raises like `score_statement`, and `DataError` if no row has the model's signals.
     """
     condition = cohort_of_rows(condition)
     manifest.require_same_counts()
@@ -161,26 +154,13 @@ def _count_rows(warehouse: Warehouse, condition: Condition) -> int:
 
 
 def cohort_of_rows(condition: str | Condition) -> Condition:
-    """Return the condition of a cohort of rows, on the view `log`. Raises `QuestionError`.
-
-    Where a minimum cohort holds, one that parts a drive's rows raises `CohortError`: twenty cars
-    with a row each would tell of another's row.
-    """
-    if isinstance(condition, Condition):
-        return condition
-    found = parse_cohort(condition, row_columns())
-    if parts := sorted(found.columns - set(drive_columns())):
-        require_single_cars(f"a condition on {', '.join(parts)}", "Score whole drives.")
-    return found
+    """Return the condition of a cohort of rows, on the view `log`. Raises `QuestionError`."""
+    return condition if isinstance(condition, Condition) else parse_cohort(condition, row_columns())
 
 
 def _score_by_sql(warehouse: Warehouse, manifest: Manifest, condition: Condition) -> Score | None:
     statement = score_statement(manifest, condition)
-    cars = read_sql("jobs", "score_cars.sql").format(**_scored_rows(manifest, condition))
     with connect_tables(warehouse, statement) as database, asking(database, condition):
-        if not tells_single_cars():
-            [(found,)] = database.execute(cars).fetchall()
-            require_vehicles(found, f"the cohort {condition.text!r}")
         result = database.execute(statement)
         names = [column[0] for column in result.description or ()]
         row = result.fetchone()
@@ -206,7 +186,6 @@ def _score_over_time(
     )
     estimates: list[FloatArray] = []
     truths: list[FloatArray] = []
-    scored_cars: set[str] = set()
     unit = float(input_scales()[label])
     with (
         connect_tables(warehouse, text) as database,
@@ -222,9 +201,6 @@ def _score_over_time(
             given = chosen & np.isfinite(estimate) & np.isfinite(truth)
             estimates.append(estimate[given])
             truths.append(truth[given])
-            if given.any():
-                scored_cars.add(rows["vehicle_id"][0].as_py())
-    require_vehicles(len(scored_cars), f"the cohort {condition.text!r}")
     if not sum(map(len, truths)):
         return None
     return _figures(np.concatenate(estimates), np.concatenate(truths))

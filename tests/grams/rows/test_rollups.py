@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import fleet_slip
 from fleet_slip.delta import Change
-from fleet_slip.errors import CohortError, FleetSlipError, StorageError
+from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts import outweighing, rollup_cells
 from fleet_slip.grams.cohorts.day_sums import sum_days
@@ -29,7 +29,6 @@ from fleet_slip.maintenance.retention import Retention, retain
 from fleet_slip.models.versions import Registry
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.warehouse.condition import parse_condition
-from fleet_slip.warehouse.minimum_cohort import MINIMUM_VARIABLE
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.fleet_messages import messages_of
 from tests.support.growth_history import FIRST_DAY, SIGNALS, Drives, day_of, write_logs
@@ -290,24 +289,6 @@ def test_what_a_revoked_key_signed_is_left_out(
     assert (cohort.drive_count, dict(cohort.revoked)) == (2 * CARS - 1, {"CAR7": 1})
     path.write_text(path.read_text().replace("CAR7", "NONE"))
     assert served(fleet.warehouse, "true", "drive", 5) == 2
-
-
-@pytest.mark.parametrize(("least", "refused"), [(5, False), (CARS, False), (CARS + 1, True)])
-def test_the_minimum_cohort_counts_each_car_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, least: int, refused: bool
-) -> None:
-    fleet = fleet_slip.open(tmp_path / "data")
-    receive(fleet, tmp_path, range(2))
-    monkeypatch.setenv(MINIMUM_VARIABLE, str(least))
-    for ask in (
-        lambda: sum_cohort(fleet.warehouse, Folding()),
-        lambda: sum_days(fleet.warehouse, INPUTS),
-    ):
-        if refused:
-            with pytest.raises(CohortError):
-                ask()
-        else:
-            ask()
 
 
 def test_versions_know_the_drives_of_rollups(
