@@ -151,3 +151,11 @@ def smoke_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def root_to_fail_in(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
     """A copy of it in which commands may fail: `status` tells of them from then on."""
     return shutil.copytree(smoke_root, tmp_path_factory.mktemp("mistakes") / "data")
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read all formats in this process, so that a test can change how."""
+    from fleet_slip.ingest.formats import confined_reader, reading  # noqa: PLC0415 - takes a while
+
+    monkeypatch.setattr(reading, "open_confined", confined_reader.open_here)

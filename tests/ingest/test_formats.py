@@ -116,6 +116,7 @@ def test_what_mdf_marks_as_invalid_is_null(tmp_path: Path) -> None:
     assert log.drives["sideslip"].to_pylist() == expected
 
 
+@pytest.mark.usefixtures("in_process")
 @pytest.mark.parametrize("version", ["3.30", "4.10", "4.20"])
 def test_a_group_of_an_mdf_file_is_read_window_by_window(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str
@@ -132,6 +133,7 @@ def test_a_group_of_an_mdf_file_is_read_window_by_window(
     assert log.drives["sideslip"].null_count == (15 if flags else 0)
 
 
+@pytest.mark.usefixtures("in_process")
 def test_a_large_group_of_an_mdf_file_is_not_read_as_a_whole_for_each_window(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -207,7 +209,7 @@ def test_a_truncated_mdf_file_is_refused(
     [
         (b"##CN", 92, 60_000, "lies outside of the records of its group: the file is damaged"),
         (b"##CG", 80, 10**9, "says that it has 1,000,000,000 samples of 18 bytes"),
-        (b"##DZ", 32, 2**60, "a block says that it has 1,152,921,504,606,846,976 bytes"),
+        (b"##DZ", 32, 2**60, "asammdf cannot read it"),
     ],
 )
 def test_a_damaged_mdf_file_does_not_lead_its_reader_astray(
@@ -355,6 +357,7 @@ def test_a_file_that_is_not_what_its_name_says_is_refused(
     assert f"not {'a ' if kind == 'DuckDB' else ''}{kind}" in failure(tmp_path / name, a_mapping())
 
 
+@pytest.mark.usefixtures("in_process")
 def test_a_package_that_is_absent_is_named_with_its_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

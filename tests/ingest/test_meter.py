@@ -95,6 +95,7 @@ def own_clock(folder: Path, name: str) -> tuple[Path, Mapping]:
     return file, load_mapping(str(folder / "bus.toml"))
 
 
+@pytest.mark.usefixtures("in_process")
 @pytest.mark.parametrize(
     "name", ["log.mf4", "log.tdms", "log.mcap", "log.blf", "log.asc", "log.log"]
 )

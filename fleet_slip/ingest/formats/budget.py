@@ -21,6 +21,8 @@ FREE_ROWS, ROWS_PER_BYTE = 10**6, 4
 """Rows that any file may have, and rows for each of its bytes if those are more."""
 FREE_BYTES, BYTES_PER_BYTE = 2**30, 200
 """The same for the bytes that it unfolds to."""
+FREE_MEMORY, MEMORY_PER_BYTE = 2**30, 8
+"""Memory that any reader of other people's may take, and more for each byte of its file."""
 FREE_S, BYTES_PER_S = 60.0, 10**5
 """Seconds in which any file must be decoded, and a speed that no format falls below."""
 
@@ -53,6 +55,11 @@ class Budget:
         return max(FREE_BYTES, BYTES_PER_BYTE * self.size)
 
     @property
+    def memory(self) -> int:
+        """Bytes of memory that its reader takes at most, where that is a process of its own."""
+        return FREE_MEMORY + MEMORY_PER_BYTE * self.size
+
+    @property
     def seconds(self) -> float:
         """How long decoding takes at most."""
         return max(FREE_S, self.size / BYTES_PER_S)
@@ -72,6 +79,20 @@ class Budget:
                 f"{shown(self.file)}: its {self.size:,} bytes unfold to {size:,} or more; of a "
                 f"file of this size at most {self.unfolded:,} are read. {_WAY_OUT}"
             )
+
+    def over_memory(self) -> InputError:
+        """Return what to say of a file whose reader asked for more memory, or longer files."""
+        return InputError(
+            f"{shown(self.file)}: its {self.size:,} bytes unfold to more than {self.memory:,} in "
+            f"memory or {self.unfolded:,} in a temporary file. {_WAY_OUT}"
+        )
+
+    def crashed(self) -> InputError:
+        """Return what to say of a file whose reader ended without a word, or talks nonsense."""
+        return InputError(
+            f"{shown(self.file)}: its reader crashed, or was ended because it took more than "
+            f"{self.memory:,} bytes of memory. {_WAY_OUT}"
+        )
 
     def over_time(self) -> InputError:
         """Return what to say of a file that took too long."""

@@ -6,6 +6,7 @@ time is a column like any other.
 """
 
 import difflib
+import errno
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -120,6 +121,8 @@ def reading_with(file: Path, package: str) -> Iterator[Any]:
     except (FleetSlipError, MemoryError):
         raise
     except Exception as error:
+        if getattr(error, "errno", 0) == errno.EFBIG:  # who set the limit tells it
+            raise
         reason = shown(str(error).strip().split("\n")[0][:200]) or type(error).__name__
         raise InputError(
             f"{shown(file)}: {package} cannot read it: {reason}. Is it complete? Copy it again, or "

@@ -3,7 +3,6 @@
 A column is the path of a vector, `Data.Vehicle.yawRate`, or one column of a matrix, `wheels(:,2)`.
 """
 
-import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,11 +16,6 @@ from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.log_source import Channel, as_column, describe_missing, reading_with
 from fleet_slip.ingest.formats.matlab_elements import open_matrices
 from fleet_slip.words import shown
-
-HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-HDF5_AT = 512
-"""Where a 7.3 file becomes HDF5: MATLAB's own header is before it."""
-MAT5_MAGIC = b"MATLAB 5.0 MAT-file"
 
 _COLUMN = re.compile(r"(.+)\(:,(\d+)\)")
 _MOST_COLUMNS = 64
@@ -51,9 +45,8 @@ class MatSource:
     def __init__(
         self, matrices: Mapping[str, _Matrix], budget: Budget, links: Collection[str] = ()
     ) -> None:
-        """Take its matrices by path, what may become of it, and names that are only links."""
-        self._file, self._budget = budget.file, budget
-        self._matrices, self._links = matrices, links
+        """Take its matrices by path, and names that are only links."""
+        self._file, self._matrices, self._links = budget.file, matrices, links
 
     def channels(self) -> list[Channel]:
         """Return all vectors, and the columns of matrices."""
@@ -81,7 +74,6 @@ class MatSource:
                     f"{shown(self._file)}: {name!r} has {length:,} values and {first!r} has "
                     f'{rows:,}. Give the signal the time that goes with it: time = "…".'
                 )
-        self._budget.require_rows(rows)
         for start in range(0, max(rows, 1), WINDOW_ROWS):
             end = min(start + WINDOW_ROWS, rows)
             yield pl.DataFrame(
@@ -165,7 +157,6 @@ def open_mat73(budget: Budget) -> Iterator[MatSource]:
                 )
             kind = item.attrs.get("MATLAB_class", b"")
             if item.shape and item.dtype.kind in "iufb" and kind != b"char":
-                budget.require_rows(math.prod(item.chunks or ()))  # unfolded at once
                 matrices[path.replace("/", ".")] = _Dataset(item)
 
         def note(path: str, link: Any) -> None:

@@ -77,7 +77,7 @@ def open_matrices(budget: Budget) -> Iterator[dict[str, StoredMatrix]]:
     with ExitStack() as opened:
         content = opened.enter_context(file.open("rb"))
         try:
-            found = list(islice(_find_matrices(content, opened, budget), _MOST_MATRICES + 1))
+            found = list(islice(_find_matrices(content, opened), _MOST_MATRICES + 1))
         except (_DamagedError, zlib.error, struct.error, RecursionError) as error:
             raise InputError(
                 f"{shown(file)}: it is truncated or damaged: {error}. Is it complete? Copy it "
@@ -88,9 +88,7 @@ def open_matrices(budget: Budget) -> Iterator[dict[str, StoredMatrix]]:
         yield dict(found)
 
 
-def _find_matrices(
-    content: IO[bytes], opened: ExitStack, budget: Budget
-) -> Iterator[tuple[str, StoredMatrix]]:
+def _find_matrices(content: IO[bytes], opened: ExitStack) -> Iterator[tuple[str, StoredMatrix]]:
     """Yield the matrices of a file; compressed ones are unfolded into a file without a name."""
     content.seek(_BYTE_ORDER_AT)
     order = ">" if content.read(2) == b"MI" else "<"
@@ -102,7 +100,7 @@ def _find_matrices(
         plain = _Part(content, elements, order)
         for kind, start, end in plain.walk(_HEADER, len(elements)):
             if kind == _COMPRESSED:
-                _unfold(elements, start, end, unfolded, budget)
+                _unfold(elements, start, end, unfolded)
                 places.append(unfolded.tell())
             else:
                 yield from plain.matrices(kind, start, end)
@@ -120,7 +118,7 @@ def _mapped(file: IO[bytes]) -> mmap.mmap:
     return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
 
-def _unfold(elements: mmap.mmap, start: int, end: int, sink: IO[bytes], budget: Budget) -> None:
+def _unfold(elements: mmap.mmap, start: int, end: int, sink: IO[bytes]) -> None:
     """Write what an element unfolds to."""
     unpacking = zlib.decompressobj()
     for at in range(start, end, _PIECE):
@@ -131,7 +129,6 @@ def _unfold(elements: mmap.mmap, start: int, end: int, sink: IO[bytes], budget: 
                 sink.write(piece)
                 sink.flush()
             packed = unpacking.unconsumed_tail
-            budget.require_unfolded(sink.tell())
     sink.write(bytes(-sink.tell() % 8))
 
 

@@ -39,9 +39,6 @@ from fleet_slip.ingest.formats.mcap_records import read_records
 from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.words import shown
 
-LARGEST_MESSAGE = 2**22
-"""Bytes of a message that is decoded: each may become an object of its own."""
-
 PIECE_ROWS = 2**13
 """Messages of one topic that are in memory at once."""
 
@@ -130,10 +127,7 @@ class McapSource(ClockSource):
                 for number in set(block.heads[:, 0].tolist()) - done:
                     channel, decode = channels[number]
                     encodings.add(channel.message_encoding)
-                    sizes = (data for _, data, _ in block.of([number]).one_by_one())
-                    data = next((one for one in sizes if len(one) <= LARGEST_MESSAGE), None)
-                    if data is None:
-                        continue
+                    _, data, _ = next(block.of([number]).one_by_one())
                     done.add(number)
                     if decode is not None and channel.topic not in found:
                         found[channel.topic] = list(leaves_of(decode(data)))
@@ -149,12 +143,9 @@ class McapSource(ClockSource):
         """Yield all messages, in the file's order, with their channels and what decodes them."""
         schemas: dict[int, Any] = {}
         channels: _Channels = {}
-        messages = 0
         for record in read_records(self._budget):
             kind = type(record).__name__
             if kind == "Block":
-                messages += len(record)
-                self._budget.require_rows(messages)
                 yield channels, record
             elif kind == "Schema":
                 schemas[record.id] = record
@@ -201,11 +192,6 @@ class McapSource(ClockSource):
             decode = channels[number][1]
             if decode is None:
                 continue
-            if len(data) > LARGEST_MESSAGE:
-                raise InputError(
-                    f"{shown(self._file)}: a message of {topic!r} has "
-                    f"{len(data):,} bytes; at most {LARGEST_MESSAGE:,} are decoded."
-                )
             message = decode(data)
             rows.times_s.append(stamp_s(message, published_ns))
             rows.values.append([field_of(message, name) for name in rows.fields.values()])

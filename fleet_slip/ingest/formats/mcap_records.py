@@ -2,21 +2,14 @@
 
 import struct
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
-from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.log_source import reading_with
 from fleet_slip.ingest.formats.mcap_fields import Block
-from fleet_slip.words import shown
 
-MAGIC = b"\x89MCAP0\r\n"
-_LARGEST_RECORD, _LARGEST_RATIO = 2**27, 1000
-"""Bytes of a record or of a chunk unpacked, and how many times its size a chunk may become."""
 _MESSAGE, _MESSAGE_INDEX = 5, 7
 _RECORD, _HEAD = struct.Struct("<BQ"), struct.Struct("<BQH12xQ")
 """What begins a record; a message also says of which channel it is, and when it was published."""
@@ -27,7 +20,7 @@ def read_records(budget: Budget) -> Iterator[Any]:
 
     Raises `InputError`.
     """
-    path, unfolded = budget.file, 0
+    path = budget.file
     with reading_with(path, "mcap.stream_reader") as mcap, path.open("rb") as file:
 
         class Reader(mcap.StreamReader):  # type: ignore[misc, name-defined]
@@ -37,18 +30,14 @@ def read_records(budget: Budget) -> Iterator[Any]:
                 kind = 0 if opcode == _MESSAGE_INDEX else opcode  # which is unknown
                 return super()._read_record(kind, length)
 
-        reader = Reader(
-            file, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST_RECORD
-        )
+        reader = Reader(file, emit_chunks=True, validate_crcs=True, record_size_limit=None)
         for record in reader.records:
             if type(record).__name__ == "Chunk":
-                chunk = _unpacked(path, record)
-                unfolded += chunk.uncompressed_size
-                budget.require_unfolded(unfolded)
-                stream, size = mcap.get_chunk_data_stream(chunk, validate_crc=True)
+                stream, size = mcap.get_chunk_data_stream(record, validate_crc=True)
                 block, others = _messages_in(stream.read(size))
-                chunk.data, chunk.uncompressed_size, chunk.uncompressed_crc = others, len(others), 0
-                yield from mcap.breakup_chunk(chunk)
+                record.compression, record.data, record.uncompressed_crc = "", others, 0
+                record.uncompressed_size = len(others)
+                yield from mcap.breakup_chunk(record)
                 yield block
                 budget.meter.pass_over(file.tell(), budget.size)
             elif type(record).__name__ == "Message":
@@ -75,23 +64,3 @@ def _messages_in(content: bytes) -> tuple[Block, bytes]:
     if at != len(content) or (messages[:, 1] > messages[:, 2]).any():
         raise EOFError("a record is cut off")
     return Block(content, messages, np.array(published_ns, np.uint64)), b"".join(others)
-
-
-def _unpacked(path: Path, chunk: Any) -> Any:
-    """Return a chunk without compression: it may not become more than it says."""
-    size, packed = chunk.uncompressed_size, len(chunk.data)
-    if _LARGEST_RECORD < size <= _LARGEST_RATIO * packed:
-        raise InputError(
-            f"{shown(path)}: a chunk of it unfolds to {size:,} bytes; at most {_LARGEST_RECORD:,} "
-            "are read at once. Write it again in smaller chunks, as rosbag2 does by default."
-        )
-    if size > _LARGEST_RATIO * max(packed, 1):
-        raise InputError(
-            f"{shown(path)}: a chunk of {packed:,} bytes says that it unfolds to "
-            f"{size:,}: the file is damaged. Copy it again."
-        )
-    if chunk.compression:
-        codec = {"zstd": "zstd", "lz4": "lz4"}[chunk.compression]
-        chunk.data = pa.decompress(chunk.data, size, codec, asbytes=True)
-        chunk.compression = ""
-    return chunk

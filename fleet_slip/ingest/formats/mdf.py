@@ -24,12 +24,8 @@ from fleet_slip.ingest.formats.log_source import (
     describe_missing,
     reading_with,
 )
-from fleet_slip.ingest.formats.mdf_links import require_tree
 from fleet_slip.words import shown
 
-MAGICS = (b"MDF     ", b"UnFinMF ")
-_LARGEST_BLOCK, _LARGEST_RATIO = 2**30, 20_000
-"""Bytes of one block of data, and how many times its size one may become."""
 WINDOW_RECORDS = 2**17
 """Records that are read at once. asammdf takes four times as long for a whole group."""
 _TIME_SYNC = 1
@@ -41,8 +37,8 @@ class MdfSource(ClockSource):
     """An open MDF file. A channel of several groups is named `CHANNEL@GROUP`."""
 
     def __init__(self, mdf: Any, budget: Budget) -> None:
-        """Take what asammdf has opened, and what may become of it."""
-        self._file, self._mdf, self._budget = budget.file, mdf, budget
+        """Take what asammdf has opened."""
+        self._file, self._mdf = budget.file, mdf
         start = mdf.start_time.timestamp()
         self._start_s = start if start > _EARLIEST_S else 0.0
 
@@ -175,19 +171,11 @@ class MdfSource(ClockSource):
             )
 
     def _require_data(self, number: int, name: str) -> None:
-        """Raise `InputError` for a group that states absurd sizes: asammdf would believe them."""
+        """Raise `InputError` for a group that states more samples than there are bytes."""
         group, there = self._mdf.groups[number], self._file.stat().st_size
         whole = there
         if hasattr(group, "get_data_blocks"):  # MDF 3 has no compressed blocks
-            blocks = list(group.get_data_blocks())
-            whole = sum(block.original_size for block in blocks)
-            for block in blocks:
-                largest = min(_LARGEST_BLOCK, _LARGEST_RATIO * max(block.compressed_size, 1))
-                if block.original_size > largest or block.compressed_size > there:
-                    raise InputError(
-                        f"{shown(self._file)}: a block says that it has {block.original_size:,} "
-                        "bytes: the file is damaged. Copy it again."
-                    )
+            whole = sum(block.original_size for block in group.get_data_blocks())
         samples, size = group.channel_group.cycles_nr, group.channel_group.samples_byte_nr
         if samples * size > whole:
             raise InputError(
@@ -195,8 +183,6 @@ class MdfSource(ClockSource):
                 f"of {size:,} bytes, and there are {whole:,}: it is truncated or damaged. Copy it "
                 "again."
             )
-        self._budget.require_unfolded(whole)
-        self._budget.require_rows(samples)
 
     def _find(self, name: str) -> tuple[int, int]:
         places = self._places(name)
@@ -233,7 +219,6 @@ def open_mdf(budget: Budget) -> Iterator[MdfSource]:
     logging at once: nothing is read of either.
     """
     file = budget.file
-    require_tree(file)
     # It leaves copies of unfinalised files behind, and more where it fails.
     with TemporaryDirectory(prefix="fleet-slip-", ignore_cleanup_errors=True) as folder:
         with reading_with(file, "asammdf") as asammdf:

@@ -4,7 +4,7 @@ What a file is, its first bytes say; only what is text goes by the mapping and t
 """
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,28 +15,31 @@ import pyarrow as pa
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.can.blf_frames import MAGIC as BLF_MAGIC
 from fleet_slip.ingest.formats.can.can_bus import CanBus
-from fleet_slip.ingest.formats.can.can_trace import open_can_trace
+from fleet_slip.ingest.formats.confined_source import open_confined
 from fleet_slip.ingest.formats.csv_batches import PlainNumbers, open_csv
 from fleet_slip.ingest.formats.csv_text import CsvFormat
 from fleet_slip.ingest.formats.duckdb_table import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.formats.duckdb_table import MAGIC_AT as DUCKDB_AT
 from fleet_slip.ingest.formats.duckdb_table import DuckdbRows, open_duckdb
 from fleet_slip.ingest.formats.log_source import Source
-from fleet_slip.ingest.formats.matlab import HDF5_AT, HDF5_MAGIC, MAT5_MAGIC, open_mat, open_mat73
-from fleet_slip.ingest.formats.mcap_log import open_mcap
-from fleet_slip.ingest.formats.mcap_records import MAGIC as MCAP_MAGIC
-from fleet_slip.ingest.formats.mdf import MAGICS as MDF_MAGICS
-from fleet_slip.ingest.formats.mdf import open_mdf
-from fleet_slip.ingest.formats.mdf_bus import open_mdf_bus
 from fleet_slip.ingest.formats.meter import Meter
 from fleet_slip.ingest.formats.parquet_batches import PARQUET_MAGIC, open_parquet
-from fleet_slip.ingest.formats.tdms import MAGIC as TDMS_MAGIC
-from fleet_slip.ingest.formats.tdms import open_tdms
 from fleet_slip.ingest.logs.log_files import parts_of
 from fleet_slip.words import shown
 
+_HDF5, _HDF5_AT = b"\x89HDF\r\n\x1a\n", 512
+"""A MATLAB file of version 7.3 becomes HDF5 there: MATLAB's own header is before it."""
+_CONFINED = {
+    b"MDF     ": "mdf",
+    b"UnFinMF ": "mdf",
+    b"\x89MCAP0\r\n": "mcap",
+    b"TDSm": "tdms",
+    b"MATLAB 5.0 MAT-file": "mat",
+    _HDF5: "mat73",
+    b"LOGG": "can_trace",
+}
+"""Formats that another process reads, by what a file begins with."""
 _ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
 _BINARY = {
     (".parquet", ".pq"): "a Parquet file",
@@ -118,7 +121,7 @@ def open_source(file: Path, formats: FileFormats, meter: Meter | None = None) ->
     """
     budget = Budget.of(file, meter)
     with file.open("rb") as stream:
-        start = stream.read(HDF5_AT + len(HDF5_MAGIC))
+        start = stream.read(_HDF5_AT + len(_HDF5))
     for magic, program in _ARCHIVES.items():
         if start.startswith(magic):
             raise InputError(
@@ -131,18 +134,21 @@ def open_source(file: Path, formats: FileFormats, meter: Meter | None = None) ->
 def _opened(
     file: Path, start: bytes, formats: FileFormats, budget: Budget
 ) -> AbstractContextManager[Source]:
-    if start.startswith(MDF_MAGICS) and formats.can is not None:
-        return open_mdf_bus(formats.can, budget)
-    for is_it, open_it in _FORMATS:
-        if is_it(start):
-            return open_it(budget)
+    suffix, name = file.suffix.lower(), _confined(start)
+    if formats.can is not None:
+        name = "mdf_bus" if name == "mdf" else name or "can_trace"
+    elif suffix in {".blf", ".asc"}:
+        name = name or "can_trace"
+    if start.startswith(PARQUET_MAGIC):
+        return open_parquet(budget)
     if start[DUCKDB_AT:].startswith(DUCKDB_MAGIC):
         rows = _wanted(formats.duckdb, file, "duckdb", 'table = "…"', formats)
         return open_duckdb(rows, budget)
-    suffix = file.suffix.lower()
-    if formats.can is not None or start.startswith(BLF_MAGIC) or suffix in {".blf", ".asc"}:
-        bus = _wanted(formats.can, file, "can", 'database = "….dbc"', formats)
-        return open_can_trace(bus, budget)
+    if name == "can_trace":
+        _wanted(formats.can, file, "can", 'database = "….dbc"', formats)
+    if name:
+        bus = formats.can if name in {"can_trace", "mdf_bus"} else None
+        return open_confined(name, bus, budget)
     for suffixes, kind in _BINARY.items():
         if suffix in suffixes:
             raise InputError(
@@ -150,6 +156,12 @@ def _opened(
                 "as what it is."
             )
     return open_csv(budget, formats.csv, formats.plain_numbers)
+
+
+def _confined(start: bytes) -> str:
+    """Return the format that another process reads, empty for any other."""
+    begun = start[_HDF5_AT:] if start.endswith(_HDF5) else start
+    return next((name for magic, name in _CONFINED.items() if begun.startswith(magic)), "")
 
 
 def _wanted(told: Told | None, file: Path, table: str, key: str, formats: FileFormats) -> Told:
@@ -160,18 +172,6 @@ def _wanted(told: Told | None, file: Path, table: str, key: str, formats: FileFo
             f"{formats.name!r}."
         )
     return told
-
-
-_FORMATS: tuple[
-    tuple[Callable[[bytes], bool], Callable[[Budget], AbstractContextManager[Source]]], ...
-] = (
-    (lambda start: start.startswith(PARQUET_MAGIC), open_parquet),
-    (lambda start: start.startswith(MDF_MAGICS), open_mdf),
-    (lambda start: start.startswith(MCAP_MAGIC), open_mcap),
-    (lambda start: start.startswith(TDMS_MAGIC), open_tdms),
-    (lambda start: start.startswith(MAT5_MAGIC), open_mat),
-    (lambda start: HDF5_MAGIC in (start[: len(HDF5_MAGIC)], start[HDF5_AT:]), open_mat73),
-)
 
 
 @contextmanager

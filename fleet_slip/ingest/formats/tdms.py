@@ -20,7 +20,6 @@ from fleet_slip.ingest.formats.log_source import OWN_TIME, Base, Channel, ClockS
 from fleet_slip.ingest.formats.matlab import MatSource
 from fleet_slip.words import shown
 
-MAGIC = b"TDSm"
 READ_AHEAD = 2**17
 """Values that are read at once: for each time npTDMS reads all that a segment has of a channel."""
 _EARLIEST_S = 10**8
@@ -55,7 +54,7 @@ class TdmsSource(ClockSource):
     """The waveforms of a file."""
 
     def __init__(self, waves: dict[str, _Vector], budget: Budget) -> None:
-        """Take the waveforms by name, and what may become of the file."""
+        """Take the waveforms by name."""
         self._waves, self._table = waves, MatSource(waves, budget)
 
     def channels(self) -> list[Channel]:

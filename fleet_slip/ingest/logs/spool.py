@@ -3,6 +3,7 @@
 The file has no name: it is gone with the process, however that ends.
 """
 
+import errno
 import tempfile
 from collections import defaultdict
 from collections.abc import Hashable, Iterator
@@ -20,6 +21,8 @@ def needing_room(written: int) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if error.errno == errno.EFBIG:  # a limit of our own, on a file that unfolds
+            raise
         raise InputError(
             f"{tempfile.gettempdir()}: no room for a temporary copy of more than {written:,} bytes "
             f"({error.strerror}). Free some, or name another folder in the environment variable "

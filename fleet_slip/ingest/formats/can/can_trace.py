@@ -3,8 +3,6 @@
 Each message is a time base, a column is `Message.Signal`. Frames of errors and remote requests are
 passed over. A value that the database gives a name, such as `SNA`, is no number: it is null, or in
 a signal that has no other values the name itself.
-
-python-can reads a line whatever its length; so that is looked at before.
 """
 
 from collections import defaultdict
@@ -42,24 +40,9 @@ from fleet_slip.ingest.formats.log_source import (
 from fleet_slip.ingest.logs.spool import Spool
 from fleet_slip.words import shown
 
-_LONGEST_LINE = 2**20
-
-BLF = ".blf"
-SUFFIXES = {BLF, ".asc", ".log", ".trc"}
-
-_MOST_NUMBERS = 100_000
+SUFFIXES = {".blf", ".asc", ".log", ".trc"}
 TOLD_EVERY = 2**12
 """Frames that are read one by one until it is told how far the file is read."""
-
-
-def require_lines(budget: Budget) -> None:
-    """Raise `InputError` for a text with a line longer than any trace has. Raises `OSError`."""
-    is_long = False
-    with budget.file.open("rb") as stream:
-        while piece := stream.read(_LONGEST_LINE):
-            if is_long and b"\n" not in piece:
-                raise budget.damaged(f"a line of more than {_LONGEST_LINE:,} bytes")
-            is_long = b"\n" not in piece
 
 
 _Key = tuple[int, bool]
@@ -70,7 +53,7 @@ class CanSource(ClockSource):
     """The messages of a CAN trace."""
 
     def __init__(self, bus: CanBus, database: Any, spool: Spool, budget: Budget) -> None:
-        """Take what the mapping says of the trace, the parsed database, and what it may become."""
+        """Take what the mapping says of the trace, the parsed database, and the file."""
         self._file, self._bus, self._database = budget.file, bus, database
         self._spool, self._budget = spool, budget
         self._messages = {message.name: message for message in database.messages}
@@ -183,11 +166,6 @@ class CanSource(ClockSource):
             )
         return frames
 
-    def _note(self, key: _Key) -> None:
-        """Note that there is a message; of those that nobody wants not more than a car has."""
-        if key in self._frames or len(self._numbers) < _MOST_NUMBERS:
-            self._numbers.add(key)
-
     def _keep(self, block: FrameBlock) -> None:
         """Keep the frames of the wanted messages, and note the numbers of all."""
         keys = block.numbers << 1 | block.extended
@@ -195,7 +173,7 @@ class CanSource(ClockSource):
         found, firsts = np.unique(keys[order], return_index=True)
         for key, chosen in zip(found.tolist(), np.split(order, firsts[1:]), strict=True):
             of = key >> 1, bool(key & 1)
-            self._note(of)
+            self._numbers.add(of)
             if of in self._frames:
                 self._frames[of].extend(block.where(chosen))
 
@@ -206,25 +184,19 @@ class CanSource(ClockSource):
                 f"{shown(self._file)}: the suffix tells the format of a CAN trace: "
                 f"{', '.join(sorted(SUFFIXES))}. Name it as what it is."
             )
-        if self._file.suffix.lower() != BLF:
-            require_lines(self._budget)
         with reading_with(self._file, "can") as can, can.LogReader(self._file) as trace:
             self._require_whole(trace)
             if isinstance(trace, can.BLFReader):
-                frames = 0
                 for block in read_blf_frames(self._budget, trace.start_timestamp):
-                    frames += len(block.numbers)
-                    self._budget.require_rows(frames)
                     self._keep(block)
                 return
             for number, frame in enumerate(trace):
-                self._budget.require_rows(number)
                 if not number % TOLD_EVERY:
                     self._budget.meter.pass_over(trace.file.buffer.tell(), self._budget.size)
                 if frame.is_error_frame or frame.is_remote_frame:
                     continue
                 key = frame.arbitration_id, frame.is_extended_id
-                self._note(key)
+                self._numbers.add(key)
                 if key in self._frames:
                     self._frames[key].append(frame.timestamp, str(frame.channel), frame.data)
 

@@ -1,0 +1,141 @@
+"""Takes from a process on Linux all that reading one file does not need.
+
+It keeps that file, a folder for its temporary files, and the installed code, of which libraries
+import parts late. It cannot connect, start programs or processes, or signal others. Where the
+kernel has no Landlock (before 5.13, or switched off) other files stay readable.
+"""
+
+import ctypes
+import os
+import platform
+import resource
+import signal
+import struct
+import sysconfig
+from collections.abc import Iterator
+from pathlib import Path
+
+import fleet_slip
+
+_PDEATHSIG, _NO_NEW_PRIVS, _SECCOMP, _FILTER = 1, 38, 22, 2
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
+_ASK_VERSION, _BENEATH = 1, 1
+_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15}
+"""By version of Landlock how many rights on files it knows; later ones know 16."""
+_READ_FILE, _READ = 1 << 2, 1 << 2 | 1 << 3
+_EVERYTHING_HERE = (1 << 13) - 1
+_TIME_ZONES = ("/etc/localtime", "/usr/share/zoneinfo")
+
+_MACHINES = {"x86_64": (0xC000003E, 0), "aarch64": (0xC00000B7, 1)}
+"""How the kernel calls a machine, and which of the numbers below are its own."""
+_FORBIDDEN = (
+    # socket, socketpair, connect, bind, listen
+    (41, 198), (53, 199), (42, 203), (49, 200), (50, 201),
+    # fork, vfork, execve, execveat, ptrace, process_vm_readv, process_vm_writev
+    (57, None), (58, None), (59, 221), (322, 281), (101, 117), (310, 270), (311, 271),
+    # kill, tkill, tgkill, rt_sigqueueinfo, rt_tgsigqueueinfo, pidfd_send_signal, pidfd_getfd
+    (62, 129), (200, 130), (234, 131), (129, 138), (297, 240), (424, 424), (438, 438),
+    # io_uring_setup, bpf, perf_event_open, userfaultfd, keyctl, add_key, request_key
+    (425, 425), (321, 280), (298, 241), (323, 282), (250, 219), (248, 217), (249, 218),
+    # mount, unshare, setns, open_by_handle_at, setpriority, sched_setaffinity
+    (165, 40), (272, 97), (308, 268), (304, 265), (141, 140), (203, 122),
+    # chown, fchown, lchown, fchownat, setxattr, lsetxattr, fsetxattr
+    (92, None), (93, 55), (94, None), (260, 54), (188, 5), (189, 6), (190, 7),
+    # utime, utimes, futimesat, utimensat, shmget, msgget, semget
+    (132, None), (235, None), (261, None), (280, 88), (29, 194), (68, 186), (64, 190),
+)  # fmt: skip
+"""System calls by their numbers on x86_64 and aarch64."""
+_PASSED_BY = ((90, None), (91, 52), (268, 53), (452, 452))
+"""Those that seem to work and do nothing, since who copies a file calls them: chmod and others."""
+_CLONE, _CLONE3, _CLONE_THREAD = (56, 220), 435, 0x10000
+_LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
+_ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050000, 0x80000000
+_PERM, _NOSYS = 1, 38
+
+_LIBC = ctypes.CDLL(None, use_errno=True)
+
+
+def confine(parent: int, file: str, folder: str, memory: int, disk: int, seconds: int) -> None:
+    """Confine this process, a child of `parent`, to a file and a folder; it cannot be undone.
+
+    `memory` are the bytes that it may take beyond what it has, `disk` those of a temporary file,
+    `seconds` those of a processor. It goes with its parent, and first where memory lacks.
+    """
+    _call(_LIBC.prctl(_PDEATHSIG, signal.SIGKILL, 0, 0, 0))
+    if os.getppid() != parent:
+        os._exit(1)
+    Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    _limit(resource.RLIMIT_AS, pages * resource.getpagesize() + memory)
+    _limit(resource.RLIMIT_FSIZE, disk)
+    _limit(resource.RLIMIT_CPU, seconds)
+    _limit(resource.RLIMIT_CORE, 0)
+    _call(_LIBC.prctl(_NO_NEW_PRIVS, 1, 0, 0, 0))
+    _close_files(file, folder)
+    _forbid_calls()
+
+
+def _limit(kind: int, most: int) -> None:
+    _, hard = resource.getrlimit(kind)
+    most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+    resource.setrlimit(kind, (most, most))
+
+
+def _close_files(file: str, folder: str) -> None:
+    """Let Landlock open no other files than these and the installed code."""
+    version = _LIBC.syscall(_CREATE_RULESET, None, 0, _ASK_VERSION)
+    if version < 1:
+        return
+    handled = (1 << _RIGHTS.get(version, 16)) - 1
+    ports, beyond = 3 if version >= 4 else 0, 3 if version >= 6 else 0
+    asked = struct.pack("QQQ", handled, ports, beyond)
+    rules = _call(_LIBC.syscall(_CREATE_RULESET, asked, len(asked), 0))
+    # Of the folder, all that the first version knows, and to cut files.
+    allowed = {file: _READ_FILE, folder: (_EVERYTHING_HERE | 1 << 14) & handled}
+    for place, rights in {**dict(_readable()), **allowed}.items():
+        try:
+            opened = os.open(place, os.O_PATH | os.O_CLOEXEC)
+        except OSError:
+            continue  # who reads it says what is wrong
+        rule = struct.pack("=Qi", rights, opened)
+        _call(_LIBC.syscall(_ADD_RULE, rules, _BENEATH, rule, 0))
+        os.close(opened)
+    _call(_LIBC.syscall(_RESTRICT_SELF, rules, 0))
+    os.close(rules)
+
+
+def _readable() -> Iterator[tuple[str, int]]:
+    """Yield what the libraries may still read, which tells nothing of anybody."""
+    code = (sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+    for place in (*code, *fleet_slip.__path__, *_TIME_ZONES):
+        yield place, _READ if Path(place).is_dir() else _READ_FILE
+
+
+def _forbid_calls() -> None:
+    """Let the kernel refuse system calls that no reader makes (seccomp)."""
+    if platform.machine() not in _MACHINES:
+        return
+    machine, place = _MACHINES[platform.machine()]
+    steps = [
+        (_LOAD, 0, 0, 4), (_EQUAL, 1, 0, machine), (_RETURN, 0, 0, _KILL),
+        (_LOAD, 0, 0, 0),
+        (_EQUAL, 0, 1, _CLONE3), (_RETURN, 0, 0, _REFUSE | _NOSYS),  # then libc takes clone
+        (_EQUAL, 0, 4, _CLONE[place]),
+        (_LOAD, 0, 0, 16), (_ANY_BIT, 1, 0, _CLONE_THREAD), (_RETURN, 0, 0, _REFUSE | _PERM),
+        (_RETURN, 0, 0, _ALLOW),
+        (_AT_LEAST, 0, 1, 0x40000000), (_RETURN, 0, 0, _KILL),  # numbers of 32-bit programs
+    ]  # fmt: skip
+    for numbers in (*_FORBIDDEN, *_PASSED_BY):
+        answer = _REFUSE if numbers in _PASSED_BY else _REFUSE | _PERM
+        if (number := numbers[place]) is not None:
+            steps += [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, answer)]
+    steps.append((_RETURN, 0, 0, _ALLOW))
+    program = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *step) for step in steps))
+    told = struct.pack("HxxxxxxP", len(steps), ctypes.addressof(program))
+    _call(_LIBC.prctl(_SECCOMP, _FILTER, told, 0, 0))
+
+
+def _call(result: int) -> int:
+    if result < 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    return result
