@@ -15,8 +15,6 @@ import sysconfig
 from collections.abc import Iterator
 from pathlib import Path
 
-import fleet_slip
-
 _PDEATHSIG, _NO_NEW_PRIVS, _SECCOMP, _FILTER = 1, 38, 22, 2
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
 _ASK_VERSION, _BENEATH = 1, 1
@@ -24,6 +22,7 @@ _RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15}
 """By version of Landlock how many rights on files it knows; later ones know 16."""
 _READ_FILE, _READ = 1 << 2, 1 << 2 | 1 << 3
 _EVERYTHING_HERE = (1 << 13) - 1
+_OURS = (str(Path(__file__).parents[2]),)
 _TIME_ZONES = ("/etc/localtime", "/usr/share/zoneinfo")
 
 _MACHINES = {"x86_64": (0xC000003E, 0), "aarch64": (0xC00000B7, 1)}
@@ -107,7 +106,7 @@ def _close_files(file: str, folder: str) -> None:
 def _readable() -> Iterator[tuple[str, int]]:
     """Yield what the libraries may still read, which tells nothing of anybody."""
     code = (sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
-    for place in (*code, *fleet_slip.__path__, *_TIME_ZONES):
+    for place in (*code, *_OURS, *_TIME_ZONES):
         yield place, _READ if Path(place).is_dir() else _READ_FILE
 
 
