@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from fleet_slip.cli.early_exit import for_machines
 from fleet_slip.errors import hide_passwords, printable
@@ -76,32 +76,26 @@ class PeopleHandler(logging.Handler):
             console.print(shown, markup=False)
 
 
-class JsonHandler(logging.Handler):
-    """Writes every record as one line of JSON."""
+class JsonFormatter(logging.Formatter):
+    """Makes a record a line of JSON: time, level, run_id, event, and what is particular to it."""
 
-    def emit(self, record: logging.LogRecord) -> None:
-        """Write a record."""
-        sys.stderr.write(json_line(record) + "\n")
-        sys.stderr.flush()
-
-
-def json_line(record: logging.LogRecord) -> str:
-    """Return a record as JSON: time, level, run_id, event, then what is particular to it."""
-    content: dict[str, Any] = {
-        "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
-        "level": record.levelname.lower(),
-        "run_id": current_run_id(),
-    }
-    if hasattr(record, "event"):
-        content |= {"event": record.event, **record.__dict__.get("fields", {})}
-    else:
-        content |= {"event": "message", "message": hide_passwords(record.getMessage())}
-    return json.dumps(content, default=str)
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        known = {"event": getattr(record, "event", "message"), **getattr(record, "fields", {})}
+        if known["event"] == "message":
+            known["message"] = hide_passwords(record.getMessage())
+        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+        level = record.levelname.lower()
+        head = {"time": time, "level": level, "run_id": current_run_id()}
+        return json.dumps(head | known, default=str)
 
 
 def configure_logs(chosen: LogFormat) -> None:
     """Send the program's log to stderr in a format."""
-    handler = JsonHandler() if for_machines(chosen) else PeopleHandler()
+    handler: logging.Handler = PeopleHandler()
+    if for_machines(chosen):
+        handler = logging.StreamHandler()
+        handler.setFormatter(JsonFormatter())
     LOGGER.handlers[:] = [handler]
     LOGGER.setLevel(logging.INFO)
     LOGGER.propagate = False
