@@ -1,9 +1,9 @@
 """Figures and numbers of docs/statistics.md, from the Gram rows of a campaign that has been run.
 
-python -m benchmarks.statistics_figures ROOT [CAMPAIGN]
+python -m benchmarks.statistics_figures ROOT [CAMPAIGN] [--output docs/images]
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import matplotlib as mpl
@@ -40,7 +40,6 @@ from fleet_slip.regression.shrinkage.disturbance import disturb
 from fleet_slip.regression.validation.folds import CohortFolds, by_hash
 from fleet_slip.warehouse.tables import Warehouse
 
-IMAGES = Path(__file__).parents[1] / "docs" / "images"
 SIGNALS = catalogue()
 LABEL = SIGNALS.label
 NINE = tuple(name for name in SIGNALS.inputs if name != "steering_wheel")
@@ -58,7 +57,7 @@ def load(root: str, campaign: str) -> tuple[TrainingFolds, IntArray]:
     return TrainingFolds(folds, DriveMoments.of(table), SCALES), assignment.fold
 
 
-def evidence(training: TrainingFolds) -> None:
+def evidence(training: TrainingFolds, output: Path) -> None:
     total = training.folds.total
     order = rank("backward", total, NINE, LABEL)
     fits = nested_fits(total, order, LABEL)
@@ -87,10 +86,10 @@ def evidence(training: TrainingFolds) -> None:
     axes.set_ylabel("contribution A")
     axes.set_xticks(at, order, rotation=30, ha="right")
     axes.legend(fontsize=8)
-    save(figure, "contributions")
+    save(figure, output / "statistics_contributions.svg")
 
 
-def orders(training: TrainingFolds, fold: IntArray) -> None:
+def orders(training: TrainingFolds, fold: IntArray, output: Path) -> None:
     total = training.folds.total
     figure, axes = plt.subplots(figsize=(6.4, 3.4))
     for name in RANKINGS:
@@ -104,14 +103,14 @@ def orders(training: TrainingFolds, fold: IntArray) -> None:
     axes.set_ylabel("cross-validated RMSE, deg")
     axes.set_yscale("log")
     axes.legend(fontsize=8, title="order")
-    save(figure, "nested")
+    save(figure, output / "statistics_nested.svg")
     for criterion in ("bic", CROSS_VALIDATION):
         rule = Rule("backward", criterion)
         honest = cross_validate_selection("rule", training, fold, NINE, LABEL, rule)
         print(f"  backward + {criterion}: {' '.join(honest.signals)}, r = {honest.correlation:.5f}")
 
 
-def subsets(training: TrainingFolds) -> None:
+def subsets(training: TrainingFolds, output: Path) -> None:
     total = training.folds.total
     results = best_subsets(total, NINE, LABEL)
     for result in results:
@@ -132,7 +131,7 @@ def subsets(training: TrainingFolds) -> None:
     axes.set_xlabel("number of signals")
     axes.set_ylabel("unexplained share, 1 - R²")
     axes.legend(fontsize=8)
-    save(figure, "subsets")
+    save(figure, output / "statistics_subsets.svg")
 
 
 def uncertainty(training: TrainingFolds, fold: IntArray) -> None:
@@ -150,20 +149,25 @@ def uncertainty(training: TrainingFolds, fold: IntArray) -> None:
         print(f"  noise {noise}: r {after.correlation:.4f}, rmse {after.rmse_deg:.4f} deg")
 
 
-def save(figure: Figure, name: str) -> None:
-    IMAGES.mkdir(exist_ok=True)
+def save(figure: Figure, file: Path) -> None:
     figure.tight_layout()
-    figure.savefig(IMAGES / f"statistics_{name}.svg", metadata={"Date": None})
+    figure.savefig(file, metadata={"Date": None})
     plt.close(figure)
 
 
 def main() -> None:
     mpl.rcParams.update({"svg.hashsalt": "fleet-slip", "axes.grid": True, "grid.alpha": 0.3})
-    training, fold = load(sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else "waterford")
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("root")
+    parser.add_argument("campaign", nargs="?", default="waterford")
+    parser.add_argument("--output", type=Path, default=Path(), help="folder of the pictures")
+    given = parser.parse_args()
+    training, fold = load(given.root, given.campaign)
+    given.output.mkdir(parents=True, exist_ok=True)
     print(f"{training.folds.drives} drives, {training.folds.total.n} rows")
-    evidence(training)
-    orders(training, fold)
-    subsets(training)
+    evidence(training, given.output)
+    orders(training, fold, given.output)
+    subsets(training, given.output)
     uncertainty(training, fold)
 
 

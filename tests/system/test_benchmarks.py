@@ -20,12 +20,8 @@ DEADLINE_S = 1800
 
 TINY = {
     "billion": "--root {folder} --rows 3e4",
-    "bound": "{root}",
-    "calibration": "--campaign fleet --cars 2",
     "cluster": "--days 1 --workers 1",
-    "course": "{root} --cohort \"campaign LIKE '%course'\" --columns ay_mean_16,steering_mean_16",
     "crash": "--kills 2 --commands gram",
-    "drift": "4 --drives 2",
     "flips": "--flips 1",
     "fuzz": "--cases 10 --target config",
     "gram_variants": "--root {root} --campaign smoke --only packed",
@@ -33,7 +29,6 @@ TINY = {
     "ingest": "--rows 2000,4000",
     "ingest_folder": "--files 3 --rows 100",
     "interleave": "--schedules 2 --first gram --second simulate",
-    "nights": "{root} --nights 2 --output {folder}",
     "on_board": "{root} smoke --seconds 0.01",
     "overnight": "--hours 0 --kills 1 --folder {folder}/overnight",
     "peers": "--root {root} --campaign smoke --only fleet_slip duckdb scikit-learn",
@@ -46,7 +41,7 @@ TINY = {
     "simulator_profile": "--campaign smoke",
     "soak": "--minutes 0.1",
     "start": "--rounds 1",
-    "statistics_figures": "{root} smoke",
+    "statistics_figures": "{root} smoke --output {folder}",
     "suggest": "",
     "validation": "",
 }
@@ -81,6 +76,7 @@ def tiny_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
 @pytest.mark.timeout(2 * DEADLINE_S)
 @pytest.mark.parametrize("name", TINY)
 def test_a_benchmark_runs_with_tiny_sizes(name: str, tiny_root: Path, tmp_path: Path) -> None:
+    before = checkout()
     root = shutil.copytree(tiny_root, tmp_path / "data")
     given = shlex.split(TINY[name].format(root=root, folder=tmp_path / "folder"))
     done = subprocess.run(
@@ -94,6 +90,33 @@ def test_a_benchmark_runs_with_tiny_sizes(name: str, tiny_root: Path, tmp_path: 
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     assert done.stdout
+    assert checkout() == before
+
+
+def checkout() -> dict[Path, int]:
+    """Return when each file was written that a benchmark might take for its own."""
+    files = (
+        path for folder in ("docs", "benchmarks", "configs") for path in (HERE / folder).rglob("*")
+    )
+    return {
+        path: path.stat().st_mtime_ns for path in files if path.is_file() and path.suffix != ".pyc"
+    }
+
+
+def test_a_benchmark_names_the_package_that_is_missing(tmp_path: Path) -> None:
+    lacking = "raise ModuleNotFoundError('No module', name='highway_env')"
+    (tmp_path / "highway_env.py").write_text(lacking)
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.simulator"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}:{HERE}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("This benchmark needs the package highway_env, which is not")
+    assert "Traceback" not in done.stderr
 
 
 def programs() -> set[str]:
