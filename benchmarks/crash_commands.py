@@ -121,7 +121,7 @@ COMMANDS = (
     Command("simulate", (), SIMULATE),
     Command("ingest", (SIMULATE,), INGEST),
     Command("replace", (*LOGS, ("gram",)), REPLACE),
-    Command("undo", (*LOGS, ("gram",)), ("ingest", "--undo", "log.csv"), done=5),
+    Command("undo", (*LOGS, ("gram",)), ("ingest", "--undo", "log.csv")),
     Command("gram", LOGS, ("gram",)),
     Command("gram of features", (*LOGS, ("gram",)), ("gram", "--features", "all")),
     Command("select", (*LOGS, ("gram",)), ("select", "--json")),

@@ -8,7 +8,7 @@ from fleet_slip.caches import code_folder
 from fleet_slip.extras import missing
 
 try:
-    import llvmlite
+    import llvmlite  # type: ignore[import-untyped]
     import numba
 except ModuleNotFoundError:  # of an extra: what is compiled says so when it is called
     numba = None  # type: ignore[assignment]

@@ -185,7 +185,7 @@ class LogsAndGrams(Rooted):
 
         `what` is the name of either, or what a file's drives begin with, such as
         `logger-0123456789ab`. Gram rows and refused rows go too; all can land again. Raises
-        `QuestionError` if there is no such drive, `StorageError` and `ConflictError`.
+        `StorageError` and `ConflictError`.
         """
         from fleet_slip.maintenance.superseding import take_back
 

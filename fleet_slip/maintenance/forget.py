@@ -8,6 +8,7 @@ logs. What such jobs have written is deleted by them or here.
 """
 
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -21,6 +22,7 @@ from fleet_slip.maintenance.find_drives import (
     Located,
     digests_of,
     drives_by_file,
+    find_old_files,
     locate,
     quarantined_of,
     read_old_files,
@@ -75,20 +77,23 @@ def forget(
     """Forget drives; with `now`, delete the replaced files at once instead of by `vacuum`.
 
     `source_file` is the file by whose name they go. It can be repeated after interruptions.
-    `progress` counts files. Raises `QuestionError` for no such drive, `StorageError`,
-    `ConflictError`.
+    `progress` counts files. What was superseded is no drive: of it, `now` deletes the old files.
+    Raises `QuestionError` for no such drive, `StorageError`, `ConflictError`.
     """
     audit = Audit(warehouse.root)
     located = locate(warehouse.grams.snapshot(), subject)
     drives = _drives_of(warehouse, subject, located)
     state = audit.state(subject)
+    superseded = False
     if not drives and state is None and subject.kind != "before":
-        raise QuestionError(
-            f"no drive has {subject.column} {subject.value!r}. See: "
-            'fleet-slip sql "SELECT drive_id, vehicle_id, day FROM drives"'
-        )
+        superseded = now and any(one.drives for one in find_old_files(warehouse, subject))
+        if not superseded:
+            raise QuestionError(
+                f"no drive has {subject.column} {subject.value!r}. See: "
+                'fleet-slip sql "SELECT drive_id, vehicle_id, day FROM drives"'
+            )
     models = audit.models_of(subject)
-    if state == ALLOWED or (drives and state != "begun"):
+    if state == ALLOWED or superseded or (drives and state != "begun"):
         models = _begin(warehouse, audit, subject, drives, located, source_file)
     for name in (cleared := warehouse.root / "cleared").names():
         cleared.delete(name)  # releases up to 0.2 listed cars there that were not forgotten
@@ -109,7 +114,7 @@ def forget(
     uncommitted = remove_old_files(warehouse, subject, replaced=False)
     reconcile(warehouse)
     old = remove_old_files(warehouse, subject, replaced=now)
-    if drives or state in ("begun", ALLOWED):
+    if drives or superseded or state in ("begun", ALLOWED):
         audit.end(subject, warehouse.grams.snapshot().version)
     under_way = [f"the run {run}" for run in runs_under_way(warehouse.root)] if now else []
     return ForgetReport(
@@ -198,19 +203,24 @@ def forget_called(
     now: bool = False,
     progress: Progress = no_progress,
 ) -> ForgetReport:
-    """Forget every drive of a name or file. Raises `QuestionError` if there is none."""
-    drives = sorted(_drives_called(warehouse, calling, value, old=now))
-    if not drives:
+    """Forget every drive of a name or file, also what takes the place of some meanwhile.
+
+    Raises `QuestionError` if there is none.
+    """
+    reports, done = [], set[str]()
+    source_file = value if calling == "source_file" else None
+    while drives := _drives_called(warehouse, calling, value, old=now and not done) - done:
+        for drive in sorted(drives):
+            subject = Forgettable("drive", drive)
+            with suppress(QuestionError):  # it was replaced
+                reports.append(forget(warehouse, subject, now=now, source_file=source_file))
+            progress(1, len(drives))
+        done |= drives
+    if not reports:
         raise QuestionError(
             f"no drive has {calling} {value!r}. See: "
             f'fleet-slip sql "SELECT drive_id, {calling} FROM drives"'
         )
-    reports = []
-    source_file = value if calling == "source_file" else None
-    for drive in drives:
-        subject = Forgettable("drive", drive)
-        reports.append(forget(warehouse, subject, now=now, source_file=source_file))
-        progress(1, len(drives))
     return ForgetReport(
         drives=sum(one.drives for one in reports),
         rows=sum(one.rows for one in reports),

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.delta import Change, Snapshot, Unit, retry_conflicts
-from fleet_slip.errors import QuestionError
+from fleet_slip.errors import ConflictError
 from fleet_slip.ingest.landing.data_files import TableName
 from fleet_slip.ingest.landing.known_files import WITHDRAWALS
 from fleet_slip.ingest.landing.marks import MEASURED, KnownMarks, Origin
@@ -74,28 +74,27 @@ def drives_in(warehouse: Warehouse, logs: Snapshot) -> dict[str, set[str]]:
 def take_back(warehouse: Warehouse, what: str) -> int:
     """Take out what was ingested from a file, or through a mapping; return how many drives.
 
-    `what` names either, or begins the names of a file's drives. Raises `QuestionError` for none.
+    `what` names either, or begins the names of a file's drives. All of it goes that is there at the
+    commit, whoever replaces it meanwhile.
     """
-    drives = _drives_called(warehouse, what)
-    if not drives:
-        raise QuestionError(
-            f"no drive of the logs came from a file {what!r}, or through a mapping of this name. "
-            'See: fleet-slip sql "SELECT drive_id, source_file FROM drives"'
-        )
-    origins = {origin.file for drive in drives if (origin := Origin.of_drive(drive))}
     taking_out = TakingOut(warehouse)
 
-    def attempt(name: TableName) -> None:
-        table = warehouse.quarantine if name == "quarantine" else warehouse.logs
-        snapshot = table.snapshot()
-        gone = taking_out.without(name, snapshot, origins)
-        change = Change(gone.add, gone.remove, gone.units, {"job": "undo"})
-        if gone.remove or gone.units:
-            snapshot.commit_or_discard(change)
+    def attempt() -> int:
+        logs = warehouse.logs.snapshot()
+        drives = _drives_called(warehouse, what)
+        if warehouse.logs.snapshot().version != logs.version:
+            raise ConflictError(f"{warehouse.root}: the logs keep changing. Run it again.")
+        origins = {origin.file for drive in drives if (origin := Origin.of_drive(drive))}
+        refused = warehouse.quarantine.snapshot()
+        changes: dict[TableName, Snapshot] = {"quarantine": refused, "logs": logs}
+        for name, snapshot in changes.items() if drives else ():
+            gone = taking_out.without(name, snapshot, origins)
+            if gone.remove or gone.units:
+                change = Change(gone.add, gone.remove, gone.units, {"job": "undo"})
+                snapshot.commit_or_discard(change)
+        return len(drives)
 
-    retry_conflicts(lambda: attempt("quarantine"))
-    retry_conflicts(lambda: attempt("logs"))
-    return len(drives)
+    return retry_conflicts(attempt)
 
 
 def _drives_called(warehouse: Warehouse, what: str) -> list[str]:

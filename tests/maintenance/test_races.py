@@ -13,11 +13,13 @@ from typing import Any
 import pytest
 
 import fleet_slip
+from fleet_slip import Fleet
 from fleet_slip.delta import Change, Snapshot
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.rows import gram_job
 from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.ingest import Mapping
 from fleet_slip.maintenance import compaction
 from fleet_slip.maintenance.compaction import compact
 from fleet_slip.maintenance.forget import forget
@@ -38,7 +40,7 @@ from fleet_slip.warehouse.tables import Warehouse
 from tests.maintenance.test_forget import CARS, drive, fill, mentions
 from tests.support.commands import RunCommand, run
 from tests.support.logs import land, path_of
-from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file
+from tests.support.measured import SIGNALS, a_mapping, csv_text, good_columns, ingest_file
 
 BETA = Forgettable("vehicle", "beta")
 
@@ -298,6 +300,72 @@ def test_the_command_says_what_may_be_left_and_finishes_when_it_is_repeated(
     assert run_command("forget", "--vehicle", "beta", "--allow").exit_code == 0
     assert run_command("forget", "--vehicle", "gamma", "--allow").exit_code == 5
     assert run_command("forget", "--vehicle", "beta", "--allow", "--now").exit_code == 2
+
+
+LAPS = {"column": "car", "vehicle_id": "car-of-mine"}
+TAKING_AWAY: dict[str, Callable[[Fleet], int]] = {
+    "undo": lambda fleet: fleet.take_back("log.csv"),
+    "forget the file": lambda fleet: fleet.forget(source_file="log.csv", now=True).drives,
+    "forget a name": lambda fleet: fleet.forget(drive_name="lap", now=True).drives,
+}
+
+
+def corrected() -> Mapping:
+    turned = {"column": "beta", "unit": "deg", "negate": True}
+    return a_mapping(drive=LAPS, signals={**SIGNALS, "sideslip": turned})
+
+
+def names_in(fleet: Fleet) -> set[str]:
+    return {name for (name,) in fleet.sql("SELECT DISTINCT drive_name FROM log").fetchall()}
+
+
+@pytest.fixture
+def laps(tmp_path: Path) -> Fleet:
+    """A file of two drives, `lap` and `slalom`."""
+    fleet = fleet_slip.open(tmp_path / "data")
+    fleet.ingest(measured(tmp_path, "lap", "slalom"), a_mapping(drive=LAPS))
+    return fleet
+
+
+@pytest.mark.parametrize("table", ["quarantine", "logs"])
+@pytest.mark.parametrize("way", TAKING_AWAY)
+def test_what_replaced_a_file_meanwhile_goes_with_it(
+    laps: Fleet, way: str, table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def replace() -> None:
+        laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
+
+    just_before_its_commit(monkeypatch, replace, table)
+    assert TAKING_AWAY[way](laps) >= (1 if way == "forget a name" else 2)
+    left = {"slalom"} if way == "forget a name" else set()
+    assert names_in(laps) == left
+    assert laps.sql("SELECT count(*) FROM quarantine").fetchall() == [(len(left),)]
+    assert not laps.verify(full=True).damage
+
+
+@pytest.mark.parametrize("way", TAKING_AWAY)
+def test_what_is_taken_away_while_it_is_replaced_is_not_doubled(
+    laps: Fleet, way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is as if it had been taken away before: what was undone lands, not what is forgotten."""
+    just_before_its_commit(monkeypatch, lambda: TAKING_AWAY[way](laps))
+    laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
+    found = laps.sql("SELECT drive_name, count(DISTINCT drive_id) FROM log GROUP BY ALL").fetchall()
+    assert all(many == 1 for _, many in found)
+    assert names_in(laps) >= ({"slalom"} if way != "forget the file" else set())
+    assert not laps.verify(full=True).damage
+
+
+@pytest.mark.parametrize("way", TAKING_AWAY)
+def test_what_was_superseded_is_no_drive(laps: Fleet, way: str, tmp_path: Path) -> None:
+    laps.gram()
+    laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
+    assert TAKING_AWAY[way](laps) == (1 if way == "forget a name" else 2)
+    assert names_in(laps) == ({"slalom"} if way == "forget a name" else set())
+    if way != "undo":
+        assert not mentions(tmp_path / "data", "lap")
+        assert laps.ingest(tmp_path / "log.csv", a_mapping(drive=LAPS), replace="all")
+        assert "lap" not in names_in(laps)
 
 
 @pytest.mark.long

@@ -210,6 +210,12 @@ def _take_back(fleet: Fleet, what: str, json: bool, *, alone: bool) -> None:
     if json:
         print_json({"drives_taken_out": drives})
         return
+    if not drives:
+        say(
+            f"nothing to undo: no drive of the logs came from a file {what!r}, or through a "
+            'mapping of this name. See: fleet-slip sql "SELECT drive_id, source_file FROM drives"'
+        )
+        return
     say(
         f"{number_of(drives, 'drive')} taken out, Gram rows and all; to land again, their files "
         "must be given again"
