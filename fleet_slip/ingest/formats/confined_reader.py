@@ -2,13 +2,12 @@
 
 A server, started once, imports what formats need and forks one reader for each file. A reader
 confines itself, opens the file, and answers what it is asked: lines of JSON on a socket. An answer
-is the sizes of its two parts, JSON, and a batch of rows as an Arrow stream.
+is two sizes and JSON; rows are an Arrow stream in memory of both processes.
 """
 
 import contextlib
 import errno
 import importlib
-import io
 import json
 import os
 import pickle
@@ -21,7 +20,7 @@ from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import polars as pl
 
@@ -75,8 +74,8 @@ def serve(control: int) -> None:
     own = os.getpid()
     with socket.socket(fileno=control) as asking:
         while True:
-            name, sockets, *_ = socket.recv_fds(asking, 100, 1)
-            if not sockets:
+            name, given, *_ = socket.recv_fds(asking, 100, 2)
+            if not given:
                 return
             module, *packages = FORMATS[name.decode()]
             importlib.import_module(f"{__package__}.{module}")
@@ -87,43 +86,61 @@ def serve(control: int) -> None:
             if not reader:
                 asking.close()
                 try:
-                    with socket.socket(fileno=sockets[0]) as channel:
-                        _read(channel, own)
+                    with (
+                        socket.socket(fileno=given[0]) as channel,
+                        os.fdopen(given[1], "wb") as rows,
+                    ):
+                        _read(_Asker(channel, rows), own)
                 finally:
                     os._exit(0)
-            os.close(sockets[0])
+            for one in given:
+                os.close(one)
             handle = os.pidfd_open(reader)
             socket.send_fds(asking, [b"."], [handle])
             os.close(handle)
 
 
-def _read(channel: socket.socket, parent: int) -> None:
+class _Asker:
+    """Who asks, and where rows are put for it."""
+
+    def __init__(self, channel: socket.socket, rows: BinaryIO) -> None:
+        self.channel, self._rows = channel, rows
+
+    def tell(self, told: Any, frame: pl.DataFrame | None = None) -> None:
+        """Send an answer, and rows with it."""
+        self._rows.seek(0)
+        if frame is not None:
+            frame.write_ipc_stream(self._rows, compat_level=pl.CompatLevel.oldest())
+            self._rows.flush()
+        line = json.dumps(told).encode()
+        self.channel.sendall(SIZES.pack(len(line), self._rows.tell()) + line)
+
+
+def _read(asker: _Asker, parent: int) -> None:
     """Answer what is asked of a file, confined to it."""
     from fleet_slip.ingest.formats.confining import confine  # noqa: PLC0415 - Linux alone
 
-    with channel.makefile("rb") as asked:
+    with asker.channel.makefile("rb") as asked:
         job: Job = pickle.load(asked)  # noqa: S301 - of our own parent
         os.chdir(job.cwd)
         tempfile.tempdir = job.folder
         confine(parent, job.file, job.folder, *job.limits)
         with contextlib.ExitStack() as opened:
-            reader = _answer(channel, job.file, partial(_Reader, channel, job, opened))
+            reader = _answer(asker, job.file, partial(_Reader, asker, job, opened))
             for line in asked if reader else ():
                 name, *arguments = json.loads(line)
-                _answer(channel, job.file, partial(getattr(reader, name), *arguments))
+                _answer(asker, job.file, partial(getattr(reader, name), *arguments))
 
 
-def _answer(channel: socket.socket, file: str, find: Callable[[], Any]) -> Any:
+def _answer(asker: _Asker, file: str, find: Callable[[], Any]) -> Any:
     """Send what is found, or what is wrong."""
-    content = io.BytesIO()
     try:
         found = find()
-        told = found.told if isinstance(found, _Reader) else found
         if isinstance(found, pl.DataFrame):
-            told = found.columns
-            plain = found.rename(dict(zip(told, map(str, range(len(told))), strict=True)))
-            plain.write_ipc_stream(content, compat_level=pl.CompatLevel.oldest())
-        _send(channel, {"found": told}, content.getbuffer())
+            names = {name: str(place) for place, name in enumerate(found.columns)}
+            asker.tell({"found": [*names]}, found.rename(names))  # Arrow cuts names at a NUL
+        else:
+            asker.tell({"found": found.told if isinstance(found, _Reader) else found})
     except Exception as error:
         kind, text = type(error).__name__, str(error)
         if is_lack_of_memory(error) or getattr(error, "errno", 0) == errno.EFBIG:
@@ -131,34 +148,28 @@ def _answer(channel: socket.socket, file: str, find: Callable[[], Any]) -> Any:
         elif not isinstance(error, FleetSlipError):
             reason = shown(text.strip().split("\n")[0][:200]) or kind
             text = f"{shown(file)}: cannot be read: {reason}. Is it complete? Copy it again."
-        _send(channel, {"error": kind, "text": text}, b"")
+        asker.tell({"error": kind, "text": text})
         return None
     return found
-
-
-def _send(channel: socket.socket, told: Any, rows: Any) -> None:
-    line = json.dumps(told).encode()
-    channel.sendall(SIZES.pack(len(line), len(rows)) + line)
-    channel.sendall(rows)
 
 
 class _FarMeter(Meter):
     """Lets the meter of the other process know."""
 
-    def __init__(self, channel: socket.socket, is_watched: bool) -> None:
+    def __init__(self, asker: _Asker, is_watched: bool) -> None:
         super().__init__()
-        self._channel, self.is_watched = channel, is_watched
+        self._asker, self.is_watched = asker, is_watched
 
     def pass_over(self, at: int, size: int) -> None:
         if self.is_watched:
-            _send(self._channel, {"passed": [at, size]}, b"")
+            self._asker.tell({"passed": [at, size]})
 
 
 class _Reader:
     """An open file, and what of it is being read."""
 
-    def __init__(self, channel: socket.socket, job: Job, opened: contextlib.ExitStack) -> None:
-        budget = Budget(Path(job.file), job.size, _FarMeter(channel, job.is_watched))
+    def __init__(self, asker: _Asker, job: Job, opened: contextlib.ExitStack) -> None:
+        budget = Budget(Path(job.file), job.size, _FarMeter(asker, job.is_watched))
         self._source = opened.enter_context(open_here(job.format, job.bus, budget))
         self._bases: list[Base] = []
         self._batches: list[Iterator[pl.DataFrame]] = []

@@ -41,6 +41,8 @@ _ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "ARROW_DEFAULT_MEMORY_POOL": "system",
+    "MALLOC_MMAP_THRESHOLD_": "1000000000",
+    "MALLOC_TRIM_THRESHOLD_": "1000000000",
 }
 """Else libraries reserve memory for threads that a reader does not need."""
 _KEPT = ("TZ", "LD_LIBRARY_PATH")
@@ -74,7 +76,7 @@ def _end(process: "subprocess.Popen[bytes]", control: socket.socket) -> None:
     process.wait()
 
 
-def _fork_reader(name: str) -> tuple[socket.socket, int]:
+def _fork_reader(name: str, rows: int, budget: Budget) -> tuple[socket.socket, int]:
     """Return what a reader is asked through, and a handle by which it is ended."""
     with _ONE_AT_A_TIME:
         process, control = _server(os.getpid())
@@ -82,10 +84,14 @@ def _fork_reader(name: str) -> tuple[socket.socket, int]:
             _server.cache_clear()
             _, control = _server(os.getpid())
         ours, theirs = socket.socketpair()
-        with theirs:
-            socket.send_fds(control, [name.encode()], [theirs.fileno()])
-        _, [handle], *_ = socket.recv_fds(control, 1, 1)
-    return ours, handle
+        handles: list[int] = []
+        with theirs, suppress(OSError):
+            socket.send_fds(control, [name.encode()], [theirs.fileno(), rows])
+            _, handles, *_ = socket.recv_fds(control, 1, 1)
+    if not handles:
+        ours.close()
+        raise budget.crashed()
+    return ours, handles[0]
 
 
 class ConfinedSource:
@@ -93,9 +99,9 @@ class ConfinedSource:
 
     has_clock = False
 
-    def __init__(self, channel: socket.socket, handle: int, budget: Budget) -> None:
-        """Take a reader, and what may become of its file."""
-        self._channel, self._handle, self._budget = channel, handle, budget
+    def __init__(self, channel: socket.socket, rows: int, budget: Budget) -> None:
+        """Take what a reader is asked through, where it puts rows, and what these may become."""
+        self._channel, self._rows, self._budget = channel, rows, budget
         self._asked: int | None = None
         self._ready: dict[int, tuple[Any, pa.Buffer]] = {}
 
@@ -114,7 +120,11 @@ class ConfinedSource:
     def ask(self, *question: Any) -> Any:
         """Return what the reader answers. Raises `InputError`."""
         self._send(*question)
-        return self._found(*self._receive())[0]
+        return self.answer()[0]
+
+    def answer(self) -> tuple[Any, pa.Buffer]:
+        """Return what the reader says, and rows. Raises `InputError`."""
+        return self._found(*self._receive())
 
     def _batches(self, number: int) -> Iterator[pl.DataFrame]:
         """Yield rows; behind the first ones the reader looks for more meanwhile."""
@@ -176,19 +186,25 @@ class ConfinedSource:
             text, rows = SIZES.unpack(self._take(SIZES.size, until_s))
             if text > _LARGEST_TEXT or rows > self._budget.memory:
                 raise self._budget.crashed()
-            told, content = self._take(text, until_s), self._take(rows, until_s)
             try:
-                found = json.loads(told.to_pybytes())
+                found = json.loads(self._take(text, until_s))
             except (ValueError, RecursionError):
                 raise self._budget.crashed() from None
             if not (isinstance(found, dict) and "passed" in found):
-                return found, content
+                return found, self._copy(rows)
             at, size = map(int, found["passed"])
             self._budget.meter.pass_over(at, size)
 
-    def _take(self, size: int, until_s: float) -> pa.Buffer:
+    def _copy(self, size: int) -> pa.Buffer:
+        """Return rows: not the memory itself, which the reader could still change."""
+        copied = pa.allocate_buffer(size)
+        if size and os.preadv(self._rows, [memoryview(copied)], 0) != size:
+            raise self._budget.crashed()
+        return copied
+
+    def _take(self, size: int, until_s: float) -> bytes:
         """Receive so many bytes. Raises `InputError` if they do not come in time."""
-        taken = pa.allocate_buffer(size)
+        taken = bytearray(size)
         left = memoryview(taken)
         while left:
             self._channel.settimeout(max(until_s - time.monotonic(), 1e-3))
@@ -201,7 +217,7 @@ class ConfinedSource:
             if not came:
                 raise self._budget.crashed()
             left = left[came:]
-        return taken
+        return bytes(taken)
 
 
 class ConfinedClock(ConfinedSource, ClockSource):
@@ -224,8 +240,9 @@ class ConfinedClock(ConfinedSource, ClockSource):
 def open_confined(name: str, bus: CanBus | None, budget: Budget) -> Iterator[ConfinedSource]:
     """Open a file of a format for reading by another process. Raises `InputError`."""
     with TemporaryDirectory(prefix="fleet-slip-", ignore_cleanup_errors=True) as folder:
-        channel, handle = _fork_reader(name)
-        with channel:
+        rows = os.memfd_create("rows")
+        with os.fdopen(rows, "rb"):
+            channel, handle = _fork_reader(name, rows, budget)
             try:
                 job = Job(
                     *(name, os.fspath(budget.file), budget.size, bus, str(Path.cwd()), folder),
@@ -233,11 +250,12 @@ def open_confined(name: str, bus: CanBus | None, budget: Budget) -> Iterator[Con
                     is_watched=budget.meter.is_watched,
                 )
                 channel.sendall(pickle.dumps(job))
-                source = ConfinedSource(channel, handle, budget)
-                has_clock = source._found(*source._receive())[0]
-                yield ConfinedClock(channel, handle, budget) if has_clock else source
+                source = ConfinedSource(channel, rows, budget)
+                has_clock = source.answer()[0]
+                yield ConfinedClock(channel, rows, budget) if has_clock else source
             finally:
                 with suppress(ProcessLookupError):
                     signal.pidfd_send_signal(handle, signal.SIGKILL)
                 select.select([handle], [], [])  # until it is gone, and its locks
                 os.close(handle)
+                channel.close()
