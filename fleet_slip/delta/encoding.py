@@ -1,13 +1,6 @@
-"""Rows as the bytes of a Parquet file, its checksum, and what stands before the rows.
-
-    PAR1 | FSPF, layout, number of parts; length and XXH3 of each; XXH3 of all this | parts | rows …
-
-Parts, such as a rollup, land and go with the rows. Parquet readers start from the end, and pass
-over them.
-"""
+"""Rows as the bytes of a Parquet file, and its checksum."""
 
 import json
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -16,11 +9,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-import xxhash
 
-from fleet_slip.errors import StorageError
 from fleet_slip.files.checksums import checksum_of, fast_checksum_of
-from fleet_slip.files.folder import Folder
 
 DAY = "day"
 """The one column of which the Delta log tells the least and the largest value."""
@@ -28,16 +18,6 @@ DAY = "day"
 ROW_GROUP_ROWS = 2**17
 WRITE_BATCH_ROWS = 2**14
 """Rows that the encoder takes at once: 16 times its default is a sixth faster."""
-
-_PARQUET = b"PAR1"
-_MAGIC = b"FSPF"
-_LAYOUT = 1
-_HEAD = struct.Struct("<4sHH")
-_PART = struct.Struct("<QQ")
-_CHECKSUM = struct.Struct("<Q")
-
-FIRST_BYTES = 2**17
-"""So much of a file is read at first: with it, mostly, the part that is wanted."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +51,8 @@ class Encoding:
             "compression": self.compression,
         }
 
-    def encode(
-        self, rows: pa.Table, omitted: Sequence[str] = (), leading: Sequence[bytes] = ()
-    ) -> Encoded:
-        """Return a file of these rows, `leading` parts first, with dictionaries of what occurs."""
+    def encode(self, rows: pa.Table, omitted: Sequence[str] = ()) -> Encoded:
+        """Return a file of these rows, with dictionaries of what occurs."""
         kept = rows.drop_columns([name for name in omitted if name in rows.schema.names])
         # A dictionary that is shared with rows of another file, or of a drive that was forgotten,
         # would bring their names along: Parquet stores one as it is given.
@@ -87,8 +65,6 @@ class Encoding:
         with pq.ParquetWriter(
             sink, stored.schema, write_batch_size=WRITE_BATCH_ROWS, **self.options()
         ) as writer:
-            if leading:
-                sink.write(pack_leading_parts(leading))
             writer.write_table(stored, row_group_size=ROW_GROUP_ROWS)
         content = sink.getvalue()
         statistics = json.dumps(_statistics(rows, stored.column_names))
@@ -117,55 +93,6 @@ def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:
     codes = whole.indices.dictionary_encode()
     values = whole.dictionary.take(codes.dictionary)
     return pa.chunked_array([pa.DictionaryArray.from_arrays(codes.indices, values)])
-
-
-def pack_leading_parts(parts: Sequence[bytes]) -> bytes:
-    """Return what stands before the rows of a file that has some parts."""
-    told = [_PART.pack(len(part), xxhash.xxh3_64_intdigest(part)) for part in parts]
-    head = _HEAD.pack(_MAGIC, _LAYOUT, len(parts)) + b"".join(told)
-    return head + _CHECKSUM.pack(xxhash.xxh3_64_intdigest(head)) + b"".join(parts)
-
-
-def read_leading_part(folder: Folder, path: str, wanted: int) -> bytes | None:
-    """Return a part before a file's rows, or None. Raises `StorageError` if it is damaged."""
-    content = folder.read(path, FIRST_BYTES)
-    places = _places(content, f"{folder}/{path}")
-    if wanted >= len(places):
-        return None
-    start, length, checksum = places[wanted]
-    if start + length > len(content):
-        content = folder.read(path, start + length)
-    part = content[start : start + length]
-    if xxhash.xxh3_64_intdigest(part) != checksum:
-        raise _damaged(f"{folder}/{path}")
-    return part
-
-
-def _places(content: bytes, where: str) -> list[tuple[int, int, int]]:
-    if not content.startswith(_PARQUET + _MAGIC) or len(content) < len(_PARQUET) + _HEAD.size:
-        return []
-    begin = len(_PARQUET)
-    _, layout, count = _HEAD.unpack_from(content, begin)
-    if layout != _LAYOUT:
-        return []
-    stop = begin + _HEAD.size + count * _PART.size
-    start = stop + _CHECKSUM.size
-    if start > len(content):
-        raise _damaged(where)
-    if _CHECKSUM.unpack_from(content, stop) != (xxhash.xxh3_64_intdigest(content[begin:stop]),):
-        raise _damaged(where)
-    places = []
-    for length, checksum in _PART.iter_unpack(content[begin + _HEAD.size : stop]):
-        places.append((start, length, checksum))
-        start += length
-    return places
-
-
-def _damaged(where: str) -> StorageError:
-    return StorageError(
-        f"{where}: what stands before its rows does not match its checksum: the file was damaged. "
-        "See what can be repaired with: fleet-slip verify --repair; or restore it from a backup."
-    )
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from deltalake.transaction import AddAction
 from fleet_slip.delta.change import TableFile, addition, columns_in
 from fleet_slip.delta.commits import NOTE, checked_note
 from fleet_slip.delta.conflicts import is_conflict, retry_conflicts
-from fleet_slip.delta.encoding import Encoded, Encoding, Names, read_leading_part, read_names
+from fleet_slip.delta.encoding import Encoded, Encoding, Names, read_names
 from fleet_slip.delta.log_check import require_sound_log
 from fleet_slip.delta.schema import require_readable, require_writable
 from fleet_slip.delta.snapshot import Snapshot
@@ -110,10 +110,6 @@ class Table:
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
             return pq.read_metadata(file)
 
-    def read_leading_part(self, path: str, part: int) -> bytes | None:
-        """Return a part of what stands before a file's rows; see `fleet_slip.delta.encoding`."""
-        return read_leading_part(self.folder, path, part)
-
     def read_names(self, path: str) -> dict[str, Names]:
         """Return the names in the dictionaries of one of the table's files, by column."""
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
@@ -123,11 +119,9 @@ class Table:
         """Whether a dictionary of one of the table's files has names that none of its rows has."""
         return any(names.unused for names in self.read_names(path).values())
 
-    def write_file(
-        self, name: str, rows: pa.Table, day: date | None = None, leading: Sequence[bytes] = ()
-    ) -> AddAction:
+    def write_file(self, name: str, rows: pa.Table, day: date | None = None) -> AddAction:
         """Write rows to the file NAME-CHECKSUMS.parquet, durably; see `put`."""
-        return self.put(name, self.encode(rows, leading), day)
+        return self.put(name, self.encode(rows), day)
 
     def put(self, name: str, encoded: Encoded, day: date | None = None) -> AddAction:
         """Write a content to the file NAME-CHECKSUMS.parquet, durably; return its add action.
@@ -158,9 +152,9 @@ class Table:
         self.folder.put(file.path, encoded.content)
         return True
 
-    def encode(self, rows: pa.Table, leading: Sequence[bytes] = ()) -> Encoded:
+    def encode(self, rows: pa.Table) -> Encoded:
         """Return the content of a file with these rows."""
-        return self.encoding.encode(rows, self.partition_by, leading)
+        return self.encoding.encode(rows, self.partition_by)
 
     def require_writable(self, columns: Iterable[str]) -> None:
         """Raise `RefusedError` if rows with some of the optional columns cannot be committed."""

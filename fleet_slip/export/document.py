@@ -31,7 +31,7 @@ def document_of(
 
     `drives` is the content of the file about the drives that trained it.
     """
-    told_by = version.manifest.trained_on.told_by
+    told_by = version.manifest.trained_on.drives_sha256
     if drives is not None:
         told_by = checksum_of_drives(drives)
     content: dict[str, Any] = {
@@ -110,7 +110,7 @@ def manifest_of(
         "to": to,
         "model": version.reference,
         "sha256": version.sha256,
-        "drives_sha256": version.manifest.trained_on.told_by,
+        "drives_sha256": version.manifest.trained_on.drives_sha256,
         "angle": {
             "column": angle.column,
             "unit": angle.unit,

@@ -88,7 +88,7 @@ def _subject(
     drives = None
     if warehouse is not None:
         made = Registry.of(warehouse).trained_drives(version.manifest)
-        drives = pack_hashes(made.salted()) if made else None
+        drives = pack_hashes(made.salted) if made else None
     return Subject(version, program, checks, drives, with_gram)
 
 

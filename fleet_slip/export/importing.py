@@ -15,7 +15,7 @@ from fleet_slip.export.document import FORMAT, SCHEMA, program_content
 from fleet_slip.files.documents import checksum
 from fleet_slip.models.manifest import ImportedFrom, Manifest
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.trained_drives import DriveRecord, checksum_of_drives
+from fleet_slip.models.trained_drives import checksum_of_drives
 from fleet_slip.models.versions import Registry
 
 LONGEST_FILE_BYTES = 2**28
@@ -40,12 +40,7 @@ def import_version(registry: Registry, file: Path) -> ModelVersion:
     origin = manifest.imported_from or ImportedFrom(
         reference=model["reference"], sha256=model["sha256"]
     )
-    trained = manifest.trained_on
-    if drives:  # all of them: Gram files of another data root tell nothing here
-        own = {"drives_sha256": drives.listed_sha256, "files_sha256": None}
-        trained = trained.model_copy(update=own)
-    told = {"imported_from": origin, "trained_on": trained}
-    return registry.add(manifest.model_copy(update=told), drives)
+    return registry.add(manifest.model_copy(update={"imported_from": origin}), drives)
 
 
 def _read(file: Path) -> dict[str, Any]:
@@ -80,16 +75,16 @@ def _manifest(file: Path, model: Mapping[str, Any]) -> Manifest:
     return manifest
 
 
-def _drives(file: Path, model: Mapping[str, Any], manifest: Manifest) -> DriveRecord | None:
+def _drives(file: Path, model: Mapping[str, Any], manifest: Manifest) -> bytes | None:
     """Return what tells the version's drives; None if nothing ever did."""
     trained = manifest.trained_on
     if trained.drives_sha256 is None:
         return None
-    expected = model.get("drives_sha256") if trained.files_sha256 else trained.drives_sha256
+    expected = trained.drives_sha256
     try:
         content = base64.b64decode(model["drives"], validate=True)
     except (KeyError, TypeError, ValueError, binascii.Error):
         content = b""
     if checksum_of_drives(content) != expected:
         raise InputError(f"{file}: lacks the hashes of the drives that trained it. {_EXPORT}")
-    return DriveRecord(content)
+    return content

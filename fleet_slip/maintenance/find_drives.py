@@ -17,7 +17,6 @@ from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.folder import StoredFile
 from fleet_slip.grams.rows.backlog import BEING_WRITTEN_HOURS
 from fleet_slip.maintenance.vacuum import find_temporary_files, find_unreferenced
-from fleet_slip.models.drives_of_files import keep_drives_of
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.audit import Forgettable
 from fleet_slip.warehouse.database import open_database, reading_files
@@ -47,8 +46,6 @@ def remove_old_files(warehouse: Warehouse, subject: Forgettable, *, replaced: bo
     deleted = kept = 0
     pending: list[str] = []
     old = find_old_files(warehouse, subject)
-    grams = (one.file for one in old if one.file.folder == warehouse.grams.folder)
-    keep_drives_of(warehouse.root, [file.path for file in grams] if replaced else ())
     for one in old:
         if one.replaced and not replaced:
             kept += 1

@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.files.folder import Folder
-from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
+from fleet_slip.grams.rows.gram_rows import Hashes, hash_numbers
 from fleet_slip.models.manifest import TrainedOn
 from fleet_slip.models.salted_drives import hash_drives
 from fleet_slip.models.versions import Registry
@@ -85,7 +85,7 @@ def _may_have_seen(
         if here and manifest.trained_on.grams_version >= without:
             return False
         made = registry.trained_drives(manifest)
-        return made is None or not bool(np.isin(made.salted(), present.hashed_for(name)).all())
+        return made is None or not bool(np.isin(made.salted, present.hashed_for(name)).all())
     except FleetSlipError:
         return True
 

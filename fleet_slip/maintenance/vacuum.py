@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 from fleet_slip.delta import Table
 from fleet_slip.files.folder import TEMPORARY_PREFIX, StoredFile
-from fleet_slip.models.drives_of_files import keep_drives_of
 from fleet_slip.runs.history import gather_runs
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -31,8 +30,6 @@ def vacuum(warehouse: Warehouse, retention_hours: float = RETENTION_HOURS) -> Va
     """Remove what nothing has referred to for some hours; gather the records of runs."""
     warehouse.require()
     expired = find_expired(warehouse, retention_hours)
-    grams = warehouse.grams.folder
-    keep_drives_of(warehouse.root, [file.path for file in expired if file.folder == grams])
     removed = [file for file in expired if file.folder.remove(file)]
     gather_runs(warehouse.root)
     return _report(warehouse, removed, dry_run=False)

@@ -18,7 +18,6 @@ from fleet_slip.grams.rows.check_grams import (
     stored_grams,
 )
 from fleet_slip.grams.rows.gram_files import is_of_received
-from fleet_slip.grams.rows.rollup import is_rollup_of, read_rollup
 from fleet_slip.maintenance.verify_files import Verification
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import database_errors, open_database
@@ -104,15 +103,11 @@ def _verify_unique(warehouse: Warehouse, grams: Sequence[TableFile], report: Ver
 
 
 def _verify_each(warehouse: Warehouse, grams: Sequence[TableFile], report: Verification) -> None:
-    """Look for received Gram rows that no counts or drives can have, and for wrong rollups."""
+    """Look for received Gram rows that no counts or drives can have."""
     for file in grams:
         rows = warehouse.grams.read(file.path)
         for drive, problem in find_unsound(rows):
             told = f"the Gram row that a car sent of drive {drive} {problem}"
-            report.note("gram", f"grams/{file.path}", told)
-        rollup = read_rollup(warehouse.grams, file.path)
-        if rollup and not is_rollup_of(rollup, rows):
-            told = "its rollup is not that of its Gram rows"
             report.note("gram", f"grams/{file.path}", told)
 
 

@@ -18,8 +18,9 @@ from fleet_slip.models.manifest import (
     TrainedOn,
 )
 from fleet_slip.models.recipe import asked_of
+from fleet_slip.models.salted_drives import hash_drives
 from fleet_slip.models.straight_on import StraightOn, straight_on
-from fleet_slip.models.trained_drives import DriveRecord
+from fleet_slip.models.trained_drives import checksum_of_drives, pack_hashes
 from fleet_slip.regression.validation.crossval import CrossValidation
 from fleet_slip.selection.select_models import RequestedSelection, Selection
 from fleet_slip.warehouse.condition import parse_cohort
@@ -58,8 +59,7 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
             rows=winner.pooled.rows + rows_beside,
             logs_version=selection.cohort.logs_version,
             grams_version=selection.cohort.grams_version,
-            drives_sha256=drives.listed_sha256,
-            files_sha256=drives.files_sha256,
+            drives_sha256=checksum_of_drives(drives),
         ),
         selected_by=SelectedBy(
             model_list=selection.model_list,
@@ -105,10 +105,10 @@ def with_straight_intercept(
     return manifest.model_copy(update={**own, **taught})
 
 
-def drives_of(selection: Selection[Any], name: str) -> DriveRecord:
-    """Return what tells the drives that a selection's winner was trained on."""
+def drives_of(selection: Selection[Any], name: str) -> bytes:
+    """Return the salted hashes of the drives that a selection's winner was trained on, packed."""
     signals = (*selection.winner.model.signals, catalogue().label)
-    return DriveRecord.of(name, *selection.cohort.members.by_file(signals))
+    return pack_hashes(hash_drives(name, selection.cohort.members.drives_with(signals)))
 
 
 def _term(name: str, coefficient: Fraction) -> ModelTerm:

@@ -64,7 +64,7 @@ def _drives(registry: Registry, one: ModelVersion, other: ModelVersion) -> Commo
     if one.manifest.name != other.manifest.name:  # their hashes are salted differently
         return None
     made = [registry.trained_drives(version.manifest) for version in (one, other)]
-    a, b = (drives.salted() if drives else None for drives in made)
+    a, b = (drives.salted if drives else None for drives in made)
     if a is None or b is None:
         return None
     both = len(np.intersect1d(a, b, assume_unique=True))

@@ -131,8 +131,8 @@ class CrossValidated(Config):
 class TrainedOn(Config):
     """The data that made a model.
 
-    `vehicles` and `drives_sha256` (`fleet_slip.models.trained_drives`) are None in older versions,
-    `files_sha256` where no Gram file tells drives; `drives_without_log` sent Gram rows.
+    `vehicles` and `drives_sha256` (`fleet_slip.models.trained_drives`) are None in older versions;
+    `drives_without_log` sent Gram rows.
     """
 
     cohort: str
@@ -144,12 +144,6 @@ class TrainedOn(Config):
     logs_version: Count
     grams_version: Count
     drives_sha256: Sha256 | None = None
-    files_sha256: Annotated[Sha256 | None, _LEFT_OUT] = None
-
-    @property
-    def told_by(self) -> str | None:
-        """The SHA-256 of what tells the drives, or most of them; None if nothing does."""
-        return self.files_sha256 or self.drives_sha256
 
     @model_validator(mode="after")
     def _can_be(self) -> Self:

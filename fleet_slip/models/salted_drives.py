@@ -4,7 +4,7 @@ from hashlib import sha256
 
 import numpy as np
 
-from fleet_slip.grams.rows.rollup import Hashes
+from fleet_slip.grams.rows.gram_rows import Hashes
 
 _SALT = b"fleet-slip trained drives\n"
 _AT_ONCE = 2**20

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from fleet_slip.catalogue.sources import RECEIVED
-from fleet_slip.grams.rows.rollup import hash_numbers
+from fleet_slip.grams.rows.gram_rows import hash_numbers
 from fleet_slip.models.estimates.score import cohort_of_rows
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.versions import Registry

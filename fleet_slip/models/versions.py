@@ -9,19 +9,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
 import pyarrow as pa
 
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN
 from fleet_slip.config import parse_document
-from fleet_slip.errors import ConflictError, QuestionError, RefusedError, StorageError
+from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.files.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.aliases import CHAMPION, AliasHistory
-from fleet_slip.models.drives_of_files import GramDrives, read_files, tree_name
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.trained_drives import DriveRecord, TrainedDrives, read_listed
+from fleet_slip.models.trained_drives import TrainedDrives, keep_drives, read_listed
 
 if TYPE_CHECKING:
     from fleet_slip.delta import Table
@@ -117,41 +115,15 @@ class Registry:
         return AliasHistory(DocumentFolder(self.folder / name / "history"))
 
     def trained_drives(self, manifest: Manifest) -> TrainedDrives | None:
-        """Return the drives that made a version; None if it does not tell. Raises `StorageError`.
-
-        Those of Gram files, which the manifest names, are read when they are asked for.
-        """
-        versions, checksum = self.folder_of(manifest.name), manifest.trained_on.files_sha256
-        listed = read_listed(versions, manifest)
-        if listed is None:
-            return None
-        files = read_files(versions, tree_name(checksum)) if checksum else {}
-        return TrainedDrives(listed, files, self._drives_of_files(manifest.name))
+        """Return what drives made a version; None if it does not tell. Raises `StorageError`."""
+        listed = read_listed(self.folder_of(manifest.name), manifest)
+        return None if listed is None else TrainedDrives(manifest.name, listed)
 
     def require_drives(self, manifest: Manifest) -> None:
         """Raise `StorageError` if what tells a version's drives is damaged or gone."""
-        if made := self.trained_drives(manifest):
-            made.among(np.array([], dtype=np.uint64))
+        self.trained_drives(manifest)
 
-    def _drives_of_files(self, name: str) -> GramDrives:
-        grams = self.grams.folder if self.grams else self.folder
-        return GramDrives(name, self.folder_of(name), grams)
-
-    def _keep_drives(self, name: str, record: DriveRecord) -> None:
-        """Write what tells a new version's drives, before there is the version."""
-        record.keep(self.folder_of(name))
-        if record.files and self.grams:
-            # Who deletes a Gram file of no current version looks for files that name it. One that
-            # was replaced before this record was there is looked after here.
-            active = {file.path for file in self.grams.snapshot().files}
-            try:
-                self._drives_of_files(name).keep(record.files.keys() - active)
-            except StorageError as error:
-                raise ConflictError(
-                    f"Gram rows that {name} was made of are gone: {error} Publish it again."
-                ) from None
-
-    def add(self, manifest: Manifest, drives: DriveRecord | None = None) -> ModelVersion:
+    def add(self, manifest: Manifest, drives: bytes | None = None) -> ModelVersion:
         """Make a manifest the next version of its model, after what tells its `drives`.
 
         If the latest is the same estimator from the same rows, it is used: another process added
@@ -159,7 +131,7 @@ class Registry:
         """
         name, versions = manifest.name, self._versions(manifest.name)
         if drives is not None:
-            self._keep_drives(name, drives)
+            keep_drives(self.folder_of(name), drives)
 
         def next_version(latest: int) -> int | None:
             if latest and self.load(name, latest).manifest.same_estimator(manifest):

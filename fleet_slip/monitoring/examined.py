@@ -17,20 +17,15 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.compute as pc
-
 from fleet_slip.caches import cache_folder
 from fleet_slip.canonical import canonical_json
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import RECEIVED
 from fleet_slip.delta import Snapshot, TableFile
 from fleet_slip.errors import DataError, NotComputedError, UnexaminedError
-from fleet_slip.grams.cohorts.folding import EACH, Folding
 from fleet_slip.grams.cohorts.gram_reader import GramReader
 from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.grams.rows.rollup import hash_numbers
 from fleet_slip.ingest.drives.measured_drives import SOURCE
 from fleet_slip.monitoring.plausibility import Fault
 from fleet_slip.monitoring.quality import SensorFault, examine_drives
@@ -238,23 +233,14 @@ def _keep(kept: Path, content: Mapping[str, Any]) -> None:
 
 
 def _pieces(warehouse: Warehouse, condition: Condition) -> list[_Piece]:
-    """Divide a cohort's days, so that new days change the last piece alone.
-
-    Gram files whose rollups serve are told by their names, which have the checksum of their rows.
-    """
+    """Divide a cohort's days, so that new days change the last piece alone."""
     with GramReader(warehouse) as reader:
-        opened = reader.opened(PLAIN, condition, Folding(by="day", count=EACH))
+        opened = reader.opened(PLAIN, condition)
         statement = opened.statement("examined_days.sql", condition)
         with asking(opened.database, condition):
             found = opened.database.execute(statement).fetchall()
-    days = {day: (drives, (rows,)) for day, drives, rows in found}
-    for (day,), cells in opened.cells.by("day"):
-        drives, rows = days.get(day, (0, ()))
-        paths = sorted(opened.cells.rollups[i].path for i in cells["rollup"].unique().to_pylist())
-        names = hash_numbers(pa.array(paths)).tolist()
-        days[day] = (drives + pc.sum(cells["gram_rows"]).as_py(), (*rows, *names))
     pieces: list[_Piece] = []
-    for day in (_Piece((day,), *days[day]) for day in sorted(days) if days[day][0]):
+    for day in (_Piece((day,), drives, (rows,)) for day, drives, rows in found if drives):
         if pieces and pieces[-1].drives < PIECE:
             pieces[-1] += day
         else:

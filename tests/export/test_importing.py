@@ -47,7 +47,7 @@ def test_an_imported_version_is_the_same_estimator(
     one, other = (fleet.registry().trained_drives(made.manifest) for fleet in (home, away))
     assert one is not None
     assert other is not None
-    assert np.array_equal(one.salted(), other.salted())
+    assert np.array_equal(one.salted, other.salted)
     assert away.import_model(exported) == brought
     assert away.registry().versions("smoke") == [1]
     assert away.registry().champion("smoke") is None

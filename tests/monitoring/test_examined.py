@@ -12,8 +12,6 @@ from fleet_slip import Fleet
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.app import app
 from fleet_slip.errors import DataError, RefusedError, UnexaminedError
-from fleet_slip.grams.cohorts.rollup_cells import NO_CELLS, RollupReader
-from fleet_slip.grams.rows import rollup
 from fleet_slip.models.acceptance import champion_rules
 from fleet_slip.monitoring import examined, quality
 from fleet_slip.monitoring.quality import QualityReport
@@ -195,7 +193,6 @@ def test_rows_of_whole_files_are_not_read_to_tell_that_they_are_known(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
-    monkeypatch.setattr(rollup, "ROWS_PER_CELL", 4)
     monkeypatch.setattr(examined, "PIECE", 150)
     fleet, asked = fleet_slip.open(tmp_path / "data"), list[str]()
 
@@ -211,10 +208,8 @@ def test_rows_of_whole_files_are_not_read_to_tell_that_they_are_known(
         fleet.cohort().examine()
         assert len(asked) == day + 1
         assert f"2024-05-0{day + 1}" in asked[-1]
-    # Their cells tell the days: no row of theirs is in the connection.
-    monkeypatch.setattr(RollupReader, "cells", lambda *_: NO_CELLS)
     fleet.cohort().examine()
-    assert len(asked) == 6
+    assert len(asked) == 3
 
 
 def test_drives_without_gram_rows_are_reduced_and_examined_before_they_train(

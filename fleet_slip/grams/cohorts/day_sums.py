@@ -1,4 +1,4 @@
-"""The sums of a cohort over each day, from rollups, and from Gram rows read batch by batch."""
+"""The sums of a cohort over each day, from Gram rows read batch by batch."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -11,12 +11,10 @@ from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.grams.cohorts.expansion import expansion_of
-from fleet_slip.grams.cohorts.folding import EACH, Folding
 from fleet_slip.grams.cohorts.gram_cohort import empty_cohort, require_training
 from fleet_slip.grams.cohorts.gram_reader import GramReader, open_grams
-from fleet_slip.grams.cohorts.members import Hashed, Members
-from fleet_slip.grams.rows.gram_rows import gram_table
-from fleet_slip.grams.rows.rollup import hash_numbers
+from fleet_slip.grams.cohorts.members import Members
+from fleet_slip.grams.rows.gram_rows import Hashes, hash_numbers
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.inference.drive_moments import missing_signals_error
@@ -51,19 +49,8 @@ def sum_days(
     days: dict[date, _Day] = defaultdict(_Day)
     found = False
     condition = parse_cohort(condition)
-    with open_grams(source, feature_set, condition, Folding(by="day", count=EACH)) as opened:
+    with open_grams(source, feature_set, condition) as opened:
         expansion = expansion_of(opened, feature_set)
-        if len(opened.cells.table):
-            found = True
-            require_training(opened.cells.table["source"].unique().to_pylist(), condition)
-        for (day, names), cells in opened.cells.by("day", "signals"):
-            if set(signals) <= set(names.split(",")):
-                days[day].add(
-                    names,
-                    gram_table(names, cells).restrict(signals).total(),
-                    opened.cells.drives(cells),
-                    opened.cells.vehicles(cells),
-                )
         for batch in opened.batches(condition):
             found = True
             require_training(batch["source"].unique().to_pylist(), condition)
@@ -93,7 +80,7 @@ class _Day:
     grams: dict[str, Gram] = field(default_factory=dict)
     members: Members = field(default_factory=Members)
 
-    def add(self, names: str, gram: Gram, drives: Hashed, vehicles: Hashed) -> None:
+    def add(self, names: str, gram: Gram, drives: Hashes, vehicles: Hashes) -> None:
         """Add Gram rows of the same signals."""
         self.grams[names] = self.grams[names] + gram if names in self.grams else gram
         self.members.add(names, drives, vehicles)
@@ -108,8 +95,6 @@ def _add_rows(days: dict[date, _Day], names: str, table: GramTable, rows: pa.Rec
     here = rows["day"].dictionary_encode()
     number, values = here.indices.to_numpy(), here.dictionary.to_pylist()
     ids = hash_numbers(rows["drive_id"])
-    once = bool(rows["part"].null_count == len(rows))
     for i, total in enumerate(table.totals(number, len(values))):
         mine = rows["vehicle_id"].filter(pa.array(number == i)).unique()
-        drives = Hashed.of(ids[number == i], once=once)
-        days[values[i]].add(names, total, drives, Hashed.of(hash_numbers(mine)))
+        days[values[i]].add(names, total, ids[number == i], hash_numbers(mine))

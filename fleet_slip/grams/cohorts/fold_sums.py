@@ -1,4 +1,4 @@
-"""The sums of a cohort over its folds, from rollups, and from Gram rows read batch by batch.
+"""The sums of a cohort over its folds, from Gram rows read batch by batch.
 
 Comparing given models needs the Gram of each fold alone: any number of rows fits in memory.
 """
@@ -17,6 +17,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
 from fleet_slip.grams.cohorts.expansion import Expansion, expansion_of
 from fleet_slip.grams.cohorts.folding import (
+    EACH,
     FOLD_KEYS,
     FoldCount,
     Folding,
@@ -26,10 +27,8 @@ from fleet_slip.grams.cohorts.folding import (
 )
 from fleet_slip.grams.cohorts.gram_cohort import empty_cohort, require_training
 from fleet_slip.grams.cohorts.gram_reader import GramReader, OpenedGrams, open_grams
-from fleet_slip.grams.cohorts.members import Hashed, Members, received_among
-from fleet_slip.grams.cohorts.rollup_cells import Cells, dealt_folds
-from fleet_slip.grams.rows.gram_rows import by_signals, gram_table
-from fleet_slip.grams.rows.rollup import Hashes, hash_numbers
+from fleet_slip.grams.cohorts.members import Members, received_among
+from fleet_slip.grams.rows.gram_rows import Hashes, hash_numbers
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.validation.folds import CohortFolds
@@ -80,12 +79,11 @@ def sum_cohort(
     """
     condition = parse_cohort(condition)
     require_divided(feature_set, folding.by, folding.count)
-    with open_grams(warehouse, feature_set, condition, folding, training=True) as opened:
+    with open_grams(warehouse, feature_set, condition, training=True) as opened:
         folds = _find_folds(opened, folding, condition)
         if folds is None:
             raise empty_cohort(warehouse, condition, feature_set)
         sums = _Sums(folds, expansion_of(opened, feature_set))
-        sums.add_cells(opened.cells, condition)
         for batch in opened.batches(condition):
             require_training(batch["source"].unique().to_pylist(), condition)
             sums.add(batch)
@@ -110,44 +108,34 @@ class _Folds:
 
     Attributes:
         of_rows: tells the fold of each Gram row, from its metadata and its drive's hash.
-        of_cells: tells the fold of each cell of rollups.
-        key: what was dealt into the buckets of the cells that folds are made of.
     """
 
     names: Sequence[str]
     of_rows: Callable[[pa.RecordBatch, Hashes], IntArray]
-    of_cells: Callable[[pa.Table], IntArray]
-    key: str = "drive"
 
 
 def _find_folds(opened: OpenedGrams, folding: Folding, condition: Condition) -> _Folds | None:
     """Return the folds of a cohort; None of an empty one. Raises like `sum_cohort`."""
-    cells, key, few = opened.cells.table, FOLD_KEYS[folding.by], dealt_folds(folding)
-    found = pa.array([], pa.null())
-    if not (few and len(cells)):  # else the cells alone tell that there are more than folds
-        text = opened.statement("cohort_sums.sql", condition)
-        query = f"SELECT DISTINCT {key} FROM ({text}){f' LIMIT {few + 1}' if few else ''}"
-        with asking(opened.database, condition):
-            found = opened.database.sql(query).to_arrow_table()[key].combine_chunks()
-    if few and (len(cells) or len(found) > few):
+    key, dealt = FOLD_KEYS[folding.by], folding.by in ("drive", "vehicle")
+    few = folding.count if dealt and folding.count != EACH else None
+    text = opened.statement("cohort_sums.sql", condition)
+    query = f"SELECT DISTINCT {key} FROM ({text}){f' LIMIT {few + 1}' if few else ''}"
+    with asking(opened.database, condition):
+        found = opened.database.sql(query).to_arrow_table()[key].combine_chunks()
+    if few and len(found) > few:
         return _Folds(
             [str(fold + 1) for fold in range(few)],
             lambda rows, drives: (_dealt(rows, drives, key) % few).astype(np.int64),
-            lambda cells: cells["bucket"].to_numpy() % few,
-            folding.by,
         )
-    if len(cells):
-        of_cells = cells[key].combine_chunks().unique().cast(found.type)
-        found = pa.concat_arrays([found, of_cells]).unique()
     if not len(found):
         return None
     assignment = assign_folds(found.to_pylist(), folding.by, folding.count)
 
-    def fold_of(rows: pa.RecordBatch | pa.Table) -> IntArray:
+    def fold_of(rows: pa.RecordBatch, _: Hashes) -> IntArray:
         at: IntArray = pc.index_in(rows[key].cast(found.type), value_set=found).to_numpy()
         return assignment.fold[at]
 
-    return _Folds(assignment.names, lambda rows, _: fold_of(rows), fold_of)
+    return _Folds(assignment.names, fold_of)
 
 
 def _dealt(rows: pa.RecordBatch, drives: Hashes, key: str) -> Hashes:
@@ -175,26 +163,10 @@ class _Sums:
         """Add a batch of Gram rows."""
         drives = hash_numbers(batch["drive_id"])
         folds, came = self.known.of_rows(batch, drives), received_among(batch)
-        once = bool(batch["part"].null_count == len(batch))  # else a drive may have several
         for signals, table, here in self.expansion.tables(batch):
             self._add(signals, table, folds[here])
             cars = hash_numbers(batch["vehicle_id"].filter(pa.array(here)).unique())
-            own, sent = (Hashed.of(drives[some], once=once) for some in (here, here & came))
-            self.members.add(signals, own, Hashed.of(cars), sent)
-
-    def add_cells(self, cells: Cells, condition: Condition) -> None:
-        """Add cells of rollups. Raises `RefusedError` for those of scenarios."""
-        if not len(cells.table):
-            return
-        require_training(cells.table["source"].unique().to_pylist(), condition)
-        dealt = cells.dealt(self.known.key).combine_chunks()
-        folds = self.known.of_cells(dealt)
-        [batch] = dealt.to_batches()
-        for signals, some, here in by_signals(batch):
-            self._add(signals, gram_table(signals, some), folds[here])
-        for (signals,), mine in cells.by("signals"):
-            found = cells.drives(mine), cells.vehicles(mine), cells.received(mine)
-            self.members.add(signals, *found)
+            self.members.add(signals, drives[here], cars, drives[here & came])
 
     def _add(self, signals: str, table: GramTable, folds: IntArray) -> None:
         totals = table.totals(folds, len(self.known.names))

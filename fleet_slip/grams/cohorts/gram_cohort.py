@@ -25,7 +25,7 @@ from fleet_slip.grams.cohorts.folding import (
 )
 from fleet_slip.grams.cohorts.gram_reader import GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.cohorts.members import Hashed, Members, received_among
-from fleet_slip.grams.rows.rollup import hash_numbers
+from fleet_slip.grams.rows.gram_rows import hash_numbers
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.inference.drive_moments import serving_drives
 from fleet_slip.regression.validation.folds import CohortFolds
@@ -79,7 +79,7 @@ class Cohort(CohortOrigin):
         received = [some[mask] for some, mask in zip(drives, came, strict=True)]
         return Members(
             *(
-                {name: Hashed.of(some) for name, some in zip(names, parts, strict=True)}
+                {name: Hashed(some) for name, some in zip(names, parts, strict=True)}
                 for parts in (drives, vehicles, received)
             )
         )

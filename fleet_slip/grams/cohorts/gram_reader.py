@@ -19,9 +19,7 @@ from fleet_slip.catalogue.sources import ALL_DRIVES, LONGEST_PAUSE_S, TRAINING_D
 from fleet_slip.delta import Snapshot
 from fleet_slip.errors import DataError, NotComputedError
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
-from fleet_slip.grams.cohorts.folding import Folding
 from fleet_slip.grams.cohorts.outweighing import Outweighing, find_outweighing
-from fleet_slip.grams.cohorts.rollup_cells import NO_CELLS, Cells, RollupReader
 from fleet_slip.grams.received.car_keys import CarKey, load_car_keys
 from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.grams.rows.receiver_delay import RECEIVER
@@ -41,13 +39,12 @@ BATCH_NUMBERS = 2**20
 
 @dataclass(frozen=True)
 class OpenedGrams:
-    """A connection to Gram rows but for those in `cells`, without what is `outweighing`."""
+    """A connection to Gram rows, without what is `outweighing`."""
 
     database: duckdb.DuckDBPyConnection
     identity: str
     logs_version: int
     grams_version: int
-    cells: Cells = NO_CELLS
     outweighing: tuple[Outweighing, ...] = ()
 
     def statement(self, name: str, condition: Condition, **values: str) -> str:
@@ -133,9 +130,7 @@ class GramReader:
         self._warehouse = warehouse
         self._logs: Snapshot | None = None
         self._grams: Snapshot | None = None
-        self._without: frozenset[str] = frozenset()
         self._database: duckdb.DuckDBPyConnection | None = None
-        self._rollups = RollupReader()
 
     def __enter__(self) -> Self:
         return self
@@ -144,17 +139,12 @@ class GramReader:
         self._close()
 
     def opened(
-        self,
-        feature_set: str,
-        condition: Condition,
-        folding: Folding | None = None,
-        *,
-        training: bool = False,
+        self, feature_set: str, condition: Condition, *, training: bool = False
     ) -> OpenedGrams:
         """Return the Gram rows of a feature set; they are valid until the next call.
 
-        For sums over folds, cells stand in for rows. For `training`, what outweighs others is left
-        out. Raises `DataError` for missing Gram rows, or a set incomplete for a cohort.
+        For `training`, what outweighs others is left out. Raises `DataError` for missing Gram rows,
+        or a set incomplete for a cohort.
         """
         grams, logs = gram_snapshots(self._warehouse, self._grams, self._logs)
         if grams is not self._grams or logs is not self._logs:
@@ -167,41 +157,25 @@ class GramReader:
                 f"Run: {'' if logs.rows else fill}fleet-slip gram."
             )
         one = features().feature_set(feature_set)
-        calibrated, drive_by_drive = bool(one.calibrated), one.calibrated or one.change_ticks
-        for name in (feature_set, *([CALIBRATION] if calibrated else [])):
+        for name in (feature_set, *([CALIBRATION] if one.calibrated else [])):
             if name != PLAIN:
                 rows = partial(self._opened, grams, logs, name)
                 _require_complete(logs, grams, rows, name, condition)
-        cells = NO_CELLS
-        if folding and not drive_by_drive:
-            identity = features().identity(feature_set)
-            revoked = {key.vehicle_id for key in _revoked_keys()}
-            cells = self._rollups.cells(grams, logs, identity, condition, folding, revoked)
-        opened = self._opened(grams, logs, feature_set, cells)
+        opened = self._opened(grams, logs, feature_set)
         sent = feature_set == PLAIN or one.change_ticks
         if not (training and sent and has_received(grams)):
             return opened
-        outweighing = find_outweighing(opened, condition)
-        if outweighing is None:
-            opened = self._opened(grams, logs, feature_set)
-            outweighing = find_outweighing(opened, condition)
-        return replace(opened, outweighing=outweighing or ())
+        return replace(opened, outweighing=find_outweighing(opened, condition))
 
-    def _opened(
-        self, grams: Snapshot, logs: Snapshot, feature_set: str, cells: Cells = NO_CELLS
-    ) -> OpenedGrams:
-        if self._database is None or cells.paths != self._without:
-            self._close()
-            read = replace(grams, without=cells.paths) if cells.paths else grams
-            self._database = open_tables(self._warehouse, {"grams"}, [read, logs])
-            self._without = cells.paths
-            lock(self._database, read.paths)
+    def _opened(self, grams: Snapshot, logs: Snapshot, feature_set: str) -> OpenedGrams:
+        if self._database is None:
+            self._database = open_tables(self._warehouse, {"grams"}, [grams, logs])
+            lock(self._database, grams.paths)
         return OpenedGrams(
             self._database,
             features().identity(feature_set),
             logs.version or 0,
             grams.version or 0,
-            cells,
         )
 
     def _close(self) -> None:
@@ -215,16 +189,15 @@ def open_grams(
     source: Warehouse | GramReader,
     feature_set: str,
     condition: Condition,
-    folding: Folding | None = None,
     *,
     training: bool = False,
 ) -> Iterator[OpenedGrams]:
     """Open the Gram rows of a feature set, anew unless by a reader; see `opened`."""
     if isinstance(source, GramReader):
-        yield source.opened(feature_set, condition, folding, training=training)
+        yield source.opened(feature_set, condition, training=training)
     else:
         with GramReader(source) as reader:
-            yield reader.opened(feature_set, condition, folding, training=training)
+            yield reader.opened(feature_set, condition, training=training)
 
 
 def _revoked_keys() -> tuple[CarKey, ...]:

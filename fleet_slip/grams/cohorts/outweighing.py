@@ -3,8 +3,8 @@
 A car that sends Gram rows says itself how many they are of. So each counts with at most `MOST_CARS`
 times the rows of the mean car, bounded likewise: with logs first, then its shortest drives, whole,
 so that sums stay exact. The mean, since where most cars have sent little yet the others are no
-liars. Rollups tell rows of `BUCKETS` groups of cars: while none has more than `MOST_GROUPS` times
-the median's, no car outweighs a sixtieth or so, and all count, with rollups or without.
+liars. Of `BUCKETS` groups of cars, while none has more than `MOST_GROUPS` times the median's rows,
+no car outweighs a sixtieth or so, and all count.
 """
 
 from collections.abc import Sequence
@@ -17,8 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.grams.cohorts.rollup_cells import Cells
-from fleet_slip.grams.rows.rollup import BUCKETS, hash_numbers
+from fleet_slip.grams.rows.gram_rows import hash_numbers
 from fleet_slip.warehouse.condition import Condition, asking
 from fleet_slip.warehouse.database import sql_text
 
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
 
 MOST_CARS = 4
 MOST_GROUPS = 2
+BUCKETS = 60
 
 LEAST_CARS = 10
 """Of fewer cars the others tell little of what is usual."""
@@ -50,19 +50,16 @@ class Outweighing:
         )
 
 
-def find_outweighing(opened: "OpenedGrams", condition: Condition) -> tuple[Outweighing, ...] | None:
-    """Return what a cohort leaves out; None if rollups cannot tell, so that rows must be read."""
+def find_outweighing(opened: "OpenedGrams", condition: Condition) -> tuple[Outweighing, ...]:
+    """Return what a cohort leaves out."""
     with asking(opened.database, condition):
         text = opened.statement("rows_of_cars.sql", condition)
         cars = opened.database.sql(text).to_arrow_table()
-    rolled_up = len(opened.cells.table) > 0
-    if not rolled_up and not pc.any(cars["received"]).as_py():
+    if not pc.any(cars["received"]).as_py():
         return ()
-    groups = _rows_of_groups(cars, opened.cells)
+    groups = _rows_of_groups(cars)
     if groups.max() <= MOST_GROUPS * np.sort(groups)[BUCKETS // 2]:
         return ()
-    if rolled_up:
-        return None
     if len(cars) < LEAST_CARS:
         return ()
     most = most_rows(cars["n"].to_numpy())
@@ -101,13 +98,10 @@ def _left_out(
     return tuple(found)
 
 
-def _rows_of_groups(cars: pa.Table, cells: Cells) -> IntArray:
+def _rows_of_groups(cars: pa.Table) -> IntArray:
     totals = np.zeros(BUCKETS, dtype=np.int64)
     buckets = (hash_numbers(cars["vehicle_id"].cast(pa.string())) % BUCKETS).astype(np.int64)
     np.add.at(totals, buckets, cars["n"].to_numpy())
-    if len(cells.table):
-        dealt = cells.dealt("vehicle")
-        np.add.at(totals, dealt["bucket"].to_numpy(), dealt["n"].to_numpy())
     return totals
 
 

@@ -9,7 +9,6 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.catalogue.sources import RECEIVED_FILES
 from fleet_slip.delta import Snapshot, Table, TableFile
-from fleet_slip.grams.rows.rollup import make_rollup
 from fleet_slip.warehouse.tables import Warehouse
 
 FILE_ROWS = 100_000
@@ -55,7 +54,7 @@ def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
             empty = [name for name in warehouse.grams.optional if _is_empty(part, name)]
             part = part.drop_columns(empty)
             name = f"{prefix}{identity}"
-            actions.append(warehouse.grams.write_file(name, part, leading=make_rollup(part)))
+            actions.append(warehouse.grams.write_file(name, part))
     return actions
 
 

@@ -1,15 +1,20 @@
 """Gram rows as they are read, turned into arrays: by which signals they have."""
 
 from collections.abc import Iterator
+from hashlib import sha256
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalogue.sources import RECEIVED_FILES
 from fleet_slip.regression.exact.gram import packed_size
 from fleet_slip.regression.exact.gram_table import GramTable
+
+Hashes = NDArray[np.uint64]
+"""Hashes of drives or cars: what tells one from others, in 8 bytes."""
 
 
 def by_signals(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.RecordBatch, BoolArray]]:
@@ -53,3 +58,9 @@ def list_array(values: IntArray) -> pa.ListArray:
 def is_received(rows: pa.Table) -> pa.ChunkedArray:
     """Return which rows of `grams` came without a log."""
     return pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
+
+
+def hash_numbers(ids: pa.Array | pa.ChunkedArray) -> Hashes:
+    """Return the hash of each id of a drive or a car, see `Hashes`."""
+    first = b"".join([sha256(one.encode("utf-8")).digest()[:8] for one in ids.to_pylist()])
+    return np.frombuffer(first, dtype=">u8").astype(np.uint64)

@@ -15,7 +15,7 @@ import pyarrow as pa
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.rows.rollup import hash_numbers
+from fleet_slip.grams.rows.gram_rows import hash_numbers
 from fleet_slip.ingest.drives.measured_drives import SOURCE
 from fleet_slip.ingest.drives.suspicion import Suspicion, find_suspicions
 from fleet_slip.models.acceptance.champion_rules import find_lacks

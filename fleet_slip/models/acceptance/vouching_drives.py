@@ -5,8 +5,6 @@ many that outweighs what it loses elsewhere. So where the champion meets new dri
 much more wrong than on those that made it, both are compared on these alone.
 """
 
-from collections import defaultdict
-from datetime import date
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,7 @@ from fleet_slip.grams.cohorts.fold_sums import SummedCohort
 from fleet_slip.grams.cohorts.folding import FOLD_KEYS, assign_folds
 from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
 from fleet_slip.grams.cohorts.taught_cohort import TaughtCohort
-from fleet_slip.grams.rows.rollup import hash_numbers
+from fleet_slip.grams.rows.gram_rows import hash_numbers
 from fleet_slip.models.acceptance.champion_rules import GROUPS, Contest, as_it_is, contest, worth
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.versions import Registry
@@ -38,11 +36,6 @@ MOST_DRIVES = 20_000
 
 _HEX = 4
 
-MOST_READ = 500_000
-"""Of more drives, only those of some days are read to choose from, the last day among them."""
-
-SOME_DAYS = 5
-
 
 def odd_gain(registry: Registry, selection: Selection[Any], champion: ModelVersion) -> str | None:
     """Return why a person must look first: it is better on odd new drives alone; else None.
@@ -54,7 +47,7 @@ def odd_gain(registry: Registry, selection: Selection[Any], champion: ModelVersi
     if made is None or isinstance(selection.cohort, TaughtCohort):
         return None
     try:
-        cohort = _some_drives(registry, selection)
+        cohort = _some_drives(selection)
         known = made.among(hash_numbers(cohort.drives["drive_id"]))
         if known.any() and not known.all():
             return _compare(selection, champion, cohort, known)
@@ -63,40 +56,16 @@ def odd_gain(registry: Registry, selection: Selection[Any], champion: ModelVersi
     return None
 
 
-def _some_drives(registry: Registry, selection: Selection[Any]) -> Cohort:
+def _some_drives(selection: Selection[Any]) -> Cohort:
     cohort: Cohort | SummedCohort = selection.cohort
     if isinstance(cohort, Cohort):
         return cohort
     condition, drives = cohort.condition, cohort.drive_count
-    if drives > MOST_READ and (days := _some_days(registry, cohort)):
-        named = ", ".join(f"DATE '{day}'" for day in days)
-        condition &= parse_condition(f"day IN ({named})")
-        drives = sum(days.values())
     if drives > MOST_DRIVES:
         below = 16**_HEX * MOST_DRIVES // drives
         chosen = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
         condition &= parse_condition(chosen)
     return load_cohort(cohort.source, condition, cohort.feature_set)
-
-
-def _some_days(registry: Registry, cohort: SummedCohort) -> dict[date, int]:
-    """Return the number of drives on some of a cohort's days, the first and the last among them.
-
-    None where not all drives are of Gram files with rollups, each of a day.
-    """
-    files, others = cohort.members.by_file(())
-    if registry.grams is None or len(others):
-        return {}
-    days = {file.path: file.days for file in registry.grams.snapshot().files}
-    drives: dict[date, int] = defaultdict(int)
-    for path, places in files.items():
-        first, last = days.get(path) or (date.min, date.max)
-        if first != last:
-            return {}
-        drives[first] += sum(many for _, many in places)
-    every = sorted(drives)
-    chosen = np.linspace(0, len(every) - 1, SOME_DAYS).round().astype(int).tolist()
-    return {every[i]: drives[every[i]] for i in chosen}
 
 
 def _compare(

@@ -6,7 +6,7 @@ import pyarrow as pa
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.grams.cohorts.members import Hashed, Members
 from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.grams.rows.rollup import hash_numbers
+from fleet_slip.grams.rows.gram_rows import hash_numbers
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 
@@ -19,10 +19,8 @@ def hashes(names: list[str]) -> list[int]:
 
 
 def members() -> Members:
-    drives = {
-        signals: Hashed.of(hash_numbers(pa.array(names))) for signals, names in DRIVES.items()
-    }
-    cars = {signals: Hashed.of(hash_numbers(pa.array(["car-1"]))) for signals in DRIVES}
+    drives = {signals: Hashed(hash_numbers(pa.array(names))) for signals, names in DRIVES.items()}
+    cars = {signals: Hashed(hash_numbers(pa.array(["car-1"]))) for signals in DRIVES}
     return Members(drives, cars)
 
 
