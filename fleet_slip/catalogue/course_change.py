@@ -40,8 +40,6 @@ LARGEST_RAD = Fraction(1, 2)
 STRAIGHT_RAD_S, STRAIGHT_RAD = Fraction(1, 50), Fraction(1, 20)
 """Largest yaw rate at both fixes, and angle turned between them, of a car that goes straight on:
 a gyroscope is off by up to 0.01 rad/s."""
-LARGEST_CHANGE_BITS = 21
-"""A difference of two counts of 20 bits."""
 LATE_PARTS = 4
 """A course's delay is a whole number of these parts of a tick, 2.5 ms: the yaw rate does not change
 by enough in half of it to matter."""

@@ -139,10 +139,6 @@ def _checksum(body: bytes) -> bytes:
     return hashlib.sha256(body).hexdigest()[:_DIGITS].encode()
 
 
-NewestDocuments = Mapping[str, tuple[int, str]]
-"""Number and SHA-256 of the newest document of each folder, by its path below the data root."""
-
-
 def newest_documents(root: Folder) -> dict[str, tuple[int, str]]:
     """Return the newest documents as they are now; nothing of a folder that cannot be read."""
     found = {}

@@ -226,7 +226,7 @@ def search_models(
     return SearchedModels(search, tuple(inputs), models)
 
 
-def searching(found: SearchedModels, size: int, *, intercept: bool = True) -> Procedure:
+def searching(found: SearchedModels, size: int, *, intercept: bool) -> Procedure:
     """Return what searches again in given rows for so many columns, or the most that they allow."""
 
     def procedure(gram: Gram) -> LinearModel:

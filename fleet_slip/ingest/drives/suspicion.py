@@ -93,15 +93,6 @@ def speed_mps(signals: Signals) -> FloatArray | None:
     return signals.get("vx", signals.get("vehicle_speed"))
 
 
-def speed_ratio(signals: Signals) -> float | None:
-    """Return ay over yaw rate times speed: 1, or how wrong the speed is; None if unrelated."""
-    speed = speed_mps(signals)
-    if speed is None or not {"ay", "yaw_rate"} <= set(signals):
-        return None
-    slope, correlation = slope_of(signals["ay"], signals["yaw_rate"] * speed, moving(speed))
-    return abs(slope) if abs(correlation) > SURE_CORRELATION and slope else None
-
-
 def _still(signals: Signals) -> Iterator[Suspicion]:
     for name, values in signals.items():
         present = values[np.isfinite(values)]

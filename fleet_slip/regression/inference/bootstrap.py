@@ -29,8 +29,9 @@ class Interval:
     replicates: int
 
 
-def percentile_interval(values: FloatArray, level: float = 0.95) -> Interval:
-    """Return the central percentile interval of finite values."""
+def percentile_interval(values: FloatArray) -> Interval:
+    """Return the central 95 % percentile interval of finite values."""
+    level = 0.95
     finite = values[np.isfinite(values)]
     low, high = np.quantile(finite, [(1 - level) / 2, (1 + level) / 2])
     return Interval(float(low), float(high), level, len(finite))

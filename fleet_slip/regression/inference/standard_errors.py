@@ -154,7 +154,7 @@ def cluster_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
     return drives.sum_clusters(scores)
 
 
-def small_sample_factor(fitted: Fit, clusters: int, unit: str = "drive") -> float:
+def small_sample_factor(fitted: Fit, clusters: int, unit: str) -> float:
     """Return P/(P-1) (n-1)/(n-k-1). Raises `DataError` for a single cluster."""
     if clusters < 2:
         otherwise = ": take drives for independent, cluster drive" if unit == "vehicle" else ""
