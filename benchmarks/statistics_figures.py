@@ -15,7 +15,6 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.regression.choice.criteria import CRITERIA, criterion_values
 from fleet_slip.regression.choice.nested_choice import (
     CROSS_VALIDATION,
     Rule,
@@ -25,7 +24,14 @@ from fleet_slip.regression.choice.nested_choice import (
     nested_fits,
 )
 from fleet_slip.regression.choice.signal_orders import RANKINGS, rank
-from fleet_slip.regression.choice.subsets import all_rss, best_subsets, pick_sizes, subset_sizes
+from fleet_slip.regression.choice.subsets import (
+    CRITERIA,
+    all_rss,
+    best_subsets,
+    criterion_values,
+    pick_sizes,
+    subset_sizes,
+)
 from fleet_slip.regression.exact.least_squares import correlation_matrix, fit
 from fleet_slip.regression.inference.bootstrap import (
     bootstrap_correlations,
@@ -36,7 +42,7 @@ from fleet_slip.regression.inference.bootstrap import (
 from fleet_slip.regression.inference.drive_moments import DriveMoments, serving_drives
 from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.inference.standard_errors import infer_by_clusters, infer_classically
-from fleet_slip.regression.shrinkage.disturbance import disturb
+from fleet_slip.regression.shrinkage.ridge import disturb
 from fleet_slip.regression.validation.folds import CohortFolds, by_hash
 from fleet_slip.warehouse.tables import Warehouse
 

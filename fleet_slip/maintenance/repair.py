@@ -25,7 +25,7 @@ from fleet_slip.maintenance.verify_files import Verification, read_whole
 from fleet_slip.resources import config_names
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
 from fleet_slip.simulation.drives import simulate_batch
-from fleet_slip.simulation.landed_batches import file_name
+from fleet_slip.simulation.simulation_job import file_name
 from fleet_slip.warehouse.tables import Warehouse
 
 

@@ -23,8 +23,7 @@ from fleet_slip.models.estimates.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.monitoring.thresholds import MonitorThresholds, thresholds
-from fleet_slip.regression.exact.distributions import student_t_quantile
-from fleet_slip.regression.exact.figures import error_sums
+from fleet_slip.regression.exact.figures import error_sums, student_t_quantile
 from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.regression.exact.least_squares import LinearModel
 from fleet_slip.regression.validation.crossval import least_squares

@@ -17,10 +17,8 @@ from fleet_slip.grams.cohorts.training_folds import clustered_moments
 from fleet_slip.regression.choice.nested_choice import Rule
 from fleet_slip.regression.choice.stepwise import METHODS
 from fleet_slip.regression.choice.winner import Worth, fall_short
-from fleet_slip.regression.exact.distributions import student_t_two_sided
+from fleet_slip.regression.exact.figures import student_t_two_sided
 from fleet_slip.regression.validation.crossval import CrossValidation
-from fleet_slip.selection.influence import influential_cars, without_vehicles
-from fleet_slip.selection.label_noise import label_noise_deg
 from fleet_slip.selection.model_list import (
     WHOLE_SET,
     CandidateModel,
@@ -46,7 +44,12 @@ from fleet_slip.selection.search import (
     try_distances,
 )
 from fleet_slip.selection.select_models import RequestedSelection, Selection, select
-from fleet_slip.selection.uncertainty import estimate_uncertainty
+from fleet_slip.selection.uncertainty import (
+    estimate_uncertainty,
+    influential_cars,
+    label_noise_deg,
+    without_vehicles,
+)
 from fleet_slip.selection.without_label import without_label
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -12,13 +12,13 @@ from fleet_slip.grams.cohorts.gram_cohort import Cohort, Served
 from fleet_slip.grams.cohorts.training_folds import clustered_moments
 from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.exact.least_squares import Fit, LinearModel, condition_number, fit
-from fleet_slip.regression.inference.coefficient_tests import (
+from fleet_slip.regression.inference.drive_moments import ClusterUnit, DriveMoments, serving_drives
+from fleet_slip.regression.inference.evidence import (
+    Evidence,
     FTest,
     chow_test,
     wald_test,
 )
-from fleet_slip.regression.inference.drive_moments import ClusterUnit, DriveMoments, serving_drives
-from fleet_slip.regression.inference.evidence import Evidence
 from fleet_slip.regression.inference.influential import LEAST_CARS, Influential
 from fleet_slip.regression.inference.serial import (
     AutoregressiveFit,
@@ -34,7 +34,7 @@ from fleet_slip.regression.inference.standard_errors import (
     variance_inflation,
 )
 from fleet_slip.regression.shrinkage.ridge import fit_errors_in_variables
-from fleet_slip.selection.influence import influential_cars
+from fleet_slip.selection.uncertainty import influential_cars
 from fleet_slip.words import number_of
 
 

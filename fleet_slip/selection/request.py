@@ -9,9 +9,9 @@ from typing_extensions import Doc
 
 from fleet_slip.errors import UsageError
 from fleet_slip.grams.cohorts.folding import FoldKey
-from fleet_slip.regression.choice.criteria import CRITERIA
 from fleet_slip.regression.choice.signal_orders import RANKINGS
 from fleet_slip.regression.choice.stepwise import METHODS
+from fleet_slip.regression.choice.subsets import CRITERIA
 from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Worth
 from fleet_slip.regression.inference.drive_moments import ClusterUnit
 

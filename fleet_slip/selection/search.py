@@ -13,7 +13,6 @@ from fleet_slip.grams.cohorts.fold_sums import SummedCohort
 from fleet_slip.grams.cohorts.folding import ROW_FOLDS, Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.grams.cohorts.training_folds import drive_folds, row_training
-from fleet_slip.regression.choice.criteria import CRITERIA
 from fleet_slip.regression.choice.nested_choice import (
     CROSS_VALIDATION,
     FEWEST_FOLDS,
@@ -27,7 +26,7 @@ from fleet_slip.regression.choice.nested_choice import (
 )
 from fleet_slip.regression.choice.nested_choice import NestedChoice as NestedSelection
 from fleet_slip.regression.choice.stepwise import stepwise_order
-from fleet_slip.regression.choice.subsets import SizeResult, best_subsets, pick_sizes
+from fleet_slip.regression.choice.subsets import CRITERIA, SizeResult, best_subsets, pick_sizes
 from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Winner, Worth, choose
 from fleet_slip.regression.exact.figures import ErrorSums
 from fleet_slip.regression.exact.gram import Gram

@@ -9,8 +9,7 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
 from fleet_slip.regression.exact.figures import Figures, error_sums
 from fleet_slip.regression.exact.least_squares import LinearModel
-from fleet_slip.regression.shrinkage.disturbance import disturb
-from fleet_slip.regression.shrinkage.ridge import fit_noise_matched
+from fleet_slip.regression.shrinkage.ridge import disturb, fit_noise_matched
 
 
 @dataclass(frozen=True)

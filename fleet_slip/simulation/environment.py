@@ -17,18 +17,19 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.compiling import equation
 from fleet_slip.errors import UsageError
 from fleet_slip.extras import needed
-from fleet_slip.vehicle.dynamics import Derivative, driven_body, rates_of
-from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
-from fleet_slip.vehicle.parameters import Constants, constants, load_vehicle
-from fleet_slip.vehicle.state import Controls, State
-from fleet_slip.vehicle.wheels import (
+from fleet_slip.vehicle.dynamics import (
     Acceleration,
+    Derivative,
     ackermann,
     braked_spins,
     build_wheel_forces,
+    driven_body,
     driver_brakes,
+    rates_of,
     transferred_loads,
 )
+from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
+from fleet_slip.vehicle.parameters import Constants, Controls, State, constants, load_vehicle
 
 
 class Brakes(NamedTuple):

@@ -6,8 +6,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from fleet_slip.config import Config
-from fleet_slip.simulation.drive_plan import CarOnRoad, DrawnPlan
-from fleet_slip.simulation.drivers import Drivers
+from fleet_slip.simulation.drive_plan import CarOnRoad, DrawnPlan, Drivers
 from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Uniform
 from fleet_slip.simulation.manoeuvres import KINDS, Manoeuvre
 from fleet_slip.simulation.roads import road_class

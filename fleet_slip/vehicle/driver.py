@@ -10,8 +10,14 @@ from typing import NamedTuple
 
 from fleet_slip.compiling import equation
 from fleet_slip.vehicle.integration import Path, Pose
-from fleet_slip.vehicle.parameters import GRAVITY_MPS2, Constants, VehicleParameters, constants
-from fleet_slip.vehicle.state import Controls, State
+from fleet_slip.vehicle.parameters import (
+    GRAVITY_MPS2,
+    Constants,
+    Controls,
+    State,
+    VehicleParameters,
+    constants,
+)
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
 SAMPLE_S = 0.01

@@ -23,8 +23,14 @@ from fleet_slip.vehicle.integration import (
     advance,
     extrapolate,
 )
-from fleet_slip.vehicle.parameters import Constants, VehicleParameters, constants, load_vehicle
-from fleet_slip.vehicle.state import Controls, State
+from fleet_slip.vehicle.parameters import (
+    Constants,
+    Controls,
+    State,
+    VehicleParameters,
+    constants,
+    load_vehicle,
+)
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
 with needed("highway", "the car as a highway-env vehicle"):

@@ -8,22 +8,23 @@ from typing import NamedTuple
 
 from fleet_slip.compiling import equation
 from fleet_slip.vehicle.car_imperfections import PNEUMATIC_TRAIL_M, Traits
-from fleet_slip.vehicle.dynamics import Derivative, driven_body, rates_of
-from fleet_slip.vehicle.integration import extrapolate
-from fleet_slip.vehicle.parameters import Constants
-from fleet_slip.vehicle.state import Controls, State
-from fleet_slip.vehicle.tyre import CREEP_SPEED_MPS, brush_force
-from fleet_slip.vehicle.wheels import (
+from fleet_slip.vehicle.dynamics import (
     Acceleration,
+    Derivative,
     Direction,
     Loads,
     WheelForce,
     WheelForces,
     direction_of,
+    driven_body,
     driven_spins,
     in_car_frame,
+    rates_of,
     transferred_loads,
 )
+from fleet_slip.vehicle.integration import extrapolate
+from fleet_slip.vehicle.parameters import Constants, Controls, State
+from fleet_slip.vehicle.tyre import CREEP_SPEED_MPS, brush_force
 
 
 class Around(NamedTuple):

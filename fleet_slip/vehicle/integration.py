@@ -8,10 +8,8 @@ its heading a unit vector: no search, no angle.
 from typing import NamedTuple
 
 from fleet_slip.compiling import equation
-from fleet_slip.vehicle.dynamics import Derivative
-from fleet_slip.vehicle.parameters import Constants
-from fleet_slip.vehicle.state import State
-from fleet_slip.vehicle.wheels import WheelRate
+from fleet_slip.vehicle.dynamics import Derivative, WheelRate
+from fleet_slip.vehicle.parameters import Constants, State
 
 STEP_S = 0.002
 

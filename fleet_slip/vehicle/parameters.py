@@ -1,4 +1,7 @@
-"""A car: the parameters of `configs/vehicles/*.toml`, and the constants of its equations."""
+"""A car: the parameters of `configs/vehicles/*.toml`, and the constants of its equations.
+
+What the equations of motion take and give.
+"""
 
 from typing import NamedTuple, Self
 
@@ -287,3 +290,30 @@ def constants(vehicle: VehicleParameters, adhesion: float) -> Constants:
         drag_per_mass=drag / mass,
         inverse_slip_band=1 / (2 * drive.slip_control),
     )
+
+
+class State(NamedTuple):
+    """Motion of the car in its own frame, SI units, signs after ISO 8855."""
+
+    vx: float
+    vy: float
+    yaw_rate: float
+    steering_wheel: float
+    traction: float
+    """Tractive force per mass after the drivetrain's lag; braking where negative."""
+    ax_lag: float
+    """Longitudinal acceleration as the load transfer has followed it."""
+    ay_lag: float
+    wheel_fl: float
+    wheel_fr: float
+    wheel_rl: float
+    wheel_rr: float
+
+
+class Controls(NamedTuple):
+    """What the driver asks for."""
+
+    steering_wheel: float
+    """Angle in rad."""
+    traction: float
+    """Force along the car per mass, in m/s²; braking where negative."""

@@ -18,7 +18,7 @@ from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.models.publish import publish
 from fleet_slip.models.versions import Registry
 from fleet_slip.monitoring.monitor import Chart, Limits, monitor
-from fleet_slip.regression.exact.distributions import student_t_quantile
+from fleet_slip.regression.exact.figures import student_t_quantile
 from fleet_slip.selection.answer_request import answer_request
 from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.views import connect

@@ -11,8 +11,8 @@ from fleet_slip import open as open_fleet
 from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.models.describe_winner import manifest_of
-from fleet_slip.selection import label_noise
-from fleet_slip.selection.label_noise import label_noise_deg
+from fleet_slip.selection import uncertainty
+from fleet_slip.selection.uncertainty import label_noise_deg
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -44,6 +44,6 @@ def test_nobody_knows_the_noise_of_a_campaign_that_is_not_there(
 ) -> None:
     root = tmp_path / "data"
     shutil.copytree(smoke_root, root)
-    monkeypatch.setattr(label_noise, "find_config", lambda *_: tmp_path / "none.toml")
+    monkeypatch.setattr(uncertainty, "find_config", lambda *_: tmp_path / "none.toml")
     warehouse = Warehouse(LocalFolder(root))
     assert label_noise_deg(warehouse, load_cohort(warehouse)) is None

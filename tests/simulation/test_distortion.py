@@ -5,9 +5,8 @@ import pytest
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
-from fleet_slip.simulation.sensing.distortion import Distortion
+from fleet_slip.simulation.sensing.distortion import Distortion, Pulses
 from fleet_slip.simulation.sensing.lags import Delay, LowPass, Wander
-from fleet_slip.simulation.sensing.pulses import Pulses
 from fleet_slip.vehicle.car_imperfections import CarImperfections
 from fleet_slip.vehicle.lanes.lane_memory import CHANNELS, IMPERFECT_CHANNELS
 

@@ -11,9 +11,17 @@ from fleet_slip.resources import config_file
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.drives import simulate_logs
 from fleet_slip.simulation.imperfections import Imperfections
-from fleet_slip.simulation.sensing.distortion import INERTIAL, LABEL, WHEELS, Distortion
+from fleet_slip.simulation.sensing.distortion import (
+    AX,
+    AY,
+    FIRST_WHEEL,
+    INERTIAL,
+    LABEL,
+    WHEELS,
+    Distortion,
+    Vibration,
+)
 from fleet_slip.simulation.sensing.sensors import held
-from fleet_slip.simulation.sensing.vibration import AX, AY, FIRST_WHEEL, Vibration
 
 TICKS = 60_000
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.inference.coefficient_tests import FTest, wald_test
 from fleet_slip.regression.inference.drive_moments import DriveMoments
+from fleet_slip.regression.inference.evidence import FTest, wald_test
 from tests.support.counts import Matrix, gram_of, names, table_of
 
 

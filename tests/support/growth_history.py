@@ -24,7 +24,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.delta import Change, Unit
 from fleet_slip.grams.rows.gram_job import unit_name
 from fleet_slip.simulation.campaign import Campaign
-from fleet_slip.simulation.landed_batches import unit_of
+from fleet_slip.simulation.simulation_job import unit_of
 from fleet_slip.warehouse.tables import Warehouse
 
 SIGNALS = catalogue().gram_signals

@@ -16,8 +16,13 @@ from fleet_slip.vehicle.imperfect_dynamics import (
     imperfect_derivative,
 )
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
-from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters, constants
-from fleet_slip.vehicle.state import Controls, State
+from fleet_slip.vehicle.parameters import (
+    GRAVITY_MPS2,
+    Controls,
+    State,
+    VehicleParameters,
+    constants,
+)
 
 STEPS = round(SAMPLE_S / STEP_S)
 

@@ -8,8 +8,14 @@ from numpy.typing import NDArray
 
 from fleet_slip.vehicle.dynamics import Derivative, derivative
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
-from fleet_slip.vehicle.parameters import GRAVITY_MPS2, Constants, constants, load_vehicle
-from fleet_slip.vehicle.state import Controls, State
+from fleet_slip.vehicle.parameters import (
+    GRAVITY_MPS2,
+    Constants,
+    Controls,
+    State,
+    constants,
+    load_vehicle,
+)
 
 SEDAN = load_vehicle("d_class_sedan")
 CAR = constants(SEDAN, adhesion=1.0)

@@ -11,11 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fleet_slip.vehicle.arctangent import arctan2
 from fleet_slip.vehicle.driver import LARGEST_GRIP_USE, Handling, slip_growth
 from fleet_slip.vehicle.integration import STEP_S, Pose, PoseSlopes, advance_pose, followed
 from fleet_slip.vehicle.parameters import constants, load_vehicle
-from fleet_slip.vehicle.tyre import cornering_stiffness
+from fleet_slip.vehicle.tyre import arctan2, cornering_stiffness
 
 CARS = ("compact_hatchback", "d_class_sedan", "rear_drive_sedan", "suv")
 SIZES = st.floats(1e-6, 1e6)

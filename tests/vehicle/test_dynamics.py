@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.vehicle.driver import handling
-from fleet_slip.vehicle.parameters import GRAVITY_MPS2, constants, load_vehicle
-from fleet_slip.vehicle.state import Controls, State
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2, Controls, State, constants, load_vehicle
 from fleet_slip.vehicle.tyre import cornering_stiffness
 from tests.support.rolling import CAR, SEDAN, Run, holding, kinetic_energy, rates, rolling
 

@@ -12,8 +12,7 @@ from highway_env.vehicle.dynamics import BicycleVehicle
 
 from fleet_slip.vehicle.dynamics import NO_EXTENSIONS
 from fleet_slip.vehicle.highway import FourWheelVehicle
-from fleet_slip.vehicle.parameters import load_vehicle
-from fleet_slip.vehicle.state import Controls
+from fleet_slip.vehicle.parameters import Controls, load_vehicle
 from tests.support.rolling import SEDAN, Run, rolling
 
 gymnasium.register_envs(highway_env)

@@ -22,8 +22,7 @@ from fleet_slip.vehicle.imperfect_dynamics import (
 from fleet_slip.vehicle.integration import SECOND_ORDER
 from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
 from fleet_slip.vehicle.lanes.road import Road, Surface
-from fleet_slip.vehicle.parameters import GRAVITY_MPS2, constants, load_vehicle
-from fleet_slip.vehicle.state import Controls, State
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2, Controls, State, constants, load_vehicle
 from tests.support.whole_drives import Truth, simulate_drives
 
 SEDAN = load_vehicle("d_class_sedan")

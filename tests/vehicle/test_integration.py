@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from fleet_slip.vehicle.arctangent import arctan2
-from fleet_slip.vehicle.state import Controls
+from fleet_slip.vehicle.parameters import Controls
+from fleet_slip.vehicle.tyre import arctan2
 from tests.support.rolling import Run, rolling
 
 

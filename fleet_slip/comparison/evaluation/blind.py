@@ -24,8 +24,7 @@ from fleet_slip.comparison.evaluation.scenario_runs import (
 from fleet_slip.config import Config, load_config
 from fleet_slip.resources import config_file
 from fleet_slip.simulation.campaign import Campaign, load_campaign
-from fleet_slip.simulation.drive_plan import FleetPlan, load_by_name
-from fleet_slip.simulation.drivers import Drivers
+from fleet_slip.simulation.drive_plan import Drivers, FleetPlan, load_by_name
 from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Range, Uniform
 from fleet_slip.simulation.random_numbers import random_generator
 from fleet_slip.simulation.roads import CLASSES, draw_road

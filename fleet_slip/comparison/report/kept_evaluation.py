@@ -16,7 +16,7 @@ from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures, Evaluat
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import Document
 from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.regression.exact.distributions import student_t_two_sided
+from fleet_slip.regression.exact.figures import student_t_two_sided
 from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -25,6 +25,7 @@ from fleet_slip.warehouse.read_only_sql import one_query
 from fleet_slip.words import shown
 
 MAGIC = b"DUCK"
+MAGIC_AT = 8
 _NAME = "measured"
 """What the file is called as a database."""
 _COMPUTED = """

@@ -11,8 +11,8 @@ import numpy as np
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.choice.criteria import best_size, criterion_values
 from fleet_slip.regression.choice.signal_orders import rank
+from fleet_slip.regression.choice.subsets import best_size, criterion_values
 from fleet_slip.regression.choice.winner import DEFAULT_WORTH, Worth, choose
 from fleet_slip.regression.exact.elimination import eliminate
 from fleet_slip.regression.exact.gram import Gram

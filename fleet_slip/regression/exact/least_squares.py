@@ -10,10 +10,13 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.exact import exact_roots
-from fleet_slip.regression.exact.eigenvalues import symmetric_eigenvalues
-from fleet_slip.regression.exact.elimination import Elimination, eliminate
+from fleet_slip.regression.exact.elimination import (
+    Elimination,
+    eliminate,
+    solve_by_lifting,
+    symmetric_eigenvalues,
+)
 from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.lifting import solve_by_lifting
 from fleet_slip.words import number_of
 
 MANY_INPUTS = 40

@@ -14,8 +14,8 @@ from fleet_slip.config import Config, Name
 from fleet_slip.simulation.imperfections import Latency, NotNegative, Range
 from fleet_slip.simulation.sensing.lags import Delay, Wander
 from fleet_slip.simulation.sensing.sensors import Gps, Outages
-from fleet_slip.vehicle.arctangent import arctan2
 from fleet_slip.vehicle.driver import SAMPLE_S
+from fleet_slip.vehicle.tyre import arctan2
 
 SATELLITE_SIGNALS = ("course", "satellite_speed")
 

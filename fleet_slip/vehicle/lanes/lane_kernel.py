@@ -38,14 +38,15 @@ from fleet_slip.vehicle.lanes.lane_memory import (
     at,
     fill_angles,
     fill_recorded_angles,
+    integrate,
+    integrate_imperfect,
+    look_around,
     place,
     read,
     record,
     write,
 )
-from fleet_slip.vehicle.lanes.movement import integrate, integrate_imperfect, look_around
-from fleet_slip.vehicle.parameters import Constants
-from fleet_slip.vehicle.state import Controls, State
+from fleet_slip.vehicle.parameters import Constants, Controls, State
 
 AFTER_LOSS = 500
 """Samples that a drive goes on after the driver lost the car: 5 s."""

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.choice import criteria
+from fleet_slip.regression.choice import subsets
 from fleet_slip.regression.choice.leaps import best_by_leaps
 from fleet_slip.regression.choice.nested_choice import nested_fits
 from fleet_slip.regression.choice.signal_orders import RANKINGS, rank, replacement_sets
@@ -56,8 +56,8 @@ def test_diabetes_best_subsets(diabetes: tuple[Gram, dict[str, Any]]) -> None:
     evidence = Evidence.naive(fits)
     rss = np.array([float(result.best.rss) for result in results])
     size = np.arange(11.0)
-    cp = criteria.subset_values("cp", evidence, rss, size)
-    bic = criteria.subset_values("bic-likelihood", evidence, rss, size)
+    cp = subsets.subset_values("cp", evidence, rss, size)
+    bic = subsets.subset_values("bic-likelihood", evidence, rss, size)
     for result, expected in zip(results, answers["best_subsets"], strict=True):
         assert list(result.best.model.signals) == expected["vars"]
         assert result.best.r_squared == pytest.approx(expected["r2"], rel=1e-12)
@@ -67,7 +67,7 @@ def test_diabetes_best_subsets(diabetes: tuple[Gram, dict[str, Any]]) -> None:
         assert bic[expected["size"]] - shift == pytest.approx(expected["bic_leaps"], rel=1e-9)
         if expected["relative_gap_to_second_best"] is not None and 0 < expected["size"] < 10:
             assert result.gap == pytest.approx(expected["relative_gap_to_second_best"], rel=1e-9)
-    adjusted = criteria.subset_values("adjusted-r2", evidence, rss, size)
+    adjusted = subsets.subset_values("adjusted-r2", evidence, rss, size)
     expected_adjusted = [row["adjr2"] for row in answers["best_subsets"]]
     assert np.argmin(adjusted) == np.argmax(expected_adjusted)
 
@@ -155,32 +155,32 @@ def test_ranking_mistakes_are_named() -> None:
         with pytest.raises(DataError, match="x2 is a linear combination of x1"):
             rank(name, twin, ["x1", "x2"], "y")
     with pytest.raises(QuestionError, match="unknown criterion"):
-        criteria.best_size("aicc", Evidence.naive(nested_fits(gram_of(counts), ["x1"], "y")))
+        subsets.best_size("aicc", Evidence.naive(nested_fits(gram_of(counts), ["x1"], "y")))
 
 
 @pytest.mark.parametrize("k", [1, 4, 9])
 def test_expected_order_statistics(k: int) -> None:
     chi = stats.chi2(1)
-    for rank_, value in enumerate(criteria.expected_squares(k), start=1):
+    for rank_, value in enumerate(subsets.expected_squares(k), start=1):
         beta = stats.beta(k - rank_ + 1, rank_)
         expected, _ = integrate.quad(lambda u: chi.ppf(u) * beta.pdf(u), 0, 1, limit=200)  # noqa: B023
         assert value == pytest.approx(expected, rel=1e-6)
-    assert sum(criteria.expected_squares(k)) == pytest.approx(k, rel=1e-12)
+    assert sum(subsets.expected_squares(k)) == pytest.approx(k, rel=1e-12)
 
 
 def test_criteria_are_prices_on_contributions() -> None:
     evidence = Evidence((50.0, 9.0, 3.0, 0.5), 1000.0, 1.0, 1.0, 995.0, "rows")
-    assert criteria.best_size("aic", evidence) == 3
-    assert criteria.best_size("cp", evidence) == 3
-    assert criteria.best_size("bic", evidence) == 2
-    assert criteria.best_size("ric", evidence) == 3
-    assert criteria.best_size("bic-likelihood", evidence) == 2
-    assert criteria.best_size("adjusted-r2", evidence) == 3
+    assert subsets.best_size("aic", evidence) == 3
+    assert subsets.best_size("cp", evidence) == 3
+    assert subsets.best_size("bic", evidence) == 2
+    assert subsets.best_size("ric", evidence) == 3
+    assert subsets.best_size("bic-likelihood", evidence) == 2
+    assert subsets.best_size("adjusted-r2", evidence) == 3
     np.testing.assert_allclose(evidence.excess(), [62.5, 12.5, 3.5, 0.5, 0])
     np.testing.assert_allclose(evidence.distances(), [58.5, 10.5, 3.5, 2.5, 4])
-    cic = criteria.criterion_values("cic", evidence)
+    cic = subsets.criterion_values("cic", evidence)
     assert cic[-1] == pytest.approx(2 * 4)
-    assert criteria.criterion_values("cic-log", evidence)[1] > cic[1]
+    assert subsets.criterion_values("cic-log", evidence)[1] > cic[1]
 
 
 def test_likelihood_criteria_equal_their_textbook_form() -> None:
@@ -192,7 +192,7 @@ def test_likelihood_criteria_equal_their_textbook_form() -> None:
     bic = n * np.log(rss / n) + np.log(n) * (size + 1)
     evidence = Evidence.naive(fits)
     for name, expected in (("aic-likelihood", aic), ("bic-likelihood", bic)):
-        values = criteria.criterion_values(name, evidence)
+        values = subsets.criterion_values(name, evidence)
         np.testing.assert_allclose(values - values[0], expected - expected[0], rtol=1e-9)
 
 

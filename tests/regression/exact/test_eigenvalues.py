@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_slip.regression.exact import eigenvalues
-from fleet_slip.regression.exact.eigenvalues import symmetric_eigenvalues
+from fleet_slip.regression.exact import elimination
+from fleet_slip.regression.exact.elimination import symmetric_eigenvalues
 
 
 @given(st.integers(1, 12), st.integers(0, 10**6))
@@ -31,7 +31,7 @@ def test_compiled_they_have_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> No
     columns = np.random.default_rng(3).normal(size=(60, 25))
     matrix = np.asarray(np.corrcoef((columns + 9 * columns[:, :1]).T))
     plain = symmetric_eigenvalues(matrix)
-    monkeypatch.setattr(eigenvalues, "MANY", 25)
+    monkeypatch.setattr(elimination, "MANY", 25)
     assert symmetric_eigenvalues(matrix) == plain
 
 

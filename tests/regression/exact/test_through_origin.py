@@ -11,9 +11,8 @@ from fleet_slip.regression.choice.signal_orders import rank
 from fleet_slip.regression.choice.subsets import best_subsets
 from fleet_slip.regression.exact.least_squares import fit
 from fleet_slip.regression.inference.bootstrap import repeated_cross_validation
-from fleet_slip.regression.inference.coefficient_tests import chow_test, wald_test
 from fleet_slip.regression.inference.drive_moments import DriveMoments
-from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.inference.evidence import Evidence, chow_test, wald_test
 from fleet_slip.regression.inference.standard_errors import infer_by_clusters, infer_classically
 from tests.support.counts import Matrix, gram_of, names, random_drives, table_of, unit_scales
 

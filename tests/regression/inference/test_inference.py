@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from scipy.special import betainc
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.exact import distributions
+from fleet_slip.regression.exact.figures import incomplete_beta, normal_cdf, normal_density
 from fleet_slip.regression.exact.gram_table import GramTable
 from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.inference.coefficient_tests import chow_test
 from fleet_slip.regression.inference.drive_moments import DriveMoments, serving_drives
+from fleet_slip.regression.inference.evidence import chow_test
 from fleet_slip.regression.inference.standard_errors import (
     cluster_covariance,
     infer_by_clusters,
@@ -138,12 +138,10 @@ def test_serving_drives_stacks_tables() -> None:
 
 @given(st.floats(0.05, 1e4), st.floats(0.05, 1e4), st.floats(0.0, 1.0))
 def test_incomplete_beta_equals_scipy(a: float, b: float, x: float) -> None:
-    assert distributions.incomplete_beta(a, b, x) == pytest.approx(
-        betainc(a, b, x), rel=1e-8, abs=1e-12
-    )
+    assert incomplete_beta(a, b, x) == pytest.approx(betainc(a, b, x), rel=1e-8, abs=1e-12)
 
 
 @given(st.floats(-40, 40))
 def test_normal_distribution_equals_scipy(x: float) -> None:
-    assert distributions.normal_cdf(x) == pytest.approx(scipy.stats.norm.cdf(x), rel=1e-12)
-    assert distributions.normal_density(x) == pytest.approx(scipy.stats.norm.pdf(x), rel=1e-12)
+    assert normal_cdf(x) == pytest.approx(scipy.stats.norm.cdf(x), rel=1e-12)
+    assert normal_density(x) == pytest.approx(scipy.stats.norm.pdf(x), rel=1e-12)

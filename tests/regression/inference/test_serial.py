@@ -15,7 +15,7 @@ from fleet_slip.regression.inference.serial import (
     quasi_difference,
     serial_correlation,
 )
-from fleet_slip.regression.shrinkage.disturbance import disturb
+from fleet_slip.regression.shrinkage.ridge import disturb
 from tests.support.counts import (
     autoregressive_drives,
     dense_fit,
