@@ -35,6 +35,10 @@ _NO_LOG = f"no file in this folder has the suffix of a log: {', '.join(SUFFIXES)
 
 AT_ONCE = 16
 
+LONGEST_NAME_BYTES = 255
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+
 
 @dataclass(frozen=True)
 class StoredParts:
@@ -254,10 +258,16 @@ def _copy(log: StoredFile | StoredParts, folder: Path) -> Path:
     from fleet_slip.files.object_inputs import copy_object, parse_url  # noqa: PLC0415 - an extra
 
     for part in stored_parts(log):
-        if not {"", ".", ".."}.isdisjoint(part.path.split("/")):
-            raise InputError(f"{part}: its name is no path in the bucket. Give it another.")
+        names = part.path.split("/")
+        if not {"", ".", ".."}.isdisjoint(names) or not all(map(_can_be_copied, names)):
+            raise InputError(f"{shown(part)}: no file may have this name. Give it another.")
         copy_object(part, folder / part.path)
     return folder / (log.path if isinstance(log, StoredFile) else parse_url(log.url)[1])
+
+
+def _can_be_copied(name: str) -> bool:
+    """Whether a part of a key is the name of a file, without characters that stores refuse."""
+    return len(os.fsencode(name)) <= LONGEST_NAME_BYTES and not _CONTROL.search(name)
 
 
 @contextmanager
