@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.caches import cache_folder
-from fleet_slip.canonical import canonical_json
+from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.sources import RECEIVED
 from fleet_slip.delta import Snapshot, TableFile
@@ -215,7 +215,8 @@ def _examine(warehouse: Warehouse, condition: Condition) -> Mapping[str, Any]:
 def _known(kept: Path, state: list[Any]) -> Mapping[str, Any] | None:
     with suppress(OSError, ValueError, KeyError, TypeError):
         known = json.loads(kept.read_bytes())
-        if known["state"] == state:
+        checksum = known.pop("sha256")
+        if known["state"] == state and checksum == sha256_of(canonical_json(known)):
             found = {
                 str(name): [str(kind), [str(one) for one in signals], str(figure)]
                 for name, (kind, signals, figure) in known["found"].items()
@@ -228,7 +229,7 @@ def _keep(kept: Path, content: Mapping[str, Any]) -> None:
     with suppress(OSError):
         kept.parent.mkdir(parents=True, exist_ok=True)
         draft = kept.with_suffix(f".{os.getpid()}")
-        draft.write_text(json.dumps(content))
+        draft.write_text(json.dumps({**content, "sha256": sha256_of(canonical_json(content))}))
         draft.replace(kept)
 
 

@@ -79,6 +79,16 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
     assert (fleet.score("m").drives, fleet.score("m", unexamined=True).drives_left_out) == (4, 4)
 
 
+def test_a_kept_verdict_of_which_a_bit_flipped_is_found_again(fleet: Fleet, tmp_path: Path) -> None:
+    found = fleet.cohort().examine()
+    (kept,) = (tmp_path / "cache").glob("fleet-slip/examined/*.json")
+    whole = kept.read_bytes()
+    place = whole.index(b"[") + 2
+    kept.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+    assert fleet.cohort().examine() == found
+    assert kept.read_bytes() == whole
+
+
 def test_a_cohort_of_which_no_drive_is_in_order_says_so(fleet: Fleet) -> None:
     with pytest.raises(DataError, match="none of 2 drives is in order: 2 stuck ay"):
         fleet.cohort("day = DATE '2026-10-06'").select(models="table1")
