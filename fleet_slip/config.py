@@ -82,6 +82,7 @@ Name = Annotated[str, StringConstraints(min_length=1, max_length=200), AfterVali
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 LONGEST_FILE_BYTES = 2**20
+LARGEST_EXPONENT = 400
 FAULTS_SHOWN = 10
 LONGEST_FAULT = 300
 """Characters of one fault that are shown; what was given may stand in it."""
@@ -122,13 +123,20 @@ def load_toml(file: Traversable) -> dict[str, Any]:
     """Parse a TOML file, decimal numbers as exact `Decimal`. Raises `ConfigError`."""
     content = read_named_file(file)
     try:
-        return tomllib.loads(content.decode("utf-8"), parse_float=Decimal)
+        return tomllib.loads(content.decode("utf-8"), parse_float=_parse_decimal)
     except UnicodeDecodeError as error:
         raise ConfigError(f"{file}: not UTF-8 text, from byte {error.start:,} on.") from None
     except RecursionError:
         raise ConfigError(f"{file}: nested too deeply.") from None
     except (ValueError, ArithmeticError) as error:  # of TOML, of a date, of a number's size
         raise ConfigError(f"{file}: not valid TOML: {error}") from None
+
+
+def _parse_decimal(text: str) -> Decimal:
+    number = Decimal(text)
+    if abs(number.adjusted()) > LARGEST_EXPONENT:  # as an integer it would take all memory
+        raise ValueError(f"{text[:40]}: no number here has such an exponent")
+    return number
 
 
 def load_config(file: Traversable, model: type[ConfigT]) -> ConfigT:

@@ -146,12 +146,19 @@ class FleetCohort(Rooted):
         `measured` is what scales and a tape measure say, in the words of
         `fleet_slip.comparison.observers.identification.Measured`. The extended Kalman filter in the
         car is fitted to the labels of up to 24 drives; its error on drives that were left out
-        stands beside. Raises `DataError` if the drives lack the label or what the filter needs.
+        stands beside. Raises `DataError` if the drives lack the label or what the filter needs, and
+        `UsageError` for a name or number that no car can have.
         """
+        from pydantic import ValidationError
+
         from fleet_slip.comparison.evaluation.filters import TuningDrives
         from fleet_slip.comparison.observers.identification import Measured, identify_held_out
+        from fleet_slip.config import faults_of
 
-        car = Measured.model_validate({"name": name, **measured})
+        try:
+            car = Measured.model_validate({"name": name, **measured})
+        except ValidationError as error:
+            raise UsageError(f"what was measured of the car: {faults_of(error)}.") from None
         chosen = TuningDrives.of(self.warehouse, self._load("signals"), weighed=False)
         with open_workers(self.root, threads) as executor:
             return identify_held_out(car, chosen.read(), executor)

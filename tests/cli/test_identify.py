@@ -28,3 +28,13 @@ def test_a_car_without_labelled_drives_cannot_be_identified(smoke_root: Path) ->
     done = run_on(smoke_root, "identify", "mine", *CAR, "--cohort", "drive_id = 'none'")
     assert done.exit_code == 5
     assert "none" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "told"), [(("Golf", *CAR), "name: "), (("mine", *CAR, "--mass", "inf"), "mass_kg: ")]
+)
+def test_what_no_car_can_have_is_a_wrong_use(
+    words: tuple[str, ...], told: str, smoke_root: Path
+) -> None:
+    done = run_on(smoke_root, "identify", *words)
+    assert (done.exit_code, told in done.stderr) == (2, True), done.stderr

@@ -21,6 +21,7 @@ TRACK = 'name = "x"\ndescription = "d"\nclosed = {closed}\nsegments = [{segments
     [
         b"x = " + b"9" * 5000,
         b"x = 1e99999999999999999999",
+        b"x = 1e999999999",
         b"x = " + b"[" * 50_000,
         b"x = " + b"{a = " * 5000,
         b"#" * 2**21,

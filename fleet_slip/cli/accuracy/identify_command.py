@@ -9,6 +9,7 @@ from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.options import Cohort
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.workers import Threads
+from fleet_slip.files.storage_errors import storage_errors
 from fleet_slip.words import number_of
 
 if TYPE_CHECKING:
@@ -57,7 +58,8 @@ def identify(
         threads=threads,
     )
     if output is not None:
-        output.write_text(found.as_toml(), encoding="utf-8")
+        with storage_errors(output):
+            output.write_text(found.as_toml(), encoding="utf-8")
     if json:
         print_json(found.as_dict())
         return

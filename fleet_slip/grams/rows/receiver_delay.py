@@ -9,6 +9,7 @@ more so the fewer drives they have (`regression/shrinkage/partial_pooling.py`).
 """
 
 import math
+import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
@@ -40,6 +41,8 @@ SURE_ERRORS = 5.0
 TINY = 1e-9
 """Share of the sum of squares that a drive's bend has at least: it may tell nothing."""
 FEWEST_DRIVES = 3
+WILD = 100.0
+"""Variances of half of the cars that a car's drives may differ by."""
 """Of fewer the uncertainty is that of a usual drive of other cars."""
 
 
@@ -216,8 +219,14 @@ def with_types(delays: dict[str, ReceiverDelay]) -> ReceiverDelays:
 
 
 def _noise(delays: Iterable[ReceiverDelay]) -> float | None:
-    """Return the variance of a delay times information, as drives of cars differ, or None."""
-    known = list(delays)
+    """Return the variance of a delay times information, as drives of cars differ, or None.
+
+    Without cars whose drives differ wildly more than those of half of the cars: their receivers or
+    logs are faulty, and one of them would make the delays of all others uncertain.
+    """
+    known = [one for one in delays if one.drives > 1]
+    usual = statistics.median([one.differing / (one.drives - 1) for one in known] or [0.0])
+    known = [one for one in known if one.differing <= WILD * usual * (one.drives - 1)]
     free = sum(one.drives - 1 for one in known)
     return math.fsum(one.differing for one in known) / free if free >= FEWEST_DRIVES - 1 else None
 

@@ -236,3 +236,12 @@ def test_quality_names_a_car_whose_delay_changed(late_fleet: LateFleet, tmp_path
 def changed(fleet: Fleet) -> list[str]:
     findings = fleet.quality("true").findings
     return [one.fault.figure for one in findings if one.fault.kind == "changed delay"]
+
+
+def test_one_wild_car_leaves_the_delays_of_the_others_known() -> None:
+    tame = {
+        f"car-{number}": ReceiverDelay(0.1, None, 2, 2000, information=40.0, differing=1.0)
+        for number in range(99)
+    }
+    wild = ReceiverDelay(0.5, None, 2, 2000, information=40.0, differing=1e9)
+    assert with_pooled(tame | {"wild": wild})["car-0"] == with_pooled(tame)["car-0"]
