@@ -91,6 +91,17 @@ def test_a_label_in_degrees() -> None:
     assert kinds({**slow, "sideslip": 20 * slow["sideslip"]}) == {("scaled", ("sideslip",))}
 
 
+@pytest.mark.parametrize(
+    ("factor", "offset_deg", "kind"), [(2, 0, "scaled"), (1 / 57.3, 0, "scaled"), (1, 1, "biased")]
+)
+def test_a_label_that_no_car_has_needs_no_peers(
+    factor: float, offset_deg: float, kind: str
+) -> None:
+    car = a_car()
+    wrong = factor * car["sideslip"] + np.radians(offset_deg)
+    assert kinds({**car, "sideslip": wrong}) == {(kind, ("sideslip",))}
+
+
 @pytest.mark.parametrize("delay", [-0.2, 0.08, 0.3, 1.0, -1.3])
 def test_a_delay_of_the_label(delay: float) -> None:
     car = a_car()

@@ -24,8 +24,6 @@ from tests.support.landing import Landing
 from tests.support.messages import START_S
 from tests.support.once import made_once
 
-NEGATED = {"sideslip_rad": "-sideslip_rad"}
-
 
 @pytest.fixture(scope="module")
 def landed(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
@@ -94,17 +92,27 @@ def test_a_cohort_of_which_no_drive_is_in_order_says_so(fleet: Fleet) -> None:
         fleet.cohort("day = DATE '2026-10-06'").select(models="table1")
 
 
-def test_a_first_champion_of_a_label_that_is_turned_in_all_drives_is_refused(
-    tmp_path: Path, smoke_root: Path
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ("-sideslip_rad", "reversed sideslip"),
+        ("2 * sideslip_rad", "scaled sideslip"),
+        ("sideslip_rad / 57.3", "scaled sideslip"),
+        ("sideslip_rad + 0.01745", "biased sideslip"),
+    ],
+)
+def test_a_first_champion_of_a_label_that_is_wrong_in_all_drives_is_refused(
+    tmp_path: Path, smoke_root: Path, wrong: str, told: str
 ) -> None:
     landing = Landing(tmp_path / "landing", smoke_root)
     landing.prepare()
     fleet = fleet_slip.open(tmp_path / "data")
-    bad = landing.land("bad", landing.drives()[:5], date(2026, 10, 5), **NEGATED)
-    fleet.ingest(bad, str(landing.mapping))
+    bad = landing.land("bad", landing.drives()[:5], date(2026, 10, 5), sideslip_rad=wrong)
+    (report,) = fleet.ingest(bad, str(landing.mapping))
+    assert told in {f"{one.kind} {one.signals[0]}" for one in report.suspicions}
     fleet.gram()
     cohort = fleet.cohort()
-    with pytest.raises(RefusedError, match=r"5 of 5 drives .* contradict .*reversed sideslip"):
+    with pytest.raises(RefusedError, match=rf"of 5 drives .* contradict .*{told}"):
         fleet.publish("m", cohort)
     assert fleet.publish("m", cohort, candidate=True).candidate
     assert fleet.publish("m", cohort, force=True).new

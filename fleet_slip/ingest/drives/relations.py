@@ -46,20 +46,21 @@ def slope_of(values: FloatArray, expected: FloatArray, rows: BoolArray) -> tuple
     return float(xy / xx), float(xy / np.sqrt(xx * yy))
 
 
-def fit(y: FloatArray, inputs: FloatArray, rows: BoolArray) -> tuple[FloatArray, float]:
-    """Return the coefficients of inputs, and the part of the variance of `y` they explain."""
+def fit(y: FloatArray, inputs: FloatArray, rows: BoolArray) -> tuple[FloatArray, float, float]:
+    """Return coefficients of inputs, the constant, and what part of the variance they explain."""
     rows = rows & np.isfinite(y) & np.isfinite(inputs).all(axis=0)
-    nothing = np.zeros(len(inputs)), 0.0
+    nothing = np.zeros(len(inputs)), 0.0, 0.0
     if rows.sum() < FEWEST_TICKS:
         return nothing
-    x = inputs[:, rows] - inputs[:, rows].mean(axis=1, keepdims=True)
-    centred = y[rows] - y[rows].mean()
+    middle, mean = inputs[:, rows].mean(axis=1), y[rows].mean()
+    x, centred = inputs[:, rows] - middle[:, None], y[rows] - mean
     total = float(centred @ centred)
     if not total > 0:
         return nothing
     coefficients = np.linalg.lstsq(x @ x.T, x @ centred, rcond=1e-12)[0]
     left = centred - coefficients @ x
-    return coefficients, 1 - float(left @ left) / total
+    constant = float(mean - coefficients @ middle)
+    return coefficients, constant, 1 - float(left @ left) / total
 
 
 def find_delay(
@@ -111,7 +112,7 @@ def _unexplained(label: FloatArray, inputs: FloatArray, rows: BoolArray) -> dict
     some = rows & (np.arange(n) % EACH == 0)
     near = dict.fromkeys(range(-MOST_LAG, MOST_LAG + 1), rows)
     return {
-        lag: 1 - fit(label[m + lag : n - m + lag], inputs[:, within], chosen[within])[1]
+        lag: 1 - fit(label[m + lag : n - m + lag], inputs[:, within], chosen[within])[2]
         for lag, chosen in (dict.fromkeys(range(-m, m + 1, EACH), some) | near).items()
     }
 

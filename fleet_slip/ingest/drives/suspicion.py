@@ -5,13 +5,14 @@ Nothing here is certain: a suspicion is a relation of vehicle dynamics that a dr
 with the figure that shows it, and what to try. Axes and signs are ISO 8855.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.catalogue.turning import WITNESSES
 from fleet_slip.ingest.drives.course_suspicion import course_fault
@@ -32,6 +33,13 @@ RADIUS_M, TRACK_M = 0.31, 1.55
 """Of a passenger car: what is looked for is a factor of 3.6, 9.8 or 57."""
 LONGEST_M, LARGE_RAD = 8.0, 0.15
 """No car's rear axle is so far behind, and a car that slips so often slides."""
+LEAST_LEVER_M, LONGEST_LEVER_M, LONGEST_PART = 0.6, 2.6, 0.75
+"""The rear axle is so far behind the centre of gravity, and by this part of the wheelbase."""
+WHEELBASE_M = (2.0, 4.5)
+"""Beyond, it is the road wheels that are in doubt."""
+LARGEST_ZERO_RAD = math.radians(0.7)
+"""Real cars have up to 0.4 deg, from a sensor that is not aligned and roads that lean."""
+SLOW_MPS, SURE_EXPLAINED = 20.0, 0.85
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 ROAD_WHEELS = ("steer_fl", "steer")
 LEAST_CORRELATION, SURE_CORRELATION = 0.6, 0.9
@@ -235,13 +243,44 @@ def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
         )
         figure += f", with {gain:.0%} less of its variance left"
         yield Suspicion("late", (label,), figure, f"Try delay_s = {seconds:.2f}.", seconds)
-    fitted, explained = fit(angle, np.array(inputs[:2]), rows & (speed < 20))
-    figure = f"turning slowly it goes with the yaw rate by {fitted[1]:+.1f} m, should be +1 to +2"
     many = large.size >= FEWEST_TICKS and np.quantile(large, 0.9) > LARGE_RAD
-    if explained > LEAST_CORRELATION and abs(fitted[1]) > LONGEST_M and many:
-        yield Suspicion("scaled", (label,), figure, "Check its unit: degrees or radians?")
-    elif explained > LEAST_CORRELATION and fitted[1] < -0.3:
+    yield from _lever(signals, np.array(inputs[:2]), rows & (speed < SLOW_MPS), many=bool(many))
+
+
+def _lever(
+    signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool
+) -> Iterator[Suspicion]:
+    """Compare the label with what any car does: it needs no peers, where all are wrong alike.
+
+    Turning slowly it is the distance to the rear axle times the yaw rate over the speed, less what
+    the rear tyres slip, and 0 on a straight (Milliken and Milliken, Race Car Vehicle Dynamics,
+    chapter 5). The same fit of the road wheels tells the wheelbase, which is longer.
+    """
+    label = catalogue().label
+    (_, lever), zero, explained = fit(signals[label], inputs, slow)
+    figure = f"turning slowly it goes with the yaw rate by {lever:+.2f} m, should be +1 to +2"
+    if explained <= LEAST_CORRELATION:
+        return
+    if lever < -LEAST_LEVER_M / 2:
         yield Suspicion("reversed", (label,), figure, "Write negate = true.")
+        return
+    longest = LONGEST_LEVER_M
+    for name in ROAD_WHEELS:
+        if name in signals:
+            (_, base), _, sure = fit(signals[name], inputs, slow)
+            if sure > SURE_EXPLAINED and WHEELBASE_M[0] < base < WHEELBASE_M[1]:
+                longest = min(longest, LONGEST_PART * base)
+                break
+    unit = "Check its unit, degrees or radians, its factor, and where its sensor is: sensor_x_m."
+    if lever > LONGEST_M and many:
+        yield Suspicion("scaled", (label,), figure, unit)
+    elif explained <= SURE_EXPLAINED:
+        return
+    elif not LEAST_LEVER_M < lever < longest:
+        yield Suspicion("scaled", (label,), figure, unit)
+    elif abs(zero) > LARGEST_ZERO_RAD:
+        figure = f"on a straight it is {np.degrees(zero):+.2f} deg, should be 0"
+        yield Suspicion("biased", (label,), figure, f"Write offset = {-zero:.4f} (rad).")
 
 
 def _of_scale(
