@@ -79,15 +79,22 @@ def find_suspicions(signals: Signals) -> list[Suspicion]:
     still = list(_still(signals))
     usual = {name: v for name, v in signals.items() if name not in {s.signals[0] for s in still}}
     speed = speed_mps(usual)
-    one_sided = find_one_sided(usual, None if speed is None else moving(speed))
     remedy = 'Where another column has its sign: sign = { column = "..." }.'
-    magnitudes = [Suspicion("magnitude", (name,), figure, remedy) for name, figure in one_sided]
-    usual = {name: v for name, v in usual.items() if name not in {m.signals[0] for m in magnitudes}}
-    found = [*still, *magnitudes, *_turning(usual, speed)]
+    magnitudes = {
+        name: Suspicion("magnitude", (name,), figure, remedy)
+        for name, figure in find_one_sided(usual, None if speed is None else moving(speed))
+    }
+    sideslip = magnitudes.pop(catalogue().label, None)
+    usual = {name: values for name, values in usual.items() if name not in magnitudes}
+    found = [*still, *magnitudes.values(), *_turning(usual, speed)]
     for check in (_axes_swapped, _wheels_differ, _rates_differ, _accelerates, _axles_swapped):
         found += check(usual, speed)
+    label: list[Suspicion] = []
     if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
-        found += _label(usual, speed)  # which is judged by them
+        label = list(_label(usual, speed))  # which is judged by them
+    if sideslip and all(one.kind != "biased" for one in label):  # else it is off to one side
+        label = [sideslip]
+    found += label
     if fault := course_fault(usual, speed):
         found.append(Suspicion(**vars(fault)))
     return found
