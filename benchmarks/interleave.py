@@ -17,7 +17,6 @@ Without --schedules it tries all; with it, so many of them, chosen by the seed.
 
 import argparse
 import contextlib
-import hashlib
 import importlib
 import itertools
 import pkgutil
@@ -44,7 +43,6 @@ def load_code(inputs: Inputs) -> None:
         with contextlib.suppress(ImportError):  # an extra that is not there
             importlib.import_module(found.name)
     importlib.import_module("pyarrow.dataset")
-    hashlib.scrypt = lambda text, *, salt, **_: hashlib.sha256(salt + text).digest()
 
 
 def schedules(pair: Pair, fates: Sequence[str]) -> Iterator[Schedule]:
