@@ -19,6 +19,9 @@ from fleet_slip.words import shown
 
 _COLUMN = re.compile(r"(.+)\(:,(\d+)\)")
 _MOST_COLUMNS = 64
+_NUMBERS = re.compile(r"u?int(8|16|32|64)|double|single|logical")
+_PACKED = {"scale_factor", "add_offset"}
+"""What netCDF says of counts in a dataset."""
 WINDOW_ROWS = 2**15
 """Rows that are read at once."""
 Array = np.ndarray[Any, Any]
@@ -43,10 +46,15 @@ class MatSource:
     has_clock = False
 
     def __init__(
-        self, matrices: Mapping[str, _Matrix], budget: Budget, links: Collection[str] = ()
+        self,
+        matrices: Mapping[str, _Matrix],
+        budget: Budget,
+        links: Collection[str] = (),
+        packed: Collection[str] = (),
     ) -> None:
-        """Take its matrices by path, and names that are only links."""
-        self._file, self._matrices, self._links = budget.file, matrices, links
+        """Take its matrices by path, and the names of links and of packed counts."""
+        self._file, self._matrices = budget.file, matrices
+        self._links, self._packed = links, packed
 
     def channels(self) -> list[Channel]:
         """Return all vectors, and the columns of matrices."""
@@ -101,6 +109,11 @@ class MatSource:
                 f"{shown(self._file)}: {name!r} is a link, which is not followed. Map what it "
                 "links to."
             )
+        if name in self._packed:
+            raise InputError(
+                f"{shown(self._file)}: {name!r} has counts, with {' and '.join(sorted(_PACKED))} "
+                "of netCDF, which are not applied. Export it again with physical values."
+            )
         names = [channel.name for channel in self.channels()]
         raise InputError(f"{shown(self._file)}: {describe_missing(name, names)}")
 
@@ -145,6 +158,7 @@ def open_mat73(budget: Budget) -> Iterator[MatSource]:
     with reading_with(file, "h5py") as h5py, h5py.File(file, "r") as root:
         matrices: dict[str, _Dataset] = {}
         links: list[str] = []
+        packed: list[str] = []
 
         def visit(path: str, item: Any) -> None:
             if not isinstance(item, h5py.Dataset) or path.startswith("#refs#"):
@@ -155,8 +169,9 @@ def open_mat73(budget: Budget) -> Iterator[MatSource]:
                     f"{shown(file)}: the values of {path!r} are in other files. Export it again "
                     "with all values in one file."
                 )
-            kind = item.attrs.get("MATLAB_class", b"")
-            if item.shape and item.dtype.kind in "iufb" and kind != b"char":
+            if _PACKED & set(item.attrs):
+                packed.append(path.replace("/", "."))
+            elif item.shape and item.dtype.kind in "iufb" and _is_plain(item.attrs):
                 matrices[path.replace("/", ".")] = _Dataset(item)
 
         def note(path: str, link: Any) -> None:
@@ -165,4 +180,11 @@ def open_mat73(budget: Budget) -> Iterator[MatSource]:
 
         root.visititems(visit)
         root.visititems_links(note)
-        yield MatSource(matrices, budget, links)
+        yield MatSource(matrices, budget, links, packed)
+
+
+def _is_plain(attributes: Any) -> bool:
+    """Whether a dataset has values of its own: of an object it has references, or only sizes."""
+    kind = attributes.get("MATLAB_class", "double")
+    kind = kind.decode("latin-1") if isinstance(kind, bytes) else str(kind)
+    return bool(_NUMBERS.fullmatch(kind)) and "MATLAB_empty" not in attributes

@@ -50,7 +50,16 @@ def decoder_of(channel: Any, schema: Any) -> Decode | None:
     if channel.message_encoding == "json":
         return json.loads
     decode: Decode | None = DecoderFactory().decoder_for(channel.message_encoding, schema)
-    return decode
+    if decode is None:
+        return None
+
+    def decode_plain(data: bytes) -> Any:
+        # The decoder reads any other as this one too, with its numbers at wrong places.
+        if data[:2] not in {b"\0\0", b"\0\1"}:
+            raise ValueError(f"a message is not plain CDR (it begins with {data[:2].hex()})")
+        return decode(data)
+
+    return decode_plain
 
 
 _Fields = dict[str, str]

@@ -24,6 +24,7 @@ from fleet_slip.ingest.formats.log_source import (
     describe_missing,
     reading_with,
 )
+from fleet_slip.ingest.formats.mdf_conversions import conversion_of, require_arithmetic, to_physical
 from fleet_slip.words import shown
 
 WINDOW_RECORDS = 2**17
@@ -111,7 +112,10 @@ class MdfSource(ClockSource):
                 [(None, number, index) for index in indices.values()],
                 record_offset=start,
                 record_count=records,
+                raw=True,
             )
+            for signal, index in zip(signals, indices.values(), strict=True):
+                signal.samples = self._physical(number, index, signal.samples)
             self._release()
         if len(signals[0]) < records:
             raise InputError(
@@ -119,6 +123,20 @@ class MdfSource(ClockSource):
                 "not as many as it says: it is truncated. Copy it again."
             )
         return list(signals)
+
+    def _physical(self, number: int, index: int, raw: Any) -> Any:
+        """Return the physical values of a channel, or None without any raw ones."""
+        channel = self._mdf.groups[number].channels[index]
+        try:
+            conversion = conversion_of(channel)
+            if raw is not None:
+                return to_physical(conversion, raw)
+            require_arithmetic(conversion)
+        except ValueError as error:
+            raise InputError(
+                f"{shown(self._file)}: channel {channel.name!r}: {error}. Export it again with "
+                "physical values, or map another channel."
+            ) from None
 
     def _release(self) -> None:
         """Let the system have back the pages of the file, or all of it counts as our memory."""
@@ -151,6 +169,7 @@ class MdfSource(ClockSource):
                 f"{shown(self._file)}: channel {name!r} is of group {number}, which has no times "
                 "(it is over an angle, a distance or an index). Map another channel."
             )
+        self._physical(number, master, None)
 
     def _require_inside(self, number: int, index: int) -> None:
         """Raise `InputError` for a channel outside of its record: asammdf would read beyond it."""

@@ -4,6 +4,7 @@ Times are from the properties of waveforms. Of a file without any, time is one o
 channel of several groups is named `CHANNEL@GROUP`.
 """
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,6 +23,11 @@ from fleet_slip.words import shown
 
 READ_AHEAD = 2**17
 """Values that are read at once: for each time npTDMS reads all that a segment has of a channel."""
+_SCALE = re.compile(r"NI_Scale\[\d+\]_Scale_Type")
+_APPLIED = {
+    "Polynomial", "Linear", "RTD", "Strain", "Table", "Thermistor", "Thermocouple", "Add",
+    "Subtract", "AdvancedAPI",
+}  # fmt: skip
 _EARLIEST_S = 10**8
 """A waveform that was given no start begins in 1904: before 1973 it is not a date."""
 
@@ -102,6 +108,8 @@ def open_tdms(budget: Budget) -> Iterator[TdmsSource | MatSource]:
         if not channels or any(one.scaler_data_types for one in channels):
             what = "has raw data of DAQmx, counts of a converter" if channels else "has no values"
             raise InputError(f"{shown(file)}: it {what}. Save it from LabVIEW or DIAdem, scaled.")
+        for of in (tdms, *tdms.groups(), *channels):
+            _require_scales(budget, of.properties)
         several = Counter(one.name for one in channels)
         vectors = {
             one.name if several[one.name] < 2 else f"{one.name}@{one.group_name}": _Vector(one)
@@ -109,3 +117,16 @@ def open_tdms(budget: Budget) -> Iterator[TdmsSource | MatSource]:
         }
         waves = {name: one for name, one in vectors.items() if one.base}
         yield TdmsSource(waves, budget) if waves else MatSource(vectors, budget)
+
+
+def _require_scales(budget: Budget, properties: Any) -> None:
+    """Raise `InputError` for scales that npTDMS would leave out: it would give raw counts."""
+    scales = {name: kind for name, kind in properties.items() if _SCALE.fullmatch(name)}
+    odd = sorted(set(scales.values()) - _APPLIED)
+    if int(properties.get("NI_Number_Of_Scales", len(scales))) != len(scales):
+        odd = odd or ["another number of scales than it says"]
+    if odd and properties.get("NI_Scaling_Status") != "scaled":
+        raise InputError(
+            f"{shown(budget.file)}: it has scales that are not applied: {', '.join(odd)}. Save it "
+            "from LabVIEW or DIAdem, scaled."
+        )
