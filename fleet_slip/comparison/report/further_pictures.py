@@ -1,4 +1,4 @@
-"""Figures beyond the paper: where and when estimates are off, what memory buys, a fleet's cars."""
+"""Figures beyond the paper: where and when estimates are off, a fleet's cars."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -7,14 +7,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
-from fleet_slip.comparison.report.column_worth import Memory
 from fleet_slip.comparison.report.error_charts import (
     Series,
     car_by_car,
     error_by_acceleration,
-    error_by_columns,
     error_over,
-    left_out,
 )
 from fleet_slip.comparison.report.gate_strips import angle_and_gates, opening
 from fleet_slip.comparison.report.paper_pictures import (
@@ -23,26 +20,24 @@ from fleet_slip.comparison.report.paper_pictures import (
     model_line,
     paper_pictures,
 )
-from fleet_slip.comparison.report.point_charts import Named, density, points_by_drive
-from fleet_slip.comparison.report.report_data import DRAWN_FILTERS, ReportData
+from fleet_slip.comparison.report.point_charts import Named, points_by_drive
+from fleet_slip.comparison.report.report_data import DRAWN_FILTERS, TRAINED_SHARE, ReportData
 from fleet_slip.comparison.report.report_tables import compared, won
 from fleet_slip.comparison.report.texts import TEXTS, read_toml
 from fleet_slip.comparison.report.time_series import Line
-from fleet_slip.comparison.report.track_map import FINE_EDGES_DEG, Map, error_map
+from fleet_slip.comparison.report.track_map import Map, error_map
 from fleet_slip.pages.drawing import Picture, Size
 
 SLIPPERY = "adhesion_0_4"
 STYLES = ("style_gentle", "nominal", "style_brisk", "style_sporty", "style_limit")
 """Drives of the training car on a dry road, from slow to the limit."""
 
-TRAINED_SHARE = 0.999
-
 PICTURES = read_toml("pictures.toml")
 
 
 def draw_pictures(data: ReportData) -> tuple[Picture, ...]:
     """Return all figures whose drives were evaluated, with captions from the same data."""
-    parts = (paper_pictures, further_pictures, memory_pictures, road_pictures, fleet_pictures)
+    parts = (paper_pictures, further_pictures, road_pictures, fleet_pictures)
     return tuple(picture for part in parts for picture in part(data))
 
 
@@ -57,7 +52,7 @@ def _picture(key: str, drawn: Callable[[Size], Figure], **words: Any) -> Picture
 
 def further_pictures(data: ReportData) -> Iterator[Picture]:
     """Return the figures that belong to no other section."""
-    choice, histogram = choice_line(data).label, data.histogram
+    choice = choice_line(data).label
     maps = {"nominal": "Nominal drive", SLIPPERY: "Adhesion 0.4"}
     shown = [
         Map(title, data.runs[name], data.choice)
@@ -69,13 +64,6 @@ def further_pictures(data: ReportData) -> Iterator[Picture]:
         yield _picture(
             "error-map", lambda size: error_map(shown, size), choice=choice, titles=titles
         )
-    yield _picture(
-        "density",
-        lambda size: density(histogram, size),
-        choice=choice,
-        rows=int(histogram.rows.sum()),
-        model=next(m for m in data.trained.selection.models if f"Model {m.name}" == choice),
-    )
     if "style_limit" in data.runs:
         yield _lateral(data)
     yield _standings(data)
@@ -92,7 +80,7 @@ def _lateral(data: ReportData) -> Picture:
         Line("kalman_tuned", "Kalman, tuned", "kalman_tuned"),
     )
     lines += [line for line in further if line.estimator in data.evaluated.estimators]
-    trained_to = data.histogram.trained_to_mps2(TRAINED_SHARE)
+    trained_to = data.trained_to_mps2
     return _picture(
         "lateral-acceleration",
         lambda size: error_by_acceleration(driven, lines, trained_to, size),
@@ -170,56 +158,3 @@ def fleet_pictures(data: ReportData) -> Iterator[Picture]:
     """Return the fleet car by car before and after calibration; none without a fleet."""
     if (cars := data.cars) is not None:
         yield _picture("fleet-cars", lambda size: car_by_car(cars, size), cars=cars)
-
-
-FILTER = "ekf_told_tuned"
-"""The best filter: an extended Kalman filter that knows the car."""
-
-LINES = {
-    "nominal": ("nominal drive", "model_4"),
-    "melbourne": ("Melbourne", "model_3"),
-    "noise_doubled": ("noise doubled", "model_2"),
-    "style_sporty": ("sporty driver", "kalman"),
-}
-
-
-def memory_pictures(data: ReportData) -> Iterator[Picture]:
-    """Return the figures on memory; none if the published model has none."""
-    if (memory := data.memory) is None:
-        return
-    yield _by_columns(data, memory)
-    published = data.version.reference
-    yield _picture(
-        "memory-left-out", lambda size: left_out(memory, size), reference=published, memory=memory
-    )
-    if "nominal" in data.runs:
-        run = data.runs["nominal"]
-        maps = [
-            Map(f"Model {data.choice_number}, one instant", run, data.choice),
-            Map(f"{published}, with memory", run, published),
-        ]
-        yield _picture(
-            "memory-map",
-            lambda size: error_map(maps, size, FINE_EDGES_DEG),
-            before=run.results[data.choice].whole,
-            after=run.results[published].whole,
-        )
-
-
-def _by_columns(data: ReportData, memory: Memory) -> Picture:
-    known = data.evaluated.figures("nominal", FILTER)
-    known_deg = known.rmse_deg if known else None
-    lines = [Series("cross-validated", "ink", memory.cross_validated_deg)]
-    for name, errors in memory.on_drives.items():
-        lines.append(Series(*LINES[name], errors, known_deg if name == "nominal" else None))
-    nominal = memory.on_drives.get("nominal", np.empty(0))
-    better = [] if known_deg is None else np.flatnonzero(nominal < known_deg).tolist()
-    return _picture(
-        "memory-columns",
-        lambda size: error_by_columns(lines, size),
-        found=memory.searched,
-        known_deg=known_deg if len(nominal) else None,
-        fewest=list(memory.searched.models[better[0]].signals) if better else None,
-        fewest_deg=float(nominal[better[0]]) if better else None,
-        labels=[line.label for line in lines],
-    )

@@ -12,11 +12,11 @@ from fleet_slip.comparison.report.report_tables import tables
 from fleet_slip.files.folder import Folder
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.pages.drawing import Picture, draw, png_file, svg_file
-from fleet_slip.pages.page_parts import Tile, count, degrees, fill_in, size
+from fleet_slip.pages.page_parts import Tile, count, degrees, fill_in
 from fleet_slip.warehouse.tables import Warehouse
 from fleet_slip.words import number_of
 
-SECTIONS = {"paper": "figure-", "memory": "memory-", "roads": "road-", "fleet": "fleet-"}
+SECTIONS = {"paper": "figure-", "roads": "road-", "fleet": "fleet-"}
 """What the keys of a section's pictures begin with."""
 
 TABLES_IN = {
@@ -25,7 +25,6 @@ TABLES_IN = {
         "without-label", "own-car", "scenarios", "standings", "limits", "fleets",
     ),
     "coefficients": ("coefficients",),
-    "storage": ("storage",),
 }  # fmt: skip
 """The tables of each section, by their names in `tables.toml`."""
 
@@ -94,18 +93,14 @@ def _tiles(data: ReportData, claims: Sequence[Judged]) -> list[Tile]:
                 f"{degrees(PAPER_TABLE_TWO[number][1])}",
             )
         )
-    logs = data.tables[0]
-    tiles.append(
-        Tile(size(logs.size_bytes), f"of logs, {logs.size_bytes / logs.rows:.1f} bytes a row")
-    )
     return tiles
 
 
 def _provenance(data: ReportData) -> list[tuple[str, str]]:
     manifest = data.version.manifest
     trained = manifest.trained_on
-    there = [one for one in data.tables if one.version is not None]
-    now = ", ".join(f"{one.name} {one.version}" for one in there)
+    cohort = data.trained.selection.cohort
+    now = f"logs {cohort.logs_version}, grams {cohort.grams_version}"
     return [
         ("model version", data.version.reference),
         ("its SHA-256", data.version.sha256),

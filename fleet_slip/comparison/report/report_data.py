@@ -8,7 +8,6 @@ from typing import Any
 from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.sources import SCENARIO
 from fleet_slip.comparison.evaluation.estimators import (
     TABLE_ONE,
     Estimate,
@@ -20,21 +19,14 @@ from fleet_slip.comparison.evaluation.estimators import (
 from fleet_slip.comparison.evaluation.filters import rebuild
 from fleet_slip.comparison.evaluation.scenario_runs import EvaluatedScenario, run_all
 from fleet_slip.comparison.evaluation.targets import THE_PAPERS_CHOICE
-from fleet_slip.comparison.report.column_worth import (
-    Cars,
-    Memory,
-    looks_back,
-    weigh_cars,
-    weigh_memory,
-)
+from fleet_slip.comparison.report.fleet_cars import Cars, weigh_cars
 from fleet_slip.comparison.report.kept_evaluation import Evaluated, latest_of, latest_on_measured
 from fleet_slip.comparison.report.training_findings import (
     Coefficients,
-    Histogram,
     Ordering,
     coefficient_table,
     compare_orders,
-    held_out_histogram,
+    lateral_reach_mps2,
 )
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohorts.folding import BANDS, Folding
@@ -48,8 +40,6 @@ from fleet_slip.selection.request import SelectionRequest
 from fleet_slip.selection.search import try_distances
 from fleet_slip.selection.select_models import Selection, select
 from fleet_slip.simulation.scenario import Scenario, load_scenario, shipped_scenarios
-from fleet_slip.views import connect
-from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse
 
 DRAWN_FILTERS = ("kalman", "kalman_tuned")
@@ -67,21 +57,10 @@ DRAWN_SCENARIOS = (
     "style_sporty",
     "style_limit",
 )
+TRAINED_SHARE = 0.999
+
 MOST_TERMS = 60
-"""Of a larger model, neither standard errors nor what each column buys are shown: hundreds of rows
-tell nothing, and take an hour to compute."""
-
-
-@dataclass(frozen=True)
-class TableSize:
-    """One table of the warehouse: its version, and what it holds."""
-
-    name: str
-    version: int | None
-    files: int
-    rows: int
-    size_bytes: int
-    drives: int | None
+"""Of a larger model no standard errors are shown: hundreds of rows tell nothing."""
 
 
 @dataclass(frozen=True)
@@ -94,16 +73,15 @@ class ReportData:
         trained: its cohort, and the models of Table I on it.
         runs: drives of the evaluation's scenarios with the estimates that figures show.
         coefficients: of the paper's choice, then of the published model if it is another and small.
-        histogram: held-out estimates of all training rows by the paper's choice.
+        trained_to_mps2: the lateral acceleration that `TRAINED_SHARE` of the training rows stay
+            below.
         ordering: what the order of the signals is worth.
         by_speed: the models of Table I with whole bands of speed left out, by name; empty where all
             drives are of one speed.
         distances: of the nested models of all signals in their declared order, or why there are
             none.
-        memory: what columns over time are worth; None if the model has none, or too many.
         cars: what a car's own numbers are worth; None without a fleet in the data root.
         on_measured: its latest evaluation on measured drives; None if there is none.
-        tables: of the warehouse.
         campaigns: of the drives that the model was trained on.
         configs: checksums of what determines the results, by file.
         shipped: names of all shipped scenarios, evaluated or not.
@@ -114,14 +92,12 @@ class ReportData:
     trained: TrainedModels
     runs: Mapping[str, EvaluatedScenario]
     coefficients: tuple[Coefficients, ...]
-    histogram: Histogram
+    trained_to_mps2: float
     ordering: Ordering
     by_speed: Mapping[str, CrossValidation]
     distances: NestedDistances | str
-    memory: Memory | None
     cars: Cars | None
     on_measured: Mapping[str, Any] | None
-    tables: tuple[TableSize, ...]
     campaigns: tuple[str, ...]
     configs: Mapping[str, str]
     shipped: tuple[str, ...]
@@ -166,8 +142,6 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     evaluated.require_figures(runs)
     cohort, models = trained.selection.cohort, trained.selection.models
     own = _own_cohort(warehouse, trained)
-    manifest = version.manifest
-    choice = _paper_choice(models)
     signals = tuple(dict.fromkeys(models[-1].signals))
     signals_toml = config_file("signals.toml").read_bytes()
     return ReportData(
@@ -176,16 +150,12 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
         trained=trained,
         runs=runs,
         coefficients=_coefficients(trained, own),
-        histogram=held_out_histogram(warehouse, trained.selection, choice),
+        trained_to_mps2=lateral_reach_mps2(warehouse, cohort, TRAINED_SHARE),
         ordering=compare_orders(cohort, signals),
         by_speed=_by_speed(trained.selection),
         distances=try_distances(cohort, signals, trained.selection.folds, SelectionRequest()),
-        memory=weigh_memory(own, manifest, trained.selection.folds, runs)
-        if looks_back(manifest) and len(manifest.terms) <= MOST_TERMS
-        else None,
         cars=weigh_cars(warehouse),
         on_measured=latest_on_measured(warehouse, version),
-        tables=_tables(warehouse),
         campaigns=tuple(sorted(set(cohort.drives["campaign"].to_pylist()))),
         configs={
             "configs/signals.toml": hashlib.sha256(signals_toml).hexdigest(),
@@ -235,31 +205,6 @@ def _coefficients(trained: TrainedModels, own: Cohort) -> tuple[Coefficients, ..
         intercept = not published.manifest.through_origin
         tables.append(coefficient_table(own, published.reference, signals, intercept=intercept))
     return tuple(tables)
-
-
-def _tables(warehouse: Warehouse) -> tuple[TableSize, ...]:
-    with (
-        connect(warehouse.root, scenarios=True) as database,
-        reading_files(database, "counting drives"),
-    ):
-        counted = database.execute(
-            "SELECT source = $scenario, count(*) FROM drives GROUP BY ALL", {"scenario": SCENARIO}
-        ).fetchall()
-    drives = sum(number for _, number in counted)
-    sizes = []
-    for table in (warehouse.logs, warehouse.grams, warehouse.quarantine):
-        snapshot = table.snapshot()
-        sizes.append(
-            TableSize(
-                name=table.folder.name,
-                version=snapshot.version,
-                files=len(snapshot.files),
-                rows=snapshot.rows,
-                size_bytes=snapshot.size_bytes,
-                drives=drives if table is warehouse.logs else None,
-            )
-        )
-    return tuple(sizes)
 
 
 def _checksum_of(scenario: Scenario) -> str:

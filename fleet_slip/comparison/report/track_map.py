@@ -21,9 +21,6 @@ SMOOTHED_S = 0.5
 EDGES_DEG = (0.1, 0.3, 1.0)
 """Sizes of errors at which the colour changes."""
 
-FINE_EDGES_DEG = (0.03, 0.06, 0.12)
-"""The same where models on a dry road are compared."""
-
 WIDTHS = (4.4, 3.6, 3.0, 2.4, 3.0, 3.6, 4.4)
 SPACING_M = 3.0
 SCALE_BAR_M = 200.0

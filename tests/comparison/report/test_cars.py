@@ -9,7 +9,7 @@ import pytest
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import input_scales
-from fleet_slip.comparison.report.column_worth import (
+from fleet_slip.comparison.report.fleet_cars import (
     FEWEST_CARS,
     FOLDS,
     Cars,

@@ -1,6 +1,5 @@
 """A report from end to end: its numbers are those of the evaluation, and it stands by itself."""
 
-import math
 import re
 import shutil
 from collections import Counter
@@ -14,12 +13,11 @@ import numpy as np
 import pytest
 from jinja2 import meta
 
-from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalogue.features import features
 from fleet_slip.comparison.evaluation.evaluate import evaluations_of, keep
 from fleet_slip.comparison.evaluation.open_gates import gates_of
 from fleet_slip.comparison.evaluation.ranking import LEAST_COVERAGE
 from fleet_slip.comparison.evaluation.targets import PAPER_TABLE_TWO
-from fleet_slip.comparison.report.column_worth import by_length, looks_back
 from fleet_slip.comparison.report.facts import NAMES, Facts
 from fleet_slip.comparison.report.further_pictures import draw_pictures, road_pictures
 from fleet_slip.comparison.report.gate_strips import opening
@@ -35,19 +33,15 @@ from fleet_slip.comparison.report.page import render
 from fleet_slip.comparison.report.report_data import ReportData
 from fleet_slip.comparison.report.report_tables import tables
 from fleet_slip.comparison.report.texts import TEXTS
-from fleet_slip.comparison.report.training_findings import ANGLE_DEG, held_out_coefficients
 from fleet_slip.errors import DataError
 from fleet_slip.files.documents import Document
 from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
 from fleet_slip.models.manifest import LearnedFrom
 from fleet_slip.pages.drawing import DESK, PHONE, png_file, svg_file
 from fleet_slip.pages.page_parts import degrees, number
-from fleet_slip.regression.exact.gram import Gram
 from fleet_slip.resources import config_names
 from fleet_slip.selection.model_list import CandidateModel
 from fleet_slip.selection.select_models import validate
-from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.reported import Reported, call
@@ -101,7 +95,6 @@ def test_each_figure_is_on_the_page_and_in_two_files(reported: Reported, page: P
     svgs = sorted(file.stem for file in reported.figures.glob("*.svg"))
     assert svgs == sorted(file.stem for file in reported.figures.glob("*.png"))
     assert set(svgs) >= {"figure-1a", "figure-1b", "figure-2", "figure-3", "figure-5", "figure-8"}
-    assert set(svgs) >= {"memory-columns", "memory-left-out", "memory-map"}
     assert set(svgs) <= set(page.ids)
     assert page.elements["figure"] == len(svgs)
     assert page.elements["svg"] == 2 * len(svgs)
@@ -116,9 +109,9 @@ def test_the_same_data_give_the_same_bytes(reported: Reported, data: ReportData)
     """Gathered and drawn once more, in another process where tests run in several."""
     shown = draw_pictures(data)
     assert render(data, shown) == reported.page.read_text(encoding="utf-8")
-    density = next(picture for picture in shown if picture.key == "density")
-    assert png_file(density) == (reported.figures / "density.png").read_bytes()
-    assert svg_file(density) == (reported.figures / "density.svg").read_text(encoding="utf-8")
+    points = next(picture for picture in shown if picture.key == "test-drives")
+    assert png_file(points) == (reported.figures / "test-drives.png").read_bytes()
+    assert svg_file(points) == (reported.figures / "test-drives.svg").read_text(encoding="utf-8")
 
 
 def test_table_one_shows_folds_by_drive_and_by_whole_bands_of_speed(data: ReportData) -> None:
@@ -161,36 +154,6 @@ def test_table_two_has_the_evaluations_numbers(data: ReportData) -> None:
         assert (row[4].mark == "good") == (
             found["error_std_deg"] <= PAPER_TABLE_TWO[row[0].text][1]
         )
-
-
-def test_held_out_estimates_are_those_of_cross_validation(
-    reported: Reported, data: ReportData
-) -> None:
-    """Pooled from exact sums there, from the rows in SQL here."""
-    selection = data.trained.selection
-    model = next(model for model in selection.models if model.name == "4")
-    signals = Warehouse(LocalFolder(reported.root)).catalogue
-    terms = " + ".join(f"h.{name} * l.{signals[name].column}" for name in model.signals)
-    with connect(reported.root) as database:
-        database.register("h", held_out_coefficients(selection, model))
-        found = database.execute(
-            f"SELECT count(*), stddev_samp(degrees(h.intercept + {terms} - sideslip_rad)), "
-            f"corr(h.intercept + {terms}, sideslip_rad) FROM log AS l JOIN h USING (drive_id)"
-        ).fetchall()
-    ((rows, std, correlation),) = found
-    assert rows == model.pooled.rows == data.histogram.rows.sum()
-    assert std == pytest.approx(model.pooled.error_std_deg, rel=1e-9)
-    assert correlation == pytest.approx(model.correlation, rel=1e-9)
-
-
-def test_the_histogram_has_the_error_of_cross_validation(data: ReportData) -> None:
-    histogram = data.histogram
-    model = next(model for model in data.trained.selection.models if model.name == "4")
-    error = (histogram.estimate - histogram.truth) * ANGLE_DEG
-    mean = np.average(error, weights=histogram.rows)
-    std = float(np.sqrt(np.average((error - mean) ** 2, weights=histogram.rows)))
-    assert std == pytest.approx(model.pooled.error_std_deg, abs=ANGLE_DEG / 2)
-    assert histogram.cells(histogram.reach_deg(1)).sum() == histogram.rows.sum()
 
 
 def test_the_published_coefficients_are_in_the_table(data: ReportData) -> None:
@@ -285,73 +248,6 @@ def test_a_model_that_was_not_evaluated_is_told(
     done = run_command("report", "smoke")
     assert done.exit_code == 5
     assert "fleet-slip evaluate smoke@1" in done.stderr
-
-
-def test_the_path_of_columns_ends_at_the_published_model(data: ReportData) -> None:
-    """Its errors are those of the selection and of the evaluation, which come another way."""
-    memory, manifest = data.memory, data.version.manifest
-    assert memory is not None
-    assert set(memory.searched.models[-1].signals) == set(manifest.signals)
-    published = manifest.cross_validation.rmse_deg
-    assert memory.cross_validated_deg[-1] == pytest.approx(published, rel=1e-12)
-    assert memory.rmse_deg < published  # whose columns were chosen again in every fold
-    assert set(memory.on_drives) == {"nominal", "noise_doubled"}
-    for name, errors in memory.on_drives.items():
-        found = data.evaluated.figures(name, data.version.reference)
-        assert found is not None
-        assert errors[-1] == pytest.approx(found.rmse_deg, rel=1e-9)
-
-
-def test_the_error_without_columns_is_that_of_a_fit_without_them(
-    reported: Reported, data: ReportData
-) -> None:
-    """By least squares in float64 on the moments of each fold, instead of exact elimination."""
-    memory, manifest = data.memory, data.version.manifest
-    assert memory is not None
-    warehouse = Warehouse(LocalFolder(reported.root))
-    cohort = load_cohort(warehouse, manifest.trained_on.cohort, "windows")
-    folding = data.trained.selection.folds
-    folds = cohort.folds(folding.by, folding.count).serving(manifest.signals, "sideslip")
-    moments = [_moments(gram) for gram in folds.grams]
-    everything = list(range(len(manifest.signals)))
-    assert memory.rmse_deg == pytest.approx(_held_out_rmse_deg(moments, everything), rel=1e-6)
-    left_out = {name: [name] for name in manifest.signals} | by_length(manifest)
-    assert sum(len(columns) for columns in by_length(manifest).values()) == len(manifest.signals)
-    assert len(memory.columns) == len(manifest.signals)
-    for one in (*memory.columns, *memory.windows):
-        gone = left_out[one.name]
-        kept = [i for i, name in enumerate(manifest.signals) if name not in gone]
-        assert one.columns == len(gone)
-        assert one.rmse_deg == pytest.approx(_held_out_rmse_deg(moments, kept), rel=1e-6)
-
-
-def _moments(gram: Gram) -> np.ndarray:
-    size = len(gram.signals) + 1
-    matrix = np.empty((size, size))
-    matrix[0] = matrix[:, 0] = [gram.n, *gram.sums]
-    matrix[1:, 1:] = gram.raw()
-    return matrix
-
-
-def _held_out_rmse_deg(moments: list[np.ndarray], kept: list[int]) -> float:
-    at = [0, *(i + 1 for i in kept)]
-    total = np.sum(moments, axis=0)
-    squares = 0.0
-    for test in moments:
-        training = total - test
-        size = np.sqrt(np.diag(training)[at])
-        system = training[np.ix_(at, at)] / np.outer(size, size)
-        weights = np.linalg.solve(system, training[at, -1] / size) / size
-        direction = np.zeros(len(test))
-        direction[at], direction[-1] = weights, -1.0
-        squares += float(direction @ test @ direction)
-    return math.degrees(math.sqrt(squares / total[0, 0]) * float(input_scales()["sideslip"]))
-
-
-def test_a_model_of_one_instant_has_no_figures_on_memory(data: ReportData) -> None:
-    assert not [one for one in draw_pictures(replace(data, memory=None)) if "memory" in one.key]
-    plain = [term for term in data.version.manifest.terms if term.logged]
-    assert not looks_back(data.version.manifest.model_copy(update={"terms": tuple(plain)}))
 
 
 def test_the_standings_mark_the_smallest_error_of_each_drive(data: ReportData) -> None:
