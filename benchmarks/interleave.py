@@ -37,7 +37,7 @@ from benchmarks.interleave_server import serving
 
 
 def load_code(inputs: Inputs) -> None:
-    """Import in this process what commands import when they are called; make hashing names fast."""
+    """Import in this process what commands import when they are called."""
     crash.load_code(inputs.files)
     for found in pkgutil.walk_packages(fleet_slip.__path__, "fleet_slip."):
         with contextlib.suppress(ImportError):  # an extra that is not there
