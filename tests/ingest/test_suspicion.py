@@ -42,11 +42,15 @@ def test_a_sign(name: str) -> None:
     assert kinds({**car, name: -car[name]}) == {("reversed", (name,))}
 
 
-def test_all_axes_reversed_are_told_by_the_wheels() -> None:
-    names = ("ay", "yaw_rate", "steering_wheel")
-    car = a_car()
-    reversed_axes = {**car, **{name: -car[name] for name in (*names, "sideslip")}}
-    assert kinds(reversed_axes) >= {("reversed", (name,)) for name in names}
+def test_of_wheels_and_axes_that_contradict_the_fewest_are_at_fault() -> None:
+    car, wheels = a_car(), [("wheel_fl", "wheel_fr"), ("wheel_rl", "wheel_rr")]
+    exchanged = {a: car[b] for pair in wheels for a, b in (pair, pair[::-1])}
+    found = find_suspicions({**car, **exchanged})
+    assert {(one.kind, one.signals) for one in found} == {("swapped", pair) for pair in wheels}
+    assert "SAE J670" in found[0].remedy
+    few = {**car, "ay": -car["ay"], "yaw_rate": -car["yaw_rate"]}
+    del few["steering_wheel"]
+    assert kinds(few) >= {("reversed", ("ay",)), ("reversed", ("yaw_rate",))}
 
 
 @pytest.mark.parametrize("sign", [1, -1])

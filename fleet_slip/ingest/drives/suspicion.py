@@ -121,8 +121,8 @@ def _still(signals: Signals) -> Iterator[Suspicion]:
 def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
     """Compare the signs of all that tells left from right.
 
-    Two axles that agree with one another settle the matter: more often are the axes not ISO 8855
-    than all wheels swapped. Without them the majority counts.
+    The fewest faults that explain all count, as in `quality`: where up to two others are against
+    both axles, the axes are not ISO 8855; where more are, left and right wheels are swapped.
     """
     known = {
         name: np.asarray(sum(k * signals[s] for s, k in parts.items()))
@@ -140,7 +140,8 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
     loadings = np.linalg.eigh(correlations)[1][:, -1]
     axles = [loadings[names.index(n)] for n in ("front wheels", "rear wheels") if n in names]
     agree = len(axles) == 2 and min(map(abs, axles)) > 0.2 and axles[0] * axles[1] > 0
-    loadings *= np.sign(axles[0] if agree else loadings.sum()) or 1
+    few = len(names) - len(axles) <= len(axles)
+    loadings *= np.sign(axles[0] if agree and few else loadings.sum()) or 1
     for name, loading in zip(names, loadings, strict=True):
         if loading > -0.2:
             continue
@@ -151,7 +152,10 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
             continue
         figure = f"its correlation with {names[against]} is {others[against]:+.2f}"
         if len(concerned) == 2:
-            yield Suspicion("swapped", concerned, figure, "Swap their columns.")
+            remedy = "Swap their columns."
+            if agree:
+                remedy += " If all others are positive to the right (SAE J670), negate these."
+            yield Suspicion("swapped", concerned, figure, remedy)
         else:
             yield Suspicion("reversed", concerned, figure, "Write negate = true.")
 
