@@ -21,7 +21,7 @@ from fleet_slip.progress import Progress, no_progress
 from fleet_slip.runs.log import step
 
 if TYPE_CHECKING:
-    from fleet_slip.grams.received.receiving import ReceiveReport
+    from fleet_slip.grams.received.counted_rows import CountedReport
     from fleet_slip.grams.rows.check_grams import CheckReport
     from fleet_slip.grams.rows.gram_job import GramReport
     from fleet_slip.ingest.drafting.preview import Preview
@@ -70,35 +70,6 @@ class LogsAndGrams(Rooted):
             )
             figures.rows, figures.size_bytes = report.rows, report.size_bytes
         return report
-
-    @record_call
-    def receive(
-        self,
-        files: Iterable[Path | str] | Path | str,
-        *,
-        each: "Callable[[ReceiveReport], None] | None" = None,
-        progress: ShowProgress | None = None,
-    ) -> "list[ReceiveReport]":
-        """Take in messages of cars that send Gram rows, no logs; return a report of each file.
-
-        Files hold messages one behind the other; folders are searched. Files and messages land
-        once; what is damaged, impossible or contradictory goes to the view `quarantine`. `each`
-        gets a report when its file has landed. Progress is in files. Raises `InputError` for an
-        unreadable file, when all others are in, `StorageError` and `ConflictError`.
-        """
-        from fleet_slip.grams.received.receiving import find_messages, receive_files
-
-        given = [Path(files)] if isinstance(files, Path | str) else [Path(file) for file in files]
-        paths = find_messages(given)
-        reports = []
-        with step("receive") as figures:
-            figures.rows = 0
-            for report in receive_files(self.warehouse, paths, count_from_start(progress)):
-                reports.append(report)
-                figures.rows += report.rows
-                if each is not None:
-                    each(report)
-        return reports
 
     @record_call
     def ingest(
@@ -178,6 +149,20 @@ class LogsAndGrams(Rooted):
             if failures or unclaimed:
                 raise joined(failures, unclaimed)
         return [reports[str(path)] for path in paths if str(path) in reports]
+
+    @record_call
+    def ingest_counted(self, file: Path | str) -> "CountedReport":
+        """Bring in Gram rows that cars counted: a Parquet or Arrow table (`docs/edge.md`).
+
+        It lands whole and once. Raises `InputError` for a row that no drive can have or of what was
+        forgotten, `RepeatedError` for a drive that is there, `StorageError` and `ConflictError`.
+        """
+        from fleet_slip.grams.received.counted_rows import ingest_counted
+
+        with step("ingest") as figures:
+            report = ingest_counted(self.warehouse, Path(file))
+            figures.rows = report.rows if report.new else 0
+        return report
 
     @record_call
     def take_back(self, what: str) -> int:

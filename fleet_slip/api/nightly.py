@@ -1,7 +1,7 @@
 """A night with real cars: what is new comes in, is examined, and trains the model again."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -238,9 +238,8 @@ class Night:
         except DataError as error:
             return "left out", str(error)
         new = [day for day in self.chart.days if not day.training]
-        left_out = _revoked(self.chart.drives_revoked)
-        if drives := self.chart.drives_left_out:
-            left_out = f" {number_of(drives, 'drive')} without a log left out.{left_out}"
+        drives = self.chart.drives_left_out
+        left_out = f" {number_of(drives, 'drive')} without a log left out." if drives else ""
         told = f"{champion} on {number_of(len(new), 'new day')}: "
         if alarms := self.chart.alarms:
             days = ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in alarms)
@@ -259,10 +258,7 @@ class Night:
             )
         if publication is None:
             publication = self.fleet.publish(name, selection, candidate=True)
-        cars = selection.cohort.outweighing
-        why, which = "they would outweigh the others", number_of(len(cars), "car")
-        left_out = _left_out((one.drives for one in cars), which, why)
-        told = f"{publication.version.reference}: {publication.reason}{left_out}"
+        told = f"{publication.version.reference}: {publication.reason}"
         return "attention" if refusal else "done", told
 
     def _verify(self) -> Told:
@@ -281,12 +277,6 @@ class Night:
             f"{number_of(forgotten, 'drive')} before {report.before} forgotten, "
             f"{number_of(removed, 'old file')} removed."
         )
-
-
-def _revoked(drives: Mapping[str, int]) -> str:
-    """Return the sentence on drives that do not count, since a revoked key signed them."""
-    cars = number_of(len(drives), "car")
-    return _left_out(drives.values(), cars, "a key of theirs was revoked")
 
 
 def _left_out(drives: Iterable[int], cars: str, why: str) -> str:

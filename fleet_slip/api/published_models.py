@@ -212,7 +212,7 @@ class PublishedModels(Rooted):
     ) -> list[Path]:
         """Write a version as a program for elsewhere into a folder; return the files.
 
-        `with_gram` adds to C what counts Gram rows in the car, for `receive`. Exports carry the
+        `with_gram` adds to C what counts Gram rows in the car, for `ingest`. Exports carry the
         version's checksum, the hash of its drives, and checks of made-up inputs; no tick of a log.
         Raises `RefusedError` if the angle's error has no bound or counts mean something else now,
         `UsageError` for an unknown target, `ConfigError` without what it needs, and what `model`

@@ -30,7 +30,6 @@ GROUPS = {
         "simulate": "data.log_commands",
         "mapping": "data.mapping_command",
         "ingest": "data.log_commands",
-        "receive": "data.receive_command",
         "gram": "data.gram_commands",
         "check": "data.gram_commands",
         "features": "data.features_command",

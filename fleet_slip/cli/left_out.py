@@ -19,19 +19,6 @@ def say_without_log(drives: int, feature_set: str) -> None:
         )
 
 
-def say_revoked(drives: Mapping[str, int]) -> None:
-    """Say how many drives of each car do not count, since a revoked key signed them."""
-    for car, many in drives.items():
-        say(f"{number_of(many, 'drive')} of {car} left out: a key of it was revoked.")
-
-
-def say_outweighing(drives: Mapping[str, int]) -> None:
-    """Say how many drives of each car do not count, since it would outweigh the others."""
-    for car, many in drives.items():
-        drives_of = f"{number_of(many, 'drive')} of {car}"
-        say(f"{drives_of} left out: with them it would outweigh the others.")
-
-
 def say_influential(cars: Mapping[str, Influential], what: str) -> None:
     """Say which cars have an influence that no honest car has, and what becomes of them."""
     for car, one in cars.items():

@@ -66,9 +66,6 @@ class Verification:
     rows: int = 0
     log_files_recomputed: int = 0
     documents: int = 0
-    signatures: int = 0
-    """Messages of cars whose signature was kept."""
-    signatures_checked: int = 0
     findings: list[Damage] = field(default_factory=list)
 
     def note(self, kind: DamageKind, path: str, problem: str) -> None:

@@ -1,1 +1,1 @@
-"""Model versions: manifests, aliases, signatures, publishing and scoring."""
+"""Model versions: manifests, aliases, publishing and scoring."""

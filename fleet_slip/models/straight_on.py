@@ -70,7 +70,7 @@ class StraightOn:
 def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) -> StraightOn:
     """Return the intercept of a model without one. Raises `DataError` if no car tells offsets."""
     evidence = calibrate(warehouse, condition).evidence
-    cohort = load_cohort(warehouse, condition, training=False)
+    cohort = load_cohort(warehouse, condition)
     signals = tuple(dict.fromkeys(name for term in manifest.terms for name in term.inputs))
     predictor = Predictor.of(manifest)
     found = []

@@ -10,8 +10,8 @@ with Student's t for m - 1 degrees of freedom: with few days the limits are as w
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from datetime import date
 from statistics import fmean, stdev
 
@@ -85,7 +85,6 @@ class Chart:
     Attributes:
         drives_left_out: drives of the cohort without Gram rows of the model's feature set, since
             their cars sent no log.
-        drives_revoked: how many drives of a car are left out, since a revoked key signed them.
     """
 
     model: str
@@ -95,7 +94,6 @@ class Chart:
     std_limits: Limits
     feature_set: str = PLAIN
     drives_left_out: int = 0
-    drives_revoked: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def alarms(self) -> tuple[Day, ...]:
@@ -149,7 +147,6 @@ def monitor(
         std,
         feature_set,
         sums.left_out,
-        sums.revoked,
     )
 
 

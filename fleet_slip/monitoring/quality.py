@@ -1,7 +1,7 @@
 """Faulty sensors, drive by drive, from Gram rows alone."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from datetime import date
 from math import ceil
 from operator import attrgetter
@@ -66,20 +66,17 @@ class QualityReport:
         drives: Gram rows long enough to be examined.
         compared: those among them that had enough peers to be compared with.
         findings: one for each that is not in order, by day and drive.
-        revoked: how many drives of a car are left out, since a revoked key signed them.
     """
 
     drives: int
     compared: int
     findings: tuple[SensorFault, ...]
-    revoked: Mapping[str, int] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report for a JSON document."""
         return {
             "drives": self.drives,
             "compared": self.compared,
-            "drives_revoked": dict(self.revoked),
             "findings": [finding.as_dict() for finding in self.findings],
         }
 
@@ -98,18 +95,15 @@ def examine_drives(
     with GramReader(warehouse) as reader:
         models = _vehicle_models(reader, drives)
         known = _faulty_courses(reader, drives) | _changed_delays(reader, drives)
-        known |= find_wrong_labels(load_cohort(reader, drives, training=False), limits)
+        known |= find_wrong_labels(load_cohort(reader, drives), limits)
         reports = [
-            examine(load_cohort(reader, drives & of_model, training=False), limits, known)
-            for of_model in models
+            examine(load_cohort(reader, drives & of_model), limits, known) for of_model in models
         ]
-        revoked = reader.opened(PLAIN, drives).revoked(drives)
     findings = [finding for report in reports for finding in report.findings]
     return QualityReport(
         sum(report.drives for report in reports),
         sum(report.compared for report in reports),
         tuple(sorted(findings, key=BY_DAY)),
-        revoked,
     )
 
 

@@ -78,7 +78,7 @@ def _answer_usual(
     logged = replace(request, models=LOGGED_MODELS)
     if request.features or request.by in (ROW_FOLDS, PARTS):
         return _answer(warehouse, logged, condition)
-    why = "messages of cars have the logged signals alone."
+    why = "Gram rows that cars counted are of the logged signals alone."
     if warehouse.logs.snapshot().rows:
         try:
             return _answer(warehouse, replace(request, models=DEFAULT_MODELS), condition)

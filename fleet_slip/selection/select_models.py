@@ -14,7 +14,6 @@ from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohorts.fold_sums import SummedCohort
 from fleet_slip.grams.cohorts.folding import ROW_FOLDS, Folding
 from fleet_slip.grams.cohorts.gram_cohort import Cohort
-from fleet_slip.grams.cohorts.outweighing import drives_by_car
 from fleet_slip.pages.notebook_table import notebook_table
 from fleet_slip.regression.choice.nested_choice import NestedDistances
 from fleet_slip.regression.choice.winner import Winner, Worth
@@ -105,8 +104,6 @@ class Selection(Generic[AnyCohort]):
             "rows_without": self.rows_without,
             "drives_without_log": self.cohort.members.count_received,
             "drives_left_out": self.cohort.left_out,
-            "drives_revoked": dict(self.cohort.revoked),
-            "drives_outweighing": drives_by_car(self.cohort.outweighing),
             "intercept": self.intercept,
             "folds": {
                 "by": self.folds.by,

@@ -77,7 +77,7 @@ def without_label(warehouse: Warehouse, cohort: CohortOrigin, error: float) -> W
     noise = _Noise()
     squares = {YAW_RATE: [0.0, 0.0], CURVATURE: [0.0, 0.0], TURNED: [0.0, 0.0]}
     turned = 0.0
-    with open_grams(warehouse, cohort.feature_set, cohort.condition, training=True) as opened:
+    with open_grams(warehouse, cohort.feature_set, cohort.condition) as opened:
         for batch in opened.batches(cohort.condition):
             for names, rows, _ in by_signals(batch):
                 if STRAIGHT not in names.split(","):

@@ -28,8 +28,7 @@ that it belongs to and `vehicle_id` its car, null if that is what is wrong; `sig
 or metadata concerned, or `time`; `value` is what stood there, as text."""
 
 SIGNED = "signed"
-"""Column of `grams` with what is kept of the signature of a message that a car sent; no view has
-it (`fleet_slip/grams/received.messages.py`)."""
+"""Column of `grams` that releases up to 0.3 kept signatures of cars in; no view has it."""
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from fleet_slip.warehouse.tables import Warehouse
 from tests.export.compiled import SANITIZED, can_sanitize, needs_cc, run_compiled
 from tests.export.course import COLUMNS, Counter, build, learned
 from tests.grams.rows.test_course_sums import hostile_drive
+from tests.support.counted_rows import rows_of_messages, write_counted
 from tests.support.logs import land
 
 pytestmark = needs_cc
@@ -76,10 +77,8 @@ def kernel_rows(folder: Folder, table: pa.Table, name: str, late: int) -> list[d
 def received_rows(root: Path, content: bytes) -> list[dict[str, Any]]:
     """The Gram rows that the messages of a drive become."""
     root.mkdir()
-    (root / "messages").write_bytes(content)
     fleet = fleet_slip.open(root / "data")
-    (report,) = fleet.receive(root / "messages")
-    assert not report.refused and report.received == report.messages
+    fleet.ingest_counted(write_counted(root / "rows", rows_of_messages(content)))
     found: list[dict[str, Any]] = fleet.sql("SELECT * FROM grams").to_arrow_table().to_pylist()
     return found
 

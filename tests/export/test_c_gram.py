@@ -15,12 +15,12 @@ import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import UsageError
 from fleet_slip.export.files import export_files
-from fleet_slip.grams.received.messages import message_size, signals_definition
+from fleet_slip.grams.received.counted_sets import counted_sets
 from fleet_slip.models.model_version import ModelVersion
 from fleet_slip.regression.exact.gram import Gram
 from tests.export.compiled import SANITIZED, can_sanitize, compile_c, needs_cc, run_compiled
 from tests.export.models import MODELS, model_of
-from tests.support.messages import parse_messages
+from tests.support.counted_rows import parse_messages
 
 pytestmark = needs_cc
 
@@ -110,7 +110,7 @@ def test_simulated_drives_have_the_gram_rows_of_the_warehouse(
         names = tuple(row["signals"].split(","))
         whole = Gram(names, row["n"], tuple(row["sums"]), tuple(row["products"]))
         assert parts_of(content) == {names: whole}
-        assert len(content) == message_size(len(SIGNALS)) == 676
+        assert len(content) == 676
 
 
 def test_each_set_of_signals_has_a_message_and_extremes_are_exact(counter: Path) -> None:
@@ -148,7 +148,7 @@ def test_the_layout_is_what_the_page_says(counter: Path) -> None:
     counts = np.ones((3, len(SIGNALS)), np.int16)
     content = count_drives(counter, [("VIN-17", 1_700_000_000, counts)])
     assert content[:8] == b"FSGR\x01\x00" + len(content).to_bytes(2, "little")
-    assert int.from_bytes(content[8:16], "little") == signals_definition()
+    assert int.from_bytes(content[8:16], "little") == next(iter(counted_sets()))
     assert content[16:32] == b"VIN-17".ljust(16, b"\0")
     assert content[32:36] == b"\0\0\x01\0"
     assert struct.unpack_from("<QIII", content, 36) == (1_700_000_000, 2**11 - 1, 3, 0)

@@ -9,7 +9,6 @@ import pytest
 
 from fleet_slip.config import LONGEST_FILE_BYTES, load_config, read_named_file
 from fleet_slip.errors import ConfigError, FleetSlipError, InputError
-from fleet_slip.grams.received.car_keys import KEYS_VARIABLE, load_car_keys
 from fleet_slip.ingest.formats.can.can_bus import CanBus, parse_database, read_can_database
 from fleet_slip.ingest.mapping.vehicle_facts import read_vehicle_facts
 from fleet_slip.models.acceptance.champion_rules import Floor
@@ -24,13 +23,7 @@ def read_database(file: Path) -> Any:
     return parse_database(read_can_database(CanBus(database=file.name), file.parent))
 
 
-def read_keys(file: Path) -> Any:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(KEYS_VARIABLE, str(file))
-        return load_car_keys()
-
-
-READERS = {"cars.csv": read_vehicle_facts, "car.dbc": read_database, "keys.csv": read_keys}
+READERS = {"cars.csv": read_vehicle_facts, "car.dbc": read_database}
 readers = pytest.mark.parametrize(("name", "read"), READERS.items(), ids=READERS)
 Read = Callable[[Path], Any]
 
@@ -111,7 +104,7 @@ def test_a_folder_of_configs_that_leads_nowhere_does_not_count_as_empty(
         find_config("campaigns", "smoke")
 
 
-@pytest.mark.parametrize("command", [("models", "import"), ("receive",)])
+@pytest.mark.parametrize("command", [("models", "import"), ("ingest",)])
 def test_a_pipe_given_to_a_command_is_refused_at_once(
     tmp_path: Path, run_command: RunCommand, command: tuple[str, ...]
 ) -> None:

@@ -10,9 +10,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip import Fleet
-from fleet_slip.grams.received.signatures import sign_messages
-from fleet_slip.models.ed25519 import generate
-from tests.support.messages import gram_of, message_of
+from tests.support.counted_rows import gram_of, row_of, write_counted
 
 ROOTS = sorted((Path(__file__).parents[1] / "evidence/roots").glob("*.tar.gz"))
 LARGEST_BYTES = 100_000
@@ -60,12 +58,10 @@ def test_its_model_estimates_and_is_trained_again_to_the_same(fleet: Fleet) -> N
     assert again.intercept == old.manifest.intercept
 
 
-def test_it_takes_signed_messages_once_it_is_migrated(fleet: Fleet, tmp_path: Path) -> None:
+def test_it_takes_gram_rows_of_cars_once_it_is_migrated(fleet: Fleet, tmp_path: Path) -> None:
     fleet.migrate()
     fleet.gram()
-    private, _ = generate()
-    (tmp_path / "m").write_bytes(sign_messages(message_of(gram_of(1), "VIN1"), private))
-    (report,) = fleet.receive(tmp_path / "m")
-    assert report.received == 1
+    report = fleet.ingest_counted(write_counted(tmp_path / "rows", [row_of(gram_of(1))]))
+    assert report.gram_rows == 1
     fleet.forget(vehicle="VIN1")
     assert not fleet.verify(full=True).damage

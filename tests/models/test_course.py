@@ -14,6 +14,7 @@ from fleet_slip.export.c.on_board import sets_on_board
 from fleet_slip.models.manifest import Manifest
 from tests.export.compiled import needs_cc
 from tests.export.course import START_S, build
+from tests.support.counted_rows import rows_of_messages, write_counted
 
 CAMPAIGN = """
 name = "received"
@@ -116,9 +117,8 @@ def test_cars_without_a_log_or_a_label_teach_the_very_same_model(
             f"FROM log_counts WHERE drive_id = '{drive}' ORDER BY tick"
         )
         sent.append(counter.messages(rows.to_arrow_table(), late, START_S + 86_400 * number))
-    (tmp_path / "messages").write_bytes(b"".join(sent))
     edge = fleet_slip.open(tmp_path / "edge")
-    assert not edge.receive(tmp_path / "messages")[0].refused
+    edge.ingest_counted(write_counted(tmp_path / "rows", rows_of_messages(b"".join(sent))))
     found = without_label(edge)
     assert found.trained_on.drives_without_log == found.trained_on.drives == len(logged)
     assert (found.intercept, found.terms) == (taught.intercept, taught.terms)

@@ -19,9 +19,9 @@ from fleet_slip.runs.nights import hash_drive, with_all_drives, without_drives
 from fleet_slip.warehouse.condition import Condition
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
-from tests.support.fleet_messages import messages_of
+from tests.support.counted_rows import START_S, write_counted
+from tests.support.fleet_rows import rows_of_fleet
 from tests.support.landing import Landing
-from tests.support.messages import START_S
 from tests.support.once import made_once
 
 
@@ -221,8 +221,8 @@ def test_rows_of_whole_files_are_not_read_to_tell_that_they_are_known(
     monkeypatch.setattr(examined, "examine_drives", ask)
     for day in range(3):
         path = tmp_path / f"day-{day}"
-        path.write_bytes(messages_of(150, START_S + 86_400 * day, seed=day))
-        fleet.receive(path)
+        write_counted(path, rows_of_fleet(150, START_S + 86_400 * day, seed=day))
+        fleet.ingest_counted(path)
         fleet.cohort().examine()
         assert len(asked) == day + 1
         assert f"2024-05-0{day + 1}" in asked[-1]

@@ -7,14 +7,11 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
 from fleet_slip.cli.left_out import (
     say_influential,
-    say_outweighing,
-    say_revoked,
     say_without_information,
     say_without_log,
 )
 from fleet_slip.cli.output import cell, figures_cells, print_line, print_table, print_text, say
 from fleet_slip.grams.cohorts.folding import BANDS, PARTS, ROW_FOLDS
-from fleet_slip.grams.cohorts.outweighing import drives_by_car
 from fleet_slip.grams.cohorts.taught_cohort import TaughtCohort
 from fleet_slip.regression.choice.nested_choice import CROSS_VALIDATION, NestedDistances
 from fleet_slip.regression.inference.evidence import Evidence
@@ -174,8 +171,6 @@ def _say_left_out(selection: Selection[Any]) -> None:
     if without_log := selection.cohort.members.count_received:
         say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
     say_without_log(selection.cohort.left_out, selection.cohort.feature_set)
-    say_revoked(selection.cohort.revoked)
-    say_outweighing(drives_by_car(selection.cohort.outweighing))
     if isinstance(selection, RequestedSelection):
         say_influential(selection.left_out, "left out")
         if selection.remark:

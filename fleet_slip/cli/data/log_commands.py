@@ -141,6 +141,8 @@ def ingest(
 ) -> None:
     """Bring measured logs into the warehouse through a mapping of columns, units and axes.
 
+    Without a mapping, files are tables of Gram rows that cars counted (docs/edge.md).
+
     Rows that cannot be used go to the quarantine with a reason: fleet-slip sql "FROM quarantine"
 
     Example: **fleet-slip ingest drive.csv --mapping logger.toml --dry-run**
@@ -151,8 +153,11 @@ def ingest(
     if undo is not None:
         _take_back(fleet, undo, json, alone=not (files or mapping or replace or dry_run or as_one))
         return
-    if not files or mapping is None:
-        raise UsageError("give files and --mapping; or --undo alone, to take drives out again.")
+    if not files:
+        raise UsageError("give files; or --undo alone, to take drives out again.")
+    if mapping is None:
+        _ingest_counted(fleet, files, json, alone=not (dry_run or as_one or replace or plot))
+        return
     if plot is not None and not (dry_run and len(files) == 1):
         raise UsageError("--plot draws one file, with --dry-run.")
     if dry_run:
@@ -178,6 +183,23 @@ def ingest(
     elif folders:
         say(_summed_up(reports))
     _require_sound(reports)
+
+
+def _ingest_counted(fleet: Fleet, files: list[str], json: bool, *, alone: bool) -> None:
+    """Bring in tables of Gram rows that cars counted."""
+    if not alone:
+        raise UsageError("give --mapping: without it files are tables of Gram rows (docs/edge.md).")
+    with recording(fleet.root, "ingest", sys.argv[1:]):
+        reports = [fleet.ingest_counted(file) for file in files]
+    if json:
+        print_json([vars(report) for report in reports])
+        return
+    for one in reports:
+        if one.new:
+            what = f"{number_of(one.gram_rows, 'Gram row')} of {number_of(one.drives, 'drive')}"
+            say(f"{one.file}: {what}, {number_of(one.rows, 'row')}")
+        else:
+            say(f"{one.file}: nothing to do, it was ingested before")
 
 
 def _require_sound(reports: "list[IngestReport]") -> None:

@@ -95,9 +95,6 @@ def _print_verification(report: Verification, rebuilt: list[str]) -> None:
     for path in rebuilt:
         say(f"rebuilt {path}")
     remarks = [finding for finding in report.findings if not finding.damage]
-    checked = ""
-    if many := report.signatures_checked:
-        checked = f", {many:,} of {number_of(report.signatures, 'signature')} checked"
     for title, findings in (("damage", report.damage), ("remarks", remarks)):
         if findings:
             rows = ([finding.path, finding.problem] for finding in findings)
@@ -106,7 +103,7 @@ def _print_verification(report: Verification, rebuilt: list[str]) -> None:
         f"{number_of(report.files, 'file')} with {report.size_bytes:,} bytes and "
         f"{number_of(report.documents, 'document')} "
         f"were read, the Gram rows of {number_of(report.log_files_recomputed, 'log file')} "
-        f"computed again{checked}: "
+        f"computed again: "
         + (f"{len(report.damage)} damaged" if report.damage else "all is as it must be")
     )
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.cli.left_out import say_revoked, say_without_log
+from fleet_slip.cli.left_out import say_without_log
 from fleet_slip.cli.model_argument import OnlyModel
 from fleet_slip.cli.output import Json, print_json, print_table
 from fleet_slip.dates import date_of
@@ -50,7 +50,6 @@ def monitor(
     else:
         _print_chart(chart)
         say_without_log(chart.drives_left_out, chart.feature_set)
-        say_revoked(chart.drives_revoked)
     if chart.alarms:
         days = ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in chart.alarms)
         raise AlarmError(f"the error of {chart.model} is beyond its limits on {days}")

@@ -5,7 +5,6 @@ from typing import Annotated
 import typer
 
 from fleet_slip.catalogue.sources import TRAINING_DRIVES
-from fleet_slip.cli.left_out import say_revoked
 from fleet_slip.cli.output import Json, print_json, print_table, print_text
 from fleet_slip.errors import AlarmError
 from fleet_slip.monitoring.quality import QualityReport
@@ -31,7 +30,6 @@ def quality(
         print_json(found)
     else:
         _print_quality(found)
-        say_revoked(found.revoked)
     if found.findings:
         raise AlarmError(
             f"{len(found.findings)} of {number_of(found.drives, 'drive')} are not in order"

@@ -1,6 +1,21 @@
 """Gram rows in C99: what a car counts at each tick of a drive, and the messages that tell it.
 
-The layout of a message is that of `fleet_slip.grams.received.messages`. Of each feature set as many
+`docs/edge.md` reads the messages in Python. All numbers are little-endian. A message is
+
+    0   4   "FSGR"                          36  8  when the drive began, s since 1970 in UTC
+    4   2   layout, 1                       44  4  which signals it is of, a bit for each
+    6   2   length with the checksum        48  4  n, rows
+    8   8   the set's definition            56  .. sums, 8 bytes each, of these signals
+    16  16  the car, ASCII, zeros behind    ..  .. products, 8 bytes each, packed lower triangle
+    32  2   place among the drive's         ..  4  CRC-32 of all before, as in Ethernet and zlib
+    34  2   number of them
+    52  4   rows that are in none of them
+
+A message of another feature set has the layout 3: at 44 over which time (2 bytes, from 0) and the
+delay of the course (2 bytes, signed, in quarters of a tick); at 56 which columns of the set it is
+of, 64 bytes, a bit for each, the first the lowest; sums from 120 on.
+
+Of each feature set as many
 rows are counted as no sum of products can reach 2^61 of: nothing overflows. Columns are computed by
 the steps of an exported estimator, changes of them as `fleet_slip.grams.rows.course_sums` does: a
 fix comes late, so that columns, course and yaw rate are kept of as many ticks as a change and a
@@ -29,19 +44,16 @@ from fleet_slip.export.c.c_steps import StepWriter, state_fields
 from fleet_slip.export.c.on_board import OnBoard, lower
 from fleet_slip.export.fill_templates import fill_template
 from fleet_slip.export.program import Steps
-from fleet_slip.grams.received.messages import (
-    HEADER_BYTES,
-    LAYOUT,
-    LONGEST_VEHICLE,
-    MAGIC,
-    MOST_COLUMNS,
-    MOST_PARTS,
-    MOST_ROWS,
-    SET_LAYOUT,
-    message_size,
-)
+from fleet_slip.grams.received.counted_sets import MOST_COLUMNS, MOST_ROWS
 from fleet_slip.grams.received.plausible import most_rows
 from fleet_slip.regression.exact.gram import packed_size
+
+MAGIC = b"FSGR"
+LAYOUT, SET_LAYOUT = 1, 3
+HEADER_BYTES, CHECKSUM_BYTES = 56, 4
+LONGEST_VEHICLE = 16
+MOST_PARTS = 4
+"""Sets of signals that a car keeps apart within a drive."""
 
 _HELPER = re.compile(r"^static \w+ (\w+)\(", re.MULTILINE)
 
@@ -82,7 +94,8 @@ def _words(prefix: str, sets: Sequence[OnBoard]) -> Mapping[str, Any]:
         "numbers": sum(numbers),
         "longest_vehicle": LONGEST_VEHICLE,
         "longest_message": max(
-            message_size(len(one.columns), of_set=number > 0) for number, one in enumerate(sets)
+            HEADER_BYTES + MOST_COLUMNS // 8 * (number > 0) + 8 * size + CHECKSUM_BYTES
+            for number, size in enumerate(sizes)
         ),
         "header_bytes": HEADER_BYTES,
         "magic": MAGIC,

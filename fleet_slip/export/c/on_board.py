@@ -18,8 +18,12 @@ from fleet_slip.columns.counted_columns import rows_of
 from fleet_slip.columns.lowering import Lowering
 from fleet_slip.errors import RefusedError
 from fleet_slip.export.program import Input, Steps
-from fleet_slip.grams.received.counted_sets import CountedSet, Range, counted_by_identity
-from fleet_slip.grams.received.messages import MOST_SIGNALS
+from fleet_slip.grams.received.counted_sets import (
+    MOST_SIGNALS,
+    CountedSet,
+    Range,
+    counted_by_identity,
+)
 from fleet_slip.grams.rows.receiver_delay import delay_columns
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.words import number_of

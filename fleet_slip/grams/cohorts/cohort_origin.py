@@ -1,12 +1,11 @@
 """Which Gram rows a cohort is made of."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 from fleet_slip.catalogue.feature_sets import PLAIN
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohorts.outweighing import Outweighing
 from fleet_slip.warehouse.condition import Condition
 
 
@@ -18,8 +17,6 @@ class CohortOrigin:
         condition: which drives, by the columns of the view `drives`.
         logs_version, grams_version, feature_set: what was read.
         left_out: drives of the condition that have no such Gram rows: their cars sent no log.
-        revoked: how many drives of a car are left out, since a revoked key signed them.
-        outweighing: which are, since their cars would outweigh the others with them.
     """
 
     condition: Condition
@@ -27,8 +24,6 @@ class CohortOrigin:
     grams_version: int
     feature_set: str = PLAIN
     left_out: int = 0
-    revoked: Mapping[str, int] = field(default_factory=dict)
-    outweighing: tuple[Outweighing, ...] = ()
 
     def inputs_among(self, names: Iterable[str]) -> tuple[str, ...]:
         """Return the inputs that are among some columns, in the order of the feature set."""
@@ -43,5 +38,4 @@ class CohortOrigin:
         return (
             f"feature_set = '{features().identity(self.feature_set)}' AND {self.condition.sql} AND "
             f"list_has_all(string_split(signals, ','), [{wanted}])"
-            + "".join(f" AND NOT {one.condition}" for one in self.outweighing)
         )

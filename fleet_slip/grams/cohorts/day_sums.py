@@ -1,7 +1,7 @@
 """The sums of a cohort over each day, from Gram rows read batch by batch."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import date
 
@@ -28,14 +28,12 @@ class DailySums:
 
     Attributes:
         left_out: drives of the condition that have no such Gram rows: their cars sent no log.
-        revoked: how many drives of a car are left out, since a revoked key signed them.
     """
 
     days: tuple[date, ...]
     grams: tuple[Gram, ...]
     drives: tuple[int, ...]
     left_out: int
-    revoked: Mapping[str, int]
 
 
 def sum_days(
@@ -58,7 +56,7 @@ def sum_days(
                 if set(signals) <= set(names.split(",")):
                     rows = batch.filter(pa.array(chosen))
                     _add_rows(days, names, table.restrict(signals), rows)
-        left_out, revoked = opened.count_left_out(condition), opened.revoked(condition)
+        left_out = opened.count_left_out(condition)
         if not found:
             raise empty_cohort(source, condition, feature_set)
     if not days:
@@ -69,7 +67,6 @@ def sum_days(
         tuple(day.total() for day in ordered),
         tuple(day.members.count_drives(day.grams) for day in ordered),
         left_out,
-        revoked,
     )
 
 

@@ -79,7 +79,7 @@ def sum_cohort(
     """
     condition = parse_cohort(condition)
     require_divided(feature_set, folding.by, folding.count)
-    with open_grams(warehouse, feature_set, condition, training=True) as opened:
+    with open_grams(warehouse, feature_set, condition) as opened:
         folds = _find_folds(opened, folding, condition)
         if folds is None:
             raise empty_cohort(warehouse, condition, feature_set)

@@ -130,17 +130,15 @@ def load_cohort(
     warehouse: Warehouse | GramReader,
     condition: str | Condition = TRAINING_DRIVES,
     feature_set: str = PLAIN,
-    *,
-    training: bool = True,
 ) -> Cohort:
     """Read the Gram rows of the drives that satisfy a condition.
 
-    For `training`, what outweighs others is left out. Raises `QuestionError` for an invalid
+    Raises `QuestionError` for an invalid
     condition, `DataError` if no drive satisfies it or the set was not computed for all logs,
     `RefusedError` for drives of evaluation scenarios.
     """
     condition = parse_cohort(condition)
-    with open_grams(warehouse, feature_set, condition, training=training) as opened:
+    with open_grams(warehouse, feature_set, condition) as opened:
         expansion = expansion_of(opened, feature_set)
         statement = opened.statement("cohort.sql", condition)
         with asking(opened.database, condition):
@@ -180,12 +178,6 @@ def empty_cohort(
 
 def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
     """Return the error that tells why a condition leaves no drive."""
-    if revoked := opened.revoked(condition):
-        drives = number_of(sum(revoked.values()), "drive")
-        return DataError(
-            f"all {drives} of the cohort {condition.text!r} are left out: they are of "
-            f"{number_of(len(revoked), 'car')} a key of which was revoked. Choose another cohort."
-        )
     if left_out := opened.count_left_out(condition):
         return NotComputedError(
             f"all {number_of(left_out, 'drive')} of the cohort {condition.text!r} are of cars that "

@@ -3,7 +3,7 @@
 import contextlib
 import shlex
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
 
@@ -19,11 +19,8 @@ from fleet_slip.catalogue.sources import ALL_DRIVES, LONGEST_PAUSE_S, TRAINING_D
 from fleet_slip.delta import Snapshot
 from fleet_slip.errors import DataError, NotComputedError
 from fleet_slip.grams.cohorts.cohort_origin import CohortOrigin
-from fleet_slip.grams.cohorts.outweighing import Outweighing, find_outweighing
-from fleet_slip.grams.received.car_keys import CarKey, load_car_keys
 from fleet_slip.grams.rows.backlog import find_backlog
 from fleet_slip.grams.rows.receiver_delay import RECEIVER
-from fleet_slip.grams.rows.same_drives import has_received
 from fleet_slip.regression.exact.gram import packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.condition import Condition, asking
@@ -39,34 +36,21 @@ BATCH_NUMBERS = 2**20
 
 @dataclass(frozen=True)
 class OpenedGrams:
-    """A connection to Gram rows, without what is `outweighing`."""
+    """A connection to Gram rows."""
 
     database: duckdb.DuckDBPyConnection
     identity: str
     logs_version: int
     grams_version: int
-    outweighing: tuple[Outweighing, ...] = ()
 
     def statement(self, name: str, condition: Condition, **values: str) -> str:
-        """Return a statement from `jobs/` for a condition, without the rows that must not count."""
-        without = [key.condition for key in _revoked_keys()]
-        without += [one.condition for one in self.outweighing]
-        sql = f"{condition.sql} AND NOT ({' OR '.join(without)})" if without else condition.sql
+        """Return a statement from `jobs/` for a condition."""
         trips = read_sql("jobs", "trips.sql").format(
             feature_set=self.identity, longest_pause_s=LONGEST_PAUSE_S
         )
-        values |= {"condition": sql, "feature_set": self.identity, "trips": trips}
+        values |= {"condition": condition.sql, "feature_set": self.identity, "trips": trips}
         values |= {"receiver": RECEIVER if RECEIVER in catalogue().drive else f"NULL AS {RECEIVER}"}
         return read_sql("jobs", name).format(**values)
-
-    def revoked(self, condition: Condition) -> dict[str, int]:
-        """Return a cohort's drives by car that are left out for a revoked key."""
-        some = [key.condition for key in _revoked_keys()]
-        if not some:
-            return {}
-        sql = f"{condition.sql} AND ({' OR '.join(some)})"
-        statement = read_sql("jobs", "count_revoked.sql").format(condition=sql)
-        return dict(self._rows(statement, condition))
 
     def origin(self, condition: Condition) -> CohortOrigin:
         """Return which Gram rows a cohort is made of."""
@@ -76,8 +60,6 @@ class OpenedGrams:
             grams_version=self.grams_version,
             feature_set=features().name_of(self.identity),
             left_out=self.count_left_out(condition),
-            revoked=self.revoked(condition),
-            outweighing=self.outweighing,
         )
 
     def batches(self, condition: Condition) -> Iterator[pa.RecordBatch]:
@@ -138,13 +120,10 @@ class GramReader:
     def __exit__(self, *_: object) -> None:
         self._close()
 
-    def opened(
-        self, feature_set: str, condition: Condition, *, training: bool = False
-    ) -> OpenedGrams:
+    def opened(self, feature_set: str, condition: Condition) -> OpenedGrams:
         """Return the Gram rows of a feature set; they are valid until the next call.
 
-        For `training`, what outweighs others is left out. Raises `DataError` for missing Gram rows,
-        or a set incomplete for a cohort.
+        Raises `DataError` for missing Gram rows, or a set incomplete for a cohort.
         """
         grams, logs = gram_snapshots(self._warehouse, self._grams, self._logs)
         if grams is not self._grams or logs is not self._logs:
@@ -161,11 +140,7 @@ class GramReader:
             if name != PLAIN:
                 rows = partial(self._opened, grams, logs, name)
                 _require_complete(logs, grams, rows, name, condition)
-        opened = self._opened(grams, logs, feature_set)
-        sent = feature_set == PLAIN or one.change_ticks
-        if not (training and sent and has_received(grams)):
-            return opened
-        return replace(opened, outweighing=find_outweighing(opened, condition))
+        return self._opened(grams, logs, feature_set)
 
     def _opened(self, grams: Snapshot, logs: Snapshot, feature_set: str) -> OpenedGrams:
         if self._database is None:
@@ -189,20 +164,13 @@ def open_grams(
     source: Warehouse | GramReader,
     feature_set: str,
     condition: Condition,
-    *,
-    training: bool = False,
 ) -> Iterator[OpenedGrams]:
     """Open the Gram rows of a feature set, anew unless by a reader; see `opened`."""
     if isinstance(source, GramReader):
-        yield source.opened(feature_set, condition, training=training)
+        yield source.opened(feature_set, condition)
     else:
         with GramReader(source) as reader:
-            yield reader.opened(feature_set, condition, training=training)
-
-
-def _revoked_keys() -> tuple[CarKey, ...]:
-    keys = load_car_keys()
-    return keys.revoked if keys else ()
+            yield reader.opened(feature_set, condition)
 
 
 def _require_complete(

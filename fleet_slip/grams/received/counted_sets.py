@@ -1,13 +1,14 @@
 """The feature sets that cars can count: their columns, the ranges of these, and their definition.
 
-A message of a set names it by the first 8 bytes of the SHA-256 of the canonical JSON of its
-identity and of name, scale and range of each signal that it is made of.
+The definition of a set is the first 8 bytes of the SHA-256 of the canonical JSON of its identity
+and of name, scale and range of each signal that it is made of.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
+from fleet_slip.canonical import canonical_json, sha256_of
 from fleet_slip.catalogue.course_change import (
     BESIDE,
     COARSER,
@@ -22,9 +23,18 @@ from fleet_slip.catalogue.feature_sets import PLAIN, FeatureSet
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.row_features import Feature
 from fleet_slip.catalogue.signals import COUNT_MAX, Signal, catalogue
-from fleet_slip.grams.received.messages import MOST_COLUMNS, definition_of
+from fleet_slip.grams.rows.drive_parts import Parts
 
 Range = tuple[int, int]
+
+MOST_ROWS = 2**31 - 1
+"""Rows of a drive: 248 days. No sum of so many products of int16 counts reaches 2^61."""
+
+MOST_SIGNALS = 32
+"""That a car counts of a set."""
+
+MOST_COLUMNS = 512
+"""Of a feature set that cars count: there is a bit for each."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +47,9 @@ class CountedSet:
         ranges: the smallest and the largest count of each.
         signals: what a car must know to count it, in catalogue order.
         times: over how many ticks columns change; none where they stand for themselves.
+        parts: what those parts of a drive are called; None alone where it is not divided.
         in_time: whether the course is moved by its delay.
-        definition: what messages call it.
+        definition: what C code calls it.
     """
 
     name: str
@@ -47,8 +58,14 @@ class CountedSet:
     ranges: tuple[Range, ...]
     signals: tuple[str, ...]
     times: tuple[int, ...]
+    parts: tuple[str | None, ...]
     in_time: bool
     definition: int
+
+    @property
+    def key(self) -> str:
+        """What a table of Gram rows calls it: its name, and what its columns mean."""
+        return f"{self.name}:{self.definition:016x}"
 
     def ranges_of(self, columns: Sequence[str]) -> list[Range]:
         """Return the ranges of some columns."""
@@ -90,9 +107,20 @@ def _counted(name: str) -> CountedSet:
         tuple(_range(column, one.change_ticks) for column in one.columns),
         signals,
         one.change_ticks,
+        Parts.of_set(features(), one).times or (None,),
         one.in_time,
-        definition_of(signals, None if name == PLAIN else features().identity(name)),
+        _definition_of(signals, None if name == PLAIN else features().identity(name)),
     )
+
+
+def _definition_of(signals: Sequence[str], identity: str | None) -> int:
+    known = [
+        [name, f"{s.scale:f}", s.min_count, s.max_count]
+        for name in signals
+        for s in [catalogue()[name]]
+    ]
+    content = canonical_json(known if identity is None else [identity, known])
+    return int.from_bytes(bytes.fromhex(sha256_of(content)[:16]), "little")
 
 
 def _range(column: str, times: Sequence[int]) -> Range:

@@ -69,8 +69,8 @@ def _not_corrected(
     if late:
         yield (
             f"the Gram rows of some cars are corrected by another delay than they have "
-            f"({_named(late)}): run fleet-slip gram --features course, and tell cars that send "
-            "messages their delay"
+            f"({_named(late)}): run fleet-slip gram --features course, and tell cars that count "
+            "on board their delay"
         )
 
 

@@ -10,16 +10,16 @@ from fleet_slip.catalogue.feature_catalogue import FeatureCatalogue
 from fleet_slip.delta import Change
 from fleet_slip.grams.rows.backlog import find_backlog, named_files
 from fleet_slip.grams.rows.gram_files import is_of_received
-from tests.support.fleet_messages import messages_of
-from tests.support.messages import START_S
+from tests.support.counted_rows import START_S, write_counted
+from tests.support.fleet_rows import rows_of_fleet
 
 
 def test_rows_of_cars_are_not_read(tmp_path: Path) -> None:
     """A year of them is 17 GB, and none is of a log."""
     fleet = fleet_slip.open(tmp_path / "data")
     path = tmp_path / "day"
-    path.write_bytes(messages_of(3, START_S, seed=1))
-    fleet.receive(path)
+    write_counted(path, rows_of_fleet(3, START_S, seed=1))
+    fleet.ingest_counted(path)
     grams = fleet.warehouse.grams.snapshot()
     [file] = grams.files
     assert is_of_received(file)

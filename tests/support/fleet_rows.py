@@ -1,18 +1,18 @@
-"""A message of each car of a fleet, all different, quickly."""
+"""A Gram row of each car of a fleet, all different, quickly."""
 
-import zlib
+from datetime import UTC, datetime
 
 import numpy as np
+import pyarrow as pa
 
-from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.received.messages import message_size, message_type, signals_definition
+from fleet_slip.grams.received.counted_rows import COLUMNS
+from fleet_slip.grams.received.counted_sets import counted_sets
+from fleet_slip.grams.rows.gram_rows import list_array
 
 
-def messages_of(
-    cars: int, start_s: int | IntArray, seed: int, *, label_follows: bool = False
-) -> bytes:
-    """Return a message of each of some cars, whose drives began at one moment, or at one each.
+def rows_of_fleet(cars: int, start_s: int, seed: int, *, label_follows: bool = False) -> pa.Table:
+    """Return a Gram row of each of some cars, whose drives began at one moment.
 
     If the label follows, it is a sum of the inputs, the same in all cars, and noise.
     """
@@ -34,12 +34,19 @@ def messages_of(
     sums = np.rint(mean * n[:, None]).astype(np.int64)
     products = np.rint(square[:, row, column] * n[:, None]).astype(np.int64)
     products[:, row == column] += (products[:, row == column] ^ sums) & 1
-    messages = np.zeros(cars, message_type(k))
-    messages["magic"], messages["layout"], messages["length"] = b"FSGR", 1, message_size(k)
-    messages["definition"], messages["parts"] = signals_definition(), 1
-    messages["vehicle"] = [f"CAR{car}" for car in range(cars)]
-    messages["start_s"], messages["mask"], messages["rows"] = start_s, 2**k - 1, n
-    messages["numbers"] = np.hstack([sums, products])
-    content = messages.view(np.uint8).reshape(cars, -1)
-    messages["checksum"] = [zlib.crc32(bytes(one[:-4])) for one in content]
-    return messages.tobytes()
+    start = datetime.fromtimestamp(start_s, UTC)
+    names = [f"CAR{car}" for car in range(cars)]
+    known = {
+        "source": ["received"] * cars,
+        "vehicle_id": names,
+        "drive_id": [f"{name}-{start:%Y%m%dT%H%M%SZ}" for name in names],
+        "day": [start.date()] * cars,
+        "feature_set": [next(iter(counted_sets().values())).key] * cars,
+        "part": [None] * cars,
+        "course_late": [None] * cars,
+        "signals": [",".join(signals)] * cars,
+        "n": n,
+        "sums": list_array(sums),
+        "products": list_array(products),
+    }
+    return pa.table(known, schema=COLUMNS)

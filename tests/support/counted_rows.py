@@ -1,59 +1,69 @@
-"""Messages of cars, packed by what docs/edge.md says of their layout."""
+"""Gram rows that cars counted: tables of them, and the messages of exported C."""
 
+import re
 import struct
 import zlib
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.grams.received.counted_rows import COLUMNS
 from fleet_slip.grams.received.counted_sets import counted_sets
-from fleet_slip.grams.received.messages import signals_definition
 from fleet_slip.regression.exact.gram import Gram
 
 START_S = 1_714_557_600
 """2024-05-01, 10:00 in UTC."""
 
-
-def message_of(gram: Gram, vehicle: str = "VIN1", start_s: int = START_S, **other: int) -> bytes:
-    """The message of a Gram row; `other` fields are as they should not be."""
-    names = catalogue().gram_signals
-    mask = sum(1 << names.index(name) for name in gram.signals)
-    numbers = np.array([*gram.sums, *gram.products], "<i8").tobytes()
-    known = {"layout": 1, "size": 60 + len(numbers), "definition": signals_definition()}
-    known |= {"place": 0, "parts": 1, "mask": mask, "rows": gram.n, "lost": 0} | other
-    head = struct.pack(
-        "<4sHHQ16s",
-        b"FSGR",
-        *(known[k] for k in ("layout", "size", "definition")),
-        vehicle.encode(),
-    )
-    head += struct.pack("<HHQ", known["place"], known["parts"], start_s)
-    head += struct.pack("<III", known["mask"], known["rows"], known["lost"])
-    body = head + numbers
-    return body + zlib.crc32(body).to_bytes(4, "little")
+PAGE = Path(__file__).parents[2] / "docs" / "edge.md"
 
 
-def set_message_of(
+def row_of(
     gram: Gram,
-    feature_set: str = "course",
     vehicle: str = "VIN1",
     start_s: int = START_S,
-    **other: int,
-) -> bytes:
-    """The message of a Gram row of a feature set; `other` fields are as they should not be."""
-    (one,) = (one for one in counted_sets().values() if one.name == feature_set)
-    numbers = np.array([*gram.sums, *gram.products], "<i8").tobytes()
-    mask = sum(1 << one.columns.index(name) for name in gram.signals)
-    known = {"size": 124 + len(numbers), "definition": one.definition, "mask": mask}
-    known |= {"part": 0, "late": 0, "rows": gram.n, "lost": 0} | other
-    head = struct.pack(
-        "<4sHHQ16s", b"FSGR", 3, known["size"], known["definition"], vehicle.encode()
-    )
-    head += struct.pack("<HHQ", 0, 1, start_s)
-    head += struct.pack("<HhII", *(known[k] for k in ("part", "late", "rows", "lost")))
-    body = head + known["mask"].to_bytes(64, "little") + numbers
-    return body + zlib.crc32(body).to_bytes(4, "little")
+    of: str = "signals",
+    **other: Any,
+) -> dict[str, Any]:
+    """A row of the table of a Gram; `other` columns are as they should not be."""
+    (key,) = (one.key for one in counted_sets().values() if one.name == of)
+    start = datetime.fromtimestamp(start_s, UTC)
+    row = {"source": "received", "vehicle_id": vehicle, "day": start.date(), "feature_set": key}
+    row |= {"drive_id": f"{vehicle}-{start:%Y%m%dT%H%M%SZ}", "part": None, "course_late": None}
+    row |= {"signals": ",".join(gram.signals), "n": gram.n}
+    return row | {"sums": gram.sums, "products": gram.products} | other
+
+
+def write_counted(path: Path, rows: Iterable[Mapping[str, Any]] | pa.Table) -> Path:
+    """Write a table of Gram rows as a platform does."""
+    if not isinstance(rows, pa.Table):
+        rows = pa.Table.from_pylist(list(rows), schema=COLUMNS)
+    pq.write_table(rows, path, write_page_checksum=True)
+    return path
+
+
+@cache
+def _reading() -> dict[str, Any]:
+    """What the Python of the page defines."""
+    found: dict[str, Any] = {}
+    exec(re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S)[0], found)  # noqa: S102
+    return found
+
+
+def rows_of_messages(content: bytes) -> list[dict[str, Any]]:
+    """The rows that the page makes of messages one behind the other."""
+    rows: list[dict[str, Any]] = []
+    while content:
+        size = int.from_bytes(content[6:8], "little")
+        rows.append(_reading()["row_of"](content[:size]))
+        content = content[size:]
+    return rows
 
 
 def drive_counts(seed: int, rows: int = 500) -> Any:

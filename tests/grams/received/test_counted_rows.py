@@ -1,0 +1,192 @@
+"""Tables of Gram rows from cars land whole and once; what no drive can have is refused."""
+
+from datetime import date, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import fleet_slip
+from fleet_slip.errors import InputError, RepeatedError
+from fleet_slip.grams.received.counted_rows import COLUMNS, LONGEST_ROWS
+from fleet_slip.regression.exact.gram import Gram
+from tests.support.commands import RunCommand
+from tests.support.counted_rows import START_S, gram_of, row_of, write_counted
+from tests.support.fleet_rows import rows_of_fleet
+
+DAY_S = 86_400
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> fleet_slip.Fleet:
+    return fleet_slip.open(tmp_path / "data")
+
+
+def gram_rows(fleet: fleet_slip.Fleet) -> list[dict[str, Any]]:
+    if not fleet.warehouse.grams.snapshot().rows:
+        return []
+    rows: list[dict[str, Any]] = fleet.sql("FROM grams ORDER BY ALL").to_arrow_table().to_pylist()
+    return rows
+
+
+def test_rows_land_as_they_are_and_are_fitted(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    grams = [gram_of(seed) for seed in range(6)]
+    rows = [row_of(gram, f"VIN{i}") for i, gram in enumerate(grams)]
+    report = fleet.ingest_counted(write_counted(tmp_path / "rows", rows))
+    assert (report.new, report.gram_rows, report.drives, report.rows) == (True, 6, 6, 3000)
+    for row, gram in zip(gram_rows(fleet), grams, strict=True):
+        assert (row["n"], tuple(row["sums"]), tuple(row["products"])) == (
+            gram.n,
+            gram.sums,
+            gram.products,
+        )
+        assert (row["source"], row["day"]) == ("received", date(2024, 5, 1))
+    found = fleet.cohort().select(model="ax,ay")
+    assert (found.cohort.rows, found.cohort.members.count_received) == (3000, 6)
+    assert not fleet.verify(full=True).findings
+
+
+def test_the_same_file_counts_once_and_is_forgotten_for_good(
+    fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    rows = [row_of(gram_of(1), "VIN1"), row_of(gram_of(2), "VIN2")]
+    path = write_counted(tmp_path / "rows", rows)
+    fleet.ingest_counted(path)
+    before = gram_rows(fleet)
+    assert not fleet.ingest_counted(path).new
+    assert gram_rows(fleet) == before
+    fleet.forget(vehicle="VIN1")
+    assert [row["vehicle_id"] for row in gram_rows(fleet)] == ["VIN2"]
+    again = write_counted(tmp_path / "again", [row_of(gram_of(3), "VIN1", START_S + DAY_S)])
+    with pytest.raises(InputError, match=r"row 1 \(drive VIN1-.*\) was forgotten"):
+        fleet.ingest_counted(again)
+    assert [row["vehicle_id"] for row in gram_rows(fleet)] == ["VIN2"]
+
+
+def other(gram: Gram, **changed: Any) -> dict[str, Any]:
+    return row_of(gram, "VIN2", START_S + DAY_S, **changed)
+
+
+GRAM = gram_of(2)
+PRODUCTS = np.array(GRAM.products)
+K = len(GRAM.signals)
+INDEFINITE = PRODUCTS.copy()
+INDEFINITE[1] = int((PRODUCTS[0] * PRODUCTS[2]) ** 0.5) + 10**6
+TOO_LONG = (np.array(some) * (LONGEST_ROWS // 500 + 1) for some in (GRAM.sums, GRAM.products))
+LONG_SUMS, LONG_PRODUCTS = TOO_LONG
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"source": "smoke"}, "another source"),
+        ({"vehicle_id": " "}, "no name of a car"),
+        ({"drive_id": None}, "has no drive_id"),
+        ({"day": date(1999, 12, 31)}, "a day before 2000"),
+        ({"day": date.today() + timedelta(days=3)}, "in the future"),
+        ({"feature_set": "signals:0000000000000000"}, "mean something else here"),
+        ({"part": "4 s"}, "a part that its set has not"),
+        ({"course_late": 3}, "a delay that no course has"),
+        ({"signals": ",".join(reversed(GRAM.signals))}, "in another order"),
+        ({"signals": "ax"}, "not the sums and products of its signals"),
+        ({"n": 0}, "has no rows"),
+        ({"sums": [None, *GRAM.sums[1:]]}, "null"),
+        (
+            {
+                "n": 500 * (LONGEST_ROWS // 500 + 1),
+                "sums": LONG_SUMS.tolist(),
+                "products": LONG_PRODUCTS.tolist(),
+            },
+            "more rows than the day of a drive has time for",
+        ),
+        ({"sums": [10**9, *GRAM.sums[1:]]}, "sums outside the ranges"),
+        ({"products": (PRODUCTS + np.eye(1, len(PRODUCTS), 0, int)[0]).tolist()}, "no integer"),
+        ({"products": INDEFINITE.tolist()}, "not positive semidefinite"),
+        ({"drive_id": "VIN1-20240501T100000Z"}, "of another car or day"),
+    ],
+)
+def test_a_row_that_cannot_be_keeps_the_whole_file_out(
+    fleet: fleet_slip.Fleet, tmp_path: Path, changed: dict[str, Any], reason: str
+) -> None:
+    path = write_counted(tmp_path / "rows", [row_of(gram_of(1)), other(GRAM, **changed)])
+    with pytest.raises(InputError, match=rf"rows: row [12] \(drive .*\) .*{reason}"):
+        fleet.ingest_counted(path)
+    assert gram_rows(fleet) == []
+
+
+def test_a_drive_that_is_there_is_refused_under_any_name(
+    fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    fleet.ingest_counted(write_counted(tmp_path / "first", [row_of(gram_of(1))]))
+    for number, rows in enumerate(
+        (
+            [other(GRAM), row_of(gram_of(3))],
+            [other(GRAM), row_of(gram_of(1), drive_id="renamed")],
+        )
+    ):
+        with pytest.raises(RepeatedError, match=r"row 2 .* is there already, as VIN1-2024"):
+            fleet.ingest_counted(write_counted(tmp_path / f"{number}", rows))
+    with pytest.raises(InputError, match=r"row 2 .* is there twice"):
+        fleet.ingest_counted(write_counted(tmp_path / "twice", [other(GRAM), other(gram_of(5))]))
+    assert len(gram_rows(fleet)) == 1
+
+
+def test_a_drive_with_a_log_is_refused(smoke_root: Path, tmp_path: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    row = fleet.sql("FROM grams WHERE feature_set = 'signals' ORDER BY drive_id LIMIT 1")
+    (stored,) = row.to_arrow_table().to_pylist()
+    signals = tuple(stored["signals"].split(","))
+    gram = Gram(signals, stored["n"], tuple(stored["sums"]), tuple(stored["products"]))
+    same = {"vehicle_id": stored["vehicle_id"], "day": stored["day"]}
+    path = write_counted(tmp_path / "rows", [row_of(gram, drive_id="other", **same)])
+    with pytest.raises(RepeatedError, match="is there already"):
+        fleet.ingest_counted(path)
+
+
+def test_pages_need_checksums_and_a_flipped_bit_is_found(
+    fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    table = rows_of_fleet(20, START_S, seed=1)
+    path = tmp_path / "rows"
+    for options in ({}, {"use_dictionary": False}, {"compression": "none"}):
+        pq.write_table(table, path, **options)
+        with pytest.raises(InputError, match="no checksums"):
+            fleet.ingest_counted(path)
+    pq.write_table(table, path, write_page_checksum=True, compression="none")
+    content = bytearray(path.read_bytes())
+    at = content.index(np.array(table["products"][7].as_py()[3:5], np.int64).tobytes())
+    content[at] ^= 2
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="table of Gram rows"):
+        fleet.ingest_counted(path)
+    assert gram_rows(fleet) == []
+
+
+def test_an_arrow_file_is_taken_and_what_is_no_table_is_not(
+    fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    table = rows_of_fleet(3, START_S, seed=1).drop_columns(["part", "course_late"])
+    with pa.ipc.new_file(str(tmp_path / "rows.arrow"), table.schema) as writer:
+        writer.write_table(table)
+    assert fleet.ingest_counted(tmp_path / "rows.arrow").gram_rows == 3
+    (tmp_path / "text").write_text("FSGR")
+    with pytest.raises(InputError, match="table of Gram rows"):
+        fleet.ingest_counted(tmp_path / "text")
+    write_counted(tmp_path / "lacks", rows_of_fleet(3, START_S, seed=1).drop_columns(["n"]))
+    with pytest.raises(InputError, match="no column n"):
+        fleet.ingest_counted(tmp_path / "lacks")
+    write_counted(tmp_path / "empty", pa.Table.from_pylist([], schema=COLUMNS))
+    with pytest.raises(InputError, match="has no Gram rows"):
+        fleet.ingest_counted(tmp_path / "empty")
+
+
+def test_the_command_says_what_landed(run_command: RunCommand, tmp_path: Path) -> None:
+    path = write_counted(tmp_path / "rows.parquet", [row_of(gram_of(1))])
+    done = run_command("--root", str(tmp_path / "data"), "ingest", str(path))
+    assert done.exit_code == 0
+    assert f"{path}: 1 Gram row of 1 drive, 500 rows" in done.stderr + done.stdout
+    done = run_command("--root", str(tmp_path / "data"), "ingest", str(path))
+    assert "nothing to do" in done.stderr + done.stdout
