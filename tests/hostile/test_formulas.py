@@ -49,7 +49,8 @@ def write_mdf(
         mdf.append([Signal(raw, TIME_S[: len(raw)], name="beta")])
         mdf.append([Signal(raw, TIME_S[: len(raw)], name="ax", conversion=conversion)])
         if version < "4":  # where asammdf writes another formula than it is given
-            mdf.groups[1].channels[1].conversion.formula = conversion["formula"]
+            made: Any = mdf.groups[1].channels[1].conversion
+            made.formula = conversion["formula"]
         if times is not None:
             mdf.groups[1].channels[0].conversion = conversion_utils.from_dict(times)
         return Path(mdf.save(folder / "log.mf4", overwrite=True))
@@ -175,7 +176,7 @@ def test_ranges_become_their_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(file, "ax"), expected)
 
 
-def ranges(bounds: dict[str, float]) -> Any:
+def ranges(bounds: dict[str, Any]) -> Any:
     """asammdf makes none from a dictionary."""
     return v4_blocks.ChannelConversion(conversion_type=6, val_param_nr=7, default=3.0, **bounds)
 
@@ -302,7 +303,8 @@ def test_only_numbers_of_their_own_are_read_from_hdf5(
 def test_what_is_private_to_other_packages_is_there(tmp_path: Path) -> None:
     """The upper bounds of their versions in pyproject.toml hold until this is looked at again."""
     with MDF(write_mdf(tmp_path, {"formula": "X1"})) as mdf:
-        inner, channel = mdf._mdf, mdf.groups[1].channels[1]
+        inner: Any = mdf._mdf
+        channel: Any = mdf.groups[1].channels[1]
         assert hasattr(mdf, "_select_fallback")
         for name in ("_file", "_delete_on_close", "_closed", "extract_attachment", "masters_db"):
             assert hasattr(inner, name), name

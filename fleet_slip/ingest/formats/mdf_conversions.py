@@ -78,7 +78,7 @@ def _by_formula(formula: str, raw: Array) -> Array:
 
 def _listed(conversion: Any, name: str) -> Array:
     """Return parameters that are numbered from 0 on."""
-    of, found = vars(conversion), []
+    of, found = vars(conversion), list[float]()
     while f"{name}_{len(found)}" in of:
         found.append(of[f"{name}_{len(found)}"])
     return np.array(found, dtype=np.float64)
