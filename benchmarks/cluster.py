@@ -16,10 +16,10 @@ from pathlib import Path
 
 from fleet_slip.compute.cluster import cluster_executor
 from fleet_slip.compute.tasks import LocalThreads
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.grams.job import update_grams
 from fleet_slip.simulation.campaign import Campaign, load_campaign
-from fleet_slip.simulation.simulation_job import simulate_campaign
+from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.dask_processes import dask_processes
 

@@ -32,22 +32,22 @@ import pyarrow.parquet as pq
 from deltalake import DeltaTable
 
 # Whatever a command imports late is here before the fork.
-import fleet_slip.ingest.landing.ingest_job
-import fleet_slip.maintenance.repair
-import fleet_slip.simulation.simulation_job  # noqa: F401
+import fleet_slip.ingest.job
+import fleet_slip.operations.repair
+import fleet_slip.simulation.job  # noqa: F401
 from benchmarks.crash_commands import COMMANDS, Command, prepare_inputs
 from benchmarks.forking import forked
 from fleet_slip.cli.main import main as fleet_slip_main
-from fleet_slip.delta import Table
 from fleet_slip.errors import PendingError
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.rows.backlog import BEING_WRITTEN_HOURS
-from fleet_slip.ingest.mapping.mapping import load_mapping
-from fleet_slip.maintenance.verify import verify
-from fleet_slip.models.versions import Registry
+from fleet_slip.grams.job import BEING_WRITTEN_HOURS
+from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.models.registry import Registry
+from fleet_slip.operations.verify import verify
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.drives import simulate_logs
-from fleet_slip.warehouse.audit import Audit
+from fleet_slip.simulation.job import simulate_logs
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.table import Table
+from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse
 
 POINTS: tuple[tuple[Any, str], ...] = (

@@ -17,7 +17,7 @@ from typing import Any
 import fleet_slip as package
 from fleet_slip.cli.main import main as fleet_slip
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.drives import simulate_logs
+from fleet_slip.simulation.job import simulate_logs
 
 TIMEOUT_S = 300
 

@@ -15,11 +15,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchmarks.flips_commands import Ended, command, in_a_child
-from fleet_slip.delta import Change
-from fleet_slip.delta.checkpoints import keep_checksums
-from fleet_slip.files.documents import DocumentFolder
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.resources import CONFIG_VARIABLE, find_config, folder
+from fleet_slip.config import CONFIG_VARIABLE, find_config, folder
+from fleet_slip.storage.commits import keep_checksums
+from fleet_slip.storage.documents import DocumentFolder
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.table import Change
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
 
 KINDS = {

@@ -16,8 +16,8 @@ from pathlib import Path
 import duckdb
 
 from benchmarks.pipeline import SIGNALS, add_options, job_statement, prepare
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.rows.statement import LOGS
+from fleet_slip.grams.compute import LOGS
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 7

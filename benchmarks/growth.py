@@ -23,8 +23,8 @@ from benchmarks.billion import PROGRAM
 from benchmarks.billion_campaigns import Sized, write
 from benchmarks.documents import insert
 from benchmarks.usage import Usage, measured
-from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.simulation.campaign import load_campaign
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support import growth_history as history
 

@@ -58,9 +58,9 @@ course = { north = "north", east = "east", unit = "m/s", antenna_x_m = 0.5, ante
 """
 
 _INGEST = """
-from fleet_slip.ingest.landing.ingest_job import ingest_files
-from fleet_slip.ingest.mapping.mapping import load_mapping
-from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.ingest.job import ingest_files
+from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 mapping = load_mapping({mapping!r})
 warehouse = Warehouse(LocalFolder(Path({root!r})))

@@ -13,18 +13,16 @@ import pyarrow.compute as pc
 
 import fleet_slip
 from benchmarks.interleave_roots import CAR, FIRST_DAY, RESCALED, ROWS
-from fleet_slip.catalogue.feature_sets import PLAIN
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.delta import Table
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.files.data_root import data_root
-from fleet_slip.maintenance.marked_models import marked_models
-from fleet_slip.maintenance.verify import verify
-from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.versions import Registry
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import fit
+from fleet_slip.models.registry import ModelVersion, Registry
+from fleet_slip.operations.forget import marked_models
+from fleet_slip.operations.verify import verify
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import fit
+from fleet_slip.storage.data_root import data_root
+from fleet_slip.storage.table import Table
 from fleet_slip.warehouse.tables import Warehouse
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 from benchmarks.crash_commands import MAPPING, let_time_pass
 from benchmarks.interleave_stops import Environment, Running
 from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE
-from fleet_slip.files.folder import TEMPORARY_PREFIX
-from fleet_slip.resources import find_config, folder
+from fleet_slip.config import find_config, folder
+from fleet_slip.storage.folder import TEMPORARY_PREFIX
 
 CAR = "mini-0000"
 """The car that is to be forgotten: simulated and measured, in what is there and in what comes."""

@@ -23,9 +23,9 @@ from benchmarks.forking import in_child
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.main import main as fleet_slip_main
-from fleet_slip.delta import Table
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.files.object_folder import ObjectFolder
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.objects import ObjectFolder
+from fleet_slip.storage.table import Table
 
 POINTS: tuple[tuple[Any, str], ...] = (
     (Path, "replace"),

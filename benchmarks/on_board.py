@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import fleet_slip
-from fleet_slip.export.c.c_names import c_prefix
-from fleet_slip.export.c.c_source import c_header, c_source
+from fleet_slip.export.c import c_header, c_source
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.files import export_files
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.export.templating import c_prefix
+from fleet_slip.models.registry import ModelVersion
 from tests.support.cortex_m import can_measure, measure_cortex_m
 
 DRIVER = """

@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.models.request import load_model_list
 
 INPUTS = list(load_model_list("table1").model[-1].signals)
 LABEL = catalogue().label
@@ -58,10 +58,12 @@ def _read(paths: list[str]) -> NDArray[np.float64]:
 
 
 def fleet_slip(threads: int) -> Fit:
-    from fleet_slip.grams.rows.aggregation import FILES_PER_QUERY  # noqa: PLC0415
-    from fleet_slip.grams.rows.statement import gram_statement  # noqa: PLC0415
-    from fleet_slip.regression.exact.gram import Gram  # noqa: PLC0415
-    from fleet_slip.regression.exact.least_squares import fit  # noqa: PLC0415
+    from fleet_slip.grams.compute import (  # noqa: PLC0415
+        FILES_PER_QUERY,
+        gram_statement,
+    )
+    from fleet_slip.regression.gram import Gram  # noqa: PLC0415
+    from fleet_slip.regression.least_squares import fit  # noqa: PLC0415
 
     def run(paths: list[str]) -> Coefficients:
         logged = pq.read_schema(paths[0]).names

@@ -33,10 +33,10 @@ from matplotlib.figure import Figure
 from benchmarks.peer_ways import COLUMNS, INPUTS, LABEL, WAYS, thread_variables
 from benchmarks.pipeline import add_options, prepare
 from fleet_slip.catalogue.features import input_scales
-from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.pages.drawing import PALETTE, STYLE
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import LinearModel, fit
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import LinearModel, fit
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 
 MOST_DIGITS = 16.0

@@ -22,19 +22,18 @@ import duckdb
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.catalogue.feature_sets import PLAIN
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.delta import Change, absent_columns
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.rows.gram_files import write_rows
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.grams.rows.statement import gram_statement
-from fleet_slip.selection.model_list import load_model_list
-from fleet_slip.selection.select_models import select
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.compute import gram_statement
+from fleet_slip.grams.gram_files import write_rows
+from fleet_slip.grams.job import update_grams
+from fleet_slip.models.request import load_model_list
+from fleet_slip.models.select import select
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.simulation_job import simulate_campaign
+from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.table import Change, absent_columns
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 5

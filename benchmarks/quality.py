@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
-from fleet_slip.monitoring.quality import QualityReport, examine, find_wrong_labels
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.grams.cohort import Cohort, load_cohort
+from fleet_slip.operations.quality import QualityReport, examine, find_wrong_labels
+from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 

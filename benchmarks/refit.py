@@ -16,14 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.fold_sums import sum_cohort
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.cohorts.gram_reader import GramReader
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.selection.answer_request import answer_request
-from fleet_slip.selection.model_list import load_model_list
-from fleet_slip.selection.request import SelectionRequest
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.reader import GramReader
+from fleet_slip.grams.sums import sum_cohort
+from fleet_slip.models.request import SelectionRequest, load_model_list
+from fleet_slip.models.select import answer_request
+from fleet_slip.regression.least_squares import fit
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 7

@@ -18,15 +18,14 @@ from pathlib import Path
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.maintenance.compaction import compact
-from fleet_slip.maintenance.forget import forget
-from fleet_slip.maintenance.verify import verify
-from fleet_slip.maintenance.verify_files import read_whole
+from fleet_slip.grams.job import update_grams
+from fleet_slip.operations.forget import forget
+from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.verify import read_whole, verify
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.simulation_job import simulate_campaign
-from fleet_slip.warehouse.audit import Forgettable
+from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.writers import concurrency
 

@@ -16,12 +16,10 @@ from functools import partial
 import numpy as np
 from highway_env.vehicle.dynamics import BicycleVehicle
 
-from fleet_slip.simulation.roads import load_track
-from fleet_slip.simulation.track import SpeedLimits, speed_profile
+from fleet_slip.simulation.roads import SpeedLimits, load_track, speed_profile
+from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive, Road, simulate_blocks
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.highway import FourWheelVehicle
-from fleet_slip.vehicle.lanes.lane_drives import STEPS_PER_SAMPLE, LaneDrive, simulate_blocks
-from fleet_slip.vehicle.lanes.road import Road
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.whole_drives import simulate_drives
 

@@ -25,13 +25,14 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.delta import Change, checksum_of
-from fleet_slip.files.local_folder import LocalFolder
 from fleet_slip.simulation.campaign import Batch, load_campaign
-from fleet_slip.simulation.drives import lane_drive, simulate_logs, tabulate
-from fleet_slip.simulation.sensing.sensors import Recorder
-from fleet_slip.vehicle.lanes import lane_kernel
-from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
+from fleet_slip.simulation.job import lane_drive, simulate_logs, tabulate
+from fleet_slip.simulation.sensors import Recorder
+from fleet_slip.storage.folder import checksum_of
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.table import Change
+from fleet_slip.vehicle import batch_kernel
+from fleet_slip.vehicle.batch import LaneDrive, simulate_blocks
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.whole_drives import simulate_drives
 
@@ -126,14 +127,14 @@ def loops(assembly: str) -> list[list[str]]:
 
 def compiled_assembly() -> str:
     """Return the kernel's assembly on this machine."""
-    fresh = numba.njit(nogil=True, error_model="numpy")(lane_kernel.build_kernel())
-    usual, lane_kernel.simulate = lane_kernel.simulate, fresh
+    fresh = numba.njit(nogil=True, error_model="numpy")(batch_kernel.build_kernel())
+    usual, batch_kernel.simulate = batch_kernel.simulate, fresh
     try:
         fleet = load_campaign("fleet")
         spec = fleet.batches(fleet.first_day)[0].drives[0]
         simulate_drives([lane_drive(replace(spec, laps=0.01))])
     finally:
-        lane_kernel.simulate = usual
+        batch_kernel.simulate = usual
     (assembly,) = fresh.inspect_asm().values()
     return str(assembly)
 

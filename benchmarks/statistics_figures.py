@@ -11,11 +11,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from fleet_slip.arrays import IntArray
+from fleet_slip.base import IntArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.regression.choice.nested_choice import (
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.regression.choice import (
     CROSS_VALIDATION,
     Rule,
     TrainingFolds,
@@ -23,8 +22,20 @@ from fleet_slip.regression.choice.nested_choice import (
     cross_validate_selection,
     nested_fits,
 )
-from fleet_slip.regression.choice.signal_orders import RANKINGS, rank
-from fleet_slip.regression.choice.subsets import (
+from fleet_slip.regression.drives import (
+    DriveMoments,
+    bootstrap_correlations,
+    held_out_products,
+    percentile_interval,
+    repeated_cross_validation,
+    serving_drives,
+)
+from fleet_slip.regression.folds import CohortFolds, by_hash
+from fleet_slip.regression.inference import Evidence, infer_by_clusters, infer_classically
+from fleet_slip.regression.least_squares import correlation_matrix, fit
+from fleet_slip.regression.orders import RANKINGS, rank
+from fleet_slip.regression.shrinkage import disturb
+from fleet_slip.regression.subsets import (
     CRITERIA,
     all_rss,
     best_subsets,
@@ -32,18 +43,7 @@ from fleet_slip.regression.choice.subsets import (
     pick_sizes,
     subset_sizes,
 )
-from fleet_slip.regression.exact.least_squares import correlation_matrix, fit
-from fleet_slip.regression.inference.bootstrap import (
-    bootstrap_correlations,
-    held_out_products,
-    percentile_interval,
-    repeated_cross_validation,
-)
-from fleet_slip.regression.inference.drive_moments import DriveMoments, serving_drives
-from fleet_slip.regression.inference.evidence import Evidence
-from fleet_slip.regression.inference.standard_errors import infer_by_clusters, infer_classically
-from fleet_slip.regression.shrinkage.ridge import disturb
-from fleet_slip.regression.validation.folds import CohortFolds, by_hash
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 
 SIGNALS = catalogue()

@@ -17,17 +17,12 @@ import numpy as np
 from matplotlib import pyplot as plt
 
 from benchmarks.documents import insert
-from fleet_slip.arrays import FloatArray
+from fleet_slip.base import FloatArray
 from fleet_slip.simulation.scenario import load_scenario
-from fleet_slip.vehicle.car_imperfections import PERFECT, CarImperfections
+from fleet_slip.vehicle.batch import LaneDrive, Road
 from fleet_slip.vehicle.driver import handling
-from fleet_slip.vehicle.lanes.lane_drives import LaneDrive
-from fleet_slip.vehicle.lanes.road import Road
-from fleet_slip.vehicle.parameters import (
-    GRAVITY_MPS2,
-    VehicleParameters,
-    load_vehicle,
-)
+from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters, load_vehicle
 from tests.support.linear_bicycle import LinearBicycle
 from tests.support.open_loop import Response, steer
 from tests.support.whole_drives import Truth, simulate_drives

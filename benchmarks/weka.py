@@ -26,8 +26,8 @@ import pyarrow.parquet as pq
 from benchmarks.peer_ways import COLUMNS, INPUTS
 from benchmarks.peers import digits, exact_model, in_process
 from benchmarks.pipeline import add_options, prepare
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.regression.exact.least_squares import LinearModel
+from fleet_slip.regression.least_squares import LinearModel
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 
 JAR = Path("/usr/share/java/weka.jar")

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from fleet_slip.api.cohort import FleetCohort
     from fleet_slip.api.fleet import Fleet
     from fleet_slip.errors import FleetSlipError
-    from fleet_slip.files.folder import Folder
-    from fleet_slip.models.model_version import ModelVersion
+    from fleet_slip.models.registry import ModelVersion
+    from fleet_slip.storage.folder import Folder
     from fleet_slip.views import connect
 
 __all__ = ["Fleet", "FleetCohort", "FleetSlipError", "ModelVersion", "connect", "open"]
@@ -39,7 +39,7 @@ _HOMES = {
     "Fleet": "fleet_slip.api.fleet",
     "FleetCohort": "fleet_slip.api.cohort",
     "FleetSlipError": "fleet_slip.errors",
-    "ModelVersion": "fleet_slip.models.model_version",
+    "ModelVersion": "fleet_slip.models.registry",
     "connect": "fleet_slip.views",
 }
 """Where the names are that are imported when they are first used: importing the package is fast."""
@@ -52,7 +52,7 @@ def open(root: "Folder | Path | str | None" = None) -> "Fleet":  # noqa: A001 - 
     else `./data`. Credentials come from the environment. Raises `StorageError` for no such root.
     """
     from fleet_slip.api.fleet import Fleet  # noqa: PLC0415 - pyarrow and Delta
-    from fleet_slip.files.data_root import data_root  # noqa: PLC0415
+    from fleet_slip.storage.data_root import data_root  # noqa: PLC0415
     from fleet_slip.warehouse.tables import Warehouse  # noqa: PLC0415
 
     return Fleet(Warehouse(data_root(root)))

@@ -4,14 +4,14 @@ import functools
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
+from fleet_slip.base import missing
 from fleet_slip.caches import code_folder
-from fleet_slip.extras import missing
 
 try:
-    import llvmlite  # type: ignore[import-untyped]
+    import llvmlite
     import numba
 except ModuleNotFoundError:  # of an extra: what is compiled says so when it is called
-    numba = None  # type: ignore[assignment]
+    numba = None
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

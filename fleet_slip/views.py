@@ -5,25 +5,24 @@ from pathlib import Path
 
 import duckdb
 
-from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
+from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, DELAY, TRAINING_DRIVES
 from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.sources import ALL_DRIVES, TRAINING_DRIVES
-from fleet_slip.files.data_root import data_root
-from fleet_slip.files.folder import Folder
-from fleet_slip.models.versions import Registry
-from fleet_slip.resources import read_sql
-from fleet_slip.runs.history import lend_runs, run_source
-from fleet_slip.warehouse.dictionary import describe_columns
-from fleet_slip.warehouse.table_views import (
+from fleet_slip.config import read_sql
+from fleet_slip.models.registry import Registry
+from fleet_slip.storage.data_root import data_root
+from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.runs import lend_runs, run_source
+from fleet_slip.warehouse.tables import (
     TABLE_VIEWS,
+    Warehouse,
     add_table,
+    describe_columns,
     lock,
     open_tables,
     paths_of,
     table_snapshots,
     views_in,
 )
-from fleet_slip.warehouse.tables import Warehouse
 
 VIEWS = frozenset({*TABLE_VIEWS, CALIBRATION, "runs", "models", "dictionary"})
 
@@ -104,8 +103,8 @@ def add_calibration(database: duckdb.DuckDBPyConnection, query: str) -> None:
 
 def _calibrate(database: duckdb.DuckDBPyConnection) -> None:
     # Imported when it is asked for: most queries are not about it.
-    from fleet_slip.grams.calibration.calibration import calibration_table  # noqa: PLC0415
-    from fleet_slip.grams.cohorts.gram_reader import OpenedGrams  # noqa: PLC0415
+    from fleet_slip.grams.calibration import calibration_table  # noqa: PLC0415
+    from fleet_slip.grams.reader import OpenedGrams  # noqa: PLC0415
 
     numbers, delays = (
         OpenedGrams(database, features().identity(name), 0, 0) for name in (CALIBRATION, DELAY)

@@ -19,11 +19,11 @@ def _():
     from matplotlib.figure import Figure
 
     import fleet_slip
-    from fleet_slip.comparison.watch.drive_frames import drive_frames
+    from fleet_slip.base import number_of
     from fleet_slip.errors import FleetSlipError
-    from fleet_slip.monitoring.control_chart import control_chart
+    from fleet_slip.evaluation.watch import drive_frames
+    from fleet_slip.operations.monitor import control_chart
     from fleet_slip.pages.drawing import DESK, SHADES, STYLE, colour
-    from fleet_slip.words import number_of
 
     return (
         DESK, SHADES, STYLE, Figure, FleetSlipError, LinearSegmentedColormap, alt, colour,

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, is_hypothesis_test, settings
 
-from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import Finished, RunCommand, done_on, run_on
 from tests.support.once import made_once, require_unchanged

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_slip.canonical import canonical_ascii, canonical_json, sha256_of
+from fleet_slip.base import canonical_ascii, canonical_json, sha256_of
 
 CONTENT = st.recursive(
     st.none()

@@ -4,7 +4,7 @@ from datetime import date, datetime
 
 import pytest
 
-from fleet_slip.dates import date_of, last_day
+from fleet_slip.base import date_of, last_day
 from fleet_slip.errors import UsageError
 
 DAY = date(2024, 5, 6)

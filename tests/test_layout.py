@@ -1,18 +1,13 @@
 """The package as a reader finds it: one name for one thing."""
 
 import ast
-from collections import Counter, defaultdict
+from collections import defaultdict
 from pathlib import Path
 
 import fleet_slip
 
 PACKAGE = Path(fleet_slip.__file__).parent
 MODULES = {path: path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))}
-
-
-def test_no_two_modules_have_one_name() -> None:
-    names = Counter(path.stem for path in MODULES if path.stem != "__init__")
-    assert not [name for name, count in names.items() if count > 1]
 
 
 def test_no_two_public_classes_have_one_name() -> None:

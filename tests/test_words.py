@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet_slip.words import number_of
+from fleet_slip.base import number_of
 
 
 @pytest.mark.parametrize(

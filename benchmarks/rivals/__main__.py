@@ -37,14 +37,21 @@ from benchmarks.rivals.observers import (
     sliding_mode,
 )
 from benchmarks.rivals.tree_filter import fit_tree_filter
-from fleet_slip.comparison.evaluation.estimators import TABLE_ONE, Estimate, published_estimate
-from fleet_slip.comparison.evaluation.evaluated_drives import simulate_drives
-from fleet_slip.comparison.evaluation.filters import FILTERS, Filter, FilterEstimate, TuningDrives
-from fleet_slip.comparison.evaluation.scenario_runs import evaluate_drive
-from fleet_slip.grams.calibration.calibration import calibrate
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
+from fleet_slip.evaluation.drives import simulate_drives
+from fleet_slip.evaluation.filters import (
+    FILTERS,
+    TABLE_ONE,
+    Estimate,
+    Filter,
+    FilterEstimate,
+    TuningDrives,
+    published_estimate,
+)
+from fleet_slip.evaluation.scenarios import evaluate_drive
+from fleet_slip.grams.calibration import calibrate
+from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.selection.model_list import load_model_list
+from fleet_slip.models.request import load_model_list
 from fleet_slip.simulation.scenario import load_scenario
 
 DRIVES = (

@@ -8,22 +8,22 @@ from typing import Any
 import numpy as np
 
 from benchmarks.rivals.learners import Fit, FittedLearner, Names, one_thread
-from fleet_slip.arrays import FloatArray
+from fleet_slip.base import FloatArray
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.blocks.column_plan import ColumnPlan
-from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts, as_counts
-from fleet_slip.comparison.evaluation.estimators import Signals
-from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
-from fleet_slip.comparison.evaluation.scenario_runs import ErrorFigures, error_figures
+from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts, as_counts
+from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError
-from fleet_slip.grams.cohorts.expansion import CarCounts
-from fleet_slip.grams.cohorts.folding import assign_folds
-from fleet_slip.grams.cohorts.gram_cohort import Cohort
-from fleet_slip.grams.cohorts.gram_reader import cohort_files
-from fleet_slip.grams.rows.drive_rows import read_drives
+from fleet_slip.evaluation.drives import EvaluatedDrive
+from fleet_slip.evaluation.filters import Signals
+from fleet_slip.evaluation.scenarios import ErrorFigures, error_figures
+from fleet_slip.grams.cohort import Cohort
+from fleet_slip.grams.compute import read_drives
+from fleet_slip.grams.expansion import CarCounts
+from fleet_slip.grams.folding import assign_folds
+from fleet_slip.grams.reader import cohort_files
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.regression.validation.folds import FoldAssignment
+from fleet_slip.regression.folds import FoldAssignment
 from fleet_slip.warehouse.tables import Warehouse
 
 

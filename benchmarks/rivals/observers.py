@@ -18,22 +18,20 @@ from typing import NamedTuple, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from fleet_slip.arrays import FloatArray
-from fleet_slip.comparison.observers import yaw_rate
-from fleet_slip.comparison.observers.drive_signals import (
+from fleet_slip.base import FloatArray
+from fleet_slip.compiling import kernel
+from fleet_slip.config import Config
+from fleet_slip.evaluation import belief
+from fleet_slip.evaluation.belief import YawRateNoise
+from fleet_slip.evaluation.single_track import (
+    SLOWEST_MPS,
     STEP_S,
     DriveSignals,
     hold_last,
-    sideslip_angle,
-)
-from fleet_slip.comparison.observers.single_track import (
-    SLOWEST_MPS,
     measured_speed_mps,
     measured_steer_rad,
+    sideslip_angle,
 )
-from fleet_slip.comparison.observers.yaw_rate import YawRateNoise
-from fleet_slip.compiling import kernel
-from fleet_slip.config import Config
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
@@ -84,7 +82,7 @@ class ObserverPoles(Config):
     yaw_rate: YawRateNoise = YawRateNoise()
 
 
-POLES_TUNABLE = ("lateral_velocity_1ps", "yaw_rate_1ps", "stiffness_factor", *yaw_rate.TUNABLE)
+POLES_TUNABLE = ("lateral_velocity_1ps", "yaw_rate_1ps", "stiffness_factor", *belief.TUNABLE)
 """What to tune."""
 
 
@@ -133,7 +131,7 @@ def luenberger(drive: DriveSignals, car: VehicleParameters, poles: ObserverPoles
         tuple(space),
         gains(space, poles),
         measured_steer_rad(drive),
-        yaw_rate.estimate(drive, car, poles.yaw_rate).yaw_rate_rad_s,
+        belief.estimate(drive, car, poles.yaw_rate).yaw_rate_rad_s,
         hold_last(drive.ay_mps2, "ay"),
         car.body.rear_axle_m,
     )
@@ -172,7 +170,7 @@ GAINS_TUNABLE = (
     "yaw_gain_rad_s2",
     "yaw_layer_rad_s",
     "stiffness_factor",
-    *yaw_rate.TUNABLE,
+    *belief.TUNABLE,
 )
 """What to tune."""
 
@@ -212,7 +210,7 @@ def sliding_mode(drive: DriveSignals, car: VehicleParameters, gains: SlidingGain
     vx_mps = measured_speed_mps(drive, car)
     space = state_space(car, vx_mps, gains.stiffness_factor)
     steer = measured_steer_rad(drive)
-    turning = yaw_rate.estimate(drive, car, gains.yaw_rate).yaw_rate_rad_s
+    turning = belief.estimate(drive, car, gains.yaw_rate).yaw_rate_rad_s
     ay_mps2 = hold_last(drive.ay_mps2, "ay")
     vy_mps = _sliding(
         tuple(space),

@@ -17,23 +17,24 @@ from pydantic import Field, FiniteFloat
 from sklearn.tree import DecisionTreeRegressor
 
 from benchmarks.rivals.learners import SEED
-from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.comparison.evaluation.estimators import Signals
-from fleet_slip.comparison.evaluation.evaluated_drives import EvaluatedDrive
-from fleet_slip.comparison.evaluation.filters import FilterEstimate, seen
-from fleet_slip.comparison.observers import ekf
-from fleet_slip.comparison.observers.belief import belief_of
-from fleet_slip.comparison.observers.drive_signals import (
-    STEP_S,
-    DriveSignals,
-    LabelledDrive,
-    hold_last,
-    sideslip_angle,
-)
-from fleet_slip.comparison.observers.single_track import Axles, follow, measured_speed_mps
-from fleet_slip.comparison.observers.tuning import tune
+from fleet_slip.base import FloatArray, IntArray
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
+from fleet_slip.evaluation import ekf
+from fleet_slip.evaluation.belief import belief_of
+from fleet_slip.evaluation.drives import EvaluatedDrive
+from fleet_slip.evaluation.filters import FilterEstimate, Signals, seen
+from fleet_slip.evaluation.identify import tune
+from fleet_slip.evaluation.single_track import (
+    STEP_S,
+    Axles,
+    DriveSignals,
+    LabelledDrive,
+    follow,
+    hold_last,
+    measured_speed_mps,
+    sideslip_angle,
+)
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 LEAVES = 6

@@ -22,11 +22,10 @@ from typing import (
 
 from typing_extensions import Doc
 
+from fleet_slip.base import Progress, needed, no_progress
 from fleet_slip.compute.tasks import LocalThreads
-from fleet_slip.extras import needed
-from fleet_slip.files.folder import Folder
-from fleet_slip.progress import Progress, no_progress
-from fleet_slip.runs.log import current_run_id, recording
+from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.runs import current_run_id, recording
 
 if TYPE_CHECKING:
     from fleet_slip.warehouse.tables import Warehouse
@@ -176,7 +175,7 @@ def open_workers(root: Folder, workers: Workers) -> Iterator[Executor]:
 
 def absolute(root: Folder) -> Folder:
     """Return a root that means the same in other working directories, such as a worker's."""
-    from fleet_slip.files.local_folder import LocalFolder
+    from fleet_slip.storage.local import LocalFolder
 
     return LocalFolder(root.path.absolute()) if isinstance(root, LocalFolder) else root
 

@@ -4,25 +4,19 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import Rooted, open_workers, takes
-from fleet_slip.api.requests import (
-    DiagnosisRequest,
-    ExaminedRequest,
-    RegimesRequest,
-    WhatIfRequest,
-)
+from fleet_slip.api.requests import DiagnosisRequest, ExaminedRequest, RegimesRequest, WhatIfRequest
 from fleet_slip.errors import UsageError
-from fleet_slip.selection.request import SelectionRequest
+from fleet_slip.models.request import SelectionRequest
 from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
-    from fleet_slip.api.examined_model import ExaminedModel
-    from fleet_slip.comparison.observers.identification import Identified
-    from fleet_slip.grams.cohorts.gram_cohort import Cohort
-    from fleet_slip.monitoring.examined import Examined
-    from fleet_slip.selection.diagnostics import Diagnosis
-    from fleet_slip.selection.regimes import RegimeComparison
-    from fleet_slip.selection.select_models import RequestedSelection
-    from fleet_slip.selection.what_if import WhatIf
+    from fleet_slip.api.requests import ExaminedModel
+    from fleet_slip.evaluation.identify import Identified
+    from fleet_slip.grams.cohort import Cohort
+    from fleet_slip.models.diagnose import Diagnosis, WhatIf
+    from fleet_slip.models.regimes import RegimeComparison
+    from fleet_slip.models.select import RequestedSelection
+    from fleet_slip.operations.examined import Examined
 
 
 class FleetCohort(Rooted):
@@ -48,7 +42,7 @@ class FleetCohort(Rooted):
         `signals` that are missing are made. Raises `UnexaminedError` if that takes more than
         seconds.
         """
-        from fleet_slip.monitoring.examined import Examined, find_trainable
+        from fleet_slip.operations.examined import Examined, find_trainable
 
         if self.unexamined:
             return Examined(self.condition)
@@ -62,7 +56,7 @@ class FleetCohort(Rooted):
         Raises what `examine` raises, `UsageError` for options that do not go together or an invalid
         list, and `DataError` if no model can be fitted.
         """
-        from fleet_slip.selection.answer_request import answer_request
+        from fleet_slip.models.select import answer_request
 
         examined = self.examine()
         with examined.explaining():
@@ -76,7 +70,7 @@ class FleetCohort(Rooted):
         Raises `UsageError` for both a model and signals, and what `Fleet.model` raises.
         """
         from fleet_slip.catalogue.features import features as known
-        from fleet_slip.selection.diagnostics import diagnose
+        from fleet_slip.models.diagnose import diagnose
 
         examined = self._examined(request)
         cohort, against = self._load(examined.feature_set), request.against
@@ -99,9 +93,9 @@ class FleetCohort(Rooted):
         `QuestionError` for a signal inside a feature, and what `Fleet.model` raises.
         """
         from fleet_slip.catalogue.signals import catalogue
-        from fleet_slip.models.estimates.counts_model import counts_model
-        from fleet_slip.regression.exact.least_squares import fit
-        from fleet_slip.selection.what_if import what_if
+        from fleet_slip.models.diagnose import what_if
+        from fleet_slip.models.predict import counts_model
+        from fleet_slip.regression.least_squares import fit
 
         noise, bias = request.noise or {}, request.bias or {}
         if not noise and not bias:
@@ -125,10 +119,9 @@ class FleetCohort(Rooted):
         `fleet.gram("regimes")` makes. Raises `UsageError` for both a model and signals, and
         `DataError` for a feature set without such regimes.
         """
-        from fleet_slip.grams.cohorts.folding import Folding, make_folding
-        from fleet_slip.selection.model_list import WHOLE_SET, inputs_of
-        from fleet_slip.selection.regimes import compare_regimes, divided_set
-        from fleet_slip.selection.request import parse_worth
+        from fleet_slip.grams.folding import Folding, make_folding
+        from fleet_slip.models.regimes import compare_regimes, divided_set
+        from fleet_slip.models.request import WHOLE_SET, inputs_of, parse_worth
 
         gain, signals = parse_worth(request.worth), request.signals
         if request.model is not None:
@@ -144,16 +137,16 @@ class FleetCohort(Rooted):
         """Identify the tyres and the yaw inertia of the car that made the cohort's drives.
 
         `measured` is what scales and a tape measure say, in the words of
-        `fleet_slip.comparison.observers.identification.Measured`. The extended Kalman filter in the
+        `fleet_slip.evaluation.identify.Measured`. The extended Kalman filter in the
         car is fitted to the labels of up to 24 drives; its error on drives that were left out
         stands beside. Raises `DataError` if the drives lack the label or what the filter needs, and
         `UsageError` for a name or number that no car can have.
         """
         from pydantic import ValidationError
 
-        from fleet_slip.comparison.evaluation.filters import TuningDrives
-        from fleet_slip.comparison.observers.identification import Measured, identify_held_out
         from fleet_slip.config import faults_of
+        from fleet_slip.evaluation.filters import TuningDrives
+        from fleet_slip.evaluation.identify import Measured, identify_held_out
 
         try:
             car = Measured.model_validate({"name": name, **measured})
@@ -164,12 +157,12 @@ class FleetCohort(Rooted):
             return identify_held_out(car, chosen.read(), executor)
 
     def _load(self, feature_set: str, condition: str | None = None) -> "Cohort":
-        from fleet_slip.grams.cohorts.gram_cohort import load_cohort
+        from fleet_slip.grams.cohort import load_cohort
 
         return load_cohort(self.warehouse, condition or self.condition, feature_set)
 
     def _examined(self, request: ExaminedRequest) -> "ExaminedModel":
-        from fleet_slip.api.examined_model import subject_of
-        from fleet_slip.models.versions import Registry
+        from fleet_slip.api.requests import subject_of
+        from fleet_slip.models.registry import Registry
 
         return subject_of(Registry(self.root / "models"), request)

@@ -5,21 +5,19 @@ from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import of_step, open_workers, record_call, takes
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.api.health_and_upkeep import HealthAndUpkeep
-from fleet_slip.api.logs_and_grams import LogsAndGrams
+from fleet_slip.api.logs import LogsAndGrams
+from fleet_slip.api.operations import HealthAndUpkeep
 from fleet_slip.api.requests import NightRequest, RunRequest
-from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
-from fleet_slip.catalogue.feature_sets import PLAIN
-from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.catalogue.facts import CALIBRATION, DELAY, TRAINING_DRIVES
+from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.models.manifest import require_model_name
-from fleet_slip.runs.log import step
+from fleet_slip.storage.runs import step
 
 if TYPE_CHECKING:
     import duckdb
 
-    from fleet_slip.api.run_report import RunReport
-    from fleet_slip.api.session import Session
-    from fleet_slip.monitoring.night_report import NightReport
+    from fleet_slip.api.session import RunReport, Session
+    from fleet_slip.operations.night import NightReport
 
 
 class Fleet(LogsAndGrams, HealthAndUpkeep):
@@ -83,10 +81,9 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         is in rows of each step. Raises what `simulate`, `gram`, `FleetCohort.select` and `publish`
         raise.
         """
-        from fleet_slip.api.run_report import RunReport, Training
+        from fleet_slip.api.session import RunReport, Training
         from fleet_slip.catalogue.features import features
-        from fleet_slip.selection.model_list import load_model_list
-        from fleet_slip.selection.request import parse_worth
+        from fleet_slip.models.request import load_model_list, parse_worth
         from fleet_slip.simulation.campaign import load_campaign
 
         begun = time.monotonic()
@@ -156,7 +153,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         `StorageError` if the night cannot be recorded.
         """
         from fleet_slip.api.nightly import Night
-        from fleet_slip.selection.request import parse_worth
+        from fleet_slip.models.request import parse_worth
 
         parse_worth(request.worth)
         require_model_name(request.name)

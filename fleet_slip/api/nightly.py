@@ -11,28 +11,24 @@ from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import of_step
 from fleet_slip.api.requests import NightRequest
-from fleet_slip.api.run_report import Training
-from fleet_slip.catalogue.car_numbers import CALIBRATION, DELAY
-from fleet_slip.catalogue.feature_sets import PLAIN
-from fleet_slip.catalogue.features import features
-from fleet_slip.dates import date_of
+from fleet_slip.api.session import Training
+from fleet_slip.base import date_of, number_of
+from fleet_slip.catalogue.facts import CALIBRATION, DELAY
+from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError, UnclaimedError
-from fleet_slip.ingest.logs.log_files import find_logs, is_url
-from fleet_slip.ingest.mapping.mapping_list import as_list
-from fleet_slip.models.aliases import CANDIDATE
-from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.monitoring.night_report import NightReport, NightStep, State
-from fleet_slip.runs.log import step
-from fleet_slip.runs.nights import Beginning, Nights, hash_drive
-from fleet_slip.selection.model_list import load_model_list
-from fleet_slip.warehouse.table_views import connect_tables, gram_snapshots
-from fleet_slip.words import number_of
+from fleet_slip.ingest.log_files import find_logs, is_url
+from fleet_slip.ingest.mapping import as_list
+from fleet_slip.models.registry import CANDIDATE, ModelVersion
+from fleet_slip.models.request import load_model_list
+from fleet_slip.operations.night import NightReport, NightStep, State
+from fleet_slip.storage.runs import Beginning, Nights, hash_drive, step
+from fleet_slip.warehouse.tables import connect_tables, gram_snapshots
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
-    from fleet_slip.ingest.landing.ingest_job import IngestReport
-    from fleet_slip.monitoring.monitor import Chart
-    from fleet_slip.monitoring.quality import SensorFault
+    from fleet_slip.ingest.job import IngestReport
+    from fleet_slip.operations.monitor import Chart
+    from fleet_slip.operations.quality import SensorFault
 
 SAMPLE_FILES = 4
 """Log files that a night verifies; the next night takes the next ones."""

@@ -12,14 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from typing_extensions import Doc
 
 from fleet_slip.api.calls import ShowProgress, ShowStep, Workers
-from fleet_slip.catalogue.sources import TRAINING_DRIVES
+from fleet_slip.catalogue.facts import TRAINING_DRIVES
+from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.errors import UsageError
-from fleet_slip.grams.cohorts.folding import FoldKey
-from fleet_slip.regression.inference.drive_moments import ClusterUnit
-from fleet_slip.selection.request import CLUSTER, DEFAULT_MODELS, WORTH
+from fleet_slip.grams.cohort import Cohort
+from fleet_slip.grams.folding import FoldKey
+from fleet_slip.models.registry import ModelVersion, Registry
+from fleet_slip.models.request import CLUSTER, DEFAULT_MODELS, WHOLE_SET, WORTH, inputs_of
+from fleet_slip.regression.drives import ClusterUnit
 
 if TYPE_CHECKING:
-    from fleet_slip.models.model_version import ModelVersion
     from fleet_slip.simulation.campaign import Campaign
 
 Subject = Literal["vehicle", "drive", "drive_name", "source_file"]
@@ -197,3 +199,40 @@ class RegimesRequest:
         Doc("Feature set that divides rows by regimes. Default: the first with the signals."),
     ] = None
     worth: Annotated[str | None, WORTH] = None
+
+
+# What is examined: a published model, or signals that are named.
+
+
+@dataclass(frozen=True)
+class ExaminedModel:
+    """The inputs of a published model, or named ones."""
+
+    feature_set: str
+    named: str | None
+    version: ModelVersion | None
+
+    @property
+    def intercept(self) -> bool:
+        """Whether the model has one; inputs that are named alone have."""
+        return self.version is None or not self.version.manifest.through_origin
+
+    def inputs(self, cohort: Cohort) -> tuple[str, ...]:
+        """Return the inputs; all that the cohort has, if that was asked for."""
+        if self.version is not None:
+            return self.version.manifest.signals
+        return inputs_of(cohort, self.named or WHOLE_SET)
+
+
+def subject_of(registry: Registry, request: ExaminedRequest) -> ExaminedModel:
+    """Return what is examined, by default the only model. Raises `UsageError` for both kinds."""
+    model = request.model
+    if request.signals is not None or request.features is not None:
+        if model is not None:
+            raise UsageError("name a published model or signals (of a feature set), not both.")
+        return ExaminedModel(request.features or PLAIN, request.signals, None)
+    if model is None:
+        model = registry.only(", or signals")
+    version = model if isinstance(model, ModelVersion) else registry.resolve(model)
+    identity = version.manifest.trained_on.feature_set
+    return ExaminedModel(features().name_of(identity), None, version)

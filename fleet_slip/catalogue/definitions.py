@@ -16,15 +16,10 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Annotated, Literal
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    StringConstraints,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
 from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.car_numbers import NumberName
+from fleet_slip.catalogue.facts import NumberName
 from fleet_slip.catalogue.signals import COUNT_MAX, Identifier, catalogue
 from fleet_slip.config import Config
 from fleet_slip.errors import QuestionError
@@ -149,7 +144,7 @@ class Gate(Config):
 
 
 class Number(Config):
-    """What a car's drives tell of it (`fleet_slip.catalogue.car_numbers`): a factor of a column.
+    """What a car's drives tell of it (`fleet_slip.catalogue.facts`): a factor of a column.
 
     The column's count times the number's, less `less`: not rounded, and not clipped. A car whose
     number is not known takes the mean since its drive began, `running`, of the same grain; without

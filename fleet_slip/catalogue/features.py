@@ -1,19 +1,423 @@
 """The features in force: `configs/features.toml`, and one's own laid over it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from decimal import Decimal
 from fractions import Fraction
-from functools import cache
+from functools import cache, cached_property
 from importlib.resources.abc import Traversable
+from itertools import pairwise
+from typing import TypeVar
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError, field_validator, model_validator
 
-from fleet_slip.catalogue.feature_catalogue import FeatureCatalogue
-from fleet_slip.catalogue.row_features import Feature
-from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.catalogue.time_columns import TimeColumn
-from fleet_slip.config import faults_of, load_config, load_toml
-from fleet_slip.errors import ConfigError
-from fleet_slip.resources import config_file, folder
+from fleet_slip.base import canonical_json, sha256_of
+from fleet_slip.catalogue.course import BESIDE, LONGEST_TICKS, YAW_RATE, course_units
+from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, plain_column
+from fleet_slip.catalogue.facts import RECEIVED
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Identifier, Signal, catalogue
+from fleet_slip.catalogue.time_columns import (
+    Calibrated,
+    Factor,
+    Feature,
+    GateFamily,
+    TimeColumn,
+    Window,
+    calibrated_column,
+    factor_column,
+    gated_columns,
+    window_column,
+)
+from fleet_slip.config import Config, config_file, faults_of, folder, load_config, load_toml
+from fleet_slip.errors import ConfigError, QuestionError
+
+# Feature sets and regimes of `configs/features.toml` as types.
+#
+# A feature set is the columns of one kind of Gram row, and how a drive's rows are divided into
+# several, if they are.
+
+PLAIN = "signals"
+"""The feature set whose columns are the catalogue's inputs and label themselves."""
+
+LAG = "_lag"
+"""What the column of a signal's previous value ends in."""
+
+
+def lag_signals(signals: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns of a lagged set: all signals now, then all one sample before."""
+    return (*signals, *(name + LAG for name in signals))
+
+
+class Regime(Config):
+    """Bands of a signal or feature."""
+
+    of: Identifier
+    absolute: bool = False
+    bounds: tuple[Decimal, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _bounds_rise(self) -> "Regime":
+        if list(self.bounds) != sorted(set(self.bounds)):
+            raise ValueError("the bounds of a regime must rise")
+        return self
+
+    @property
+    def bands(self) -> tuple[str, ...]:
+        """What the bands are called."""
+        name = f"|{self.of}|" if self.absolute else self.of
+        edges = [f"{bound:f}".rstrip("0").rstrip(".") for bound in self.bounds]
+        middle = [f"{name} {low}-{high}" for low, high in pairwise(edges)]
+        return (f"{name} < {edges[0]}", *middle, f"{name} >= {edges[-1]}")
+
+
+class FeatureSet(Config):
+    """The columns of one kind of Gram row, and what divides a drive's rows."""
+
+    description: str = Field(min_length=1)
+    of: Identifier | None = None
+    """The set whose columns these are the changes of, beside those that are named."""
+    signals: tuple[Identifier, ...] = ()
+    features: tuple[Identifier, ...] = ()
+    windows: tuple[Identifier, ...] = ()
+    calibrated: tuple[Identifier, ...] = ()
+    regimes: tuple[Identifier, ...] = ()
+    block_s: Decimal | None = Field(default=None, gt=0, le=100_000)
+    row_folds: int | None = Field(default=None, ge=2, le=1000)
+    lagged: bool = False
+    change_s: tuple[Decimal, ...] = ()
+    """Instead of the columns, what they change by in so much time, with the course as the label;
+    of several times, each is a part of the drive."""
+    as_logged: bool = False
+    """Whether the course of changes stays where it was logged, however late its receiver is."""
+
+    @field_validator("change_s", mode="before")
+    @classmethod
+    def _one_is_enough(cls, given: object) -> object:
+        return given if isinstance(given, list | tuple) else (given,)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "FeatureSet":
+        if self.of is None and not self.signals:
+            raise ValueError("a set has signals, or is of another set")
+        if self.of is not None and not self.change_s:
+            raise ValueError("a set of another has change_s")
+        unknown = [name for name in self.signals if name not in catalogue().feature_inputs]
+        if unknown:
+            raise ValueError(f"not input signals: {', '.join(unknown)}")
+        if len(set(self.columns)) < len(self.columns):
+            raise ValueError("a column stands twice")
+        if bool(self.regimes) + bool(self.block_s) + bool(self.row_folds) + self.lagged > 1:
+            raise ValueError("a set has regimes, block_s, row_folds or lagged, not several of them")
+        if (self.windows or self.calibrated) and (self.row_folds or self.lagged):
+            raise ValueError("a set with windows has no row_folds or lagged")
+        if self.change_ticks and (self.row_folds or self.lagged or self.regimes or self.block_s):
+            raise ValueError("a set with change_s does not divide rows")
+        if self.change_ticks and not (self.windows or self.of):
+            raise ValueError("a set with change_s has windows")
+        if self.as_logged and not self.change_ticks:
+            raise ValueError("only a set with change_s is as_logged")
+        if any(not 0 < ticks <= LONGEST_TICKS for ticks in self.change_ticks):
+            raise ValueError(f"change_s is at most {LONGEST_TICKS * float(SAMPLE_TIME_S):g}")
+        for name, times_s in (("block_s", (self.block_s,)), ("change_s", self.change_s)):
+            if any(one and Fraction(one) % SAMPLE_TIME_S for one in times_s):
+                raise ValueError(f"{name} must be a multiple of {float(SAMPLE_TIME_S)}")
+        return self
+
+    @property
+    def block_ticks(self) -> int | None:
+        """Number of ticks of a block of time; None where rows are not divided by time."""
+        return None if self.block_s is None else int(Fraction(self.block_s) / SAMPLE_TIME_S)
+
+    @property
+    def change_ticks(self) -> tuple[int, ...]:
+        """Numbers of ticks over which columns change; none where they stand for themselves."""
+        return tuple(int(Fraction(time_s) / SAMPLE_TIME_S) for time_s in self.change_s)
+
+    @property
+    def change_text(self) -> str:
+        """The times over which columns change, as messages say them."""
+        *most, last = (f"{time_s:f}" for time_s in self.change_s)
+        return f"{', '.join(most)} and {last} s" if most else f"{last} s"
+
+    @property
+    def in_time(self) -> bool:
+        """Whether the delays of receivers are corrected in the Gram rows."""
+        return bool(self.change_ticks) and not self.as_logged
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """What a model of this set may use."""
+        return (*self.signals, *self.features, *self.windows, *self.calibrated)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of a Gram row, in its order; calibrated ones follow from it."""
+        beside = BESIDE if self.change_ticks else ()
+        now = (*self.signals, *self.features, *self.windows, *beside, catalogue().label)
+        return lag_signals(now) if self.lagged else now
+
+
+# Features and feature sets: `configs/features.toml` as a catalogue.
+#
+# A feature is an integer function of the counts of one row; a window looks back on a signal or a
+# feature over time; a factor is a column times what a car knows of itself; a gate is a column as
+# far as another one opens it.
+
+T = TypeVar("T")
+
+
+class FeatureCatalogue(Config):
+    """All features, regimes and feature sets, in the file's order."""
+
+    features: dict[Identifier, Feature]
+    windows: dict[Identifier, Window] = Field(default_factory=dict)
+    factors: dict[Identifier, Factor] = Field(default_factory=dict)
+    gates: dict[Identifier, GateFamily] = Field(default_factory=dict)
+    calibrated: dict[Identifier, Calibrated] = Field(default_factory=dict)
+    regimes: dict[Identifier, Regime]
+    sets: dict[Identifier, FeatureSet]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "FeatureCatalogue":
+        signals = catalogue()
+        taken = {*signals.signals, *(s.column for s in signals.signals.values()), *signals.drive}
+        columns: dict[str, Feature | TimeColumn] = {**self.features, **self.time_columns}
+        taken |= {"day", "tick", "clipped", *BESIDE}
+        names = [*columns, *(one.column for one in columns.values())]
+        twice = sorted(name for name in names if name in taken or names.count(name) > 1)
+        if twice:
+            raise ValueError(f"names must differ, from those of signals too: {', '.join(twice)}")
+        if PLAIN in self.sets:
+            raise ValueError(f"{PLAIN!r} is the set of the catalogue's own signals")
+        if RECEIVED in self.sets:
+            raise ValueError(f"files of Gram rows that cars sent are called {RECEIVED!r}")
+        for name, regime in self.regimes.items():
+            if regime.of not in {*self.features, *signals.feature_inputs}:
+                raise ValueError(f"regimes.{name}: {regime.of} is no input signal or feature")
+        for name, one in self.sets.items():
+            unknown = [f for f in one.features if f not in self.features]
+            unknown += [r for r in one.regimes if r not in self.regimes]
+            known = {*self.windows, *self.gates, *self.time_columns}
+            unknown += [w for w in one.windows if w not in known or w in self.calibrated]
+            unknown += [c for c in one.calibrated if c not in self.calibrated]
+            unknown += [one.of] if one.of and one.of not in self.sets else []
+            still = [c for c in one.calibrated if one.change_s and self.calibrated[c].alone]
+            if still:
+                raise ValueError(f"sets.{name}: {', '.join(still)}: a number does not change")
+            if unknown:
+                raise ValueError(f"sets.{name}: unknown {', '.join(unknown)}")
+        return self
+
+    @cached_property
+    def time_columns(self) -> Mapping[str, TimeColumn]:
+        """Every column over time: the members of the families of windows, then the factors.
+
+        Raises `ValueError` for one that looks back on nothing known, or twice the same name.
+        """
+        found: dict[str, TimeColumn] = {}
+        for family, window in self.windows.items():
+            row, scale = self._row(window.of, f"windows.{family}")
+            for name, ticks in window.members(family).items():
+                if name in found:
+                    raise ValueError(f"windows.{family}: {name} stands twice")
+                found[name] = _named(f"windows.{name}", window_column, window, ticks, row, scale)
+        for name, factor in self.factors.items():
+            if factor.of in found:
+                base, scale = found[factor.of].definition, found[factor.of].exact_scale
+            else:
+                base, scale = self._row(factor.of, f"factors.{name}")
+            if name in found:
+                raise ValueError(f"factors.{name} stands twice")
+            found[name] = _named(f"factors.{name}", factor_column, factor, base, scale)
+        for name, gate in self.gates.items():
+            members = _named(f"gates.{name}", gated_columns, name, gate, dict(found))
+            if twice := [member for member in members if member in found]:
+                raise ValueError(f"gates.{name}: {twice[0]} stands twice")
+            found |= members
+        for name, calibrated in self.calibrated.items():
+            if name in found:
+                raise ValueError(f"calibrated.{name} stands twice")
+            found[name] = self._calibrated(name, calibrated, found)
+        return found
+
+    def _calibrated(
+        self, name: str, one: Calibrated, known: Mapping[str, TimeColumn]
+    ) -> TimeColumn:
+        where = f"calibrated.{name}"
+        if one.running is not None and one.running not in known:
+            raise ValueError(f"{where}: {one.running} is no column over time")
+        of: Feature | Signal | TimeColumn
+        if one.of in known:
+            of, base = known[one.of], known[one.of].definition
+        else:
+            base, _ = self._row(one.of, where)
+            of = self.features[one.of] if one.of in self.features else catalogue()[one.of]
+            if base.sql:  # the count itself, as it stands in the rows
+                base = base.model_copy(update={"bits": base.of_bits})
+        if base.number is not None:
+            raise ValueError(f"{where}: {one.of} has a number already")
+        running = known[one.running] if one.running else None
+        return _named(where, calibrated_column, one, base, of.scale, of.unit, running)
+
+    def _row(self, name: str, where: str) -> tuple[Definition, Fraction]:
+        """Return a signal or feature of a row as the definition of a column, and its scale."""
+        if name in self.features:
+            one = self.features[name]
+            return Definition(of=name, sql=one.sql, of_bits=one.bits), one.exact_scale
+        if name in catalogue().feature_inputs:
+            return Definition(of=name), catalogue()[name].exact_scale
+        raise ValueError(f"{where}: {name} is no input signal or feature")
+
+    def definition(self, name: str) -> Definition | None:
+        """Return the definition of an input that is more than a signal or a feature of 16 bits."""
+        if name in self.time_columns:
+            return self.time_columns[name].definition
+        one = self.features.get(name)
+        if one is None or one.bits == COUNT_BITS:
+            return None
+        return Definition(of=name, sql=one.sql, of_bits=one.bits, bits=one.bits)
+
+    def rows(self, names: Iterable[str]) -> dict[str, Definition]:
+        """Return the definitions of those names that are features, as columns of one row."""
+        known = {name: self.features[name] for name in names if name in self.features}
+        return {name: plain_column(name, one.sql, one.bits) for name, one in known.items()}
+
+    def definitions(self, name: str) -> dict[str, Definition]:
+        """Return the definitions of a set's columns over time, by name."""
+        return {w: self.time_columns[w].definition for w in self.feature_set(name).windows}
+
+    def feature_set(self, name: str) -> FeatureSet:
+        """Return a feature set by name. Raises `QuestionError` for an unknown one.
+
+        Families of windows are replaced by their members.
+        """
+        if name == PLAIN:
+            return FeatureSet(description="The logged signals", signals=catalogue().inputs)
+        if name not in self.sets:
+            known = ", ".join((PLAIN, *self.sets))
+            raise QuestionError(f"no feature set is called {name!r}. Feature sets: {known}.")
+        one = self.sets[name]
+        members = [member for window in one.windows for member in self.members(window)]
+        one = one.model_copy(update={"windows": tuple(dict.fromkeys(members))})
+        return one if one.of is None else self._changes_of(one, self.feature_set(one.of))
+
+    def _changes_of(self, one: FeatureSet, of: FeatureSet) -> FeatureSet:
+        """Return a set with the columns of another whose changes tell something, beside its own.
+
+        A sum of the yaw rate has the gyroscope's noise in common with the course, which least
+        squares takes for knowledge. A mean since the drive began hardly changes, a number of the
+        car not at all.
+        """
+        columns = {}
+        for kind in ("signals", "features", "windows", "calibrated"):
+            both = dict.fromkeys((*getattr(of, kind), *getattr(one, kind)))
+            columns[kind] = tuple(name for name in both if self._changes(name))
+        return one.model_copy(update=columns)
+
+    def _changes(self, name: str) -> bool:
+        if name not in self.time_columns:
+            return True
+        one = self.time_columns[name].definition
+        alone = one.number is not None and one.number.alone
+        summed = one.over == "sum" and YAW_RATE in one.signals
+        return not (alone or summed or one.over == "running_mean")
+
+    def members(self, name: str) -> tuple[str, ...]:
+        """Return the columns of a family of windows or gates; any other name stays."""
+        if name in self.windows:
+            return tuple(self.windows[name].members(name))
+        return tuple(self.gates[name].members(name)) if name in self.gates else (name,)
+
+    def families(self, signals: Iterable[str]) -> dict[str, int]:
+        """Return the names of signals, whole families of windows and gates by their own.
+
+        Beside a family is the number of its members, beside a signal 0.
+        """
+        shown = {name: (name, 0) for name in signals}
+        for family in (*self.windows, *self.gates):
+            members = self.members(family)
+            if shown.keys() >= set(members):
+                shown |= dict.fromkeys(members, (family, len(members)))
+        return dict(shown.values())
+
+    def identity(self, name: str) -> str:
+        """Return what the Gram rows of a set carry: its name and a checksum of its definition.
+
+        The set of the catalogue's own signals is just called `signals`.
+        """
+        if name == PLAIN:
+            return PLAIN
+        one = self.feature_set(name)
+        used = [*one.features, *(self.regimes[r].of for r in one.regimes)]
+        content = {
+            "columns": list(one.columns),
+            "signals": {s: str(catalogue()[s].scale) for s in catalogue().inputs},
+            "features": {f: self._definition(f) for f in used if f in self.features},
+            "regimes": {r: self.regimes[r].model_dump(mode="json") for r in one.regimes},
+            "row_folds": one.row_folds,
+            "lagged": one.lagged,
+        }
+        if extras := self._extras(one):
+            content["extras"] = {name: str(catalogue()[name].scale) for name in extras}
+        if one.block_ticks:
+            content["block_ticks"] = one.block_ticks
+        if one.change_ticks:
+            content["change"] = {"ticks": list(one.change_ticks), **vars(course_units())}
+        if one.windows:
+            content["windows"] = {
+                w: self.time_columns[w].model_dump(mode="json", exclude={"description"})
+                for w in one.windows
+            }
+        digest = sha256_of(canonical_json(content))
+        return f"{name}-{digest[:12]}"
+
+    def _extras(self, one: FeatureSet) -> tuple[str, ...]:
+        """Return the signals that a set is made of and that not every set knows."""
+        divided_by = [self.regimes[regime].of for regime in one.regimes]
+        used = {*one.signals, *divided_by}
+        for name in (*one.features, *divided_by):
+            used |= set(self.features[name].inputs) if name in self.features else set()
+        for name in one.windows:
+            used |= set(self.time_columns[name].definition.signals)
+        return tuple(name for name in catalogue().extras if name in used)
+
+    def name_of(self, identity: str) -> str:
+        """Return the name of the set that Gram rows are of, if it is still defined like that.
+
+        Raises `QuestionError` otherwise.
+        """
+        name = identity.rpartition("-")[0] or identity
+        if name in {PLAIN, *self.sets} and self.identity(name) == identity:
+            return name
+        raise QuestionError(
+            f"the feature set {identity} is not defined as it was then: configs/features.toml has "
+            "changed. Publish the model again."
+        )
+
+    def _definition(self, name: str) -> Mapping[str, str]:
+        feature = self.features[name]
+        content = {"sql": feature.sql, "scale": str(feature.scale), "unit": feature.unit}
+        return content if feature.bits == COUNT_BITS else content | {"bits": str(feature.bits)}
+
+    def of(self, name: str) -> Signal | Feature | TimeColumn:
+        """Return an input by name: a logged signal, a feature, or a column over time."""
+        if name in self.time_columns:
+            return self.time_columns[name]
+        return self.features[name] if name in self.features else catalogue()[name]
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Everything that a model may use."""
+        return (*catalogue().feature_inputs, *self.features, *self.time_columns)
+
+
+def _named(where: str, make: Callable[..., T], *parts: object) -> T:
+    """Make a column, or several. Raises `ValueError` that says which one cannot be."""
+    try:
+        return make(*parts)
+    except ValidationError as error:
+        raise ValueError(f"{where}: {faults_of(error)}") from None
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def load_features(file: Traversable) -> FeatureCatalogue:

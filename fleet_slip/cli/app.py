@@ -1,21 +1,29 @@
 """The commands of `fleet-slip` as one program: its options, and how it ends."""
 
+import functools
+import inspect
 import logging
 import os
 import signal
 import sys
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from functools import cache, cached_property
+from importlib import import_module
+from importlib.abc import InspectLoader
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from types import CodeType, FunctionType
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar, cast
 
 import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_group
 
 import fleet_slip
-from fleet_slip.cli.commands import CommandGroup
 from fleet_slip.cli.early_exit import LOG_VARIABLE, leave
-from fleet_slip.cli.logs import LogFormat, configure_logs
 from fleet_slip.cli.output import say
-from fleet_slip.cli.streams import Streams
+from fleet_slip.cli.streams import LogFormat, Streams, configure_logs
+from fleet_slip.config import CONFIG_VARIABLE, own_configs
 from fleet_slip.errors import (
     INTERRUPTED,
     FleetSlipError,
@@ -23,12 +31,141 @@ from fleet_slip.errors import (
     StorageError,
     is_lack_of_memory,
 )
-from fleet_slip.files.data_root import ROOT_VARIABLE
 from fleet_slip.limits import memory_bytes
-from fleet_slip.resources import CONFIG_VARIABLE, own_configs
+from fleet_slip.storage.data_root import ROOT_VARIABLE
+from fleet_slip.storage.runs import recording
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
+
+
+# All commands: which module has each. A module is imported when one of its commands is called.
+#
+# So `--help` and shell completion wait for none of them, and a command waits for what it needs
+# itself. What the list of commands says of one is its docstring's, which Python finds in the
+# module's compiled code without running it. Help is plain text: boxes and colours took longer than
+# all else.
+
+GROUPS = {
+    "Begin with": {
+        "run": "begin",
+        "sql": "sql",
+        "select": "begin",
+        "publish": "begin",
+        "show": "models",
+    },
+    "Data": {
+        "simulate": "data",
+        "mapping": "data",
+        "ingest": "data",
+        "gram": "grams",
+        "check": "grams",
+        "features": "grams",
+        "init": "data",
+    },
+    "Models": {
+        "models": "models",
+        "diff": "models",
+        "promote": "models",
+        "rollback": "models",
+        "pin": "models",
+        "unpin": "models",
+        "export": "models",
+    },
+    "Accuracy": {
+        "score": "accuracy",
+        "evaluate": "accuracy",
+        "identify": "accuracy",
+        "report": "accuracy",
+        "watch": "accuracy",
+        "explore": "accuracy",
+        "diagnose": "statistics",
+        "regimes": "statistics",
+        "what-if": "statistics",
+    },
+    "Operations": {
+        "nightly": "operations",
+        "status": "operations",
+        "quality": "operations",
+        "calibrate": "operations",
+        "monitor": "operations",
+        "verify": "upkeep",
+        "compact": "upkeep",
+        "vacuum": "upkeep",
+        "forget": "upkeep",
+        "retain": "upkeep",
+        "migrate": "upkeep",
+    },
+}
+"""The commands in the groups and the order of `--help`, and the module of `fleet_slip.cli` that has
+each as a function."""
+
+COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items()}
+
+
+class Command(TyperCommand):
+    """A command whose help is plain text."""
+
+    def get_help(self, ctx: Any) -> str:
+        """Return the help without what marks examples in docstrings."""
+        return super().get_help(ctx).replace("**", "")
+
+
+class CommandGroup(TyperGroup):
+    """The commands, listed from their docstrings; the one that is called is loaded."""
+
+    def __init__(self, **settings: Any) -> None:
+        """Add a command that has nothing but its docstring for each of `COMMANDS`."""
+        super().__init__(**settings)
+        for name, module in COMMANDS.items():
+            self.add_command(Command(name, help=docstrings(module)[_function(name)]))
+
+    def get_help(self, ctx: Any) -> str:
+        """Return the help without what marks examples in docstrings."""
+        return super().get_help(ctx).replace("**", "")
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 - of the base
+        """Write the commands, group by group."""
+        wide = max(map(len, COMMANDS))
+        left = formatter.width - wide - 6
+        for group, names in GROUPS.items():
+            with formatter.section(group):
+                rows = [(name, self.commands[name].get_short_help_str(2 * left)) for name in names]
+                formatter.write_dl([(f"{name:<{wide}}", text) for name, text in rows])
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Put the command that is called in the place of its docstring."""
+        if args[0] in COMMANDS:
+            self.commands[args[0]] = load_command(args[0])
+        return super().resolve_command(ctx, args)
+
+
+def load_command(name: str) -> Any:
+    """Return a command, with its options."""
+    module = import_module(f"fleet_slip.cli.{COMMANDS[name]}")
+    app = typer.Typer(rich_markup_mode=None)
+    app.command(name, cls=Command)(getattr(module, _function(name)))
+    return get_group(app).commands[name]
+
+
+@cache
+def docstrings(module: str) -> Mapping[str, str]:
+    """Return the docstrings of a module's functions by name; the module is not imported."""
+    name = f"fleet_slip.cli.{module}"
+    spec = find_spec(name)
+    loader = spec.loader if spec else None
+    compiled = loader.get_code(name) if isinstance(loader, InspectLoader) else None
+    codes = [one for one in compiled.co_consts if isinstance(one, CodeType)] if compiled else []
+    return {
+        code.co_name: inspect.cleandoc(FunctionType(code, {}).__doc__ or "")
+        for code in codes
+        if not code.co_freevars
+    }
+
+
+def _function(command: str) -> str:
+    return command.replace("-", "_")
+
 
 app = typer.Typer(
     cls=CommandGroup,
@@ -177,3 +314,21 @@ def _choose_font_folder() -> None:
     folder = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
     if folder:
         os.environ.setdefault("MPLCONFIGDIR", folder)
+
+
+# Marks the commands that change the warehouse: each leaves a record in the history of runs.
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def record_run(command: Callable[P, R]) -> Callable[P, R]:
+    """Return the command, recorded. Its `context` parameter carries the warehouse."""
+
+    @functools.wraps(command)
+    def run(*arguments: P.args, **options: P.kwargs) -> R:
+        context = cast(typer.Context, options["context"])
+        with recording(context.obj.root, command.__name__, sys.argv[1:]):
+            return command(*arguments, **options)
+
+    return run

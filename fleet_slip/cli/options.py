@@ -2,17 +2,78 @@
 
 import functools
 import inspect
+import os
 import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import MISSING, fields
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
 
 from fleet_slip.api.calls import documented, type_of
-from fleet_slip.cli.completing import complete_config, complete_feature_set, complete_model
-from fleet_slip.dates import date_of, last_day
-from fleet_slip.errors import UsageError
+from fleet_slip.base import date_of, last_day
+from fleet_slip.config import CONFIG_VARIABLE, config_names
+from fleet_slip.errors import FleetSlipError, UsageError
+
+# What Tab completes in a shell of the system: names of models, campaigns, lists and feature sets.
+#
+# Completion never fails and never speaks: where names cannot be read, there are none.
+
+Complete = Callable[[typer.Context, str], list[str]]
+
+
+def complete_model(context: typer.Context, incomplete: str) -> list[str]:
+    """Return the models that a word may become, or the versions of one after its @."""
+    import fleet_slip  # noqa: PLC0415 - completion of other words need not wait for it
+    from fleet_slip.models.registry import Registry  # noqa: PLC0415
+
+    options = context.find_root().params
+    try:
+        registry = Registry(fleet_slip.open(options.get("root")).root / "models")
+        name, at, _ = incomplete.partition("@")
+        if at and name in registry.names():
+            versions = [str(number) for number in reversed(registry.versions(name))]
+            found = [f"{name}@{one}" for one in (*registry.history(name).aliases(), *versions)]
+        else:
+            found = registry.names()
+    except (FleetSlipError, OSError):
+        return []
+    return [one for one in found if one.startswith(incomplete)]
+
+
+def complete_config(kind: str) -> Complete:
+    """Return what completes the names of the configs of one kind, such as `campaigns`."""
+
+    def complete(context: typer.Context, incomplete: str) -> list[str]:
+        _lay_over_configs(context)
+        try:
+            return [name for name in config_names(kind) if name.startswith(incomplete)]
+        except (FleetSlipError, OSError):
+            return []
+
+    return complete
+
+
+def complete_feature_set(context: typer.Context, incomplete: str) -> list[str]:
+    """Return the feature sets that a word may become."""
+    from fleet_slip.catalogue.features import (  # noqa: PLC0415
+        PLAIN,
+        features,
+    )
+
+    _lay_over_configs(context)
+    try:
+        return [name for name in (PLAIN, *features().sets) if name.startswith(incomplete)]
+    except (FleetSlipError, OSError):
+        return []
+
+
+def _lay_over_configs(context: typer.Context) -> None:
+    own = context.find_root().params.get("config")
+    if own is not None:
+        os.environ[CONFIG_VARIABLE] = str(Path(own).absolute())
+
 
 R = TypeVar("R")
 
@@ -137,3 +198,39 @@ def quantities(values: Sequence[str] | None, option: str) -> dict[str, float]:
                 f"{option} {value}: write SIGNAL=NUMBER in SI units, such as ay=0.2."
             ) from None
     return found
+
+
+# Where a command's tasks run: threads of this process, or the workers of a Dask cluster.
+
+CLUSTER_VARIABLE = "DASK_SCHEDULER_ADDRESS"
+
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Threads of this machine. The result is the same. Default: all cores."
+    ),
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        envvar=CLUSTER_VARIABLE,
+        metavar="ADDRESS",
+        help="Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers do the work; "
+        "they must share the data root. Default: threads of this machine.",
+        show_default=False,
+    ),
+]
+
+
+# The argument that names a published model, for commands that wait for nothing else.
+
+OnlyModel = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="MODEL",
+        help="NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. "
+        "Default: the only one that there is.",
+        autocompletion=complete_model,
+        show_default=False,
+    ),
+]

@@ -38,8 +38,8 @@ from fleet_slip.compute.cluster_worker import (
 )
 from fleet_slip.compute.tasks import LostTaskError
 from fleet_slip.errors import ClusterError, StorageError
-from fleet_slip.files.folder import Folder
-from fleet_slip.runs.log import log_event
+from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.runs import log_event
 
 IN_FLIGHT_MIN = 8
 """Tasks that may be under way however few workers there are: more of them may be on their way."""

@@ -17,9 +17,9 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
+from fleet_slip.config import folder, own_configs
 from fleet_slip.errors import FleetSlipError, RefusedError, StorageError
-from fleet_slip.files.folder import Folder
-from fleet_slip.resources import folder, own_configs
+from fleet_slip.storage.folder import Folder
 
 PACKAGES = (
     "fleet-slip",

@@ -17,7 +17,7 @@ from itertools import islice
 from typing import TypeVar
 
 from fleet_slip.errors import ClusterError
-from fleet_slip.runs.log import LOGGER
+from fleet_slip.storage.runs import LOGGER
 
 IN_FLIGHT = 4
 """Tasks that may be under way, or done and not yet looked at, where the executor does not say."""

@@ -1,17 +1,47 @@
 """Makes the integer program of a published manifest."""
 
+import csv
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from decimal import Decimal
+from fractions import Fraction
+from io import StringIO
+from operator import itemgetter
+from typing import Any
 
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.base import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.definitions import plain_column
+from fleet_slip.catalogue.facts import round_number
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
-from fleet_slip.columns.lowering import Lowering
-from fleet_slip.columns.operations import size_of
-from fleet_slip.errors import DataError
-from fleet_slip.export.fixed_point import LARGEST_ANGLE, OUTPUT_COUNTS, fixed_point
-from fleet_slip.export.program import Angle, Input, Program
-from fleet_slip.models.estimates.counts_model import counts_model
+from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
+from fleet_slip.columns.operations import (
+    CarFact,
+    Lowering,
+    operands_of,
+    operation_of,
+    plain_of,
+    size_of,
+)
+from fleet_slip.errors import DataError, InputError
+from fleet_slip.export import program as do
+from fleet_slip.export.program import (
+    LARGEST_ANGLE,
+    OUTPUT_COUNTS,
+    UNKNOWN_CAR,
+    Angle,
+    Car,
+    Input,
+    Program,
+    fixed_point,
+)
+from fleet_slip.grams.compute import counts_of
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.predict import Predictor, counts_model
 
 
 def compile_program(manifest: Manifest) -> Program:
@@ -20,7 +50,7 @@ def compile_program(manifest: Manifest) -> Program:
     Raises what `write_program` raises, and `QuestionError` or `DataError` for definitions that
     contradict each other.
     """
-    from fleet_slip.models.estimates.predictor import Predictor  # noqa: PLC0415 - numba, not for show
+    from fleet_slip.models.predict import Predictor  # noqa: PLC0415 - numba, not for show
 
     _ = Predictor.of(manifest).plan.program  # raises for what the kernel could not compute
     return write_program(manifest)
@@ -69,3 +99,394 @@ def _inputs(manifest: Manifest) -> tuple[Input, ...]:
         for name, s in catalogue().signals.items()
         if name in used
     )
+
+
+# Checks of a program that travel with it: ticks of made-up drives, and the angles.
+#
+# No tick is of a drive of the warehouse: an export goes to people who may not see the logs.
+# The angles come from the columns as the warehouse's kernel computes them, which knows nothing of
+# programs, and from exact integers.
+
+SMOOTH_TICKS = 300
+HOSTILE_TICKS = 200
+
+Sample = tuple[int | None, ...]
+"""The counts of a tick in the order of the program's signals; None where missing."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A drive, tick by tick from the first, and the angle at each; None where there is none.
+
+    Attributes:
+        name: what it is.
+        facts, numbers: what the car knows, in the order of the program; None where unknown.
+        samples: of each tick.
+        angles: counts of the program's angle.
+    """
+
+    name: str
+    facts: tuple[int | None, ...]
+    numbers: tuple[int | None, ...]
+    samples: tuple[Sample, ...]
+    angles: tuple[int | None, ...]
+
+
+def make_checks(manifest: Manifest, program: Program) -> tuple[Check, ...]:
+    """Return a smooth drive and hostile ones, each with the angle at every tick."""
+    hostile = _hostile_car(program)
+    drives: dict[str, tuple[Car, Iterable[Sample]]] = {
+        "smooth": (UNKNOWN_CAR, _smooth(program)),
+        "extremes": (hostile, _extremes(program, np.random.default_rng(1))),
+        "holes": (UNKNOWN_CAR, _holes(program, np.random.default_rng(2))),
+        "standstill": (hostile, _standstill(program, np.random.default_rng(3))),
+    }
+    return tuple(
+        _check(manifest, program, name, car, samples) for name, (car, samples) in drives.items()
+    )
+
+
+def angles_by_kernel(
+    manifest: Manifest, program: Program, car: Car, samples: Sequence[Sample]
+) -> list[int | None]:
+    """Return the angle of each tick, by the columns of the kernel and exact integers."""
+    predictor = Predictor.of(manifest)
+    drive = drive_counts(program, predictor, car, samples)
+    return angles_of_columns(program, DriveColumns(predictor.plan, drive).compute())
+
+
+def drive_counts(
+    program: Program, predictor: Predictor, car: Car, samples: Sequence[Sample]
+) -> DriveCounts:
+    """Return samples of consecutive ticks as a drive of the warehouse."""
+    names = [one.name for one in program.signals]
+    valid = [_valid(sample, program.signals) for sample in samples]
+    counts = {
+        name: pa.array(values, pa.int16())
+        for name, values in zip(names, zip(*valid, strict=True), strict=True)
+    }
+    rows = pa.table({"tick": np.arange(len(samples), dtype=np.int64), **counts})
+    facts = {name: car.facts.get(name) for name in predictor.plan.facts}
+    return counts_of(rows, predictor.plan, facts, car.numbers)
+
+
+def angles_of_columns(program: Program, columns: FloatArray) -> list[int | None]:
+    """Return the angle of each row, given the columns of the terms, shape (terms, rows)."""
+    angle = program.angle
+    missing: BoolArray = np.any(np.isnan(columns), axis=0)
+    whole = np.where(missing, 0.0, columns).astype(np.int64).astype(object)
+    total = np.full(columns.shape[1], angle.intercept + (1 << (angle.bits - 1)), dtype=object)
+    for (_, coefficient), column in zip(angle.terms, whole, strict=True):
+        total += coefficient * column
+    rounded = [max(-angle.limit, min(angle.limit, int(one >> angle.bits))) for one in total]
+    return [None if gone else one for one, gone in zip(rounded, missing, strict=True)]
+
+
+def _valid(sample: Sample, signals: Sequence[Input]) -> Sample:
+    """Return a sample in which counts beyond the valid range are missing."""
+    return tuple(
+        count if count is not None and one.min_count <= count <= one.max_count else None
+        for count, one in zip(sample, signals, strict=True)
+    )
+
+
+def _check(
+    manifest: Manifest, program: Program, name: str, car: Car, samples: Iterable[Sample]
+) -> Check:
+    ticks = tuple(samples)
+    angles = tuple(angles_by_kernel(manifest, program, car, ticks))
+    return Check(name, car.fact_counts(program), car.number_counts(program), ticks, angles)
+
+
+def _smooth(program: Program) -> Iterable[Sample]:
+    """Yield a drive of whole counts without holes: every signal swings with a period of its own."""
+    for tick in range(SMOOTH_TICKS):
+        yield tuple(_swing(one, tick, 60 + 14 * i) for i, one in enumerate(program.signals))
+
+
+def _swing(signal: Input, tick: int, period: int) -> int:
+    """Return a count at a tick of a triangle that is an eighth of the range high."""
+    height = (signal.max_count - signal.min_count) // 8
+    middle = (signal.min_count + signal.max_count) // (4 if signal.min_count >= 0 else 2)
+    distance = abs(2 * (tick % period) - period)  # from the middle of the period, 0 to `period`
+    return middle + height * distance // period - height // 2
+
+
+def _hostile_car(program: Program) -> Car:
+    """Return a car whose facts and numbers are far from usual."""
+    facts: Mapping[str, object] = {one.name: _hostile_fact(one) for one in program.facts}
+    numbers = {
+        one.name: COUNT_MAX if place % 2 else -COUNT_MAX
+        for place, one in enumerate(program.numbers)
+    }
+    return Car(facts, numbers)
+
+
+def _hostile_fact(fact: CarFact) -> object:
+    return 2**16 if fact.equals is None else fact.equals
+
+
+def _extremes(program: Program, random: np.random.Generator) -> Iterable[Sample]:
+    """Yield ends of the ranges, all at once and one by one, and what is just beyond them."""
+    for tick in range(HOSTILE_TICKS):
+        if tick % 40 < 10:
+            high = tick % 80 < 40
+            yield tuple(one.max_count if high else one.min_count for one in program.signals)
+        else:
+            yield tuple(_extreme(one, random) for one in program.signals)
+
+
+def _extreme(one: Input, random: np.random.Generator) -> int | None:
+    within = (one.min_count, one.max_count, -1, 0, 1, one.max_count // 2)
+    beyond = (one.min_count - 1, one.max_count + 1, None)
+    if random.random() < 0.98:
+        return within[random.integers(len(within))]
+    return beyond[random.integers(len(beyond))]
+
+
+def _holes(program: Program, random: np.random.Generator) -> Iterable[Sample]:
+    """Yield a drive that lacks ticks, long and short, and single values."""
+    gone = 0
+    for _ in range(HOSTILE_TICKS):
+        begins = random.random() < 0.05
+        gone = gone - 1 if gone else (1, 2, 30)[random.integers(3)] if begins else 0
+        yield tuple(
+            None
+            if gone or random.random() < 0.01
+            else int(random.integers(0, one.max_count // 4 + 1))
+            for one in program.signals
+        )
+
+
+def _standstill(program: Program, random: np.random.Generator) -> Iterable[Sample]:
+    """Yield a start from standstill: no feature that divides by speed has a value at first."""
+    for tick in range(HOSTILE_TICKS):
+        yield tuple(
+            int(random.integers(-2, 3)) + one.max_count * tick // (8 * HOSTILE_TICKS)
+            for one in program.signals
+        )
+
+
+def checks_csv(program: Program, checks: Sequence[Check]) -> str:
+    """Return CSV with a row a tick: columns as the statement of SQL reads them, and the angle.
+
+    An empty cell is a missing value, or no angle.
+    """
+    facts = tuple(dict.fromkeys(one.name for one in program.facts))
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    columns = [one.column for one in program.signals]
+    numbers = [one.name for one in program.numbers]
+    writer.writerow(["drive_id", "tick", *columns, *facts, *numbers, "expected_angle"])
+    for check in checks:
+        known = [_fact(program, check, name) for name in facts]
+        known += [
+            _physical(count, one.grain)
+            for count, one in zip(check.numbers, program.numbers, strict=True)
+        ]
+        for tick, (sample, angle) in enumerate(zip(check.samples, check.angles, strict=True)):
+            values = [
+                _physical(count, one.scale)
+                for count, one in zip(sample, program.signals, strict=True)
+            ]
+            writer.writerow([check.name, tick, *values, *known, angle])
+    return text.getvalue()
+
+
+def _physical(count: int | None, scale: Decimal) -> str | None:
+    return None if count is None else f"{count * scale:f}"
+
+
+def _fact(program: Program, check: Check, name: str) -> object:
+    """Return a fact as the logs have it; `another` is a text that no fact of the program is."""
+    found: object = None
+    for one, count in zip(program.facts, check.facts, strict=True):
+        if one.name == name and count is not None:
+            if one.equals is None:
+                return count
+            found = one.equals if count else found or "another"
+            if count:
+                return found
+    return found
+
+
+# A published version tick by tick, for test benches: `Fleet.estimator`.
+
+
+class Estimator:
+    """Estimates the side-slip angle of a drive, a sample at a time.
+
+    Attributes:
+        columns: names in SI units that a sample has.
+    """
+
+    def __init__(self, manifest: Manifest, car: Mapping[str, Any] | None = None) -> None:
+        """Take a version, and what is known of the car: facts, and numbers in SI units, by name.
+
+        Raises `InputError` for what the version does not use, and what `compile_program` raises.
+        """
+        program = compile_program(manifest)
+        layout = _Layout(program, manifest, _known(manifest, program, car or {}))
+        self.columns = tuple(one.column for one in program.signals)
+        self._name = manifest.name
+        self._ticks = program.longest_ticks
+        self._begin, self._steps = layout.memory(), layout.rows()
+        self._values = layout.values()
+        self._intercept = manifest.intercept
+        self._memory = self._begin.copy()
+        self._given = self._values.data
+        self._pack = struct.Struct(f"{len(self.columns)}d").pack_into
+        self._chosen = itemgetter(*self.columns)
+        self._single = len(self.columns) == 1
+
+    def step(self, sample: Mapping[str, float | None]) -> float | None:
+        """Return the angle of the next tick in rad; None if there is none.
+
+        A sample has the columns of `columns` in SI units, None where a value is missing, as one
+        that is beyond its valid range is; others are left alone. They are rounded to counts, half
+        to even, as the sensors do. The angles of a drive have the bits that `predict` computes.
+
+        Raises `InputError` if the sample lacks a column.
+        """
+        try:
+            found = self._chosen(sample)
+            self._pack(self._given, 0, *((found,) if self._single else found))
+        except (KeyError, struct.error):
+            self._pack(self._given, 0, *self._complete(sample))
+        angle: float = do.run_tick(self._steps, self._memory, self._values, self._intercept)
+        return None if angle != angle else angle  # noqa: PLR0124 - NaN
+
+    def skip(self, ticks: int = 1) -> None:
+        """Take ticks that were not logged."""
+        nothing = dict.fromkeys(self.columns)
+        for _ in range(min(ticks, self._ticks + 1)):  # then nothing is left of before
+            self.step(nothing)
+
+    def restart(self) -> None:
+        """Begin another drive of the same car."""
+        self._memory[:] = self._begin
+
+    def _complete(self, sample: Mapping[str, float | None]) -> list[float]:
+        """Return the values of a sample, NaN where missing."""
+        if missing := [name for name in self.columns if name not in sample]:
+            raise InputError(f"{self._name} needs {', '.join(missing)} in every sample.")
+        values = [sample[name] for name in self.columns]
+        try:
+            return [np.nan if value is None else float(value) for value in values]
+        except (TypeError, ValueError):
+            raise InputError(f"{self._name}: a sample has what is no number.") from None
+
+
+def _known(manifest: Manifest, program: Program, given: Mapping[str, Any]) -> Car:
+    """Return a car: numbers in counts."""
+    numbers = {one.name: one for one in program.numbers}
+    used = {*numbers, *(one.name for one in program.facts)}
+    if unknown := sorted({*given} - used):
+        raise InputError(
+            f"{manifest.name} does not use {', '.join(unknown)} of a car. It uses: "
+            f"{', '.join(sorted(used)) or 'nothing'}."
+        )
+    counts = {
+        name: count
+        for name, one in numbers.items()
+        if given.get(name) is not None
+        and (count := round_number(_fraction(given[name]), _fraction(str(one.grain)))) is not None
+    }
+    return Car({name: value for name, value in given.items() if name not in numbers}, counts)
+
+
+def _fraction(value: Any) -> Fraction:
+    try:
+        return Fraction(value)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{value!r} is no number of a car.") from None
+
+
+class _Layout:
+    """Where everything of a program lies in memory, and the rows of its steps.
+
+    The value of a step lies at its number.
+    """
+
+    def __init__(self, program: Program, manifest: Manifest, car: Car) -> None:
+        """Take a program and a car."""
+        self._program, self._manifest = program, manifest
+        self._begin: list[int] = []
+        told = {"fact": car.fact_counts(program), "number": car.number_counts(program)}
+        for step in program.steps:
+            name, (first, *_) = operation_of(step), plain_of(step)
+            constant = first if name == "constant" else told[name][first] if name in told else None
+            self._keep((0 if name in ("sum", "values") else constant,))
+        self._rings = {
+            of: (self._keep((None,) * ticks), ticks, self._keep((0,)))
+            for of, ticks in program.rings.items()
+        }
+        self._rows = list(self._written())
+
+    def memory(self) -> IntArray:
+        """Return memory at the beginning of a drive."""
+        return np.array(self._begin, dtype=np.int64)
+
+    def rows(self) -> IntArray:
+        """Return the rows of all steps, in order."""
+        table = np.zeros((len(self._rows), do.ROW), dtype=np.int64)
+        for number, row in enumerate(self._rows):
+            table[number, : len(row)] = row
+        return table
+
+    def values(self) -> FloatArray:
+        """Return room for a sample, the scales of signals, coefficients, and scales of terms."""
+        signals, terms = self._program.signals, self._manifest.terms
+        scales = [float(one.scale) for one in signals]
+        coefficients = [term.coefficient for term in terms]
+        known = {one.name: float(one.scale) for one in signals}
+        worth = [known[t.signal] if t.logged else float(t.scale) for t in terms]
+        return np.array([np.nan] * len(signals) + scales + coefficients + worth)
+
+    def _keep(self, values: Sequence[int | None]) -> int:
+        place = len(self._begin)
+        self._begin += [do.MISSING if one is None else one for one in values]
+        return place
+
+    def _written(self) -> Iterator[tuple[int, ...]]:
+        signals, terms = self._program.signals, self._program.angle.terms
+        slid: set[tuple[int, ...]] = set()
+        at = list(range(len(self._program.steps)))
+        for place, step in enumerate(self._program.steps):
+            name, plain = operation_of(step), plain_of(step)
+            operands = [at[one] for one in operands_of(step)]
+            if self._changes_nothing(name, plain):
+                at[place] = operands[0]
+            elif name == "signal":
+                one = signals[plain[0]]
+                scale = len(signals) + plain[0]
+                yield (do.SIGNAL, place, plain[0], scale, one.min_count, one.max_count)
+            elif name == "ago":
+                yield (do.AGO, place, operands[0], *self._rings[plain[0]], plain[1])
+            elif name in ("sum", "values"):
+                if plain not in slid:
+                    yield self._slide(operands[0], *plain)
+                slid.add(plain)
+            elif name not in ("constant", "fact", "number"):
+                yield (do.CODES[name], place, operands[0], operands[-1])
+        for of, ring in self._rings.items():
+            if ring[1]:
+                yield (do.KEEP, 0, at[of], *ring)
+        first = 2 * len(signals)
+        for i, (column, _) in enumerate(terms):
+            yield (do.TERM, 0, at[column], first + i, first + len(terms) + i)
+
+    def _changes_nothing(self, name: str, plain: tuple[int, ...]) -> bool:
+        """Whether a step is always what it works on first: it takes no time then."""
+        ranges = self._program.ranges
+        if name == "clip":
+            return size_of(ranges[plain[0]]) <= ranges[plain[1]][1]
+        return name in ("nearest", "//") and ranges[plain[1]] == (1, 1)
+
+    def _slide(self, at: int, of: int, ticks: int, most: int) -> tuple[int, ...]:
+        """Return what brings a sum and its number of values to this tick."""
+        known = {step: place for place, step in enumerate(self._program.steps)}
+        both = [known.get((name, of, ticks, most)) for name in ("sum", "values")]
+        total, count = (self._keep((0,)) if one is None else one for one in both)
+        ring = self._rings[of] if ticks else (0, 0, 0)
+        return (do.SLIDE, total, at, *ring, ticks or most, count)

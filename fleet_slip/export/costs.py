@@ -10,13 +10,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from fleet_slip.base import number_of
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.export.c.c_source import step_lines
-from fleet_slip.export.c.c_steps import StepWriter, state_bytes
+from fleet_slip.export.c import StepWriter, state_bytes, step_lines
 from fleet_slip.export.compile import write_program
 from fleet_slip.export.program import Program
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.words import number_of
 
 COEFFICIENT_BYTES = 8
 """Two words of 32 bits."""

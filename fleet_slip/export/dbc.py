@@ -1,10 +1,9 @@
 """The messages of an estimator on a CAN bus, as a DBC file: what it needs, and what it says."""
 
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
-from fleet_slip.export.c.c_names import different
-from fleet_slip.export.fill_templates import fill_in_version
 from fleet_slip.export.program import Program
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.export.templating import different, fill_in_version
+from fleet_slip.models.registry import ModelVersion
 
 FIRST_ID = 0x100
 """Identifier of the first message; whose bus it is decides."""

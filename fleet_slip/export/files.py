@@ -1,33 +1,141 @@
 """The files that an export of a published version consists of."""
 
+import base64
+import binascii
+import hashlib
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Literal, get_args
 
-from fleet_slip.errors import ConfigError, UsageError
-from fleet_slip.export.c.c_gram import c_gram_header, c_gram_source
-from fleet_slip.export.c.c_names import c_prefix, file_prefix
-from fleet_slip.export.c.c_source import (
-    a2l_text,
-    c_fuzz_target,
-    c_header,
-    c_self_test,
-    c_source,
-)
-from fleet_slip.export.c.on_board import sets_on_board
-from fleet_slip.export.checks import Check, checks_csv, make_checks
-from fleet_slip.export.compile import compile_program
+from fleet_slip.base import canonical_json, sha256_of
+from fleet_slip.catalogue.definitions import LARGEST_FACT
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.columns.operations import CarFact
+from fleet_slip.config import parse_document, read_named_file
+from fleet_slip.errors import ConfigError, InputError, RefusedError, StorageError, UsageError
+from fleet_slip.export.c import a2l_text, c_fuzz_target, c_header, c_self_test, c_source
+from fleet_slip.export.c_gram import c_gram_header, c_gram_source, sets_on_board
+from fleet_slip.export.compile import Check, checks_csv, compile_program, make_checks
+from fleet_slip.export.costs import count_costs
 from fleet_slip.export.dbc import dbc_text
-from fleet_slip.export.document import document_of, manifest_of
-from fleet_slip.export.fill_templates import fill_in_version
 from fleet_slip.export.fmu import fmu
-from fleet_slip.export.program import Program
-from fleet_slip.export.sql_source import sql_macro, sql_statement
-from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.trained_drives import pack_hashes
-from fleet_slip.models.versions import Registry
+from fleet_slip.export.program import Angle, Input, Program
+from fleet_slip.export.sql import sql_macro, sql_statement
+from fleet_slip.export.templating import c_prefix, file_prefix, fill_in_version
+from fleet_slip.models.manifest import ImportedFrom, Manifest
+from fleet_slip.models.registry import ModelVersion, Registry
+from fleet_slip.models.trained_drives import checksum_of_drives, pack_hashes
+from fleet_slip.storage.documents import checksum
 from fleet_slip.warehouse.tables import Warehouse
+
+# A program as a JSON document, from which an implementation can be written: docs/export.md.
+#
+# Whole numbers that may need more than 53 bits are texts.
+
+FORMAT = "fleet-slip estimator"
+SCHEMA = 2
+"""Number of the schema: it changes if an implementation of before would compute something else."""
+
+
+def document_of(
+    version: ModelVersion, program: Program, checks: Sequence[Check], drives: bytes | None
+) -> dict[str, Any]:
+    """Return the document of a published version; `sha256` is of everything else in it.
+
+    `drives` is the content of the file about the drives that trained it.
+    """
+    told_by = version.manifest.trained_on.drives_sha256
+    if drives is not None:
+        told_by = checksum_of_drives(drives)
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "schema": SCHEMA,
+        "model": {
+            "reference": version.reference,
+            "sha256": version.sha256,
+            "drives_sha256": told_by,
+            "drives": None if drives is None else base64.b64encode(drives).decode("ascii"),
+            "manifest": version.manifest.model_dump(mode="json"),
+        },
+        "program": program_content(program),
+        "costs": count_costs(program).as_dict(),
+        "checks": [asdict(one) for one in checks],
+    }
+    return {**content, "sha256": sha256_of(canonical_json(content))}
+
+
+def program_content(program: Program) -> dict[str, Any]:
+    """Return the program alone."""
+    return {
+        "tick_s": str(float(SAMPLE_TIME_S)),
+        "signals": [_signal(one) for one in program.signals],
+        "facts": [_fact(one) for one in program.facts],
+        "numbers": [
+            {"name": one.name, "unit": one.unit, "grain": f"{one.grain:f}"}
+            for one in program.numbers
+        ],
+        "steps": [list(step) for step in program.steps],
+        "angle": _angle(program.angle),
+    }
+
+
+def _signal(one: Input) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "column": one.column,
+        "unit": one.unit,
+        "scale": f"{one.scale:f}",
+        "min": one.min_count,
+        "max": one.max_count,
+    }
+
+
+def _fact(one: CarFact) -> dict[str, Any]:
+    if one.equals is not None:
+        return {"name": one.name, "equals": one.equals}
+    return {"name": one.name, "largest": LARGEST_FACT}
+
+
+def _angle(angle: Angle) -> dict[str, Any]:
+    return {
+        "name": angle.name,
+        "column": angle.column,
+        "unit": angle.unit,
+        "scale": f"{angle.scale:f}",
+        "bits": angle.bits,
+        "intercept": str(angle.intercept),
+        "terms": [
+            {"step": step, "coefficient": str(coefficient)} for step, coefficient in angle.terms
+        ],
+        "error": f"{angle.error.numerator}/{angle.error.denominator}",
+        "largest": angle.largest,
+        "limit": angle.limit,
+    }
+
+
+def manifest_of(
+    version: ModelVersion, program: Program, to: str, files: Mapping[str, bytes]
+) -> dict[str, Any]:
+    """Return what is said of the files of an export: of which version, the error and the costs."""
+    angle = program.angle
+    return {
+        "format": "fleet-slip export",
+        "to": to,
+        "model": version.reference,
+        "sha256": version.sha256,
+        "drives_sha256": version.manifest.trained_on.drives_sha256,
+        "angle": {
+            "column": angle.column,
+            "unit": angle.unit,
+            "scale": f"{angle.scale:f}",
+            "error": f"{angle.error.numerator}/{angle.error.denominator}",
+        },
+        "costs": count_costs(program).as_dict(),
+        "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
+    }
+
 
 Target = Literal["json", "c", "sql", "dbc", "onnx", "fmu"]
 """What a version can be exported to."""
@@ -98,7 +206,7 @@ def log_version(version: ModelVersion, warehouse: Warehouse, uri: str) -> str:
     Raises `ConfigError` without the library, `UsageError` for a URI with a password, `StorageError`
     if the server does not take it, and what `export_files` raises.
     """
-    from fleet_slip.export.mlflow_log import log_to_mlflow  # noqa: PLC0415 - it renders documents
+    from fleet_slip.export.mlflow import log_to_mlflow  # noqa: PLC0415 - it renders documents
 
     subject = _subject(version, warehouse)
     content = document_of(version, subject.program, subject.checks, subject.drives)
@@ -153,7 +261,7 @@ def _dbc(subject: Subject) -> dict[str, str]:
 
 def _onnx(subject: Subject) -> dict[str, str | bytes]:
     try:
-        from fleet_slip.export.onnx_graph import onnx_model  # noqa: PLC0415 - it is optional
+        from fleet_slip.export.onnx import onnx_model  # noqa: PLC0415 - it is optional
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"ONNX needs the package {error.name}. Run: pip install 'fleet-slip[onnx]'"
@@ -205,3 +313,77 @@ _WRITERS: dict[str, Callable[[Subject], Mapping[str, str | bytes]]] = {
     "onnx": _onnx,
     "fmu": _fmu,
 }
+
+
+# Brings a version into a registry from the JSON document that another data root exported.
+
+LONGEST_FILE_BYTES = 2**28
+
+
+def import_version(registry: Registry, file: Path) -> ModelVersion:
+    """Add the version of a document as the next of its model, to which nothing points yet.
+
+    It says where it comes from. If the model's latest version is the same estimator, that is the
+    result. Raises `InputError` for a file that is no such document or was changed, and
+    `RefusedError` if a signal means something else here.
+    """
+    content = _read(file)
+    model = content["model"]
+    manifest = _manifest(file, model)
+    drives = _drives(file, model, manifest)
+    if program_content(compile_program(manifest)) != content["program"]:
+        raise RefusedError(
+            f"{file}: its signals have other scales or ranges than configs/signals.toml says here, "
+            "so that its counts would mean something else."
+        )
+    origin = manifest.imported_from or ImportedFrom(
+        reference=model["reference"], sha256=model["sha256"]
+    )
+    return registry.add(manifest.model_copy(update={"imported_from": origin}), drives)
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """Return a document whose checksum is right. Raises `InputError` for anything else."""
+    text = read_named_file(file, LONGEST_FILE_BYTES, InputError)
+    try:
+        content = json.loads(text)
+        known = (content["format"], content["schema"])
+        stated = content.pop("sha256")
+        found = sha256_of(canonical_json(content))
+        _ = content["model"]["manifest"], content["program"]
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise InputError(f"{file}: is no exported version. {_EXPORT}") from None
+    if known != (FORMAT, SCHEMA):
+        raise InputError(f"{file}: has format {known[0]!r}, schema {known[1]!r}. {_EXPORT}")
+    if stated != found:
+        raise InputError(f"{file}: was changed or damaged: its SHA-256 is another. {_EXPORT}")
+    return dict(content)
+
+
+_EXPORT = "Export it again with: fleet-slip export NAME@VERSION --to json"
+
+
+def _manifest(file: Path, model: Mapping[str, Any]) -> Manifest:
+    try:
+        manifest = parse_document(model["manifest"], Manifest, str(file), "its manifest")
+        reference, stated = str(model["reference"]), model["sha256"]
+    except (StorageError, KeyError) as error:
+        raise InputError(f"{file}: is no version that this program knows: {error}") from None
+    if checksum(model["manifest"]) != stated or reference.partition("@")[0] != manifest.name:
+        raise InputError(f"{file}: its manifest is not that of {reference[:100]!r}. {_EXPORT}")
+    return manifest
+
+
+def _drives(file: Path, model: Mapping[str, Any], manifest: Manifest) -> bytes | None:
+    """Return what tells the version's drives; None if nothing ever did."""
+    trained = manifest.trained_on
+    if trained.drives_sha256 is None:
+        return None
+    expected = trained.drives_sha256
+    try:
+        content = base64.b64decode(model["drives"], validate=True)
+    except (KeyError, TypeError, ValueError, binascii.Error):
+        content = b""
+    if checksum_of_drives(content) != expected:
+        raise InputError(f"{file}: lacks the hashes of the drives that trained it. {_EXPORT}")
+    return content

@@ -16,11 +16,10 @@ from tempfile import TemporaryDirectory
 from typing import Literal
 
 from fleet_slip.errors import ConfigError
-from fleet_slip.export.c.c_names import c_prefix, different
-from fleet_slip.export.c.c_source import c_header, c_source
-from fleet_slip.export.fill_templates import fill_in_version, read_source
+from fleet_slip.export.c import c_header, c_source
 from fleet_slip.export.program import Program
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.export.templating import c_prefix, different, fill_in_version, read_source
+from fleet_slip.models.registry import ModelVersion
 
 FmiVersion = Literal[2, 3]
 

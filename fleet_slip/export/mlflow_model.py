@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.config import parse_document
-from fleet_slip.models.estimates.predict import predict
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.predict import predict
 
 
 class LoggedVersion:

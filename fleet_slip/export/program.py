@@ -6,14 +6,248 @@
 * **The angle** is a dot product of steps, and missing where one of them is.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from fractions import Fraction
 from functools import cached_property
+from typing import Any
 
-from fleet_slip.columns.lowering import CarCount, CarFact, given_ranges
-from fleet_slip.columns.operations import Range, Step, plain_of, ranges_of, rings_of, roots_of
-from fleet_slip.export.fixed_point import FixedPoint
+import numpy as np
+
+from fleet_slip.columns.operations import (
+    CarCount,
+    CarFact,
+    Range,
+    Step,
+    given_ranges,
+    plain_of,
+    ranges_of,
+    rings_of,
+    roots_of,
+)
+from fleet_slip.compiling import inner_loop, kernel
+from fleet_slip.errors import RefusedError
+
+# Runs steps for one tick, compiled: a row of whole numbers for each.
+#
+# A row is an operation, the place in memory that it writes, and operands, which are places in
+# memory or plain numbers. Memory is int64; `MISSING` is a value that is not there.
+
+MISSING = -(2**63)
+
+(
+    ADD, SUBTRACT, MULTIPLY, DIVIDE, NEAREST, LEAST, MOST, NEGATIVE, ABSOLUTE, SIGN, CLIP,
+    AT_LEAST, WHERE,  # so far missing where an operand is
+    ELSE, SIGNAL, AGO, SLIDE, KEEP, TERM,
+) = range(19)  # fmt: skip
+"""What a tick does; `SLIDE` is the sums and the values of a window."""
+
+CODES = {
+    **{"+": ADD, "-": SUBTRACT, "*": MULTIPLY, "//": DIVIDE, "nearest": NEAREST, "min": LEAST},
+    **{"max": MOST, "negative": NEGATIVE, "abs": ABSOLUTE, "sign": SIGN, "clip": CLIP},
+    **{"at_least": AT_LEAST, "where": WHERE, "else": ELSE},
+}
+"""Operations of steps that are computed from values of the same tick."""
+
+ROW = 8
+"""Whole numbers of an operation."""
+
+
+@kernel
+def run_tick(rows: Any, memory: Any, values: Any, intercept: float) -> Any:
+    """Return the angle in rad of the next tick; NaN if there is none.
+
+    `values` has the given physical values of the signals first, then constants.
+    """
+    estimate = intercept
+    for n in range(len(rows)):
+        operation, out, a, b = rows[n, 0], rows[n, 1], rows[n, 2], rows[n, 3]
+        if operation < ELSE:
+            memory[out] = _calculate(operation, memory[a], memory[b])
+        elif operation == ELSE:
+            memory[out] = memory[b] if memory[a] == MISSING else memory[a]
+        elif operation == SIGNAL:
+            memory[out] = _count(values[a], values[b], rows[n, 4], rows[n, 5])
+        elif operation == TERM:
+            column = memory[a]
+            term = np.nan if column == MISSING else column * values[rows[n, 4]]
+            estimate += values[b] * term
+        else:
+            _remember(operation, memory, out, a, b, rows[n, 4], rows[n, 5], rows[n, 6], rows[n, 7])
+    return estimate
+
+
+@inner_loop
+def _calculate(operation: int, a: int, b: int) -> Any:
+    """Return what a step computes of two values; of one, both are the same."""
+    found = a
+    if MISSING in (a, b):
+        found = MISSING
+    elif operation == ADD:
+        found = a + b
+    elif operation == SUBTRACT:
+        found = a - b
+    elif operation == MULTIPLY:
+        found = a * b
+    elif operation in (DIVIDE, NEAREST):
+        found = _quotient(a, b, operation == NEAREST)
+    elif operation == LEAST:
+        found = min(a, b)
+    elif operation == MOST:
+        found = max(a, b)
+    elif operation == NEGATIVE:
+        found = -a
+    elif operation == ABSOLUTE:
+        found = abs(a)
+    elif operation == SIGN:
+        found = (1 if a > 0 else 0) - (1 if a < 0 else 0)
+    elif operation == CLIP:
+        found = max(-b, min(a, b))
+    elif operation == AT_LEAST and a < b:
+        found = MISSING
+    return found
+
+
+@inner_loop
+def _quotient(a: int, b: int, rounds: bool) -> Any:
+    if b <= 0:
+        return MISSING
+    size = (2 * abs(a) + b) // (2 * b) if rounds else abs(a) // b
+    return -size if a < 0 else size
+
+
+@inner_loop
+def _count(value: float, scale: float, least: int, most: int) -> Any:
+    """Return a physical value in counts, as the sensors round it: half to even."""
+    count = np.rint(value / scale)
+    inside = np.float64(least) <= count <= np.float64(most)
+    return np.int64(count) if inside else MISSING
+
+
+@inner_loop
+def _remember(
+    operation: int, memory: Any, out: int, a: int, b: int, c: int, d: int, e: int, f: int
+) -> None:
+    """Read or write a ring of `c` values at `b`, whose next place stands at `d`; or bring a sum
+    and its number of values, at `out` and `f`, to this tick."""
+    if operation == KEEP:
+        memory[b + memory[d]] = memory[a]
+        memory[d] = 0 if memory[d] + 1 == c else memory[d] + 1
+        return
+    if operation == AGO:
+        memory[out] = _ago(memory, b, c, memory[d], e)
+        return
+    oldest = _ago(memory, b, c, memory[d], e) if c else MISSING
+    if oldest != MISSING:
+        memory[out] -= oldest
+        memory[f] -= 1
+    # Without a ring, `e` is how many values are taken at most.
+    if memory[a] != MISSING and (c or memory[f] < e):
+        memory[out] += memory[a]
+        memory[f] += 1
+
+
+@inner_loop
+def _ago(memory: Any, ring: int, length: int, at: int, ticks: int) -> Any:
+    place = at - ticks
+    return memory[ring + (place if place >= 0 else place + length)]
+
+
+# Exact coefficients as integers, and a proof of how far the angle can be from the exact model.
+#
+# **The claim.** Let E be the exact angle in output counts, a sum b + sum(g_i * n_i) of rationals,
+# where n_i are counts of columns and |n_i| <= N_i. Let B = round(b * 2^F), C_i = round(g_i * 2^F)
+# and A = floor((B + sum(C_i * n_i)) / 2^F + 1/2). Then |A - E| <= 1/2 + (1 + sum(N_i)) / 2^(F + 1).
+#
+# **The proof.** Rounding to the nearest integer moves b * 2^F and each g_i * 2^F by at most 1/2. So
+# S = B + sum(C_i * n_i), an integer that is computed without an error, differs from E * 2^F by at
+# most (1 + sum(N_i)) / 2; and A from S / 2^F by at most 1/2. (An angle beyond 32 bits is clipped.)
+#
+# An output count is a tenth of a count of the label, so that this is far below half of one of
+# those. `fixed_point` takes the largest F for which each coefficient is two words of 32 bits, and
+# S two of 64 bits, each of which adds up one part of every coefficient, and none of which can
+# overflow.
+
+OUTPUT_COUNTS = 10
+"""Counts of the angle for one count of the label."""
+
+LOW_BITS = 31
+"""Most bits of the lower part of a coefficient, so that it is a word of 32 bits."""
+
+LARGEST_PART = 2**31 - 1
+"""Largest size of the upper part."""
+
+LARGEST_SUM = 2**62
+"""No sum of parts, nor the rounding after it, reaches this."""
+
+LARGEST_ANGLE = 2**31 - 1
+"""Largest size of the angle, a word of 32 bits: what is beyond, thousands of turns, is clipped."""
+
+_TOO_LARGE = (
+    "the coefficients are so large, for what the columns can count, that no bound of the angle's "
+    "error can be stated. Publish a model with fewer or other signals."
+)
+
+
+@dataclass(frozen=True)
+class FixedPoint:
+    """A dot product of integers.
+
+    Attributes:
+        bits: of the fraction, F.
+        low_bits: of the lower part of each coefficient, which is not negative.
+        intercept, coefficients: over 2^bits.
+        error: bound of |A - E|, in counts of the output.
+        largest: bound of |A|, before it is clipped.
+    """
+
+    bits: int
+    low_bits: int
+    intercept: int
+    coefficients: tuple[int, ...]
+    error: Fraction
+    largest: int
+
+    @property
+    def parts(self) -> tuple[tuple[int, int], ...]:
+        """The upper and lower part of the intercept, then of each coefficient."""
+        return tuple(divmod(c, 1 << self.low_bits) for c in (self.intercept, *self.coefficients))
+
+
+def fixed_point(
+    intercept: Fraction, coefficients: Sequence[Fraction], largest: Sequence[int]
+) -> FixedPoint:
+    """Return the integers of a dot product, given the largest size of each factor, N_i.
+
+    Raises `RefusedError` if the bound would be above half a count of the label.
+    """
+    sizes = sum(largest)
+    low_bits = min(LOW_BITS, (LARGEST_SUM - 1).bit_length() - (sizes + 1).bit_length())
+    bits = _most_bits(intercept, coefficients, largest, low_bits)
+    scaled = [round(one * 2**bits) for one in (intercept, *coefficients)]
+    error = Fraction(1, 2) + Fraction(1 + sizes, 2 ** (bits + 1))
+    size = abs(intercept) + sum(abs(g) * n for g, n in zip(coefficients, largest, strict=True))
+    if error > Fraction(OUTPUT_COUNTS, 2):
+        raise RefusedError(_TOO_LARGE)
+    return FixedPoint(bits, low_bits, scaled[0], tuple(scaled[1:]), error, int(size + error))
+
+
+def _most_bits(
+    intercept: Fraction, coefficients: Sequence[Fraction], largest: Sequence[int], low_bits: int
+) -> int:
+    """Return the largest F with which the sum of the upper parts stays below `LARGEST_SUM`."""
+    sizes = (1, *largest)
+    bits = low_bits + 62
+    while bits > low_bits:
+        upper = [round(one * 2**bits) >> low_bits for one in (intercept, *coefficients)]
+        total = sum(abs(c) * n for c, n in zip(upper, sizes, strict=True))
+        # The carry of the lower parts, and half of an output count, come to it.
+        carried = total + 2 ** (62 - low_bits) + 2 ** (bits - low_bits)
+        if carried < LARGEST_SUM and max(map(abs, upper[1:])) <= LARGEST_PART:
+            return bits
+        bits -= 1
+    raise RefusedError(_TOO_LARGE)
 
 
 @dataclass(frozen=True)
@@ -33,7 +267,7 @@ class Angle(FixedPoint):
     """The dot product: `(intercept + sum(coefficient * step)) / 2^bits`, in counts of `scale`.
 
     Rounded to the nearest integer, halves up, and clipped to 32 bits. How far it is from the exact
-    model is proven in `fleet_slip.export.fixed_point`.
+    model is proven in `fleet_slip.export.program`.
 
     Attributes:
         name, column, unit: what is estimated.

@@ -7,15 +7,62 @@ import math
 import re
 from decimal import Decimal
 from fractions import Fraction
-from typing import Annotated, Literal, Self
+from hashlib import sha256
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, FiniteFloat, model_validator
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    Field,
+    FiniteFloat,
+    PlainSerializer,
+    PlainValidator,
+    model_validator,
+)
 
 from fleet_slip.catalogue.definitions import Definition, integer_arithmetic, plain_column
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
-from fleet_slip.models.exact_fraction import ExactFraction
+from fleet_slip.grams.gram_rows import Hashes
+
+# Fractions in the documents of models, exact however long they are.
+
+MOST_DIGITS = 4000
+"""Most decimal digits of a number that stands in decimal; Python refuses longer ones as text."""
+
+_FRACTION = re.compile(r"-?[0-9]{1,4000}/[0-9]{1,4000}")
+_LONG_FRACTION = re.compile(r"-?0x[0-9a-f]{1,30000}/0x[0-9a-f]{1,30000}")
+"""In hexadecimal, as models of hundreds of inputs need it."""
+
+
+def _exact_fraction(value: Any) -> Fraction:
+    """Return a fraction, also from its text "3/4". Raises `ValueError` for anything else."""
+    if isinstance(value, Fraction):
+        return value
+    if isinstance(value, str) and _FRACTION.fullmatch(value):
+        base = 10
+    elif isinstance(value, str) and _LONG_FRACTION.fullmatch(value):
+        base = 16
+    else:
+        raise ValueError("is not a fraction such as 3/4")
+    numerator, denominator = (int(part, base) for part in value.split("/"))
+    if not denominator:
+        raise ValueError("is divided by zero")
+    return Fraction(numerator, denominator)
+
+
+def _fraction_text(value: Fraction) -> str:
+    """Return the text of a fraction, such as "3/4"; "0x3/0x4" if it were too long in decimal."""
+    numerator, denominator = value.numerator, value.denominator
+    if max(abs(numerator), denominator) < 10**MOST_DIGITS:
+        return f"{numerator}/{denominator}"
+    return f"{numerator:#x}/{denominator:#x}"
+
+
+ExactFraction = Annotated[
+    Fraction, PlainValidator(_exact_fraction), PlainSerializer(_fraction_text)
+]
 
 Scale = Annotated[Decimal, Field(ge=Decimal("1e-12"), le=Decimal("1e12"), allow_inf_nan=False)]
 
@@ -272,3 +319,25 @@ def require_model_name(name: str) -> str:
             "with a letter, at most 41."
         )
     return name
+
+
+# Hashes of drives as they stay where rows go: salted with a model's name.
+
+_SALT = b"fleet-slip trained drives\n"
+_AT_ONCE = 2**20
+
+
+def hash_drives(name: str, drives: Hashes) -> Hashes:
+    """Return the salted hashes of drives, as the versions of a model keep them, sorted."""
+    return np.sort(salt_drives(name, drives))
+
+
+def salt_drives(name: str, drives: Hashes) -> Hashes:
+    """Return the salted hash of each drive, in the order of the drives."""
+    salt, numbers = _SALT + name.encode(), drives.astype("<u8")
+    hashed = np.empty(len(drives), dtype=np.uint64)
+    for first in range(0, len(drives), _AT_ONCE):
+        some = numbers[first : first + _AT_ONCE].tobytes()
+        digests = [sha256(salt + some[at : at + 8]).digest()[:8] for at in range(0, len(some), 8)]
+        hashed[first : first + _AT_ONCE] = np.frombuffer(b"".join(digests), dtype=">u8")
+    return hashed

@@ -1,16 +1,276 @@
 """From a selection's winner to a published model version, unless the champion is better."""
 
 import functools
-from dataclasses import dataclass
+import math
+from dataclasses import asdict, dataclass, fields, replace
+from fractions import Fraction
+from importlib.metadata import version as package_version
 from typing import Any
 
-from fleet_slip.models.acceptance.judgement import judge
-from fleet_slip.models.aliases import CANDIDATE, CHAMPION, AliasMove
-from fleet_slip.models.describe_winner import drives_of
-from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.versions import Registry
-from fleet_slip.selection.select_models import Selection
+from fleet_slip.catalogue.facts import TRAINING_DRIVES
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import ConfigError, QuestionError
+from fleet_slip.grams.cohort import TaughtCohort
+from fleet_slip.models.acceptance import judge
+from fleet_slip.models.manifest import (
+    CrossValidated,
+    LearnedFrom,
+    Manifest,
+    ModelLabel,
+    ModelTerm,
+    SelectedBy,
+    TrainedOn,
+    hash_drives,
+)
+from fleet_slip.models.registry import CANDIDATE, CHAMPION, AliasMove, ModelVersion, Registry
+from fleet_slip.models.request import SelectionRequest, load_model_list
+from fleet_slip.models.select import GIVEN, RequestedSelection, Selection, checksum_of_list
+from fleet_slip.models.straight_on import StraightOn, straight_on
+from fleet_slip.models.trained_drives import checksum_of_drives, pack_hashes
+from fleet_slip.regression.folds import CrossValidation
+from fleet_slip.storage.runs import with_all_drives
+from fleet_slip.warehouse.condition import parse_cohort
+from fleet_slip.warehouse.tables import Warehouse
+
+# How a model is trained again: as its champion was, and whether that would change anything.
+
+COHORT = "cohort"
+"""Key of the condition that was asked, where cars were left out of it."""
+
+_WHAT = {"models", "model", "nested", "features", "label", "rank", "criterion", "all_subsets"}
+_WHAT |= {"search", "most"}
+"""What says which models are compared: who asks for one of these asks for all anew."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What is asked for, of which drives, and in words whose it is and what is new in it."""
+
+    request: SelectionRequest
+    cohort: str
+    told: str = ""
+
+
+def asked_of(selection: RequestedSelection) -> dict[str, Any] | None:
+    """Return what a manifest keeps of what was asked for; None if its list says it all."""
+    asked = _asked(selection.request)
+    if asked.keys() <= {"models"}:
+        return None
+    whole = selection.asked == selection.cohort.condition.text
+    return asked if whole else {**asked, COHORT: selection.asked}
+
+
+def recipe_for(
+    registry: Registry, name: str, request: SelectionRequest, cohort: str | None = None
+) -> Recipe:
+    """Return how to train a model as before, but for what is asked. Raises `QuestionError`."""
+    before = _newest(registry, name)
+    asked = _asked(request)
+    if before is None:
+        return Recipe(request, cohort or TRAINING_DRIVES)
+    chosen_from = before.manifest.selected_by.model_list
+    was = with_all_drives(before.manifest.trained_on.cohort)
+    if asked.keys() & _WHAT:
+        wanted = request
+        told = f"not as {before.reference}, chosen from {chosen_from}"
+    else:
+        kept, was = _kept(before)
+        wanted = replace(kept, **asked)
+        told = f"trained as {before.reference}, chosen from {chosen_from}"
+    if cohort is None or cohort == was:
+        return Recipe(wanted, was, f"{told}, on drives where {was}")
+    return Recipe(wanted, cohort, f"{told}, but not on drives where {was}: this is where {cohort}")
+
+
+def _asked(request: SelectionRequest) -> dict[str, Any]:
+    usual = asdict(SelectionRequest())
+    return {name: value for name, value in asdict(request).items() if value != usual[name]}
+
+
+def _newest(registry: Registry, name: str) -> ModelVersion | None:
+    if name not in registry.names():
+        return None
+    numbers = registry.versions(name)
+    return registry.champion(name) or (registry.load(name, numbers[-1]) if numbers else None)
+
+
+def _kept(version: ModelVersion) -> tuple[SelectionRequest, str]:
+    manifest = version.manifest
+    chosen = manifest.selected_by
+    cohort = with_all_drives(manifest.trained_on.cohort)
+    if chosen.asked is None:
+        return _of_list(manifest, version.reference), cohort
+    known = {field.name for field in fields(SelectionRequest)}
+    asked: dict[str, Any] = {name: one for name, one in chosen.asked.items() if name in known}
+    return SelectionRequest(**asked), with_all_drives(str(chosen.asked.get(COHORT, cohort)))
+
+
+def _of_list(manifest: Manifest, reference: str) -> SelectionRequest:
+    name = manifest.selected_by.model_list
+    if name == GIVEN:
+        feature_set = features().name_of(manifest.trained_on.feature_set)
+        return SelectionRequest(model=",".join(manifest.signals), features=feature_set)
+    try:
+        load_model_list(name)
+    except ConfigError:
+        raise QuestionError(
+            f"{reference} was chosen from {name!r}, which is no model list here. Say what to "
+            "compare, such as models = estimator."
+        ) from None
+    return SelectionRequest(models=name)
+
+
+def is_up_to_date(
+    manifest: Manifest, warehouse: Warehouse, cohort: str, models: str, worth: str | None
+) -> bool:
+    """Return whether a selection from a model list would come to this manifest again.
+
+    It is a function of table versions, cohort, list and program. Raises `ConfigError` for the list.
+    """
+    model_list = load_model_list(models)
+    trained, chosen = manifest.trained_on, manifest.selected_by
+    made_from = (
+        trained.cohort,
+        trained.feature_set,
+        trained.logs_version,
+        trained.grams_version,
+        chosen.model_list,
+        chosen.config_sha256,
+        manifest.package_version,
+    )
+    return manifest.imported_from is None and made_from == (
+        cohort,
+        features().identity(model_list.features),
+        warehouse.logs.snapshot().version or 0,  # none, where cars send Gram rows alone
+        warehouse.grams.snapshot().version,
+        models,
+        checksum_of_list(model_list, worth),
+        package_version("fleet-slip"),
+    )
+
+
+# What a selection's winner is, as the manifest of a model version.
+
+
+def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
+    """Describe the winner of a selection as a manifest."""
+    signals = catalogue()
+    winner = selection.winner.model
+    label = signals[signals.label]
+    wanted = (*winner.signals, signals.label)
+    drives = drives_of(selection, name)
+    beside = rows_beside = 0
+    if isinstance(selection.cohort, TaughtCohort):
+        beside, rows_beside = selection.cohort.count_others(wanted)
+    return Manifest(
+        name=name,
+        label=ModelLabel(
+            signal=signals.label, column=label.column, unit=label.unit, scale=label.scale
+        ),
+        intercept=winner.model.offset,
+        intercept_exact=winner.model.intercept,
+        through_origin=not selection.intercept,
+        terms=tuple(
+            _term(signal, exact)
+            for signal, exact in zip(winner.signals, winner.model.coefficients, strict=True)
+        ),
+        cross_validation=_cross_validated(winner, selection),
+        trained_on=TrainedOn(
+            cohort=selection.cohort.condition.text,
+            feature_set=features().identity(selection.cohort.feature_set),
+            drives=winner.drives + beside,
+            vehicles=selection.cohort.members.count_vehicles_with(wanted),
+            drives_without_log=selection.cohort.members.count_received_with(wanted) or None,
+            rows=winner.pooled.rows + rows_beside,
+            logs_version=selection.cohort.logs_version,
+            grams_version=selection.cohort.grams_version,
+            drives_sha256=checksum_of_drives(drives),
+        ),
+        selected_by=SelectedBy(
+            model_list=selection.model_list,
+            model=winner.name,
+            reason=selection.winner.reason,
+            config_sha256=selection.config_sha256,
+            asked=asked_of(selection),
+        ),
+        package_version=package_version("fleet-slip"),
+    )
+
+
+def with_straight_intercept(
+    warehouse: Warehouse, manifest: Manifest, selection: Selection[Any]
+) -> Manifest:
+    """Return a manifest with the intercept that changes do not tell, if changes taught its model.
+
+    One through the origin keeps 0, of no cars. Raises `DataError` if the cars do not tell their
+    sensors' offsets.
+    """
+    name = features().name_of(manifest.trained_on.feature_set)
+    change_s = features().feature_set(name).change_s
+    if not change_s:
+        return manifest
+    found = StraightOn(Fraction(0), {}, None, 0.0, 0)
+    if not manifest.through_origin:
+        found = straight_on(warehouse, parse_cohort(manifest.trained_on.cohort), manifest)
+    weight = selection.cohort.weight if isinstance(selection.cohort, TaughtCohort) else None
+    learned = LearnedFrom(
+        label="course" if weight is None else "course+sideslip",
+        weight=weight,
+        change_s=float(change_s[0]) if len(change_s) == 1 else tuple(map(float, change_s)),
+        cars=found.cars,
+        intercept_uncertainty_deg=(
+            None if found.uncertainty is None else math.degrees(found.uncertainty)
+        ),
+        intercept_spread_deg=math.degrees(found.spread),
+    )
+    scales = input_scales()
+    terms = (_term(column, slope / scales[column]) for column, slope in found.slopes.items())
+    own = {"intercept": float(found.intercept), "intercept_exact": found.intercept}
+    taught = {"learned_from": learned, "terms": (*manifest.terms, *terms)}
+    return manifest.model_copy(update={**own, **taught})
+
+
+def drives_of(selection: Selection[Any], name: str) -> bytes:
+    """Return the salted hashes of the drives that a selection's winner was trained on, packed."""
+    signals = (*selection.winner.model.signals, catalogue().label)
+    return pack_hashes(hash_drives(name, selection.cohort.members.drives_with(signals)))
+
+
+def _term(name: str, coefficient: Fraction) -> ModelTerm:
+    known = features()
+    one = known.of(name)
+    definition = known.definition(name)
+    return ModelTerm(
+        signal=name,
+        column=one.column,
+        unit=one.unit,
+        scale=one.scale,
+        sql=known.features[name].sql if name in known.features and not definition else "",
+        definition=definition,
+        signal_scales=(
+            {signal: catalogue()[signal].scale for signal in definition.signals}
+            if definition
+            else None
+        ),
+        coefficient=float(coefficient),
+        coefficient_exact=coefficient,
+    )
+
+
+def _cross_validated(winner: CrossValidation, selection: RequestedSelection) -> CrossValidated:
+    figures = winner.pooled
+    return CrossValidated(
+        folds_by=selection.folds.by,
+        folds=len(winner.folds),
+        correlation=figures.correlation,
+        correlation_standard_error=winner.standard_error,
+        rmse_deg=figures.rmse_deg,
+        error_mean_deg=figures.error_mean_deg,
+        error_std_deg=figures.error_std_deg,
+        condition_number=winner.condition_number,
+        label_noise_deg=selection.label_noise_deg,
+    )
 
 
 @dataclass(frozen=True)

@@ -15,19 +15,19 @@ from statistics import NormalDist
 
 import numpy as np
 
-from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.car_numbers import NumberName
+from fleet_slip.base import FloatArray
+from fleet_slip.catalogue.facts import NumberName
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.blocks.drive_columns import DriveCounts
+from fleet_slip.columns.drive_columns import DriveCounts
 from fleet_slip.errors import DataError
-from fleet_slip.grams.calibration.calibration import calibrate
-from fleet_slip.grams.calibration.car_evidence import CalibratedNumber
-from fleet_slip.grams.cohorts.gram_cohort import Cohort, load_cohort
-from fleet_slip.models.estimates.predictor import Predictor
+from fleet_slip.grams.calibration import calibrate
+from fleet_slip.grams.car_evidence import CalibratedNumber
+from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import LinearModel, fit
+from fleet_slip.models.predict import Predictor
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import LinearModel, fit
 from fleet_slip.warehouse.condition import Condition
 from fleet_slip.warehouse.tables import Warehouse
 

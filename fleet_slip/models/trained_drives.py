@@ -11,12 +11,11 @@ from hashlib import sha256
 
 import numpy as np
 
-from fleet_slip.arrays import BoolArray
+from fleet_slip.base import BoolArray
 from fleet_slip.errors import StorageError
-from fleet_slip.files.folder import Folder
-from fleet_slip.grams.rows.gram_rows import Hashes
-from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.salted_drives import salt_drives
+from fleet_slip.grams.gram_rows import Hashes
+from fleet_slip.models.manifest import Manifest, salt_drives
+from fleet_slip.storage.folder import Folder
 
 
 @dataclass(frozen=True)

@@ -15,23 +15,24 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
 
-from fleet_slip.arrays import FloatArray
-from fleet_slip.canonical import canonical_ascii, sha256_of
+from fleet_slip.base import FloatArray, canonical_ascii, sha256_of
 from fleet_slip.catalogue.signals import Identifier
-from fleet_slip.config import Config, load_config, load_toml
+from fleet_slip.config import Config, find_config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
-from fleet_slip.resources import find_config
-from fleet_slip.simulation.drive_plan import FleetPlan, GridPlan
 from fleet_slip.simulation.imperfections import NONE, Imperfections
-from fleet_slip.simulation.manoeuvres import Manoeuvre
-from fleet_slip.simulation.random_numbers import random_generator
-from fleet_slip.simulation.sensing.distortion import Distortion
-from fleet_slip.simulation.sensing.receivers import Receiver, Receivers
-from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ, Sensors
-from fleet_slip.simulation.surface import surface
-from fleet_slip.simulation.track import SpeedLimits, SpeedProfile, Track, speed_profile
-from fleet_slip.simulation.trials import TrialPlan
-from fleet_slip.vehicle.lanes.road import Surface
+from fleet_slip.simulation.plan import FleetPlan, GridPlan, TrialPlan
+from fleet_slip.simulation.receivers import Receiver, Receivers
+from fleet_slip.simulation.roads import (
+    Manoeuvre,
+    SpeedLimits,
+    SpeedProfile,
+    Track,
+    random_generator,
+    speed_profile,
+    surface,
+)
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Distortion, Sensors
+from fleet_slip.vehicle.batch import Surface
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 ROAD_SPACING_M = 1.0

@@ -9,14 +9,16 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple, SupportsFloat
 
+import gymnasium
 import numba
 import numpy as np
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from fleet_slip.base import needed
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.compiling import equation
 from fleet_slip.errors import UsageError
-from fleet_slip.extras import needed
 from fleet_slip.vehicle.dynamics import (
     Acceleration,
     Derivative,
@@ -87,8 +89,7 @@ def move(
 
 
 with needed("highway", "an environment for controllers"):
-    import gymnasium
-    from gymnasium.spaces import Box
+    pass
 
 Observation = NDArray[np.float32]
 WHEELS = ("fl", "fr", "rl", "rr")

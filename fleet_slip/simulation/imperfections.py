@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from fleet_slip.config import Config, added
-from fleet_slip.vehicle.car_imperfections import CarImperfections
+from fleet_slip.vehicle.imperfections import CarImperfections
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]

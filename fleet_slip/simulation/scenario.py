@@ -13,17 +13,16 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from fleet_slip.canonical import sha256_of
+from fleet_slip.base import sha256_of
+from fleet_slip.catalogue.facts import SCENARIO
 from fleet_slip.catalogue.signals import Identifier, catalogue
-from fleet_slip.catalogue.sources import SCENARIO
-from fleet_slip.config import Config, load_config, load_toml
+from fleet_slip.config import Config, config_names, find_config, load_config, load_toml
 from fleet_slip.errors import ConfigError
-from fleet_slip.resources import config_names, find_config
 from fleet_slip.simulation.campaign import Batch, DriveSpec, merged
-from fleet_slip.simulation.drive_plan import NamedTrack, NamedVehicle
 from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative, Positive
-from fleet_slip.simulation.sensing.sensors import GPS_SIGNALS, Sensors
-from fleet_slip.simulation.track import SpeedLimits, SpeedProfile
+from fleet_slip.simulation.plan import NamedTrack, NamedVehicle
+from fleet_slip.simulation.roads import SpeedLimits, SpeedProfile
+from fleet_slip.simulation.sensors import GPS_SIGNALS, Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 DAY = date(2024, 4, 1)

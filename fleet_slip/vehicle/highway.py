@@ -9,11 +9,13 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import Any, NamedTuple, Self
 
+import numba
 import numpy as np
+from highway_env.vehicle.dynamics import BicycleVehicle
+from highway_env.vehicle.kinematics import Vehicle
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.base import FloatArray, needed
 from fleet_slip.compiling import equation
-from fleet_slip.extras import needed
 from fleet_slip.vehicle.dynamics import NO_EXTENSIONS, Extensions, build_derivative
 from fleet_slip.vehicle.integration import (
     FIRST_ORDER,
@@ -34,9 +36,7 @@ from fleet_slip.vehicle.parameters import (
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
 with needed("highway", "the car as a highway-env vehicle"):
-    import numba
-    from highway_env.vehicle.dynamics import BicycleVehicle
-    from highway_env.vehicle.kinematics import Vehicle
+    pass
 
 NO_SLOPES = Slopes(*(0.0 for _ in Slopes._fields))
 

@@ -17,11 +17,17 @@ from typing import Any
 
 import duckdb
 
+from fleet_slip.catalogue.facts import SCENARIO, TRAINING_DRIVES
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.catalogue.sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, StorageError, printable
-from fleet_slip.warehouse.database import duckdb_message, reading_files
-from fleet_slip.warehouse.read_only_sql import LONGEST_QUERY, Tree, columns_of, problems
+from fleet_slip.warehouse.database import (
+    LONGEST_QUERY,
+    Tree,
+    columns_of,
+    duckdb_message,
+    problems,
+    reading_files,
+)
 
 LONGEST_S = 3600.0
 """No condition is asked for longer: what a manifest keeps is read by jobs that nobody watches."""

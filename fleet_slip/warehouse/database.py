@@ -1,20 +1,27 @@
 """DuckDB connections: how they are opened, what they may use, and how their errors are told."""
 
 import contextlib
+import json
 import resource
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, wait
-from typing import TypeVar
+from itertools import accumulate
+from typing import Any, TypeVar
 
 import duckdb
 
-from fleet_slip.errors import FleetSlipError, QueryGoesOnError, QuestionError, StorageError
-from fleet_slip.files.checksums import check_local_files
-from fleet_slip.files.folder import Folder
+from fleet_slip.errors import (
+    FleetSlipError,
+    QueryGoesOnError,
+    QuestionError,
+    StorageError,
+    printable,
+)
 from fleet_slip.limits import data_needed, memory_bytes
+from fleet_slip.storage.folder import Folder, check_local_files
 
 SPILL_LIMIT = "20GB"
 """Largest size of what one connection may write to disk for a query beyond its memory."""
@@ -204,3 +211,214 @@ def duckdb_message(error: BaseException) -> str:
 
 
 _RESTORE = "If a file is missing or damaged, restore it from a backup."
+
+
+# Which SQL may come from people: queries that only read, and conditions that last.
+#
+# The type of a statement does not tell. DuckDB lets a SELECT begin with a common table expression
+# that copies rows to a file or changes a table, and has table functions that run SQL from a
+# string. So what the parser made of the text is searched, where neither comments nor quotes hide
+# anything. A condition, which manifests keep, may moreover be made only of what means the same
+# everywhere, for ever.
+
+LONGEST_QUERY = 100_000
+"""Characters of one query. Planning takes more than linear time in some of them."""
+
+QUERY_NODES = frozenset({"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"})
+"""Parts of a statement that read. Others, such as COPY_QUERY_NODE, write."""
+
+CATALOGUE_PREFIX = "duckdb_"
+
+_SYMBOLS = frozenset({"+", "-", "*", "/", "//", "%", "||", "~~", "!~~", "~~*", "!~~*", "~~~"})
+"""Operators that are functions to DuckDB; the last ones are LIKE, ILIKE and GLOB."""
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+TABLE_FUNCTIONS = _words(
+    """
+    generate_series histogram histogram_values json_each json_tree parquet_file_metadata
+    parquet_full_metadata parquet_metadata parquet_schema pragma_table_info range read_parquet
+    repeat repeat_row summary unnest
+    """
+)
+"""What may stand after FROM like a function, beside duckdb_tables() and its like."""
+
+
+def split_statements(database: duckdb.DuckDBPyConnection, text: str) -> list[str]:
+    """Return the statements of a text; the text itself where it has none, or is not valid SQL."""
+    if len(text) > LONGEST_QUERY:
+        return [text]
+    try:
+        return [one.query for one in database.extract_statements(text)] or [text]
+    except (UnicodeEncodeError, duckdb.Error):
+        return [text]
+
+
+def one_query(database: duckdb.DuckDBPyConnection, text: str) -> str:
+    """Return the text if it is one statement that only reads. Raises `QuestionError`."""
+    if len(text) > LONGEST_QUERY:
+        raise QuestionError(
+            f"the query has {len(text):,} characters, at most {LONGEST_QUERY:,} are read."
+        )
+    try:
+        text.encode()
+        statements = database.extract_statements(text)
+    except UnicodeEncodeError:
+        raise QuestionError("not valid SQL: it is not Unicode text.") from None
+    except duckdb.Error as error:
+        raise QuestionError(f"not valid SQL: {duckdb_message(error)}") from None
+    if len(statements) != 1:
+        raise QuestionError(f"one SQL statement is expected, not {len(statements)}.")
+    explained = statements[0].type == duckdb.StatementType.EXPLAIN
+    _require_reading(database, _explained(text) if explained else text)
+    return text
+
+
+def _explained(text: str) -> str:
+    """Return what an EXPLAIN statement explains; EXPLAIN ANALYZE runs it."""
+    encoded = text.encode()
+    tokens = [start for start, kind in duckdb.tokenize(text) if kind != duckdb.token_type.comment]
+    ends = [*tokens[1:], len(encoded)]
+    words = [encoded[a:b].split()[0].lower() for a, b in zip(tokens, ends, strict=True)]
+    begin = 2 if words[1] == b"analyze" else 1
+    if words[1] == b"(":  # options in parentheses, or a query in parentheses
+        depths = accumulate((word == b"(") - (word == b")") for word in words[1:])
+        after = 2 + next(i for i, depth in enumerate(depths) if depth == 0)
+        begin = after if after < len(tokens) else 1
+    return encoded[tokens[begin] :].decode()
+
+
+def _require_reading(database: duckdb.DuckDBPyConnection, text: str) -> None:
+    statement = "SELECT json_serialize_sql($text::VARCHAR)"
+    [(serialised,)] = database.execute(statement, {"text": text}).fetchall()
+    try:
+        tree = json.loads(serialised, object_hook=_checked)
+    except RecursionError:
+        raise QuestionError("the query is nested too deeply. Divide it into parts.") from None
+    if tree["error"]:
+        raise QuestionError(
+            "only queries are allowed here (SELECT, WITH, DESCRIBE, SUMMARIZE, EXPLAIN; a PIVOT "
+            "with IN): the warehouse is written by the jobs alone."
+        )
+
+
+def _checked(node: dict[str, Any]) -> dict[str, Any]:
+    """Return a node of the parsed statement. Raises `QuestionError` if it may do harm."""
+    kind = node.get("type")
+    if not isinstance(kind, str):
+        return node
+    if kind.endswith("_NODE") and kind not in QUERY_NODES:
+        raise QuestionError(
+            "the query would write: only reading is allowed here. The warehouse is written by the "
+            "jobs alone."
+        )
+    if kind == "VALUE_PARAMETER":
+        raise QuestionError("the query has a parameter, and nothing gives it a value.")
+    if kind == "TABLE_FUNCTION":
+        name = str(node["function"]["function_name"]).lower()
+        if name not in TABLE_FUNCTIONS and not name.startswith(CATALOGUE_PREFIX):
+            raise QuestionError(
+                f"the function {name!r} cannot be called after FROM here. Functions: "
+                f"{', '.join(sorted(TABLE_FUNCTIONS))}, and those that begin with duckdb_."
+            )
+    return node
+
+
+Tree = Mapping[str, Any]
+"""An expression as DuckDB's parser serialises it."""
+
+_EXPRESSIONS = _words(
+    "BETWEEN CASE CAST COLUMN_REF COMPARISON CONJUNCTION CONSTANT FUNCTION OPERATOR TYPE"
+)
+"""Kinds of expressions, as DuckDB calls them; others are subqueries, windows, lambdas, stars …"""
+
+_OPERATORS = _words(
+    "COMPARE_IN COMPARE_NOT_IN OPERATOR_COALESCE OPERATOR_IS_NOT_NULL OPERATOR_IS_NULL OPERATOR_NOT"
+)
+
+
+FUNCTIONS = _words(
+    """
+        abs ceil ceiling floor greatest least mod nullif round sign sqrt trunc
+        contains ends_with left length lower ltrim prefix right rtrim split_part starts_with strpos
+        substr substring suffix trim upper
+        regexp_full_match regexp_matches like_escape not_like_escape ilike_escape not_ilike_escape
+        list_value md5 sha256
+        date_diff date_part date_trunc datediff datepart datetrunc day dayofmonth dayofweek
+        dayofyear isodow isoyear make_date month quarter week weekday weekofyear year yearweek
+        to_days to_months to_weeks to_years
+        """,
+)
+"""Functions of their arguments alone, the same on every machine and in every version of DuckDB.
+
+None makes a text longer than its arguments together, so that the cost of a condition is bounded by
+its length. `to_days` and its like are what INTERVAL becomes, `list_value` is a list in brackets."""
+
+TYPES = _words("BOOLEAN TINYINT SMALLINT INTEGER BIGINT HUGEINT FLOAT DOUBLE DECIMAL VARCHAR DATE")
+"""What may be cast to. Not a time with a zone: the zone is the machine's."""
+
+
+def problems(tree: Tree, columns: frozenset[str]) -> Iterator[str]:
+    """Yield what is not allowed in an expression on some columns, as what a condition does."""
+    for node in _nodes(tree):
+        if problem := _problem(node, columns):
+            yield problem
+
+
+def columns_of(tree: Tree) -> frozenset[str]:
+    """Return the columns that an expression without problems asks for."""
+    return frozenset(
+        name.lower()
+        for node in _nodes(tree)
+        if node.get("class") == "COLUMN_REF"
+        for name in node["column_names"]
+    )
+
+
+def _nodes(value: Any) -> Iterator[Tree]:
+    if isinstance(value, dict):
+        yield value
+        for part in value.values():
+            yield from _nodes(part)
+    elif isinstance(value, list):
+        for part in value:
+            yield from _nodes(part)
+
+
+def _problem(node: Tree, columns: frozenset[str]) -> str | None:
+    kind = node.get("class")
+    if kind is None:
+        return None
+    if kind not in _EXPRESSIONS or (kind == "OPERATOR" and node["type"] not in _OPERATORS):
+        what = str(node["type"]).replace("_", " ").lower()
+        return f"may not have this in it: {what}. Columns, constants, operators and functions may."
+    if kind == "COLUMN_REF":
+        return _column_problem(node, columns)
+    if kind == "FUNCTION":
+        return _function_problem(node)
+    if kind == "TYPE" and (node["type_name"].upper() not in TYPES or node["schema"]):
+        named = printable(node["type_name"])
+        return f"casts to {named!r}. It may cast to: {', '.join(sorted(TYPES))}."
+    return None
+
+
+def _column_problem(node: Tree, columns: frozenset[str]) -> str | None:
+    names = node["column_names"]
+    if len(names) == 1 and names[0].lower() in columns:
+        return None
+    named = printable(".".join(map(str, names)))
+    return f"names the column {named!r}. Columns: {', '.join(sorted(columns))}."
+
+
+def _function_problem(node: Tree) -> str | None:
+    name = str(node["function_name"]).lower()
+    plain = not (node["schema"] or node["catalog"] or node["filter"] or node["distinct"])
+    if name in FUNCTIONS | _SYMBOLS and plain and not node["order_bys"]["orders"]:
+        return None
+    return (
+        f"calls {printable(name)!r}. A condition must mean the same for ever, so it may call "
+        f"only: {', '.join(sorted(FUNCTIONS))}."
+    )

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import fleet_slip
-from fleet_slip import Fleet
+from fleet_slip.api.fleet import Fleet
 from tests.support.commands import done_on
 from tests.support.once import made_once
 

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 import fleet_slip
-from fleet_slip import Fleet
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import DataError, QuestionError, RefusedError, UsageError
-from fleet_slip.files.folder import Folder
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.storage.folder import Folder
 from tests.support.commands import start
 from tests.support.s3_server import forget_clients
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import fleet_slip
-from fleet_slip import Fleet
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import QuestionError, StorageError
 from tests.support.commands import run
 

@@ -17,10 +17,9 @@ import fleet_slip
 from fleet_slip.api.nightly import Night
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import UsageError
-from fleet_slip.models.acceptance.champion_rules import floor
-from fleet_slip.monitoring.night_page import render_night
-from fleet_slip.monitoring.night_report import NightReport
-from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.models.acceptance import floor
+from fleet_slip.operations.night import NightReport, render_night
+from fleet_slip.regression.gram import Gram
 from tests.support.cars import counts, drive
 from tests.support.commands import Finished, run_on, start_on
 from tests.support.counted_rows import START_S, row_of, write_counted

@@ -15,11 +15,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_slip import Fleet, ModelVersion
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
-from fleet_slip.models.estimates.score import score_statement
 from fleet_slip.models.manifest import (
     CrossValidated,
     Manifest,
@@ -28,6 +27,8 @@ from fleet_slip.models.manifest import (
     SelectedBy,
     TrainedOn,
 )
+from fleet_slip.models.registry import ModelVersion
+from fleet_slip.models.score import score_statement
 
 Column = list[float | None]
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")

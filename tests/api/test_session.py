@@ -7,7 +7,7 @@ import duckdb
 import pytest
 
 import fleet_slip
-from fleet_slip import Fleet
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import QuestionError, StorageError
 
 COUNT = "SELECT count(*) FROM drives"

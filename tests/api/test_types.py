@@ -8,8 +8,10 @@ import polars as pl
 from numpy.typing import NDArray
 
 import fleet_slip
-from fleet_slip import Fleet, FleetCohort, ModelVersion
-from fleet_slip.selection.select_models import RequestedSelection
+from fleet_slip.api.cohort import FleetCohort
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.models.registry import ModelVersion
+from fleet_slip.models.select import RequestedSelection
 
 
 def test_a_users_lines_are_typed(fleet: Fleet) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.course_relation import CourseRelation, relate
+from fleet_slip.catalogue.course import CourseRelation, relate
 
 Rows = NDArray[np.float64]
 LEVER_M, COMPLIANCE, SPEED = 1.4, -0.005, 18.0

@@ -13,21 +13,20 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue import features as features_module
-from fleet_slip.catalogue.feature_sets import lag_signals
-from fleet_slip.catalogue.features import features, load_features
+from fleet_slip.catalogue.features import features, lag_signals, load_features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.blocks.column_plan import ColumnPlan
-from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
-from fleet_slip.columns.column_sql import with_columns
-from fleet_slip.delta import Change, Unit
+from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
+from fleet_slip.columns.plan import ColumnPlan
+from fleet_slip.columns.sql import with_columns
+from fleet_slip.config import folder
 from fleet_slip.errors import ConfigError, DataError, QuestionError
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.rows import aggregation, gram_job
-from fleet_slip.grams.rows import statement as gram_statement
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.gram_table import GramTable
-from fleet_slip.resources import folder
+from fleet_slip.grams import compute as aggregation
+from fleet_slip.grams import compute as gram_statement
+from fleet_slip.grams import job
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 
@@ -259,7 +258,7 @@ def test_a_changed_definition_never_mixes_with_the_old_rows(
     changed = load_features(tmp_path / "features.toml")
     assert changed.identity("motion") != before.identity("motion")
     assert changed.identity("lags") == before.identity("lags")
-    for module in (features_module, aggregation, gram_job, gram_statement):
+    for module in (features_module, aggregation, job, gram_statement):
         monkeypatch.setattr(module, "features", lambda: changed)
     assert update_grams(warehouse, feature_set="motion").rows_read == 300
     rows = pa.concat_tables(

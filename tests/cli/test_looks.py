@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.text import Text
 
-from fleet_slip.cli.accuracy.evaluation_tables import print_summary
+from fleet_slip.cli.accuracy import print_summary
 from fleet_slip.cli.app import app
 from fleet_slip.cli.output import print_table, print_text
 from fleet_slip.errors import AlarmError

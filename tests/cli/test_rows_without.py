@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.grams.job import update_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import TICKS, counts, drive
 from tests.support.commands import RunCommand

@@ -22,17 +22,17 @@ from fleet_slip.api.requests import (
     RunRequest,
     WhatIfRequest,
 )
-from fleet_slip.cli.commands import COMMANDS, GROUPS, CommandGroup, load_command
+from fleet_slip.cli.app import COMMANDS, GROUPS, CommandGroup, load_command
 from fleet_slip.cli.options import RESAMPLING
-from fleet_slip.selection.request import SelectionRequest
+from fleet_slip.models.request import SelectionRequest
 from tests.support.commands import COMMAND, run
 
 TABLES = {"deltalake", "numpy", "pyarrow"}
 ENGINES = {"duckdb", "highway_env", "jinja2", "matplotlib", "numba", "pint", "polars"}
 SIMULATOR = (
     "fleet_slip.vehicle",
-    "fleet_slip.simulation.drives",
-    "fleet_slip.simulation.simulation_job",
+    "fleet_slip.simulation.job",
+    "fleet_slip.simulation.job",
 )
 DRIVE = "smoke-2024-05-01-0000"
 PROGRAM = """
@@ -73,7 +73,7 @@ def test_watching_a_drive_of_the_logs_waits_for_no_simulator(
     words = ["watch", DRIVE, "smoke", "--until", "1", "--output", str(tmp_path / "watch.html")]
     imported = imported_by(smoke_root, *words)
     assert (tmp_path / "watch.html").exists()
-    assert "fleet_slip.comparison.watch.drive_frames" in imported
+    assert "fleet_slip.evaluation.watch" in imported
     assert not {name for name in imported if name.startswith(SIMULATOR)}
     assert "highway_env" not in imported
 
@@ -111,13 +111,13 @@ def test_help_groups_the_commands_and_begins_with_five() -> None:
 
 def test_summaries_are_read_without_running_a_module() -> None:
     program = (
-        "import sys; from fleet_slip.cli.commands import COMMANDS, docstrings;"
+        "import sys; from fleet_slip.cli.app import COMMANDS, docstrings;"
         "[docstrings(module) for module in COMMANDS.values()]; print(*sys.modules)"
     )
     done = run([sys.executable, "-c", program])
     loaded = {name for name in done.stdout.split() if name.startswith("fleet_slip.cli.")}
     rooms = {f"fleet_slip.cli.{module.partition('.')[0]}" for module in COMMANDS.values()}
-    assert loaded == {"fleet_slip.cli.commands"} | rooms
+    assert loaded == {"fleet_slip.cli.app"} | rooms
 
 
 def test_a_selections_options_stand_once_and_are_those_of_the_api() -> None:

@@ -13,9 +13,9 @@ from distributed import Client
 from fleet_slip.compute.cluster import cluster_executor
 from fleet_slip.compute.cluster_worker import Marker, environment, pickled, work
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
-from fleet_slip.delta import checksum_in
 from fleet_slip.errors import RefusedError, StorageError
-from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.storage.folder import checksum_in
+from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import RunCommand, finish, run, start_on
 from tests.support.dask_processes import DaskProcesses, dask_processes
 from tests.support.measured import csv_text, good_columns

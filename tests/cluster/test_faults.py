@@ -13,7 +13,7 @@ from fleet_slip.compute import cluster as cluster_module
 from fleet_slip.compute.cluster import ClusterExecutor, cluster_executor
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ClusterError
-from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.storage.local import LocalFolder
 from tests.support.dask_processes import DaskProcesses, dask_processes
 from tests.support.orders import Order, obey
 from tests.support.waiting import until

@@ -6,8 +6,8 @@ import pytest
 
 from fleet_slip.catalogue.definitions import plain_column
 from fleet_slip.catalogue.features import features
-from fleet_slip.columns.column_sql import with_columns
-from fleet_slip.columns.row_counts import row_counts
+from fleet_slip.columns.drive_columns import row_counts
+from fleet_slip.columns.sql import with_columns
 from fleet_slip.warehouse.database import open_database
 
 HOSTILE = {

@@ -134,7 +134,7 @@ def test_a_change_of_any_source_and_of_the_compiler_takes_another_folder(
 
 
 LANES = """
-from fleet_slip.vehicle.lanes.lane_kernel import simulate, simulate_imperfect
+from fleet_slip.vehicle.batch_kernel import simulate, simulate_imperfect
 
 for kernel in (simulate, simulate_imperfect):
     print(kernel._cache._index_key("signature", kernel.targetctx.codegen()))

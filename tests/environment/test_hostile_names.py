@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.ingest.drives.checking import find_look_alikes
-from fleet_slip.ingest.landing.ingest_job import ingest_files
+from fleet_slip.ingest.job import ingest_files
+from fleet_slip.ingest.log_rows import find_look_alikes
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.measured import a_mapping, csv_text, good_columns

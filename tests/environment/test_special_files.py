@@ -10,9 +10,9 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import StorageError
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.models.versions import Registry
-from fleet_slip.runs.log import recording
+from fleet_slip.models.registry import Registry
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.runs import recording
 from tests.support.commands import RunCommand
 from tests.support.manifests import manifest, publish
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.export.c.c_names import c_prefix, field_names
-from fleet_slip.export.c.c_source import c_header, c_source
-from fleet_slip.export.checks import Sample
+from fleet_slip.export.c import c_header, c_source
+from fleet_slip.export.compile import Sample
 from fleet_slip.export.program import Car, Program
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.export.templating import c_prefix, field_names
+from fleet_slip.models.registry import ModelVersion
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror")
 SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")

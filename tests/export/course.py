@@ -11,8 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.catalogue.features import features
-from fleet_slip.export.c.c_gram import c_gram_header, c_gram_source
-from fleet_slip.export.c.on_board import OnBoard, lower
+from fleet_slip.export.c_gram import OnBoard, c_gram_header, c_gram_source, lower
 from fleet_slip.models.manifest import LearnedFrom, Manifest, ModelTerm
 from tests.export.compiled import compile_c, run_compiled
 from tests.export.models import MODELS, model_of

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from fleet_slip.catalogue.definitions import Definition, Fact, Gate, Number
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.export.checks import Sample
+from fleet_slip.export.compile import Sample
 from fleet_slip.export.files import export_files
 from fleet_slip.export.program import Car, Program
 from fleet_slip.models.manifest import Manifest, ModelTerm
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.registry import ModelVersion
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.manifests import manifest
 

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
-from fleet_slip.export.checks import Sample
+from fleet_slip.export.compile import Sample
 from fleet_slip.export.files import export_files
-from fleet_slip.export.onnx_graph import UNKNOWN
+from fleet_slip.export.onnx import UNKNOWN
 from fleet_slip.export.program import Car, Program
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.registry import ModelVersion
 
 
 def open_session(version: ModelVersion, kind: str) -> onnxruntime.InferenceSession:

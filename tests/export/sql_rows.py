@@ -9,7 +9,7 @@ import duckdb
 import numpy as np
 import polars as pl
 
-from fleet_slip.export.checks import Sample
+from fleet_slip.export.compile import Sample
 from fleet_slip.export.program import Car, Program
 
 TEXTS = {"mass_kg": pl.Float64, "vehicle_model": pl.String}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import compile_c, needs_cc
 from tests.export.models import export_texts, model_of
 

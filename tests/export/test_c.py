@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
-from fleet_slip.export.c.c_steps import LARGEST_UNSIGNED
-from fleet_slip.export.checks import Sample, angles_by_kernel, angles_of_columns
-from fleet_slip.export.compile import compile_program
+from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
+from fleet_slip.export.c import LARGEST_UNSIGNED
+from fleet_slip.export.compile import Sample, angles_by_kernel, angles_of_columns, compile_program
 from fleet_slip.export.program import Car, Program
-from fleet_slip.grams.rows.drive_rows import read_drives
-from fleet_slip.models.estimates.predictor import Predictor
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.grams.compute import read_drives
+from fleet_slip.models.predict import Predictor
+from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import (
     DEADLINE_S,
     SANITIZED,

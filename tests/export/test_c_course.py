@@ -12,18 +12,17 @@ import pyarrow.compute as pc
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.feature_sets import FeatureSet
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.features import FeatureSet, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import RefusedError
-from fleet_slip.export.c.on_board import sets_on_board
+from fleet_slip.export.c_gram import sets_on_board
 from fleet_slip.export.files import export_files
-from fleet_slip.files.folder import Folder
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.received.counted_sets import counted_by_identity, counted_sets
-from fleet_slip.grams.rows.aggregation import aggregate
-from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.grams.compute import aggregate
+from fleet_slip.grams.on_board import counted_by_identity, counted_sets
+from fleet_slip.models.registry import ModelVersion
+from fleet_slip.regression.gram import Gram
+from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.export.compiled import SANITIZED, can_sanitize, needs_cc, run_compiled
 from tests.export.course import COLUMNS, Counter, build, learned

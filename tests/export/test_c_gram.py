@@ -15,9 +15,9 @@ import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import UsageError
 from fleet_slip.export.files import export_files
-from fleet_slip.grams.received.counted_sets import counted_sets
-from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.grams.on_board import counted_sets
+from fleet_slip.models.registry import ModelVersion
+from fleet_slip.regression.gram import Gram
 from tests.export.compiled import SANITIZED, can_sanitize, compile_c, needs_cc, run_compiled
 from tests.export.models import MODELS, model_of
 from tests.support.counted_rows import parse_messages

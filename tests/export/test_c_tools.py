@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.export.c.on_board import sets_on_board
+from fleet_slip.export.c_gram import sets_on_board
 from fleet_slip.export.costs import cost_on_board
 from fleet_slip.export.files import export_files
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import STRICT, run_compiled
 from tests.export.course import learned, write_counter
 from tests.export.models import MODELS, export_texts, model_of

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 import fleet_slip
-from fleet_slip.export.c.c_names import c_prefix
-from fleet_slip.export.c.c_source import c_header
+from fleet_slip.export.c import c_header
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.costs import cost_on_board, costs_content, count_costs, describe_costs
 from fleet_slip.export.files import export_files
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.export.templating import c_prefix
+from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import compile_c, needs_cc
 from tests.export.models import DEFINITIONS, MODELS, model_of
 

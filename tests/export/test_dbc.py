@@ -7,11 +7,10 @@ import cantools
 import pytest
 from cantools.database.can.database import Database
 
-from fleet_slip.export.checks import Sample, angles_by_kernel
-from fleet_slip.export.compile import compile_program
+from fleet_slip.export.compile import Sample, angles_by_kernel, compile_program
 from fleet_slip.export.dbc import MISSING
 from fleet_slip.export.program import Car, Program
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.registry import ModelVersion
 from tests.export.models import DEFINITIONS, export_texts, hostile_drive, model_of
 
 VERSION = ModelVersion(7, model_of(dict.fromkeys(DEFINITIONS, Fraction(1, 10**6))), "12ab34" * 10)

@@ -11,12 +11,10 @@ from hypothesis import strategies as st
 
 import fleet_slip
 from fleet_slip.errors import InputError
-from fleet_slip.export.checks import Sample, drive_counts
-from fleet_slip.export.compile import compile_program
-from fleet_slip.export.estimator import Estimator
+from fleet_slip.export.compile import Estimator, Sample, compile_program, drive_counts
 from fleet_slip.export.program import Car, Program
-from fleet_slip.models.estimates.predictor import Predictor
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.predict import Predictor
 from tests.export.models import cars, drives, model_of, models
 
 

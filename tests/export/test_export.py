@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.canonical import canonical_json
+from fleet_slip.base import canonical_json
 from fleet_slip.cli.app import app
-from fleet_slip.columns.blocks.drive_columns import DriveColumns
+from fleet_slip.columns.drive_columns import DriveColumns
 from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.export.checks import angles_of_columns
-from fleet_slip.export.compile import compile_program
-from fleet_slip.files.documents import checksum
-from fleet_slip.grams.rows.drive_rows import read_drives
-from fleet_slip.models.estimates.predictor import Predictor
+from fleet_slip.export.compile import angles_of_columns, compile_program
+from fleet_slip.grams.compute import read_drives
+from fleet_slip.models.predict import Predictor
+from fleet_slip.storage.documents import checksum
 from tests.export import plain
 from tests.export.models import export_texts
 

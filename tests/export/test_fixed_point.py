@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.errors import RefusedError
-from fleet_slip.export.fixed_point import LARGEST_SUM, OUTPUT_COUNTS, fixed_point
+from fleet_slip.export.program import LARGEST_SUM, OUTPUT_COUNTS, fixed_point
 
 COEFFICIENT = st.fractions(-1000, 1000, max_denominator=10**30)
 

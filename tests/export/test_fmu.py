@@ -18,11 +18,10 @@ import pytest
 import fleet_slip
 from fleet_slip.errors import ConfigError
 from fleet_slip.export import fmu
-from fleet_slip.export.checks import Sample, angles_by_kernel
-from fleet_slip.export.compile import compile_program
+from fleet_slip.export.compile import Sample, angles_by_kernel, compile_program
 from fleet_slip.export.files import export_files
 from fleet_slip.export.program import Car, Program
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import needs_cc
 from tests.export.models import CARS, MODELS, hostile_drive, model_of
 

@@ -21,10 +21,10 @@ from cantools.database.can.database import Database
 from fleet_slip.catalogue.definitions import Definition, Fact
 from fleet_slip.errors import InputError
 from fleet_slip.export import fmu
-from fleet_slip.export.c.c_names import different
 from fleet_slip.export.files import export_files
 from fleet_slip.export.mlflow_model import LoggedVersion
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.export.templating import different
+from fleet_slip.models.registry import ModelVersion
 from tests.export import plain
 from tests.export.compiled import compile_c, needs_cc
 from tests.export.models import MODELS, model_of

@@ -12,16 +12,15 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.canonical import canonical_json, sha256_of
+from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.cli.app import app
 from fleet_slip.errors import DataError, InputError, RefusedError, UsageError
 from fleet_slip.export.files import export_files
-from fleet_slip.files.documents import checksum
-from fleet_slip.maintenance.verify import verify_models
-from fleet_slip.maintenance.verify_files import Verification
-from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.recipe import is_up_to_date
-from fleet_slip.monitoring.monitor import monitor
+from fleet_slip.models.publish import is_up_to_date
+from fleet_slip.models.registry import ModelVersion
+from fleet_slip.operations.monitor import monitor
+from fleet_slip.operations.verify import Verification, verify_models
+from fleet_slip.storage.documents import checksum
 from tests.export.models import model_of
 from tests.support.commands import PATIENCE_S
 

@@ -17,17 +17,21 @@ from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from fleet_slip.catalogue.car_numbers import NumberName
 from fleet_slip.catalogue.definitions import Definition, Fact, Gate, Number, Over
-from fleet_slip.catalogue.row_features import Feature
-from fleet_slip.columns.column_sql import with_columns
-from fleet_slip.export.checks import Sample, angles_by_kernel, angles_of_columns
-from fleet_slip.export.compile import compile_program
-from fleet_slip.export.document import program_content
-from fleet_slip.export.estimator import Estimator
+from fleet_slip.catalogue.facts import NumberName
+from fleet_slip.catalogue.time_columns import Feature
+from fleet_slip.columns.sql import with_columns
+from fleet_slip.export.compile import (
+    Estimator,
+    Sample,
+    angles_by_kernel,
+    angles_of_columns,
+    compile_program,
+)
+from fleet_slip.export.files import program_content
 from fleet_slip.export.program import Car, Program
 from fleet_slip.models.manifest import Manifest, ModelTerm
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.models.registry import ModelVersion
 from tests.export import plain
 from tests.export.compiled import build_driver, drive, needs_cc
 from tests.export.models import cars, export_texts

@@ -18,7 +18,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import ConfigError, StorageError
-from fleet_slip.export.mlflow_log import describe, parameters, require_answer
+from fleet_slip.export.mlflow import describe, parameters, require_answer
 
 START_S = 120
 

@@ -10,12 +10,11 @@ import pytest
 import fleet_slip
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.errors import ConfigError
-from fleet_slip.export.checks import drive_counts
-from fleet_slip.export.compile import compile_program
+from fleet_slip.export.compile import compile_program, drive_counts
 from fleet_slip.export.files import export_files
-from fleet_slip.export.onnx_graph import FloatName, error_bound
-from fleet_slip.models.estimates.predictor import Predictor
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.export.onnx import FloatName, error_bound
+from fleet_slip.models.predict import Predictor
+from fleet_slip.models.registry import ModelVersion
 from tests.export.models import CARS, DEFINITIONS, MODELS, hostile_drive, model_of
 from tests.export.onnx_drives import in_si, open_session, run_drives
 
@@ -98,7 +97,7 @@ def test_the_files_say_what_they_are_of(smoke_root: Path) -> None:
 
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
-    monkeypatch.delitem(__import__("sys").modules, "fleet_slip.export.onnx_graph")
+    monkeypatch.delitem(__import__("sys").modules, "fleet_slip.export.onnx")
     version = ModelVersion(1, model_of(MODELS["signals"]), "0" * 64)
     with pytest.raises(ConfigError, match=r"onnx. Run: pip install 'fleet-slip\[onnx\]'"):
         export_files(version, None, "onnx")

@@ -7,13 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.canonical import canonical_json, sha256_of
+from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalogue.definitions import Definition
-from fleet_slip.columns.lowering import most_values
+from fleet_slip.columns.operations import most_values
 from fleet_slip.errors import QuestionError
-from fleet_slip.export.checks import angles_by_kernel, make_checks
-from fleet_slip.export.compile import compile_program
-from fleet_slip.export.document import program_content
+from fleet_slip.export.compile import angles_by_kernel, compile_program, make_checks
+from fleet_slip.export.files import program_content
 from fleet_slip.export.program import Car
 from fleet_slip.models.manifest import Manifest
 from tests.export import plain

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.export.checks import angles_by_kernel
-from fleet_slip.export.compile import compile_program
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.export.compile import angles_by_kernel, compile_program
+from fleet_slip.models.registry import ModelVersion
 from tests.export.models import CARS, DEFINITIONS, MODELS, export_texts, hostile_drive, model_of
 from tests.export.sql_rows import by_duckdb, by_sqlite, table
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression.gram import Gram
 from tests.support.lying_cars import LABEL, SIGNALS, left_out, told
 
 

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.config import load_toml
+from fleet_slip.config import find_config, load_toml
 from fleet_slip.errors import ConfigError, FleetSlipError, StorageError
-from fleet_slip.files.data_root import data_root
-from fleet_slip.resources import find_config
 from fleet_slip.simulation.roads import load_track
+from fleet_slip.storage.data_root import data_root
 from tests.support.commands import RunCommand
 
 TRACK = 'name = "x"\ndescription = "d"\nclosed = {closed}\nsegments = [{segments}]\n'

@@ -14,7 +14,8 @@ from nptdms import ChannelObject
 
 import fleet_slip
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats import budget, confined_source
+from fleet_slip.ingest.formats import confined_source
+from fleet_slip.ingest.formats import source as budget
 from tests.ingest.test_tdms import own_clock, wave, write
 from tests.support.measured import failure, read_measured
 from tests.support.waiting import until

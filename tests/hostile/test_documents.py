@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from fleet_slip.errors import FleetSlipError, StorageError
-from fleet_slip.files.documents import DocumentFolder, checksum
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.models.versions import Registry
+from fleet_slip.models.registry import Registry
+from fleet_slip.storage.documents import DocumentFolder, checksum
+from fleet_slip.storage.local import LocalFolder
 from tests.support.logs import path_of
 from tests.support.manifests import manifest, publish
 

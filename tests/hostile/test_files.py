@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.landing.ingest_job import ingest_files
-from fleet_slip.ingest.logs.log_files import StrayLink, find_logs
+from fleet_slip.ingest.job import ingest_files
+from fleet_slip.ingest.log_files import StrayLink, find_logs
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file, read_measured
 

@@ -17,9 +17,9 @@ from mcap import stream_reader
 from mcap.writer import CompressionType
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.budget import Budget
 from fleet_slip.ingest.formats.confined_reader import open_here
 from fleet_slip.ingest.formats.formulas import compute_formula
+from fleet_slip.ingest.formats.source import Budget
 from tests.support.commands import COMMAND, run, run_on
 from tests.support.waiting import within
 

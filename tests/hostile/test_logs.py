@@ -19,9 +19,9 @@ import pytest
 from asammdf import MDF, Signal
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import Mapping
-from fleet_slip.ingest.formats import budget
-from fleet_slip.ingest.formats.can.can_bus import CanBus
+from fleet_slip.ingest.formats import source
+from fleet_slip.ingest.formats.can import CanBus
+from fleet_slip.ingest.mapping import Mapping
 from tests.support.fuzz.logs import DBC, FORMATS, sound_file
 from tests.support.measured import a_mapping, read_measured
 from tests.support.waiting import within
@@ -122,7 +122,7 @@ def test_links_are_not_followed(tmp_path: Path) -> None:
 def test_rows_that_stand_nowhere_are_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(budget, "FREE_MEMORY", 2**27)
+    monkeypatch.setattr(source, "FREE_MEMORY", 2**27)
     rows = 10**9
 
     def write(file: Path, **options: Any) -> Path:
@@ -160,14 +160,14 @@ def test_the_index_of_a_dataset_is_no_log(tmp_path: Path) -> None:
 def test_columns_that_unfold_to_many_bytes_are_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(budget, "FREE_BYTES", 10**7)
+    monkeypatch.setattr(source, "FREE_BYTES", 10**7)
     file = tmp_path / "log.parquet"
     text = pa.array(["x" * 10**6] * 11)
     numbers = {column: np.arange(11) / 100 for column in COLUMNS}
     pq.write_table(
         pa.table({**numbers, "text": text}), file, compression="zstd", use_dictionary=False
     )
-    assert file.stat().st_size < 10**7 / budget.BYTES_PER_BYTE
+    assert file.stat().st_size < 10**7 / source.BYTES_PER_BYTE
     assert "bytes unfold to" in failure(file)
 
 
@@ -244,7 +244,7 @@ def test_equal_rows_of_a_database_are_counted_first(tmp_path: Path) -> None:
     ids=["rows", "a product", "recursion"],
 )
 def test_an_endless_query_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, query: str) -> None:
-    monkeypatch.setattr(budget, "FREE_S", 0.1)
+    monkeypatch.setattr(source, "FREE_S", 0.1)
     file = database(tmp_path / "log.duckdb")
     told = failure(file, a_mapping(duckdb={"query": query}))
     assert "did not suffice to decode" in told or "rows or more in" in told
@@ -298,8 +298,8 @@ def test_an_attachment_of_a_channel_is_not_read(
 
 
 def test_links_in_a_circle_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(budget, "FREE_S", 0.5)
-    monkeypatch.setattr(budget, "FREE_MEMORY", 2**27)
+    monkeypatch.setattr(source, "FREE_S", 0.5)
+    monkeypatch.setattr(source, "FREE_MEMORY", 2**27)
     file = mdf(tmp_path / "log")
     data = bytearray(file.read_bytes())
     at = data.index(b"##DG", 64)
@@ -322,8 +322,8 @@ def conversion(parts: list[int]) -> bytes:
 def test_conversions_of_conversions_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_circle: bool
 ) -> None:
-    monkeypatch.setattr(budget, "FREE_S", 0.5)
-    monkeypatch.setattr(budget, "FREE_MEMORY", 2**27)
+    monkeypatch.setattr(source, "FREE_S", 0.5)
+    monkeypatch.setattr(source, "FREE_MEMORY", 2**27)
     file = mdf(tmp_path / "log")
     data = bytearray(file.read_bytes())
     data += bytes(-len(data) % 8)
@@ -369,7 +369,7 @@ def test_an_object_of_a_trace_has_a_size(tmp_path: Path, size: int, compress: bo
 def test_what_a_trace_unfolds_to_is_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(budget, "FREE_MEMORY", 2**26)
+    monkeypatch.setattr(source, "FREE_MEMORY", 2**26)
     assert "unfold to more than" in trace(tmp_path, "log.blf", blf(bytes(2**27)))
 
 

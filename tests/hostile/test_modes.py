@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.models.versions import Registry
-from fleet_slip.progress import no_progress
+from fleet_slip.base import no_progress
+from fleet_slip.grams.job import update_grams
+from fleet_slip.models.registry import Registry
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, path_of, random_counts
 from tests.support.manifests import manifest, publish

@@ -17,14 +17,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet_slip.base import no_progress
 from fleet_slip.errors import FleetSlipError, QuestionError, StorageError
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.progress import no_progress
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
-from fleet_slip.warehouse.database import database_errors, interruptible
-from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.database import database_errors, interruptible, one_query
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows, path_of, random_counts

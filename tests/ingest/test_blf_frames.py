@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.can import blf_frames
-from fleet_slip.ingest.formats.can.blf_frames import read_blf_frames
+from fleet_slip.ingest.formats import can_files
+from fleet_slip.ingest.formats.can_files import read_blf_frames
+from fleet_slip.ingest.formats.source import Budget
 
 Frame = tuple[float, int, bool, int, bytes]
 
@@ -70,7 +70,7 @@ def test_frames_are_those_that_python_can_reads(
             trace.on_message_received(frame)
             if number % 7 == 3:
                 trace.log_event("a remark of an odd length" + "!" * (number % 4))
-    with mock.patch.object(blf_frames, "_AT_ONCE", at_once):
+    with mock.patch.object(can_files, "_AT_ONCE", at_once):
         assert read(file) == expected(file)
 
 

@@ -18,13 +18,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.errors import ConfigError, InputError
-from fleet_slip.ingest import load_mapping
-from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.can import can_frames
-from fleet_slip.ingest.formats.can.can_bus import CanBus, read_can_database
-from fleet_slip.ingest.formats.can.can_frames import CanFrames, FrameBlock, physical, raw_numbers
-from fleet_slip.ingest.formats.can.can_trace import open_can_trace
-from fleet_slip.ingest.logs.spool import Spool
+from fleet_slip.ingest.formats import can as can_frames
+from fleet_slip.ingest.formats.can import (
+    CanBus,
+    CanFrames,
+    FrameBlock,
+    physical,
+    raw_numbers,
+    read_can_database,
+)
+from fleet_slip.ingest.formats.can_files import open_can_trace
+from fleet_slip.ingest.formats.source import Budget
+from fleet_slip.ingest.log_files import Spool
+from fleet_slip.ingest.mapping import load_mapping
 from tests.support.logs import without_names
 from tests.support.measured import MeasuredLog, read_measured, ticks
 

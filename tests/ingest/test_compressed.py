@@ -8,8 +8,8 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats import budget
-from fleet_slip.ingest.formats.csv_batches import BLOCK_BYTES
+from fleet_slip.ingest.formats import source
+from fleet_slip.ingest.formats.csv import BLOCK_BYTES
 from tests.support.logs import without_names
 from tests.support.measured import a_mapping, csv_text, good_columns, read_measured, read_text
 
@@ -68,8 +68,8 @@ def test_a_file_that_becomes_far_more_than_it_is_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compress: Compress
 ) -> None:
     bomb = compress(TEXT + b"1,1,1\n" * 100_000)
-    monkeypatch.setattr(budget, "FREE_ROWS", 50_000)
+    monkeypatch.setattr(source, "FREE_ROWS", 50_000)
     assert "rows or more in" in failure(tmp_path, bomb)
-    monkeypatch.setattr(budget, "FREE_ROWS", 10**6)
-    monkeypatch.setattr(budget, "FREE_BYTES", 10_000)
+    monkeypatch.setattr(source, "FREE_ROWS", 10**6)
+    monkeypatch.setattr(source, "FREE_BYTES", 10_000)
     assert "bytes unfold to" in failure(tmp_path, bomb)

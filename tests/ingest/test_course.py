@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from fleet_slip.ingest.drives.suspicion import find_suspicions
+from fleet_slip.ingest.suspicion import find_suspicions
 from tests.support.cars import Signals, drive
 from tests.support.measured import MeasuredLog, a_mapping, physical, read_columns
 from tests.support.reported import call

@@ -13,9 +13,9 @@ import pytest
 from asammdf import MDF, Signal
 
 from fleet_slip.errors import InputError, UsageError
-from fleet_slip.ingest import load_mapping
-from fleet_slip.ingest.drives.suspicion import RADIUS_M, WHEELS
-from fleet_slip.ingest.mapping.vocabulary import parts_of
+from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
+from fleet_slip.ingest.vocabulary import parts_of
 from tests.support.measured import read_measured
 from tests.support.reported import call
 from tests.support.suggested import LOGS, wrong_guesses

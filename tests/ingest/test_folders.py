@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 
 import fleet_slip
-from fleet_slip.delta import Snapshot
 from fleet_slip.errors import InputError
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.files.object_inputs import parse_url
-from fleet_slip.ingest.landing import ingest_job as job
-from fleet_slip.ingest.landing.landing import write_batch
-from fleet_slip.ingest.mapping.mapping import Mapping
+from fleet_slip.ingest import job
+from fleet_slip.ingest.load import write_batch
+from fleet_slip.ingest.log_files import parse_url
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import a_mapping, csv_text, good_columns
 from tests.support.reported import call

@@ -6,11 +6,11 @@ from typing import Literal
 import pyarrow as pa
 import pytest
 
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
-from fleet_slip.ingest.drives.stream import open_measured
-from fleet_slip.ingest.landing.allowed_rows import keep_drives, keep_refused
-from fleet_slip.warehouse.audit import Audit, Forgettable
+from fleet_slip.ingest.drives import MeasuredDrive
+from fleet_slip.ingest.load import keep_drives, keep_refused
+from fleet_slip.ingest.stream import open_measured
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.forgotten import Audit, Forgettable
 from tests.support.measured import a_mapping, csv_text, good_columns
 
 

@@ -19,11 +19,11 @@ import scipy.sparse
 from asammdf import MDF, Signal
 
 from fleet_slip.errors import ExtraError, InputError
-from fleet_slip.ingest import Mapping
-from fleet_slip.ingest.drafting.preview import preview_log
-from fleet_slip.ingest.formats import budget, matlab, mdf
-from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.log_source import reading_with
+from fleet_slip.ingest.formats import matlab, mdf
+from fleet_slip.ingest.formats import source as budget
+from fleet_slip.ingest.formats.source import Budget, reading_with
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.preview import preview_log
 from tests.support.measured import MeasuredLog, a_mapping, failure, read_measured, ticks
 
 START = datetime(2024, 5, 31, 12, tzinfo=UTC)

@@ -8,18 +8,18 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.counts import as_arrow
-from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
-from fleet_slip.ingest.landing.data_files import SHARED_ROWS, log_table
+from fleet_slip.catalogue.signals import as_arrow
+from fleet_slip.ingest.drives import MeasuredDrive
+from fleet_slip.ingest.load import SHARED_ROWS, log_table
 from tests.support.commands import run
 from tests.support.measured import a_mapping, csv_text, good_columns
 
 INGEST = """
 import sys
 from pathlib import Path
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.ingest.landing.ingest_job import ingest_files
-from fleet_slip.ingest.mapping.mapping import Mapping
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.ingest.job import ingest_files
+from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.warehouse.tables import Warehouse
 root, log, mapping = sys.argv[1:]
 warehouse = Warehouse(LocalFolder(Path(root)))

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from fleet_slip.errors import ConfigError
-from fleet_slip.ingest.mapping.mapping_list import as_list
+from fleet_slip.ingest.mapping import as_list
 from tests.support.commands import Finished, run_on
 from tests.support.measured import csv_text, good_columns
 

@@ -12,10 +12,9 @@ from mcap.writer import Writer as PlainWriter
 from mcap_ros2.writer import Writer
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import Mapping
-from fleet_slip.ingest.formats import mcap_log
-from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.log_source import OWN_TIME
+from fleet_slip.ingest.formats import mcap as mcap_log
+from fleet_slip.ingest.formats.source import OWN_TIME, Budget
+from fleet_slip.ingest.mapping import Mapping
 from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
 from tests.support.measured import a_mapping, read_measured
 from tests.support.reported import call

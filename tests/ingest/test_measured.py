@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import load_mapping
-from fleet_slip.ingest.drives import checking, file_totals
+from fleet_slip.ingest import log_rows, stream
+from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 from tests.support.logs import schema_without, without_names
 from tests.support.measured import (
@@ -296,15 +296,15 @@ def test_a_rate_too_low_to_interpolate_leaves_what_was_measured(tmp_path: Path) 
 def test_what_is_absurd_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     columns = good_columns(300)
     columns["run"] = [i // 3 for i in range(300)]
-    monkeypatch.setattr(file_totals, "MAX_DRIVES", 99)
+    monkeypatch.setattr(stream, "MAX_DRIVES", 99)
     with pytest.raises(InputError, match="falls into more than 99 drives, of 3 rows on average"):
         read_columns(tmp_path, columns, a_mapping(drive={"column": "run"}))
-    monkeypatch.setattr(checking, "MAX_KEYS", 99)
+    monkeypatch.setattr(log_rows, "MAX_KEYS", 99)
     with pytest.raises(InputError, match="more than 99 combinations"):
         read_columns(tmp_path, columns, a_mapping(drive={"column": "run"}))
     columns["t"] = [10 * i for i in range(300)]
-    monkeypatch.setattr(file_totals, "MAX_TICKS", 100)
-    monkeypatch.setattr(file_totals, "MOST_TICKS_A_ROW", 10)
+    monkeypatch.setattr(stream, "MAX_TICKS", 100)
+    monkeypatch.setattr(stream, "MOST_TICKS_A_ROW", 10)
     with pytest.raises(InputError, match="300 rows last 299,001 ticks"):
         read_columns(tmp_path, columns, a_mapping(time={"split_gap_s": 60, "longest_gap_s": 10}))
 

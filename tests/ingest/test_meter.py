@@ -10,13 +10,13 @@ from nptdms import ChannelObject
 
 import fleet_slip
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import Mapping, load_mapping
-from fleet_slip.ingest.drives import stream, time_bases
-from fleet_slip.ingest.formats import csv_batches, mdf
-from fleet_slip.ingest.formats.can import can_trace
-from fleet_slip.ingest.formats.meter import Meter
+from fleet_slip.ingest import raw_columns, stream
+from fleet_slip.ingest.formats import can_files, mdf
+from fleet_slip.ingest.formats import csv as csv_batches
 from fleet_slip.ingest.formats.reading import FileFormats, open_source
-from fleet_slip.ingest.logs.log_files import size_of
+from fleet_slip.ingest.formats.source import Meter
+from fleet_slip.ingest.log_files import size_of
+from fleet_slip.ingest.mapping import Mapping, load_mapping
 from tests.ingest import test_can, test_formats, test_mcap, test_tdms
 from tests.support.measured import a_mapping, csv_text, good_columns
 
@@ -102,9 +102,9 @@ def own_clock(folder: Path, name: str) -> tuple[Path, Mapping]:
 def test_a_file_with_a_clock_tells_bytes_too(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(can_trace, "TOLD_EVERY", 8)
+    monkeypatch.setattr(can_files, "TOLD_EVERY", 8)
     monkeypatch.setattr(mdf, "WINDOW_RECORDS", 10)
-    monkeypatch.setattr(time_bases, "WINDOW_ROWS", 20)
+    monkeypatch.setattr(raw_columns, "WINDOW_ROWS", 20)
     monkeypatch.setattr(stream, "RATE_ROWS", 20)
     monkeypatch.setattr(stream, "FEWEST_STEPS", 2)
     file, mapping = own_clock(tmp_path, name)

@@ -8,13 +8,13 @@ import pytest
 
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.column_sql import column_query
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.ingest import load_mapping
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.inference.standard_errors import infer_classically
+from fleet_slip.columns.sql import column_query
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.regression.inference import infer_classically
+from fleet_slip.regression.least_squares import fit
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand

@@ -8,12 +8,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fleet_slip.catalogue.counts import as_arrow
+from fleet_slip.catalogue.signals import as_arrow
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.drives import checking, log_rows
-from fleet_slip.ingest.formats import csv_batches, parquet_batches
-from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.parquet_batches import open_parquet
+from fleet_slip.ingest import log_rows
+from fleet_slip.ingest import log_rows as checking
+from fleet_slip.ingest.formats import csv as csv_batches
+from fleet_slip.ingest.formats import tables
+from fleet_slip.ingest.formats.source import Budget
+from fleet_slip.ingest.formats.tables import open_parquet
 from tests.support.logs import without_names
 from tests.support.measured import (
     a_mapping,
@@ -271,7 +273,7 @@ def test_a_list_is_refused_before_it_is_decoded(
     values = pa.ListArray.from_arrays(pa.array([0, 1, 3_000_000], pa.int32()), np.zeros(3_000_000))
     table = pa.table({"t": [0.0, 0.01], "ax": values, "beta": [0.0, 0.0]})
     pq.write_table(table, tmp_path / "log.parquet")
-    monkeypatch.setattr(parquet_batches, "_parquet_batches", None)
+    monkeypatch.setattr(tables, "_parquet_batches", None)
     with pytest.raises(InputError, match=r"3,000,000 rows or more"):
         read_measured(tmp_path / "log.parquet", a_mapping())
     pq.write_table(table.slice(0, 1), tmp_path / "log.parquet")

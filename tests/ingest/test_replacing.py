@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip import Fleet
-from fleet_slip.delta import Change, Snapshot
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import RepeatedError
-from fleet_slip.ingest import Mapping
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.storage.table import Change, Snapshot
 from tests.support.measured import SIGNALS, a_mapping, csv_text
 
 ROWS = 6000

@@ -10,8 +10,8 @@ import polars as pl
 import pytest
 
 from fleet_slip.errors import AlarmError
-from fleet_slip.ingest.drives.stream import open_measured
-from fleet_slip.ingest.drives.suspicion import WHEELS, Suspicion
+from fleet_slip.ingest.stream import open_measured
+from fleet_slip.ingest.suspicion import WHEELS, Suspicion
 from tests.ingest.test_strange_logs import a_mapping
 from tests.support.reported import call
 from tests.support.textbook_car import a_car

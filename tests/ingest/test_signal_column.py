@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from fleet_slip.ingest.drives.resampling import build_resampler
+from fleet_slip.ingest.resampling import build_resampler
 from tests.support.measured import a_mapping, good_columns, physical, read_columns, reasons, ticks
 
 

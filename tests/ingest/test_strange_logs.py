@@ -10,12 +10,10 @@ import polars as pl
 import pytest
 
 from fleet_slip.errors import AlarmError, ConfigError
-from fleet_slip.ingest import load_mapping
-from fleet_slip.ingest.drives.file_totals import IngestCounts
-from fleet_slip.ingest.drives.measured_drives import MeasuredDrive
-from fleet_slip.ingest.drives.one_sided import find_one_sided
-from fleet_slip.ingest.drives.stream import open_measured
-from fleet_slip.ingest.drives.suspicion import RADIUS_M, WHEELS, find_suspicions
+from fleet_slip.ingest.drives import MeasuredDrive
+from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.ingest.stream import IngestCounts, open_measured
+from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_one_sided, find_suspicions
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
 

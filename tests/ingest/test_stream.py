@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from fleet_slip.compute import tasks as read_ahead_module
 from fleet_slip.compute.tasks import AHEAD, map_ahead, read_ahead
 from fleet_slip.errors import InputError
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.ingest.drives import drive_cutter, open_drives, stream
-from fleet_slip.ingest.drives.drive_cutter import DriveCutter
-from fleet_slip.ingest.formats import csv_batches
-from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.csv_batches import PlainNumbers, open_csv
-from fleet_slip.ingest.formats.csv_text import CsvFormat
-from fleet_slip.ingest.landing import data_files
+from fleet_slip.ingest import drives as drive_cutter
+from fleet_slip.ingest import drives as open_drives
+from fleet_slip.ingest import load, stream
+from fleet_slip.ingest.drives import DriveCutter
+from fleet_slip.ingest.formats import csv as csv_batches
+from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers, open_csv
+from fleet_slip.ingest.formats.source import Budget
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import PATIENCE_S
 from tests.support.measured import (
@@ -120,7 +120,7 @@ def test_the_usual_rate_does_not_depend_on_blocks(
 def test_what_lands_does_not_depend_on_the_size_of_data_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, files: int
 ) -> None:
-    monkeypatch.setattr(data_files, "FILE_ROWS", limit)
+    monkeypatch.setattr(load, "FILE_ROWS", limit)
     columns = good_columns(90)
     columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(90)]
     columns["ax"][3] = columns["ax"][70] = "x"
@@ -150,10 +150,10 @@ def test_the_bits_that_land_depend_on_neither_threads_nor_blocks(
     columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(120)]
     columns["ax"][70] = "broken"
     (tmp_path / "log.csv").write_text(csv_text(columns))
-    monkeypatch.setattr(data_files, "FILE_ROWS", 50)
+    monkeypatch.setattr(load, "FILE_ROWS", 50)
     expected = _land_in(tmp_path / "as it is", tmp_path / "log.csv")
     monkeypatch.setattr(read_ahead_module, "WORKERS", threads)
-    monkeypatch.setattr(data_files, "WRITERS", threads)
+    monkeypatch.setattr(load, "WRITERS", threads)
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", block_bytes)
     assert _land_in(tmp_path / "otherwise", tmp_path / "log.csv") == expected
     assert len(expected) == 3  # 4 drives in two files, and the quarantine
@@ -170,7 +170,7 @@ def _land_in(root: Path, file: Path) -> list[str]:
 def test_nothing_is_left_of_a_file_that_fails_at_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(data_files, "FILE_ROWS", 1)
+    monkeypatch.setattr(load, "FILE_ROWS", 1)
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 100)
     columns = good_columns(90)
     columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(90)]

@@ -10,12 +10,11 @@ import pytest
 from typer.testing import CliRunner
 
 import fleet_slip
-from fleet_slip.arrays import FloatArray
+from fleet_slip.base import FloatArray
 from fleet_slip.cli.app import app
 from fleet_slip.errors import AlarmError, UsageError
-from fleet_slip.ingest.drives import relations
-from fleet_slip.ingest.drives.file_suspicion import find_refusals
-from fleet_slip.ingest.drives.suspicion import RADIUS_M, WHEELS, find_suspicions
+from fleet_slip.ingest import suspicion as relations
+from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_refusals, find_suspicions
 from tests.ingest.test_folders import MAPPING as PLAIN
 from tests.support.measured import csv_text, good_columns
 from tests.support.reported import call

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from nptdms import ChannelObject, TdmsWriter
 
 from fleet_slip.ingest.formats import matlab, tdms
-from fleet_slip.ingest.formats.log_source import OWN_TIME
 from fleet_slip.ingest.formats.reading import FileFormats, open_source
+from fleet_slip.ingest.formats.source import OWN_TIME
 from tests.support.measured import a_mapping, failure, physical, read_measured, ticks
 from tests.support.suggested import ENGLISH, Suggested, suggest, wrong_guesses
 from tests.support.textbook_car import Car

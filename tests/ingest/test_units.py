@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_slip.ingest.mapping.units import conversion_factor
+from fleet_slip.ingest.columns import conversion_factor
 
 UNITS = {
     "rad": {"deg": math.pi / 180, "°": math.pi / 180, "mrad": 1e-3, "turn": 2 * math.pi},

@@ -10,7 +10,7 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError, RefusedError
-from fleet_slip.export.c.on_board import sets_on_board
+from fleet_slip.export.c_gram import sets_on_board
 from fleet_slip.models.manifest import Manifest
 from tests.export.compiled import needs_cc
 from tests.export.course import START_S, build
@@ -132,9 +132,7 @@ def test_a_course_of_another_place_is_refused(
     """As if the receiver were known to be 200 ms late: then the place is 4 m from where it was."""
     cars = fleet.sql("SELECT DISTINCT vehicle_id FROM drives").fetchall()
     late = {car: 0.2 for (car,) in cars}
-    monkeypatch.setattr(
-        "fleet_slip.models.acceptance.sound_course.require_in_time", lambda *_: late
-    )
+    monkeypatch.setattr("fleet_slip.models.acceptance.require_in_time", lambda *_: late)
     with pytest.raises(RefusedError, match="course of 1 of 1 car is not that of a car") as refused:
         without_label(fleet)
     assert "Check antenna_x_m" in str(refused.value)

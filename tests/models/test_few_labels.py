@@ -13,11 +13,10 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, UsageError
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.cohorts.taught_cohort import load_taught
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import fit
+from fleet_slip.grams.cohort import load_cohort, load_taught
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import fit
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from fleet_slip.models.exact_fraction import MOST_DIGITS, ExactFraction
+from fleet_slip.models.manifest import MOST_DIGITS, ExactFraction
 
 FRACTIONS: TypeAdapter[Fraction] = TypeAdapter(ExactFraction)
 

@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.app import app
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.models.versions import Registry
-from fleet_slip.regression.exact import least_squares as exact
-from fleet_slip.regression.exact.figures import error_sums
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.models.registry import Registry
+from fleet_slip.regression import least_squares as exact
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.once import made_once
 

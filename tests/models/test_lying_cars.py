@@ -10,11 +10,11 @@ import pytest
 import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import RefusedError
-from fleet_slip.models.estimates.counts_model import counts_model
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.regression.exact.figures import error_sums
-from fleet_slip.regression.exact.gram import Gram, packed_position
-from fleet_slip.selection.select_models import RequestedSelection
+from fleet_slip.models.predict import counts_model
+from fleet_slip.models.select import RequestedSelection
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.gram import Gram, packed_position
 from tests.support.cars import counts, drive
 from tests.support.counted_rows import START_S, row_of, write_counted
 

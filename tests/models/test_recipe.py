@@ -11,13 +11,13 @@ from typer.testing import CliRunner
 
 from fleet_slip.cli.app import app
 from fleet_slip.errors import QuestionError
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.rows.gram_job import update_grams
+from fleet_slip.grams.job import update_grams
 from fleet_slip.models.manifest import SelectedBy
-from fleet_slip.models.recipe import recipe_for
-from fleet_slip.models.versions import Registry
-from fleet_slip.selection.answer_request import answer_request
-from fleet_slip.selection.request import SelectionRequest
+from fleet_slip.models.publish import recipe_for
+from fleet_slip.models.registry import Registry
+from fleet_slip.models.request import SelectionRequest
+from fleet_slip.models.select import answer_request
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 from tests.support.manifests import manifest

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleet_slip.models.salted_drives import hash_drives
+from fleet_slip.models.manifest import hash_drives
 from fleet_slip.models.trained_drives import pack_hashes
 
 

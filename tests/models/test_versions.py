@@ -8,10 +8,9 @@ from typing import Any
 import pytest
 
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
-from fleet_slip.files.documents import Document, DocumentFolder
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.models.aliases import CHAMPION, AliasHistory
-from fleet_slip.models.versions import Registry
+from fleet_slip.models.registry import CHAMPION, AliasHistory, Registry
+from fleet_slip.storage.documents import Document, DocumentFolder
+from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import PATIENCE_S
 from tests.support.manifests import manifest, publish
 from tests.support.processes import PROCESSES, call_at_once

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip import Fleet
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.models.estimates.counts_model import counts_model
+from fleet_slip.grams.job import update_grams
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.regression.exact.figures import error_sums
-from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.models.predict import counts_model
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.gram import Gram
 from tests.support.cars import Signals, counts, drive
 from tests.support.commands import RunCommand
 from tests.support.logs import DAY, land, log_rows

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from fleet_slip.pages.drawing import PALETTE, Picture, Size, colour, inline, inline_svgs
-from fleet_slip.pages.page_parts import degrees, listed, number, percent, scientific, size
+from fleet_slip.pages.page import degrees, listed, number, percent, scientific, size
 
 
 def test_numbers_read_well() -> None:

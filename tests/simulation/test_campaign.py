@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from fleet_slip.config import config_names, find_config
 from fleet_slip.errors import ConfigError
-from fleet_slip.resources import config_names, find_config
 from fleet_slip.simulation.campaign import Campaign, load_campaign
-from fleet_slip.simulation.drive_plan import GridPlan
-from fleet_slip.simulation.random_numbers import random_generator
+from fleet_slip.simulation.plan import GridPlan
+from fleet_slip.simulation.roads import random_generator
 
 SMOKE = find_config("campaigns", "smoke").read_text(encoding="utf-8")
 FLEET = find_config("campaigns", "fleet").read_text(encoding="utf-8")

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.base import FloatArray
 from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
-from fleet_slip.simulation.sensing.distortion import Distortion, Pulses
-from fleet_slip.simulation.sensing.lags import Delay, LowPass, Wander
-from fleet_slip.vehicle.car_imperfections import CarImperfections
-from fleet_slip.vehicle.lanes.lane_memory import CHANNELS, IMPERFECT_CHANNELS
+from fleet_slip.simulation.sensors import Delay, Distortion, LowPass, Pulses, Wander
+from fleet_slip.vehicle.batch_kernel import CHANNELS, IMPERFECT_CHANNELS
+from fleet_slip.vehicle.imperfections import CarImperfections
 
 TICKS = 3000
 TIME_S = np.arange(TICKS) / 100

@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.simulation import drives as simulate
+from fleet_slip.simulation import job as simulate
 from fleet_slip.simulation.campaign import Batch, DriveSpec, load_campaign
-from fleet_slip.simulation.drives import DriveLog, simulate_batch, simulate_logs, tabulate
+from fleet_slip.simulation.job import DriveLog, simulate_batch, simulate_logs, tabulate
 from fleet_slip.simulation.roads import load_track
-from fleet_slip.simulation.sensing.sensors import SAMPLE_RATE_HZ
-from fleet_slip.vehicle.lanes.lane_memory import BLOCK, CHANNELS
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.vehicle.batch_kernel import BLOCK, CHANNELS
 from tests.support.logs import schema_without
 from tests.support.measuring import measure
 

@@ -7,19 +7,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from fleet_slip.config import find_config
 from fleet_slip.errors import ConfigError
-from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.drives import simulate_logs
-from fleet_slip.simulation.imperfections import (
-    NONE,
-    ImperfectionRanges,
-    Range,
-    RoadImperfections,
-)
-from fleet_slip.simulation.roads import load_track
+from fleet_slip.simulation.imperfections import NONE, ImperfectionRanges, Range, RoadImperfections
+from fleet_slip.simulation.job import simulate_logs
+from fleet_slip.simulation.roads import load_track, surface
 from fleet_slip.simulation.scenario import load_scenario
-from fleet_slip.simulation.surface import surface
 from fleet_slip.vehicle.driver import handling
 from fleet_slip.vehicle.parameters import load_vehicle
 

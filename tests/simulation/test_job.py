@@ -7,15 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from fleet_slip.base import no_progress
 from fleet_slip.errors import RefusedError
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.progress import no_progress
 from fleet_slip.simulation.campaign import Batch, Campaign, load_campaign
-from fleet_slip.simulation.simulation_job import (
-    SimulationReport,
-    simulate_batches,
-    simulate_campaign,
-)
+from fleet_slip.simulation.job import SimulationReport, simulate_batches, simulate_campaign
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 
 DAYS = 12

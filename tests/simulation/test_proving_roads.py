@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.comparison.evaluation.blind import blind_scenarios
+from fleet_slip.config import find_config
 from fleet_slip.errors import ConfigError
-from fleet_slip.resources import find_config
+from fleet_slip.evaluation.blind import blind_scenarios
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
-from fleet_slip.simulation.drives import simulate_logs
 from fleet_slip.simulation.imperfections import Imperfections, RoadImperfections
-from fleet_slip.simulation.roads import CLASSES, load_track
-from fleet_slip.simulation.sensing.sensors import Sensors
-from fleet_slip.simulation.track import SpeedLimits
+from fleet_slip.simulation.job import simulate_logs
+from fleet_slip.simulation.roads import CLASSES, SpeedLimits, load_track
+from fleet_slip.simulation.sensors import Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 
 TEXT = find_config("campaigns", "proving_roads").read_text(encoding="utf-8")

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError
 from fleet_slip.simulation.campaign import Campaign, load_campaign
-from fleet_slip.simulation.drives import simulate_logs
 from fleet_slip.simulation.imperfections import Range
-from fleet_slip.simulation.sensing.receivers import Receiver, ReceiverFixes, ReceiverLog, Receivers
+from fleet_slip.simulation.job import simulate_logs
+from fleet_slip.simulation.receivers import Receiver, ReceiverFixes, ReceiverLog, Receivers
 
 TICK_S = 0.01
 RAD = 2 * np.pi / 65536

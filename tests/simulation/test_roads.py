@@ -6,9 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import ConfigError
-from fleet_slip.simulation.random_numbers import random_generator
-from fleet_slip.simulation.roads import CLASSES, draw_road, driven_line, load_track
-from fleet_slip.simulation.track import Track
+from fleet_slip.simulation.roads import (
+    CLASSES,
+    Track,
+    draw_road,
+    driven_line,
+    load_track,
+    random_generator,
+)
 
 ROADS = st.tuples(st.sampled_from(sorted(CLASSES)), st.integers(0, 10**9 - 1))
 

@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet_slip.comparison.evaluation.blind import BlindSet
-from fleet_slip.config import load_toml
-from fleet_slip.resources import config_file
+from fleet_slip.config import config_file, load_toml
+from fleet_slip.evaluation.blind import BlindSet
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.drives import simulate_logs
 from fleet_slip.simulation.imperfections import Imperfections
-from fleet_slip.simulation.sensing.distortion import (
+from fleet_slip.simulation.job import simulate_logs
+from fleet_slip.simulation.sensors import (
     AX,
     AY,
     FIRST_WHEEL,
@@ -20,8 +19,8 @@ from fleet_slip.simulation.sensing.distortion import (
     WHEELS,
     Distortion,
     Vibration,
+    held,
 )
-from fleet_slip.simulation.sensing.sensors import held
 
 TICKS = 60_000
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError
-from fleet_slip.simulation.sensing.sensors import Gps, Recorder, Sensors
+from fleet_slip.simulation.sensors import Gps, Recorder, Sensors
 from tests.support.measuring import measure, quantise
 
 TICKS = 200_000

@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fleet_slip.simulation.roads import load_track
-from fleet_slip.simulation.track import (
+from fleet_slip.simulation.roads import (
     Segment,
     SpeedLimits,
     SpeedProfile,
     Track,
+    load_track,
     speed_profile,
 )
 

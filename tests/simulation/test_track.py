@@ -8,10 +8,9 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import fresnel
 
+from fleet_slip.config import config_names
 from fleet_slip.errors import ConfigError
-from fleet_slip.resources import config_names
-from fleet_slip.simulation.roads import load_track
-from fleet_slip.simulation.track import Segment, Track
+from fleet_slip.simulation.roads import Segment, Track, load_track
 from tests.support.evidence import EVIDENCE
 
 

@@ -5,15 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fleet_slip.config import find_config
 from fleet_slip.errors import ConfigError
-from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
-from fleet_slip.simulation.drives import lane_drive
-from fleet_slip.simulation.manoeuvres import SLOWEST_MPS, Manoeuvre, road_with
+from fleet_slip.simulation.job import lane_drive
+from fleet_slip.simulation.plan import TrialPlan
+from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, road_with
 from fleet_slip.simulation.scenario import shipped_scenarios
-from fleet_slip.simulation.trials import TrialPlan
-from fleet_slip.vehicle.lanes.lane_drives import LaneDrive
-from fleet_slip.vehicle.lanes.road import Road
+from fleet_slip.vehicle.batch import LaneDrive, Road
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.whole_drives import simulate_drives
 

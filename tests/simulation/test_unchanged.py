@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.simulation.campaign import Batch, load_campaign
-from fleet_slip.simulation.drives import simulate_batch
+from fleet_slip.simulation.job import simulate_batch
 from fleet_slip.simulation.scenario import load_scenario
 
 CAMPAIGNS = {

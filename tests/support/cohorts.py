@@ -7,10 +7,10 @@ from datetime import date, timedelta
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohorts.gram_cohort import Cohort
-from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.grams.cohort import Cohort
+from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.condition import parse_condition
 from tests.support.counts import Matrix, table_of
 

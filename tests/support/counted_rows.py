@@ -14,9 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.received.counted_rows import COLUMNS
-from fleet_slip.grams.received.counted_sets import counted_sets
-from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.grams.on_board import COLUMNS, counted_sets
+from fleet_slip.regression.gram import Gram
 
 START_S = 1_714_557_600
 """2024-05-01, 10:00 in UTC."""

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.gram_table import GramTable
-from fleet_slip.regression.inference.serial import LagGram
+from fleet_slip.regression.drives import LagGram
+from fleet_slip.regression.gram import Gram, GramTable
 
 Matrix = NDArray[Any]
 

@@ -5,12 +5,11 @@ from datetime import date
 
 import numpy as np
 
-from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.base import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.comparison.observers.drive_signals import STEP_S, DriveSignals, LabelledDrive
-from fleet_slip.comparison.observers.single_track import loaded_axles
+from fleet_slip.evaluation.single_track import STEP_S, DriveSignals, LabelledDrive, loaded_axles
 from fleet_slip.simulation.campaign import Batch, load_campaign
-from fleet_slip.simulation.drives import simulate_batch
+from fleet_slip.simulation.job import simulate_batch
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 GPS_EVERY = 10

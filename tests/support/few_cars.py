@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.inference.drive_moments import DriveMoments
-from fleet_slip.regression.inference.evidence import FTest, wald_test
+from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.inference import FTest, wald_test
+from fleet_slip.regression.least_squares import fit
 from tests.support.counts import Matrix, gram_of, names, table_of
 
 

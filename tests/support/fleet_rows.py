@@ -6,9 +6,8 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.received.counted_rows import COLUMNS
-from fleet_slip.grams.received.counted_sets import counted_sets
-from fleet_slip.grams.rows.gram_rows import list_array
+from fleet_slip.grams.gram_rows import list_array
+from fleet_slip.grams.on_board import COLUMNS, counted_sets
 
 
 def rows_of_fleet(cars: int, start_s: int, seed: int, *, label_follows: bool = False) -> pa.Table:

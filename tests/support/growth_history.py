@@ -18,13 +18,12 @@ import pyarrow as pa
 from deltalake.transaction import AddAction
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.feature_sets import PLAIN
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.delta import Change, Unit
-from fleet_slip.grams.rows.gram_job import unit_name
+from fleet_slip.grams.job import unit_name
 from fleet_slip.simulation.campaign import Campaign
-from fleet_slip.simulation.simulation_job import unit_of
+from fleet_slip.simulation.job import unit_of
+from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
 
 SIGNALS = catalogue().gram_signals

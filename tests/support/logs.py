@@ -9,8 +9,8 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.delta import Change, Unit
-from fleet_slip.files.folder import Folder
+from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
 
 DAY = date(2024, 5, 1)

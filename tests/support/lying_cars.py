@@ -7,10 +7,8 @@ from fractions import Fraction
 import numpy as np
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.regression.exact.gram import Gram, packed_position
-from fleet_slip.regression.exact.gram_table import GramTable
-from fleet_slip.regression.inference.drive_moments import DriveMoments
-from fleet_slip.regression.inference.influential import find_influential
+from fleet_slip.regression.drives import DriveMoments, find_influential
+from fleet_slip.regression.gram import Gram, GramTable, packed_position
 
 INPUTS = (
     *("ax", "ay", "yaw_rate", "steering_wheel"),

@@ -11,8 +11,7 @@ from fleet_slip.models.manifest import (
     SelectedBy,
     TrainedOn,
 )
-from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.models.versions import Registry
+from fleet_slip.models.registry import ModelVersion, Registry
 
 
 def manifest(coefficient: Fraction = Fraction(1, 3), name: str = "sideslip") -> Manifest:

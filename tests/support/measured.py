@@ -10,10 +10,10 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import IngestCounts, Mapping
-from fleet_slip.ingest.drives.stream import open_measured
-from fleet_slip.ingest.landing.data_files import log_table
-from fleet_slip.ingest.landing.ingest_job import IngestReport, ingest_files
+from fleet_slip.ingest.job import IngestReport, ingest_files
+from fleet_slip.ingest.load import log_table
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.warehouse.tables import Warehouse
 
 TIME = {"column": "t", "unit": "s"}

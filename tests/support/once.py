@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.storage.local import LocalFolder
 
 _made: dict[Path, frozenset[Path]] = {}
 """What is committed and published in each."""

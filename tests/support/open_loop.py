@@ -5,15 +5,16 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from fleet_slip.arrays import FloatArray
-from fleet_slip.vehicle.car_imperfections import CarImperfections, traits
+from fleet_slip.base import FloatArray
 from fleet_slip.vehicle.driver import SAMPLE_S, SPEED_GAIN_1PS
-from fleet_slip.vehicle.imperfect_dynamics import (
+from fleet_slip.vehicle.imperfections import (
     Around,
+    CarImperfections,
     Give,
     GiveRates,
     advance_give,
     imperfect_derivative,
+    traits,
 )
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
 from fleet_slip.vehicle.parameters import (

@@ -29,7 +29,7 @@ from typing import Any, Never
 
 import fleet_slip
 from fleet_slip.cli.main import main as fleet_slip_main
-from fleet_slip.ingest.mapping.units import require_unit
+from fleet_slip.ingest.columns import require_unit
 
 READ_LATE = (
     *("AWS_", "FLEET_SLIP_", "XDG_CACHE_HOME", "CACHE_DIRECTORY", "TMPDIR"),

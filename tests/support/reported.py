@@ -32,7 +32,7 @@ LITTLE_S = 12
 
 def call(root: Path, *words: str) -> Any:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fleet_slip.comparison.evaluation.filters.TUNING_S", LITTLE_S)
+        patch.setattr("fleet_slip.evaluation.filters.TUNING_S", LITTLE_S)
         result = CliRunner().invoke(app, ["--root", str(root), *words])
     require_no_failed_run(root)
     if result.exception is not None:

@@ -18,7 +18,7 @@ from typing import Any
 from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
 from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
 
-from fleet_slip.files.object_client import aws_profile, client
+from fleet_slip.storage.objects import aws_profile, client
 from tests.support.commands import PATIENCE_S, Finished, run_on
 
 ACCESS_KEY = "AKIDFORTESTS"

@@ -4,8 +4,8 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.models.versions import Registry
+from fleet_slip.models.registry import Registry
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 
 

@@ -16,16 +16,14 @@ from typing import Any
 import numpy as np
 from asammdf import MDF, Signal
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.base import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.drafting.draft import draft_mapping
-from fleet_slip.ingest.drafting.draft_text import write_draft
-from fleet_slip.ingest.drafting.profile import profile_file
-from fleet_slip.ingest.drives.suspicion import RADIUS_M
+from fleet_slip.ingest.columns import SignalColumn, conversion_factor
+from fleet_slip.ingest.draft import draft_mapping, write_draft
 from fleet_slip.ingest.formats.reading import FileFormats
-from fleet_slip.ingest.mapping.signal_column import SignalColumn
-from fleet_slip.ingest.mapping.units import conversion_factor
+from fleet_slip.ingest.profile import profile_file
+from fleet_slip.ingest.suspicion import RADIUS_M
 from tests.support.textbook_car import a_car
 
 NAMES = Path(__file__).parents[1] / "data" / "stranger_names.csv"

@@ -13,12 +13,12 @@ import polars as pl
 import scipy.io
 from asammdf import MDF, Signal
 
-from fleet_slip.ingest.drafting.draft import Draft, draft_mapping, signal_keys
-from fleet_slip.ingest.drafting.profile import profile_file
-from fleet_slip.ingest.drives.suspicion import RADIUS_M, WHEELS
-from fleet_slip.ingest.formats.can.can_bus import CanBus
+from fleet_slip.ingest.columns import SignalColumn
+from fleet_slip.ingest.draft import Draft, draft_mapping, signal_keys
+from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.reading import FileFormats
-from fleet_slip.ingest.mapping.signal_column import SignalColumn
+from fleet_slip.ingest.profile import profile_file
+from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
 from tests.support.textbook_car import Car, a_car
 
 G_MPS2 = 9.80665

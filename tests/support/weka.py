@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import Literal
 
-from fleet_slip.regression.exact import exact_roots
-from fleet_slip.regression.exact.figures import error_sums
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import LinearModel
-from fleet_slip.regression.shrinkage.ridge import fit_penalised
+from fleet_slip.regression import exact as exact_roots
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import LinearModel
+from fleet_slip.regression.shrinkage import fit_penalised
 
 Selection = Literal["none", "m5", "greedy"]
 

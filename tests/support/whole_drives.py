@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet_slip.arrays import FloatArray
-from fleet_slip.vehicle.lanes.lane_drives import STEPS_PER_SAMPLE, LaneDrive, simulate_blocks
-from fleet_slip.vehicle.lanes.lane_memory import CHANNELS
+from fleet_slip.base import FloatArray
+from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive, simulate_blocks
+from fleet_slip.vehicle.batch_kernel import CHANNELS
 
 
 @dataclass(frozen=True)

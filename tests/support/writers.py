@@ -14,12 +14,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.delta import Change, Table, Unit, retry_conflicts
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.maintenance.compaction import compact
-from fleet_slip.maintenance.vacuum import vacuum
-from fleet_slip.maintenance.verify import verify
+from fleet_slip.grams.job import update_grams
+from fleet_slip.operations.find_drives import vacuum
+from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.verify import verify
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.table import Change, Table, Unit, retry_conflicts
 from fleet_slip.warehouse.tables import Warehouse
 
 DAY = date(2024, 5, 1)

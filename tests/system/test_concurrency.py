@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from fleet_slip.files.local_folder import LocalFolder
+from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import PATIENCE_S, RunCommand, finish, start_on
 from tests.support.measured import csv_text, good_columns
 from tests.support.state import state

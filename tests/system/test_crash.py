@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import fleet_slip
-from fleet_slip.files.folder import TEMPORARY_PREFIX
+from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from tests.support.commands import RunCommand, run
 from tests.support.state import state
 

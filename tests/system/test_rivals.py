@@ -16,11 +16,11 @@ from benchmarks.rivals.learners import FittedLearner, hold_back, one_thread
 from benchmarks.rivals.tree_filter import LeafNoise, TreeFilter, fit_tree_filter
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.comparison.evaluation.filters import FILTERS, FilterEstimate
-from fleet_slip.comparison.observers import ekf
-from fleet_slip.comparison.observers.drive_signals import LabelledDrive
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
+from fleet_slip.evaluation import ekf
+from fleet_slip.evaluation.filters import FILTERS, FilterEstimate
+from fleet_slip.evaluation.single_track import LabelledDrive
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse

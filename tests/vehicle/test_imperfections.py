@@ -3,25 +3,22 @@
 import numpy as np
 import pytest
 
-from fleet_slip.vehicle.car_imperfections import (
+from fleet_slip.vehicle.batch import LaneDrive, Road, Surface, simulate_blocks
+from fleet_slip.vehicle.driver import SAMPLE_S, handling
+from fleet_slip.vehicle.dynamics import derivative
+from fleet_slip.vehicle.imperfections import (
     CAMBER_PER_SLIP,
     PERFECT,
     PNEUMATIC_TRAIL_M,
-    CarImperfections,
-    traits,
-)
-from fleet_slip.vehicle.driver import SAMPLE_S, handling
-from fleet_slip.vehicle.dynamics import derivative
-from fleet_slip.vehicle.imperfect_dynamics import (
     Around,
+    CarImperfections,
     Give,
     GiveRates,
     advance_give,
     imperfect_derivative,
+    traits,
 )
 from fleet_slip.vehicle.integration import SECOND_ORDER
-from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
-from fleet_slip.vehicle.lanes.road import Road, Surface
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, Controls, State, constants, load_vehicle
 from tests.support.whole_drives import Truth, simulate_drives
 

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import ConfigError
-from fleet_slip.simulation.roads import load_track
-from fleet_slip.simulation.track import SpeedLimits, speed_profile
-from fleet_slip.vehicle.lanes import lane_kernel
-from fleet_slip.vehicle.lanes.lane_drives import LaneDrive, simulate_blocks
-from fleet_slip.vehicle.lanes.lane_memory import BLOCK, CHANNELS
-from fleet_slip.vehicle.lanes.road import Road
+from fleet_slip.simulation.roads import SpeedLimits, load_track, speed_profile
+from fleet_slip.vehicle import batch_kernel
+from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
+from fleet_slip.vehicle.batch_kernel import BLOCK, CHANNELS
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from tests.support.rolling import SEDAN
 from tests.support.whole_drives import Truth, simulate_drives
@@ -94,8 +92,8 @@ def test_on_a_slippery_road_a_dry_speed_profile_loses_the_car(mass_kg: float) ->
     truth = drive(SEDAN.with_sprung_mass(mass_kg), road("waterford_hills", 5.0), adhesion=0.4)
     lost = truth.lost_control_tick
     assert lost is not None
-    assert len(truth.vx_mps) == lost + lane_kernel.AFTER_LOSS + 1
-    assert np.abs(truth.lateral_offset_m[:lost]).max() <= lane_kernel.LOST_OFFSET_M
+    assert len(truth.vx_mps) == lost + batch_kernel.AFTER_LOSS + 1
+    assert np.abs(truth.lateral_offset_m[:lost]).max() <= batch_kernel.LOST_OFFSET_M
     for name in CHANNELS:
         assert np.isfinite(getattr(truth, name)).all()
     horizontal = np.hypot(truth.ax_mps2, truth.ay_mps2)
@@ -269,13 +267,13 @@ def test_impossible_adhesion_is_refused() -> None:
 
 def test_the_inner_loop_is_vector_instructions_without_fused_operations() -> None:
     """On x86-64 with AVX: the physics divides in whole vectors, and no operation is fused."""
-    fresh = numba.njit(nogil=True, error_model="numpy")(lane_kernel.build_kernel())
+    fresh = numba.njit(nogil=True, error_model="numpy")(batch_kernel.build_kernel())
     on = circle(50.0, 15.0)
-    usual, lane_kernel.simulate = lane_kernel.simulate, fresh
+    usual, batch_kernel.simulate = batch_kernel.simulate, fresh
     try:
         drive(SEDAN, on, laps=0.01)
     finally:
-        lane_kernel.simulate = usual
+        batch_kernel.simulate = usual
     (assembly,) = fresh.inspect_asm().values()
     if "ymm" not in assembly:
         pytest.skip("this processor has no AVX")

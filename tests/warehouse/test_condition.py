@@ -8,16 +8,15 @@ from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.day_sums import sum_days
-from fleet_slip.grams.cohorts.fold_sums import sum_cohort
-from fleet_slip.grams.cohorts.folding import Folding
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.models.estimates.score import score_statement
-from fleet_slip.models.model_version import ModelVersion
-from fleet_slip.monitoring.monitor import monitor
-from fleet_slip.monitoring.quality import examine_drives
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.folding import Folding
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.sums import sum_cohort, sum_days
+from fleet_slip.models.registry import ModelVersion
+from fleet_slip.models.score import score_statement
+from fleet_slip.operations.monitor import monitor
+from fleet_slip.operations.quality import examine_drives
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.condition import asking, drive_columns, parse_condition
 from fleet_slip.warehouse.database import open_database
 from fleet_slip.warehouse.tables import Warehouse

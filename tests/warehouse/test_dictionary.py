@@ -4,7 +4,7 @@ from pathlib import Path
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.views import VIEWS, connect
-from fleet_slip.warehouse.dictionary import COMMON, column_descriptions
+from fleet_slip.warehouse.tables import COMMON, column_descriptions
 
 
 def columns(root: Path) -> dict[str, dict[str, tuple[str, str]]]:

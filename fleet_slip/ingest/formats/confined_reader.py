@@ -24,21 +24,19 @@ from typing import Any, BinaryIO
 
 import polars as pl
 
+from fleet_slip.base import shown
 from fleet_slip.errors import FleetSlipError, is_lack_of_memory
-from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.can.can_bus import CanBus
-from fleet_slip.ingest.formats.log_source import Base, ClockSource, Source
-from fleet_slip.ingest.formats.meter import Meter
-from fleet_slip.words import shown
+from fleet_slip.ingest.formats.can import CanBus
+from fleet_slip.ingest.formats.source import Base, Budget, ClockSource, Meter, Source
 
 FORMATS = {
     "mdf": ("mdf", "asammdf"),
-    "mdf_bus": ("mdf_bus", "asammdf", "cantools"),
-    "mcap": ("mcap_log", "mcap.stream_reader", "mcap_ros2.decoder"),
+    "mdf_bus": ("mdf", "asammdf", "cantools"),
+    "mcap": ("mcap", "mcap.stream_reader", "mcap_ros2.decoder"),
     "tdms": ("tdms", "nptdms"),
     "mat": ("matlab",),
     "mat73": ("matlab", "h5py"),
-    "can_trace": ("can.can_trace", "can", "cantools"),
+    "can_trace": ("can_files", "can", "cantools"),
 }
 """By format the module that has `open_FORMAT`, and what that imports of other people's."""
 SIZES = struct.Struct("<QQ")

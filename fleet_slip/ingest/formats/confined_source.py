@@ -27,10 +27,9 @@ import pyarrow as pa
 
 from fleet_slip import errors
 from fleet_slip.errors import FleetSlipError, InputError
-from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.can.can_bus import CanBus
+from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.confined_reader import SIZES, Job
-from fleet_slip.ingest.formats.log_source import Base, Channel, ClockSource
+from fleet_slip.ingest.formats.source import Base, Budget, Channel, ClockSource
 
 _SERVE = (
     "import sys; sys.path[:] = sys.argv[2:]; "

@@ -3,7 +3,7 @@
 import mmap
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,21 +11,130 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.base import FloatArray, shown
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.log_source import (
+from fleet_slip.ingest.formats.can import Bytes, CanBus, FrameBlock, parse_database
+from fleet_slip.ingest.formats.can_files import CanSource
+from fleet_slip.ingest.formats.formulas import compute_formula
+from fleet_slip.ingest.formats.source import (
     OWN_TIME,
     Base,
+    Budget,
     Channel,
     ClockSource,
     as_column,
     describe_missing,
     reading_with,
 )
-from fleet_slip.ingest.formats.mdf_conversions import conversion_of, require_arithmetic, to_physical
-from fleet_slip.words import shown
+from fleet_slip.ingest.log_files import Spool
+
+# Applies the conversions of an MDF file, of counts to physical values.
+#
+# asammdf hands the formula of a stranger to sympy, which runs it, and where it cannot it leaves the
+# counts. So it is asked for raw values only, and for the arithmetic that has no formula. It also
+# rounds the bounds of ranges, and matches other rows in a long block than in a short one.
+
+_NONE, _FORMULA, _RANGES_TO_NUMBERS, _VALUES_TO_TEXT, _RANGES_TO_TEXT, _TABLE, _PLAIN, _TEXT = (
+    "none", "formula", "ranges to numbers", "values to text", "ranges to text", "table", "plain",
+    "text",
+)  # fmt: skip
+_KINDS = {
+    b"##CC": {
+        0: _NONE, 1: _PLAIN, 2: _PLAIN, 3: _FORMULA, 4: _TABLE, 5: _TABLE, 6: _RANGES_TO_NUMBERS,
+        7: _VALUES_TO_TEXT, 8: _RANGES_TO_TEXT, 9: _TEXT, 10: _TEXT, 11: _TEXT,
+    },
+    b"CC": {
+        65535: _NONE, 0: _PLAIN, 1: _TABLE, 2: _TABLE, 6: _PLAIN, 9: _PLAIN, 10: _FORMULA,
+        11: _TEXT, 12: _RANGES_TO_TEXT,
+    },
+}  # fmt: skip
+"""What becomes of each type of conversion, of MDF 4 and of MDF 3; others are refused."""
+
+Array = np.ndarray[Any, Any]
+
+
+def conversion_of(channel: Any) -> Any:
+    """Return a channel's conversion, or None. Raises `ValueError` if asammdf lost it."""
+    if channel.conversion is None and channel.conversion_addr:
+        raise ValueError("its conversion cannot be read, or is of an unknown type")
+    return channel.conversion
+
+
+def require_arithmetic(conversion: Any) -> None:
+    """Raise `ValueError` for one that asammdf may not apply itself, as it does to times."""
+    if _kind_of(conversion) not in {_NONE, _PLAIN}:
+        raise ValueError("times that a formula or a table computes are not read")
+
+
+def to_physical(conversion: Any, raw: Array) -> Array:
+    """Return physical values, texts as bytes. Raises `ValueError` for what cannot be applied."""
+    kind = _kind_of(conversion)
+    if kind == _NONE:
+        return raw
+    if kind == _FORMULA:
+        return _by_formula(conversion.formula, raw)
+    if kind in {_VALUES_TO_TEXT, _RANGES_TO_TEXT, _RANGES_TO_NUMBERS}:
+        return _by_ranges(conversion, kind, raw)
+    if kind == _TABLE and np.any(np.diff(_listed(conversion, "raw")) < 0):
+        raise ValueError("the table of its conversion is not in order")
+    if any(not isinstance(part, bytes) for part in conversion.referenced_blocks.values()):
+        raise ValueError("the parts of its conversion are conversions themselves")
+    converted: Array = conversion.convert(raw)
+    return converted
+
+
+def _kind_of(conversion: Any) -> str:
+    if conversion is None:
+        return _NONE
+    kinds, number = _KINDS[conversion.id], conversion.conversion_type
+    if number not in kinds:
+        raise ValueError(f"a conversion of type {number} is not applied")
+    return kinds[number]
+
+
+def _by_formula(formula: str, raw: Array) -> Array:
+    try:
+        return compute_formula(formula.strip("\0"), raw.astype(np.float64))
+    except ValueError as error:
+        raise ValueError(f"its formula {formula[:100]!r} is not computed: {error}") from None
+
+
+def _listed(conversion: Any, name: str) -> Array:
+    """Return parameters that are numbered from 0 on."""
+    of, found = vars(conversion), list[float]()
+    while f"{name}_{len(found)}" in of:
+        found.append(of[f"{name}_{len(found)}"])
+    return np.array(found, dtype=np.float64)
+
+
+def _by_ranges(conversion: Any, kind: str, raw: Array) -> Array:
+    """Return what a table says of ranges, or of single values; integers include the upper end."""
+    points = kind == _VALUES_TO_TEXT
+    lower, upper = (_listed(conversion, "val" if points else end) for end in ("lower", "upper"))
+    order = np.argsort(lower, kind="stable")
+    lower, upper = np.append(lower[order], np.inf), np.append(upper[order], -np.inf)
+    place = np.searchsorted(lower[:-1], raw, side="right") - 1
+    ends = (raw.dtype.kind in "iub") | (lower == upper)
+    inside = (raw < upper[place]) | (ends[place] & (raw == upper[place]))
+    place = np.where(inside & (place >= 0), place, len(order))
+    if kind == _RANGES_TO_NUMBERS:
+        return np.append(_listed(conversion, "phys")[order], conversion.default)[place]
+    texts = conversion.referenced_blocks
+    parts = [*(texts[f"text_{number}"] for number in order), texts["default_addr"]]
+    if all(isinstance(part, bytes) and b"{X}" not in part for part in parts):
+        return np.array(parts, dtype=bytes)[place]
+    values = np.full(raw.shape, np.nan)  # of which some have a name instead
+    for number in np.unique(place).tolist():
+        part, mine = parts[number], place == number
+        if not isinstance(part, bytes):
+            values[mine] = to_physical(part, raw[mine])
+        elif b"{X}" in part:  # of MDF 3, between quotes
+            formula = part.decode("latin-1").replace("{X}", "X")
+            values[mine] = _by_formula(formula.strip().strip('"'), raw[mine])
+    return values
+
 
 WINDOW_RECORDS = 2**17
 """Records that are read at once. asammdf takes four times as long for a whole group."""
@@ -263,3 +372,79 @@ def _close_half_made(error: Exception) -> None:
             half_made._closed = True
             if hasattr(half_made, "_tempfile"):
                 half_made._tempfile.close()  # while its folder is there
+
+
+# Reads the CAN frames that a logger stored in an MDF 4 file (bus logging), through a database.
+#
+# ASAM's associated standard names the channels: a group of frames has `CAN_DataFrame.ID` and
+# others.
+
+_FRAME = "CAN_DataFrame."
+_EXTENDED = 1 << 31
+"""Bit that marks an identifier of 29 bits, where no channel of its own does."""
+_IDENTIFIER = (1 << 29) - 1
+
+
+class MdfBus(CanSource):
+    """The CAN messages of an MDF file."""
+
+    def __init__(
+        self, bus: CanBus, database: Any, spool: Spool, budget: Budget, mdf: MdfSource
+    ) -> None:
+        """Take what a trace does, and the open file."""
+        super().__init__(bus, database, spool, budget)
+        self._mdf = mdf
+
+    def _read_trace(self) -> None:
+        """Keep the frames of the wanted messages, and note the numbers of all."""
+        groups = [*self._mdf.groups_with(f"{_FRAME}ID")]
+        frames, passed = sum(self._mdf.count_records(number) for number, _ in groups), 0
+        for number, places in groups:
+            names = ("ID", "DataBytes", "DataLength", "IDE", "BusChannel")
+            there = {n: places[_FRAME + n] for n in names if _FRAME + n in places}
+            if "DataBytes" not in there:
+                raise InputError(
+                    f"{shown(self._file)}: group {number} has frames without {_FRAME}DataBytes. "
+                    "Export it again, with payloads."
+                )
+            for window in self._mdf.windows(number, there):
+                self._keep(self._block(dict(zip(there, window, strict=True))))
+                passed += len(window[0])
+                self._budget.meter.pass_over(passed, frames)
+        if not self._numbers:
+            raise InputError(
+                f"{shown(self._file)}: there is no CAN frame in it ({_FRAME}ID). Map its channels "
+                "without [can] in the mapping."
+            )
+
+    def _block(self, found: dict[str, Any]) -> FrameBlock:
+        """Return some frames of a group."""
+        numbers = found["ID"].samples.astype(np.int64)
+        extended = numbers & _EXTENDED != 0
+        if "IDE" in found:
+            extended |= found["IDE"].samples.astype(np.int64) != 0
+        payloads = _payloads(found["DataBytes"].samples)
+        sizes = np.full(len(numbers), payloads.shape[1])
+        if "DataLength" in found:
+            sizes = np.minimum(sizes, found["DataLength"].samples.astype(np.int64))
+        buses = np.zeros(len(numbers), dtype=np.int64)
+        if "BusChannel" in found:
+            buses = found["BusChannel"].samples.astype(np.int64)
+        times_s = self._mdf.times_s(found["ID"])
+        return FrameBlock(numbers & _IDENTIFIER, extended, times_s, buses, sizes, payloads)
+
+
+def _payloads(samples: NDArray[Any]) -> Bytes:
+    """Return payloads as a matrix of bytes, those that are shorter filled up."""
+    if samples.ndim > 1:
+        return samples.astype(np.uint8, copy=False)
+    found = np.asarray(samples, dtype="S64" if samples.dtype.kind == "O" else samples.dtype)
+    return np.ascontiguousarray(found).view(np.uint8).reshape(len(found), -1)
+
+
+@contextmanager
+def open_mdf_bus(bus: CanBus, budget: Budget) -> Iterator[MdfBus]:
+    """Open an MDF file for the CAN frames in it. Raises `InputError`."""
+    database = parse_database(bus)
+    with closing(Spool()) as spool, open_mdf(budget) as mdf:
+        yield MdfBus(bus, database, spool, budget, mdf)

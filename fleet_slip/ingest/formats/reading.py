@@ -13,20 +13,16 @@ from typing import TypeVar
 import polars as pl
 import pyarrow as pa
 
+from fleet_slip.base import shown
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.can.can_bus import CanBus
+from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.confined_source import open_confined
-from fleet_slip.ingest.formats.csv_batches import PlainNumbers, open_csv
-from fleet_slip.ingest.formats.csv_text import CsvFormat
-from fleet_slip.ingest.formats.duckdb_table import MAGIC as DUCKDB_MAGIC
-from fleet_slip.ingest.formats.duckdb_table import MAGIC_AT as DUCKDB_AT
-from fleet_slip.ingest.formats.duckdb_table import DuckdbRows, open_duckdb
-from fleet_slip.ingest.formats.log_source import Source
-from fleet_slip.ingest.formats.meter import Meter
-from fleet_slip.ingest.formats.parquet_batches import PARQUET_MAGIC, open_parquet
-from fleet_slip.ingest.logs.log_files import parts_of
-from fleet_slip.words import shown
+from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers, open_csv
+from fleet_slip.ingest.formats.source import Budget, Meter, Source
+from fleet_slip.ingest.formats.tables import MAGIC as DUCKDB_MAGIC
+from fleet_slip.ingest.formats.tables import MAGIC_AT as DUCKDB_AT
+from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, DuckdbRows, open_duckdb, open_parquet
+from fleet_slip.ingest.log_files import parts_of
 
 _HDF5, _HDF5_AT = b"\x89HDF\r\n\x1a\n", 512
 """A MATLAB file of version 7.3 becomes HDF5 there: MATLAB's own header is before it."""

@@ -15,11 +15,17 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from fleet_slip.base import shown
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.budget import Budget
-from fleet_slip.ingest.formats.log_source import OWN_TIME, Base, Channel, ClockSource, reading_with
 from fleet_slip.ingest.formats.matlab import MatSource
-from fleet_slip.words import shown
+from fleet_slip.ingest.formats.source import (
+    OWN_TIME,
+    Base,
+    Budget,
+    Channel,
+    ClockSource,
+    reading_with,
+)
 
 READ_AHEAD = 2**17
 """Values that are read at once: for each time npTDMS reads all that a segment has of a channel."""

@@ -4,13 +4,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS, TILE
-from fleet_slip.columns.blocks.product_sums import (
-    PIECE_ROWS,
-    add_products,
-    add_sums,
-    find_pieces,
-)
+from fleet_slip.columns.kernel import PIECE_ROWS, add_products, add_sums, find_pieces
+from fleet_slip.columns.plan import BLOCK_ROWS, TILE
 
 
 @settings(deadline=None, max_examples=60)

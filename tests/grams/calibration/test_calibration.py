@@ -12,25 +12,21 @@ import pyarrow as pa
 import pytest
 from typer.testing import CliRunner
 
-from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
+from fleet_slip.catalogue.facts import CAR_NUMBERS
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.cli.app import app
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.calibration.calibration import calibrate
-from fleet_slip.grams.calibration.car_evidence import CarEvidence
-from fleet_slip.grams.calibration.numbers_over_drives import changed_numbers, convergence
-from fleet_slip.grams.calibration.road_lean import roads_of
-from fleet_slip.grams.calibration.tell_by_satellite import NO_RECEIVER
-from fleet_slip.grams.calibration.tell_numbers import FLAT, KINDS, tell_numbers
-from fleet_slip.grams.calibration.telling import EVEN, NO_COURSE, NO_TYRE, STRAIGHT
-from fleet_slip.grams.cohorts.drive_sums import collect_sums
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.maintenance.forget import forget
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.exact.moments_relation import ExactSums, solve
+from fleet_slip.grams.calibration import calibrate, changed_numbers, convergence
+from fleet_slip.grams.car_estimates import FLAT, KINDS, NO_RECEIVER, tell_numbers
+from fleet_slip.grams.car_evidence import CarEvidence, roads_of
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.reader import collect_sums
+from fleet_slip.grams.telling import EVEN, NO_COURSE, NO_TYRE, STRAIGHT
+from fleet_slip.operations.forget import forget
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import ExactSums, fit, solve
 from fleet_slip.views import connect
-from fleet_slip.warehouse.audit import Forgettable
+from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support import cars
 from tests.support.logs import land, log_rows

@@ -7,16 +7,15 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.car_numbers import BY_COURSE, BY_SATELLITE
-from fleet_slip.catalogue.course_change import TURNED
-from fleet_slip.catalogue.course_relation import turned_scale
+from fleet_slip.catalogue.course import TURNED, turned_scale
+from fleet_slip.catalogue.facts import BY_COURSE, BY_SATELLITE
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.calibration.car_evidence import CarEvidence
-from fleet_slip.grams.calibration.tell_by_satellite import NO_CAR, kinds_by_set, tell_by_satellite
-from fleet_slip.grams.calibration.telling import Told
-from fleet_slip.grams.cohorts.drive_sums import DriveSums, collect_sums
-from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.grams.car_estimates import NO_CAR, kinds_by_set, tell_by_satellite
+from fleet_slip.grams.car_evidence import CarEvidence
+from fleet_slip.grams.reader import DriveSums, collect_sums
+from fleet_slip.grams.telling import Told
+from fleet_slip.regression.gram import Gram
 
 RATIO, LEVER_M, COMPLIANCE, BIAS_RAD = 1.07, 1.3, -0.006, 0.004
 COLUMNS = {set_: columns for set_, kind in kinds_by_set().items() for columns in kind.values()}

@@ -7,21 +7,20 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.car_numbers import CAR_NUMBERS
+from fleet_slip.catalogue.facts import CAR_NUMBERS
 from fleet_slip.catalogue.features import features
-from fleet_slip.columns.blocks.column_plan import ColumnPlan
-from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
+from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
+from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, InputError, QuestionError
-from fleet_slip.grams.calibration.calibration import calibrate
-from fleet_slip.grams.cohorts.expansion import expand
-from fleet_slip.grams.cohorts.fold_sums import sum_cohort
-from fleet_slip.grams.cohorts.folding import Folding
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.models.estimates.predict import predict
-from fleet_slip.models.estimates.score import score, score_statement
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.gram_table import GramTable
+from fleet_slip.grams.calibration import calibrate
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.expansion import expand
+from fleet_slip.grams.folding import Folding
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.sums import sum_cohort
+from fleet_slip.models.predict import predict
+from fleet_slip.models.score import score, score_statement
+from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support import cars
 from tests.support.logs import land, log_rows

@@ -7,20 +7,17 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.feature_sets import PLAIN
+from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts import gram_reader
-from fleet_slip.grams.cohorts.day_sums import sum_days
-from fleet_slip.grams.cohorts.fold_sums import sum_cohort
-from fleet_slip.grams.cohorts.folding import FoldCount, Folding, FoldKey
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.cohorts.gram_reader import GramReader
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.selection.answer_request import answer_request
-from fleet_slip.selection.model_list import load_model_list
-from fleet_slip.selection.request import SelectionRequest
-from fleet_slip.selection.select_models import select
+from fleet_slip.grams import reader as gram_reader
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.folding import FoldCount, Folding, FoldKey
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.reader import GramReader
+from fleet_slip.grams.sums import sum_cohort, sum_days
+from fleet_slip.models.request import SelectionRequest, load_model_list
+from fleet_slip.models.select import answer_request, select
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import VIEWS, connect, needed_views
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse

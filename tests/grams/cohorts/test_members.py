@@ -3,10 +3,10 @@
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.cohorts.members import Hashed, Members
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.grams.rows.gram_rows import hash_numbers
+from fleet_slip.grams.cells import Hashed, Members
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.gram_rows import hash_numbers
+from fleet_slip.grams.job import update_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohorts.folding import Folding, FoldKey
-from fleet_slip.grams.cohorts.training_folds import drive_folds, row_training
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.inference.drive_moments import DriveMoments
+from fleet_slip.grams.cohort import drive_folds, row_training
+from fleet_slip.grams.folding import Folding, FoldKey
+from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.gram import Gram
 from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
 
 COEFFICIENTS = (0.1, 0.4, 0.9, 0.2)

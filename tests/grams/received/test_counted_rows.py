@@ -11,8 +11,8 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import InputError, RepeatedError
-from fleet_slip.grams.received.counted_rows import COLUMNS, LONGEST_ROWS
-from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.grams.on_board import COLUMNS, LONGEST_ROWS
+from fleet_slip.regression.gram import Gram
 from tests.support.commands import RunCommand
 from tests.support.counted_rows import START_S, gram_of, row_of, write_counted
 from tests.support.fleet_rows import rows_of_fleet

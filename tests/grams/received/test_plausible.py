@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.grams.received.plausible import INDEFINITE, NO_ROWS, PRODUCTS, SUMS, find_impossible
-from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.grams.on_board import INDEFINITE, NO_ROWS, PRODUCTS, SUMS, find_impossible
+from fleet_slip.regression.gram import Gram
 
 RANGES = [(-100, 100), (0, 30000), (-32767, 32767)]
 

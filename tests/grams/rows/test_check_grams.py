@@ -6,13 +6,13 @@ import pyarrow.compute as pc
 import pytest
 
 from fleet_slip.compute.tasks import LocalThreads
-from fleet_slip.delta import Change
 from fleet_slip.errors import StorageError
-from fleet_slip.grams.rows.aggregation import aggregate
-from fleet_slip.grams.rows.check_grams import check_grams, differing_drives
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.grams.rows.gram_rows import gram_table
-from fleet_slip.regression.exact.gram import Gram, packed_size
+from fleet_slip.grams.check import check_grams, differing_drives
+from fleet_slip.grams.compute import aggregate
+from fleet_slip.grams.gram_rows import gram_table
+from fleet_slip.grams.job import update_grams
+from fleet_slip.regression.gram import Gram, packed_size
+from fleet_slip.storage.table import Change
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 

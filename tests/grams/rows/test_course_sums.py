@@ -10,17 +10,20 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from fleet_slip.catalogue.course_change import LARGEST_RAD, TURNED, course_units
-from fleet_slip.catalogue.feature_sets import FeatureSet
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.course import LARGEST_RAD, TURNED, course_units
+from fleet_slip.catalogue.features import FeatureSet, features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.blocks.column_plan import ColumnPlan
-from fleet_slip.columns.blocks.drive_columns import Workspace
-from fleet_slip.grams.rows.aggregation import aggregate, by_sql
-from fleet_slip.grams.rows.check_grams import grams_of
-from fleet_slip.grams.rows.course_sums import course_changes, find_fixes
-from fleet_slip.grams.rows.drive_rows import counts_of
-from fleet_slip.grams.rows.windowed_grams import wide_grams
+from fleet_slip.columns.drive_columns import Workspace
+from fleet_slip.columns.plan import ColumnPlan
+from fleet_slip.grams.check import grams_of
+from fleet_slip.grams.compute import (
+    aggregate,
+    by_sql,
+    counts_of,
+    course_changes,
+    find_fixes,
+    wide_grams,
+)
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 

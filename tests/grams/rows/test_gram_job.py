@@ -11,15 +11,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.delta import Change, Unit
 from fleet_slip.errors import StorageError
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.rows import gram_files
-from fleet_slip.grams.rows.aggregation import aggregate
-from fleet_slip.grams.rows.backlog import find_backlog
-from fleet_slip.grams.rows.check_grams import check_grams, grams_of
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.grams.rows.statement import gram_statement
+from fleet_slip.grams import gram_files
+from fleet_slip.grams.check import check_grams, grams_of
+from fleet_slip.grams.compute import aggregate, gram_statement
+from fleet_slip.grams.job import find_backlog, update_grams
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import DAY, land, log_rows, random_counts
 

@@ -13,15 +13,10 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalogue.car_numbers import DELAY
+from fleet_slip.catalogue.facts import DELAY
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.cohorts.gram_reader import open_grams
-from fleet_slip.grams.rows.receiver_delay import (
-    ReceiverDelay,
-    receiver_delays,
-    with_pooled,
-    with_types,
-)
+from fleet_slip.grams.reader import open_grams
+from fleet_slip.grams.receiver_delay import ReceiverDelay, receiver_delays, with_pooled, with_types
 from fleet_slip.warehouse.condition import parse_condition
 
 CAMPAIGN = """

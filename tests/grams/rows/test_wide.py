@@ -15,16 +15,14 @@ from hypothesis import strategies as st
 from fleet_slip.catalogue.definitions import WEIGHT, Definition, Fact, Gate, limit_of
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.blocks.column_plan import ColumnPlan
-from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts
-from fleet_slip.columns.column_sql import with_columns
+from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
+from fleet_slip.columns.plan import ColumnPlan
+from fleet_slip.columns.sql import with_columns
 from fleet_slip.errors import DataError
-from fleet_slip.grams.rows import statement
-from fleet_slip.grams.rows.aggregation import aggregate, by_sql
-from fleet_slip.grams.rows.check_grams import grams_of
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.grams.rows.statement import gram_statement
-from fleet_slip.grams.rows.windowed_grams import wide_grams
+from fleet_slip.grams import compute as statement
+from fleet_slip.grams.check import grams_of
+from fleet_slip.grams.compute import aggregate, by_sql, gram_statement, wide_grams
+from fleet_slip.grams.job import update_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 

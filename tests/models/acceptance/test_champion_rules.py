@@ -11,29 +11,22 @@ import pytest
 import fleet_slip
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.config import CONFIG_VARIABLE
 from fleet_slip.errors import ConfigError, RefusedError, StorageError
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.maintenance.forget import forget
-from fleet_slip.maintenance.marked_models import models_trained_on
-from fleet_slip.models.acceptance import champion_rules
-from fleet_slip.models.aliases import CANDIDATE
-from fleet_slip.models.describe_winner import manifest_of
+from fleet_slip.grams.job import update_grams
+from fleet_slip.models import acceptance as champion_rules
 from fleet_slip.models.diff import compare_versions
-from fleet_slip.models.estimates.counts_model import counts_model
-from fleet_slip.models.publish import Publication, publish, would_publish
-from fleet_slip.models.versions import Registry
-from fleet_slip.regression.choice.stepwise import stepwise_order
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.validation.crossval import (
-    cross_validate,
-    held_out_errors,
-    least_squares,
-)
-from fleet_slip.resources import CONFIG_VARIABLE
-from fleet_slip.selection.answer_request import answer_request
-from fleet_slip.selection.request import SelectionRequest
-from fleet_slip.warehouse.audit import Forgettable
+from fleet_slip.models.predict import counts_model
+from fleet_slip.models.publish import Publication, manifest_of, publish, would_publish
+from fleet_slip.models.registry import CANDIDATE, Registry
+from fleet_slip.models.request import SelectionRequest
+from fleet_slip.models.select import answer_request
+from fleet_slip.operations.forget import forget, models_trained_on
+from fleet_slip.regression.folds import cross_validate, held_out_errors, least_squares
+from fleet_slip.regression.least_squares import fit
+from fleet_slip.regression.orders import stepwise_order
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows
 

@@ -8,10 +8,10 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.blocks.block_operations import BLOCK_ROWS
-from fleet_slip.columns.blocks.drive_columns import DriveColumns, DriveCounts, Workspace
-from fleet_slip.models.estimates.predictor import Predictor
-from fleet_slip.models.model_version import ModelVersion
+from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts, Workspace
+from fleet_slip.columns.plan import BLOCK_ROWS
+from fleet_slip.models.predict import Predictor
+from fleet_slip.models.registry import ModelVersion
 from tests.export.models import MODELS, model_of
 
 MANIFEST = model_of(MODELS["every_kind"], Fraction(1, 7))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fleet_slip.regression.choice.nested_choice import nested_fits
-from fleet_slip.regression.inference.evidence import Evidence
+from fleet_slip.regression.choice import nested_fits
+from fleet_slip.regression.inference import Evidence
 from tests.support.counts import gram_of
 
 ORDER = ("x1", "x2", "x3", "x4")

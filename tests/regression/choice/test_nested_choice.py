@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.regression.choice.nested_choice import (
+from fleet_slip.regression.choice import (
     CROSS_VALIDATION,
     Rule,
     TrainingFolds,
@@ -12,12 +12,11 @@ from fleet_slip.regression.choice.nested_choice import (
     cross_validate_selection,
     select_nested,
 )
-from fleet_slip.regression.choice.subsets import best_subsets, pick_sizes
-from fleet_slip.regression.exact.figures import error_sums
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.inference.drive_moments import DriveMoments
-from fleet_slip.regression.validation.crossval import cross_validate, least_squares
-from fleet_slip.regression.validation.folds import CohortFolds, by_value
+from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.folds import CohortFolds, by_value, cross_validate, least_squares
+from fleet_slip.regression.least_squares import fit
+from fleet_slip.regression.subsets import best_subsets, pick_sizes
 from tests.support.counts import gram_of, names, table_of, unit_scales
 
 INPUTS = names(5)[:-1]

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.regression.choice import stepwise
-from fleet_slip.regression.choice.signal_orders import rank, replacement_sets
-from fleet_slip.regression.choice.stepwise import METHODS, stepwise_order
-from fleet_slip.regression.exact.gram import Gram
+from fleet_slip.regression import orders
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.orders import METHODS, rank, replacement_sets, stepwise_order
 
 
 def correlated(seed: int, inputs: int, rows: int = 400) -> Gram:
@@ -85,7 +84,7 @@ def test_what_shortens_a_search_changes_no_order(
     gram = correlated(5, 40)
     found = stepwise_order(gram, names(40), "y", method, 40)
     assert len(found) == 40
-    monkeypatch.setattr(stepwise, "DEPENDENT", 1e-13)
+    monkeypatch.setattr(orders, "DEPENDENT", 1e-13)
     monkeypatch.setattr(np.linalg, "cholesky", _singular)
     assert stepwise_order(gram, names(40), "y", method, 40) == found
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_slip.regression.exact import elimination
-from fleet_slip.regression.exact.elimination import symmetric_eigenvalues
+from fleet_slip.regression import exact as elimination
+from fleet_slip.regression.exact import symmetric_eigenvalues
 
 
 @given(st.integers(1, 12), st.integers(0, 10**6))

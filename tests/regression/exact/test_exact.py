@@ -8,11 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.choice.nested_choice import nested_fits
-from fleet_slip.regression.exact.elimination import eliminate, inverse_matrix
-from fleet_slip.regression.exact.exact_roots import sqrt
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import (
+from fleet_slip.regression.choice import nested_fits
+from fleet_slip.regression.exact import eliminate, inverse_matrix, sqrt
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import (
     condition_number,
     correlation_matrix,
     dependence,

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.exact.gram import Gram, packed_position
-from fleet_slip.regression.exact.gram_table import GramTable, exact_sum
+from fleet_slip.regression.gram import Gram, GramTable, exact_sum, packed_position
 from tests.support.counts import table_of
 
 SIGNALS = ("ax", "ay", "sideslip")

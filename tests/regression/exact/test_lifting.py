@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.exact import least_squares as exact
-from fleet_slip.regression.exact.elimination import PRIMES, eliminate, solve_by_lifting
+from fleet_slip.regression import least_squares as exact
+from fleet_slip.regression.exact import PRIMES, eliminate, solve_by_lifting
 from tests.support.counts import gram_of, names
 
 

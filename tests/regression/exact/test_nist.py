@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.inference.standard_errors import infer_classically
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.inference import infer_classically
+from fleet_slip.regression.least_squares import fit
 from tests.support.counts import columns_to_counts
 from tests.support.evidence import evidence
 

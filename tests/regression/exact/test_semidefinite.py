@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.regression.exact.elimination import is_semidefinite
+from fleet_slip.regression.exact import is_semidefinite
 
 
 def determinant(matrix: list[list[int]]) -> int:

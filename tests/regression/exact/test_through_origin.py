@@ -6,14 +6,18 @@ import statsmodels.api as sm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.regression.choice.nested_choice import nested_fits
-from fleet_slip.regression.choice.signal_orders import rank
-from fleet_slip.regression.choice.subsets import best_subsets
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.inference.bootstrap import repeated_cross_validation
-from fleet_slip.regression.inference.drive_moments import DriveMoments
-from fleet_slip.regression.inference.evidence import Evidence, chow_test, wald_test
-from fleet_slip.regression.inference.standard_errors import infer_by_clusters, infer_classically
+from fleet_slip.regression.choice import nested_fits
+from fleet_slip.regression.drives import DriveMoments, repeated_cross_validation
+from fleet_slip.regression.inference import (
+    Evidence,
+    chow_test,
+    infer_by_clusters,
+    infer_classically,
+    wald_test,
+)
+from fleet_slip.regression.least_squares import fit
+from fleet_slip.regression.orders import rank
+from fleet_slip.regression.subsets import best_subsets
 from tests.support.counts import Matrix, gram_of, names, random_drives, table_of, unit_scales
 
 INPUTS = names(4)[:-1]

@@ -4,18 +4,17 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.exact.gram_table import GramTable
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.inference.bootstrap import (
+from fleet_slip.regression.drives import (
+    DriveMoments,
     bootstrap_correlations,
     held_out_products,
     percentile_interval,
     repeated_cross_validation,
     solve,
 )
-from fleet_slip.regression.inference.drive_moments import DriveMoments
-from fleet_slip.regression.validation.crossval import cross_validate, least_squares
-from fleet_slip.regression.validation.folds import CohortFolds, by_value
+from fleet_slip.regression.folds import CohortFolds, by_value, cross_validate, least_squares
+from fleet_slip.regression.gram import GramTable
+from fleet_slip.regression.least_squares import fit
 from tests.support.counts import gram_of, names, random_drives, table_of, unit_scales
 
 INPUTS = names(4)[:-1]

@@ -8,17 +8,17 @@ from hypothesis import strategies as st
 from scipy.special import betainc
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.exact.figures import incomplete_beta, normal_cdf, normal_density
-from fleet_slip.regression.exact.gram_table import GramTable
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.inference.drive_moments import DriveMoments, serving_drives
-from fleet_slip.regression.inference.evidence import chow_test
-from fleet_slip.regression.inference.standard_errors import (
+from fleet_slip.regression.drives import DriveMoments, serving_drives
+from fleet_slip.regression.figures import incomplete_beta, normal_cdf, normal_density
+from fleet_slip.regression.gram import GramTable
+from fleet_slip.regression.inference import (
+    chow_test,
     cluster_covariance,
     infer_by_clusters,
     infer_classically,
     variance_inflation,
 )
+from fleet_slip.regression.least_squares import fit
 from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of, unit_scales
 
 

@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.inference.drive_moments import DriveMoments
-from fleet_slip.regression.inference.influential import LEAST_CARS, find_influential
+from fleet_slip.regression.drives import LEAST_CARS, DriveMoments, find_influential
+from fleet_slip.regression.gram import Gram
 from tests.support.counts import table_of
 
 SIGNALS = ("a", "b", "y")

@@ -8,14 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.exact.figures import error_sums
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.inference.serial import (
-    fit_autoregressive,
-    quasi_difference,
-    serial_correlation,
-)
-from fleet_slip.regression.shrinkage.ridge import disturb
+from fleet_slip.regression.drives import fit_autoregressive, quasi_difference, serial_correlation
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.least_squares import fit
+from fleet_slip.regression.shrinkage import disturb
 from tests.support.counts import (
     autoregressive_drives,
     dense_fit,

@@ -5,10 +5,9 @@ import statsmodels.api as sm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.inference.drive_moments import DriveMoments
-from fleet_slip.regression.inference.serial import fit_autoregressive
-from fleet_slip.regression.inference.standard_errors import infer_by_clusters, infer_classically
+from fleet_slip.regression.drives import DriveMoments, fit_autoregressive
+from fleet_slip.regression.inference import infer_by_clusters, infer_classically
+from fleet_slip.regression.least_squares import fit
 from tests.support.counts import (
     autoregressive_drives,
     gram_of,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.exact.least_squares import fit
-from fleet_slip.regression.shrinkage.ridge import (
+from fleet_slip.regression.least_squares import fit
+from fleet_slip.regression.shrinkage import (
     fit_errors_in_variables,
     fit_noise_matched,
     fit_penalised,

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.regression.choice.nested_choice import nested_fits
-from fleet_slip.regression.choice.signal_orders import backward
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import LinearModel, fit
-from fleet_slip.regression.inference.evidence import Evidence
-from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate
-from fleet_slip.regression.validation.folds import Folds
+from fleet_slip.regression.choice import nested_fits
+from fleet_slip.regression.folds import CrossValidation, Folds, cross_validate
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.inference import Evidence
+from fleet_slip.regression.least_squares import LinearModel, fit
+from fleet_slip.regression.orders import backward
 from tests.support.counts import columns_to_counts
 from tests.support.evidence import EVIDENCE, evidence
 from tests.support.weka import weka_linear_regression

@@ -12,16 +12,17 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.choice.winner import Worth, choose
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.validation.crossval import CrossValidation, cross_validate_inputs
-from fleet_slip.regression.validation.folds import (
+from fleet_slip.regression.choice import Worth, choose
+from fleet_slip.regression.folds import (
     CohortFolds,
+    CrossValidation,
     by_band,
     by_hash,
     by_value,
+    cross_validate_inputs,
     hash_fold,
 )
+from fleet_slip.regression.gram import Gram
 from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of
 
 SCALES = {**{name: Fraction(1, 100) for name in names(6)}, "y": Fraction(1, 10_000)}

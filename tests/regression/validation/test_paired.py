@@ -6,12 +6,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from fleet_slip.regression.choice.winner import Shortfall, Worth, compare_paired, compare_typical
-from fleet_slip.regression.exact.figures import error_sums
-from fleet_slip.regression.exact.gram import Gram
-from fleet_slip.regression.exact.least_squares import LinearModel
-from fleet_slip.regression.validation.crossval import CrossValidation, assemble
-from fleet_slip.regression.validation.folds import Folds
+from fleet_slip.regression.choice import Shortfall, Worth, compare_paired, compare_typical
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.folds import CrossValidation, Folds, assemble
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import LinearModel
 
 SIGNALS = ("x", "z", "y")
 SCALES = dict.fromkeys(SIGNALS, Fraction(1))

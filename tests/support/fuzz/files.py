@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_slip.ingest.mapping.mapping import Mapping
+from fleet_slip.ingest.mapping import Mapping
 from tests.support.fuzz.mutate import NUMBERS, WORDS, mutate_bytes
 
 COLUMNS = ("t", "ax", "beta", "car", "day")

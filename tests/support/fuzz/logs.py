@@ -22,8 +22,8 @@ import pyarrow as pa
 import scipy.io
 from asammdf import MDF, Signal
 
-from fleet_slip.ingest.formats.can.can_bus import CanBus
-from fleet_slip.ingest.mapping.mapping import Mapping
+from fleet_slip.ingest.formats.can import CanBus
+from fleet_slip.ingest.mapping import Mapping
 from tests.support.fuzz.files import _BASE
 from tests.support.fuzz.mutate import mutate_bytes
 

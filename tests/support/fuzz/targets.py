@@ -22,29 +22,28 @@ import pyarrow as pa
 
 from fleet_slip.catalogue.features import load_features
 from fleet_slip.catalogue.signals import catalogue, load_catalogue
-from fleet_slip.delta import Change, Unit
+from fleet_slip.config import find_config, folder
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.files.data_root import data_root
-from fleet_slip.files.documents import checksum
-from fleet_slip.files.local_folder import LocalFolder
-from fleet_slip.grams.cohorts.folding import FoldKey
-from fleet_slip.grams.cohorts.gram_cohort import load_cohort
-from fleet_slip.grams.rows.gram_job import update_grams
-from fleet_slip.ingest.mapping.mapping import Mapping, load_mapping
-from fleet_slip.maintenance.retention import load_retention
-from fleet_slip.models.estimates.score import score
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.folding import FoldKey
+from fleet_slip.grams.job import update_grams
+from fleet_slip.ingest.mapping import Mapping, load_mapping
 from fleet_slip.models.manifest import require_model_name
-from fleet_slip.models.versions import Registry
-from fleet_slip.resources import find_config, folder
-from fleet_slip.selection.answer_request import answer_request
-from fleet_slip.selection.model_list import load_model_list
-from fleet_slip.selection.request import SelectionRequest
+from fleet_slip.models.registry import Registry
+from fleet_slip.models.request import SelectionRequest, load_model_list
+from fleet_slip.models.score import score
+from fleet_slip.models.select import answer_request
+from fleet_slip.operations.retention import load_retention
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.storage.data_root import data_root
+from fleet_slip.storage.documents import checksum
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.table import Change, Unit
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
-from fleet_slip.warehouse.read_only_sql import one_query
+from fleet_slip.warehouse.database import one_query
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.fuzz.files import MAPPINGS, csv_file, parquet_file
 from tests.support.fuzz.logs import damaged_file

@@ -1,0 +1,276 @@
+"""The part of a `Fleet` that fills the warehouse: logs, and Gram rows made of them."""
+
+from collections.abc import Callable, Iterable
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fleet_slip.api.calls import (
+    Rooted,
+    ShowProgress,
+    Workers,
+    count_from_start,
+    open_workers,
+    record_call,
+    unless_local,
+    within_reach,
+)
+from fleet_slip.base import Progress, last_day, no_progress
+from fleet_slip.errors import InputError
+from fleet_slip.storage.runs import step
+
+if TYPE_CHECKING:
+    from fleet_slip.grams.check import CheckReport
+    from fleet_slip.grams.job import GramReport
+    from fleet_slip.grams.on_board import CountedReport
+    from fleet_slip.ingest.job import IngestReport
+    from fleet_slip.ingest.load import Replace
+    from fleet_slip.ingest.log_files import Log
+    from fleet_slip.ingest.mapping import Mapping, MappingList
+    from fleet_slip.ingest.preview import Preview
+    from fleet_slip.operations.migration import MigrationReport
+    from fleet_slip.simulation.campaign import Campaign
+    from fleet_slip.simulation.job import SimulationReport
+
+
+class LogsAndGrams(Rooted):
+    """Simulated and measured logs, and Gram rows. Whatever was done is not done again."""
+
+    @record_call
+    def simulate(
+        self,
+        campaign: "str | Campaign",
+        *,
+        days: int | None = None,
+        through: date | str | None = None,
+        workers: Workers = None,
+        progress: ShowProgress | None = None,
+    ) -> "SimulationReport":
+        """Simulate what is missing of a campaign and write it to the logs.
+
+        `campaign` is a name, the path of a TOML file, or a `Campaign`; of its days the first
+        `days`, up to `through`. Progress is in rows. Raises `ConfigError` for an invalid campaign,
+        `UsageError` if it has no such days, `RefusedError` for one changed since it was written,
+        and `ClusterError`.
+        """
+        from fleet_slip.simulation.campaign import load_campaign
+        from fleet_slip.simulation.job import simulate_campaign
+
+        chosen = load_campaign(campaign) if isinstance(campaign, str) else campaign
+        wanted = chosen.chosen_days(days, last_day(through, "through"))
+        with open_workers(self.root, workers) as executor, step("simulate") as figures:
+            report = simulate_campaign(
+                within_reach(self.warehouse, executor),
+                chosen,
+                wanted,
+                executor,
+                count_from_start(progress),
+            )
+            figures.rows, figures.size_bytes = report.rows, report.size_bytes
+        return report
+
+    @record_call
+    def ingest(
+        self,
+        files: Iterable[Path | str] | Path | str,
+        mapping: "str | Mapping | MappingList",
+        *,
+        as_one: bool = False,
+        replace: "Replace" = "no",
+        workers: Workers = None,
+        each: "Callable[[IngestReport], None] | None" = None,
+        progress: ShowProgress | None = None,
+    ) -> "list[IngestReport]":
+        """Bring measured logs in through a mapping of columns, units and axes.
+
+        `mapping` is a name, the path of a TOML file, or a `Mapping`; or a list of them for files of
+        their own (`docs/mapping.md`). Rows that cannot be used go to the view `quarantine`. Of
+        folders, at any depth, and patterns, the logs are taken that have not landed unchanged; with
+        `as_one` they are parts of one log. Objects are given as URLs.
+        Returns a report of each file read, in order; `each` gets it once the file is committed.
+        Progress is in files for folders and patterns, else in bytes.
+        Without a cluster, threads read a folder's small files; large ones are read one by one, by
+        all cores.
+
+        A recording that is there already is told by its bytes and samples. With `replace="all"` its
+        drives give way to the new ones, in one commit; with `corrected` those of the same file and
+        an older state of the same mapping do. Raises `ConfigError` for an invalid mapping;
+        `InputError`, when all others are in, for files that cannot be used, or `RepeatedError`
+        where these are all in already, or `UnclaimedError` where no mapping of a list takes them,
+        or several do; `StorageError` and `ClusterError`.
+        """
+        from fleet_slip.ingest.job import ingest_files, joined
+        from fleet_slip.ingest.load import KnownFiles
+        from fleet_slip.ingest.log_files import find_logs, find_whole_logs, names_several
+        from fleet_slip.ingest.mapping import as_list
+        from fleet_slip.operations.rewriting import TakingOut
+
+        plans = as_list(mapping)
+        given = [files] if isinstance(files, Path | str) else list(files)
+        paths = find_whole_logs(given) if as_one else find_logs(given)
+        folders = any(map(names_several, given))
+        told = count_from_start(progress)
+        failures: list[InputError] = []
+        reports = {}
+        with open_workers(self.root, workers) as executor, step("ingest") as figures:
+            elsewhere = unless_local(executor)
+            if elsewhere:  # a worker has a working directory of its own
+                paths = [one.absolute() if isinstance(one, Path) else one for one in paths]
+            figures.rows = 0
+            warehouse = within_reach(self.warehouse, executor)
+            shares, unclaimed = plans.share_out(paths, given)
+            by_file = folders and not as_one
+            threads = executor if by_file else elsewhere
+            taking_out = TakingOut(self.warehouse)
+            logs = [log for _, share in shares for log in share]
+            read = no_progress if by_file or progress is None else _bytes_of(logs, told)
+            for plan, share in shares:
+                known = KnownFiles.of(self.warehouse, plan) if folders else None
+                wanted = share
+                if known is not None and not as_one:  # what is in a folder its size does not tell
+                    wanted = known.without_landed(share, warehouse)
+                if landed := len(share) - len(wanted):
+                    told(landed, len(logs))
+                try:
+                    for report in ingest_files(
+                        warehouse, wanted, plan, threads, known, read, replace, taking_out, failures
+                    ):
+                        reports[report.file] = report
+                        figures.rows += report.counts.ticks if report.new else 0
+                        if each is not None:
+                            each(report)
+                        if by_file:
+                            told(1, len(logs))
+                finally:
+                    if known is not None:
+                        known.save(warehouse)
+            if failures or unclaimed:
+                raise joined(failures, unclaimed)
+        return [reports[str(path)] for path in paths if str(path) in reports]
+
+    @record_call
+    def ingest_counted(self, file: Path | str) -> "CountedReport":
+        """Bring in Gram rows that cars counted: a Parquet or Arrow table (`docs/edge.md`).
+
+        It lands whole and once. Raises `InputError` for a row that no drive can have or of what was
+        forgotten, `RepeatedError` for a drive that is there, `StorageError` and `ConflictError`.
+        """
+        from fleet_slip.grams.on_board import ingest_counted
+
+        with step("ingest") as figures:
+            report = ingest_counted(self.warehouse, Path(file))
+            figures.rows = report.rows if report.new else 0
+        return report
+
+    @record_call
+    def take_back(self, what: str) -> int:
+        """Take out what was ingested from a file or through a mapping; return how many drives.
+
+        `what` is the name of either, or what a file's drives begin with, such as
+        `logger-0123456789ab`. Gram rows and refused rows go too; all can land again. Raises
+        `StorageError` and `ConflictError`.
+        """
+        from fleet_slip.operations.rewriting import take_back
+
+        with step("undo"):
+            return take_back(self.warehouse, what)
+
+    def preview(
+        self,
+        files: Iterable[Path | str] | Path | str,
+        mapping: "str | Mapping | MappingList",
+        *,
+        as_one: bool = False,
+    ) -> "list[Preview]":
+        """Read measured files as `ingest` does, and store nothing; raises the same.
+
+        Tells rows, drives, rejections, each signal's range, and what looks wrong in the longest
+        drive: a sign, a unit, swapped wheels, a delay of the label.
+        """
+        from fleet_slip.ingest.log_files import find_logs, find_whole_logs
+        from fleet_slip.ingest.mapping import as_list
+        from fleet_slip.ingest.preview import preview_log
+
+        plans = as_list(mapping)
+        given = [files] if isinstance(files, Path | str) else list(files)
+        logs = find_whole_logs(given) if as_one else find_logs(given)
+        shares, unclaimed = plans.share_out(logs, given)
+        if unclaimed:
+            raise unclaimed
+        return [preview_log(log, plan) for plan, share in shares for log in share]
+
+    @record_call
+    def gram(
+        self,
+        features: str = "signals",
+        *,
+        cohort: str | None = None,
+        workers: Workers = None,
+        progress: ShowProgress | None = None,
+    ) -> "GramReport":
+        """Reduce new log files to Gram rows, and drop the rows of files that are gone.
+
+        `features` is a feature set of `configs/features.toml`; `signals` are the logged ones. A
+        set's first time costs a pass over the logs. With a `cohort`, only files with a drive of it
+        are read, as the Gram rows of `signals` tell. Progress is in rows. Raises `QuestionError`
+        for an unknown set, `StorageError`, `ConflictError` and `ClusterError`.
+        """
+        from fleet_slip.grams.job import update_grams
+        from fleet_slip.grams.reader import cohort_files
+        from fleet_slip.warehouse.condition import parse_cohort
+
+        among = cohort_files(self.warehouse, parse_cohort(cohort)) if cohort else None
+        with open_workers(self.root, workers) as executor, step("gram") as figures:
+            report = update_grams(
+                within_reach(self.warehouse, executor),
+                count_from_start(progress),
+                features,
+                unless_local(executor),
+                among,
+            )
+            figures.rows = report.rows_read
+        return report
+
+    def check(
+        self, files: int = 4, *, begin: int = 0, progress: ShowProgress | None = None
+    ) -> "CheckReport":
+        """Compute the Gram rows of some log files three ways; compare them bit for bit.
+
+        By SQL, by float64 products with exact partial sums, and by Python integers; and with the
+        stored rows. Files are evenly chosen; those of `begin` + 1 are the next ones. Progress is in
+        files. Raises `StorageError` naming the first drive that differs, and `DataError` if there
+        is nothing to check.
+        """
+        from fleet_slip.grams.check import check_grams
+
+        return check_grams(self.warehouse, files, count_from_start(progress), begin)
+
+    @record_call
+    def migrate(self, *, progress: ShowProgress | None = None) -> "MigrationReport":
+        """Bring the logs to the signal catalogue (`docs/schema.md`): add columns, convert scales.
+
+        Progress is in rows. Raises `RefusedError` if counts would not fit, and `ConflictError`.
+        """
+        from fleet_slip.operations.migration import migrate
+
+        with step("migrate") as figures:
+            report = migrate(self.warehouse, count_from_start(progress))
+            figures.rows = report.rows_rewritten
+        return report
+
+
+def _bytes_of(logs: "Iterable[Log]", told: Progress) -> Progress:
+    """Return what counts the bytes read of each log among those that all have."""
+    from fleet_slip.ingest.log_files import size_of
+
+    total = sum(map(size_of, logs))
+    left = total
+
+    def count(more: int, _of_one: int) -> None:
+        nonlocal left
+        more = min(more, left)  # a batch is written again at a conflict
+        left -= more
+        if total:
+            told(more, total)
+
+    return count

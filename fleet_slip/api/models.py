@@ -1,0 +1,442 @@
+"""The part of a `Fleet` that publishes models and serves them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fleet_slip.api.calls import Rooted, ShowProgress, count_from_start, open_workers, record_call
+from fleet_slip.api.cohort import FleetCohort
+from fleet_slip.base import needed
+from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.errors import RefusedError, UsageError
+from fleet_slip.models.manifest import require_model_name
+from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from fleet_slip.evaluation.blind import BlindRow
+    from fleet_slip.evaluation.report import Written
+    from fleet_slip.export.compile import Estimator
+    from fleet_slip.export.files import Target
+    from fleet_slip.models.diff import Difference
+    from fleet_slip.models.manifest import Manifest
+    from fleet_slip.models.publish import DryRun, Publication
+    from fleet_slip.models.score import Score
+    from fleet_slip.models.select import RequestedSelection
+    from fleet_slip.operations.examined import Examined
+    from fleet_slip.storage.documents import Document
+    from fleet_slip.warehouse.condition import Condition
+
+
+class PublishedModels(Rooted):
+    """Published models. A reference is `NAME@VERSION`, `NAME@ALIAS`, or `NAME` for its champion.
+
+    None stands for the only model that there is.
+    """
+
+    def models(self, name: str | None = None) -> "pa.Table":
+        """Return all published versions, or those of one model, as the view `models` has them.
+
+        `trained_on_forgotten`: whether drives were forgotten since. Raises `QuestionError`,
+        `StorageError`.
+        """
+        from fleet_slip.operations.forget import marked_models
+
+        self.warehouse.require()
+        registry = self.registry()
+        if name is not None:
+            registry.require(name)
+        found = registry.as_table(name)
+        marked = marked_models(self.root)
+        pairs = zip(found["name"].to_pylist(), found["version"].to_pylist(), strict=True)
+        return found.append_column(
+            "trained_on_forgotten", [[f"{name}@{version}" in marked for name, version in pairs]]
+        )
+
+    def model(self, reference: str | None = None) -> ModelVersion:
+        """Return the version that a reference names, by default the only model.
+
+        Raises `QuestionError` for an unknown one, `StorageError` for one that was changed, and
+        `RefusedError` for one without a required signature.
+        """
+        return self.registry().resolve(reference)
+
+    @record_call
+    def publish(
+        self,
+        name: str,
+        choice: "RequestedSelection | FleetCohort | None" = None,
+        *,
+        force: bool = False,
+        candidate: bool = False,
+    ) -> "Publication":
+        """Make a selection's winner the next version of a model, and its champion.
+
+        `choice` is what `FleetCohort.select` returned; or a cohort, None for that of before, on
+        which the model is trained as it was before, or from the usual list. A winner that is worse
+        than the champion on the same cohort and folds needs `force`. A `candidate` waits for
+        `promote`, and so does any winner while the champion is held.
+
+        Raises `RefusedError` for a worse winner, a late or false course, or first measured drives
+        that contradict any car; `UsageError` for an invalid name, and
+        what `FleetCohort.select` raises.
+        """
+        from fleet_slip.models.publish import publish
+
+        registry = self.registry()
+        manifest, selection = self._challenger(name, choice, force=force, candidate=candidate)
+        return publish(registry, manifest, selection, force=force, candidate=candidate)
+
+    def would_publish(
+        self,
+        name: str,
+        choice: "RequestedSelection | FleetCohort | None" = None,
+        *,
+        force: bool = False,
+        candidate: bool = False,
+    ) -> "DryRun":
+        """Tell what `publish` of the same would come to, a refusal too; nothing is written."""
+        from fleet_slip.models.publish import DryRun, would_publish
+
+        registry = self.registry()
+        try:
+            manifest, selection = self._challenger(name, choice, force=force, candidate=candidate)
+            return would_publish(registry, manifest, selection, force=force, candidate=candidate)
+        except RefusedError as error:
+            return DryRun(name, False, str(error), refused=True)
+
+    def _challenger(
+        self,
+        name: str,
+        choice: "RequestedSelection | FleetCohort | None",
+        *,
+        force: bool,
+        candidate: bool,
+    ) -> "tuple[Manifest, RequestedSelection]":
+        """Return a selection's winner, whose drives and course are looked at unless forced."""
+        from fleet_slip.models.acceptance import (
+            require_in_time,
+            require_sound_course,
+            require_sound_drives,
+        )
+        from fleet_slip.models.publish import manifest_of, with_straight_intercept
+
+        require_model_name(name)
+        selection = self._chosen(name, choice)
+        manifest = with_straight_intercept(self.warehouse, manifest_of(selection, name), selection)
+        if manifest.learned_from and not force:
+            delays_s = require_in_time(self.warehouse, manifest)
+            require_sound_course(self.warehouse, manifest, delays_s)
+        if not (force or candidate):
+            registry = self.registry()
+            champion, made = registry.champion(name), None
+            if champion:
+                made = registry.trained_drives(champion.manifest)
+            if champion is None or made is not None:
+                settled = len(champion.manifest.terms) if champion else 0
+                require_sound_drives(self.warehouse, manifest, made, settled)
+        return manifest, selection
+
+    def _chosen(
+        self, name: str, choice: "RequestedSelection | FleetCohort | None"
+    ) -> "RequestedSelection":
+        from fleet_slip.models.publish import recipe_for
+        from fleet_slip.models.request import SelectionRequest
+
+        if choice is not None and not isinstance(choice, FleetCohort):
+            return choice
+        condition, unexamined = (choice.condition, choice.unexamined) if choice else (None, False)
+        recipe = recipe_for(self.registry(), name, SelectionRequest(), condition)
+        cohort = FleetCohort(self.warehouse, recipe.cohort, unexamined)
+        return cohort.select(**vars(recipe.request))
+
+    @record_call
+    def promote(self, reference: str, alias: str = CHAMPION) -> ModelVersion:
+        """Point an alias at a version; return the version. Raises `UsageError`, and as `model`."""
+        require_model_name(alias)
+        version = self.model(reference)
+        self.registry().promote(version.manifest.name, version.version, alias)
+        return version
+
+    @record_call
+    def rollback(self, name: str, alias: str = CHAMPION) -> ModelVersion:
+        """Point an alias back at the version before; return it. It is held there as by `pin`.
+
+        Raises `RefusedError` if it never had another, and what `model` raises.
+        """
+        registry = self.registry()
+        return registry.load(name, registry.rollback(name, alias))
+
+    @record_call
+    def pin(self, name: str, alias: str = CHAMPION) -> ModelVersion:
+        """Keep an alias where it is until `promote` or `unpin`; return its version, as `model`."""
+        registry = self.registry()
+        return registry.load(name, registry.hold(name, alias, "pin"))
+
+    @record_call
+    def unpin(self, name: str, alias: str = CHAMPION) -> ModelVersion:
+        """Let publications move an alias again; return its version. Raises as `model`."""
+        registry = self.registry()
+        return registry.load(name, registry.hold(name, alias, "unpin"))
+
+    def diff(self, one: str | ModelVersion, other: str | ModelVersion) -> "Difference":
+        """Tell two versions apart: data, signals, coefficients, figures. Raises as `model`."""
+        from fleet_slip.models.diff import compare_versions
+
+        return compare_versions(self.registry(), self.resolve(one), self.resolve(other))
+
+    @record_call
+    def import_model(self, file: Path) -> ModelVersion:
+        """Bring a version in that another data root exported to JSON; return it.
+
+        It becomes its model's next version, with its origin and no alias; the latest is returned if
+        it is the same estimator. Raises `InputError` for no such export, or a changed one,
+        `RefusedError` if a signal means something else here.
+        """
+        from fleet_slip.export.files import import_version
+
+        return import_version(self.registry(), file)
+
+    def estimator(
+        self, model: str | ModelVersion, car: Mapping[str, Any] | None = None
+    ) -> "Estimator":
+        """Return a version that estimates a drive sample by sample, as a car does.
+
+        `car` is what the car knows of itself, by name: drive columns such as `mass_kg`, and numbers
+        of the view `calibration`, in SI units. Raises `InputError` for what the version does not
+        use, and what `export` and `model` raise.
+        """
+        from fleet_slip.export.compile import Estimator
+
+        return Estimator(self.resolve(model).manifest, car)
+
+    def export(
+        self,
+        model: str | ModelVersion | None,
+        to: "Target",
+        output: Path,
+        *,
+        with_gram: bool = False,
+    ) -> list[Path]:
+        """Write a version as a program for elsewhere into a folder; return the files.
+
+        `with_gram` adds to C what counts Gram rows in the car, for `ingest`. Exports carry the
+        version's checksum, the hash of its drives, and checks of made-up inputs; no tick of a log.
+        Raises `RefusedError` if the angle's error has no bound or counts mean something else now,
+        `UsageError` for an unknown target, `ConfigError` without what it needs, and what `model`
+        raises.
+        """
+        from fleet_slip.export.files import export_files
+        from fleet_slip.storage.local import LocalFolder
+
+        folder = LocalFolder(output)
+        files = export_files(self.resolve(model), self.warehouse, to, with_gram=with_gram)
+        for name, content in files.items():
+            folder.put(name, content)
+        return [output / name for name in files]
+
+    def log_to_mlflow(self, model: str | ModelVersion, uri: str) -> str:
+        """Log a version to an MLflow server and register it, once; return its number there.
+
+        It is a pyfunc model with signature, input example, metrics and tags. Raises `ConfigError`
+        without the library, `UsageError` for a password in the URI, `StorageError` if the server
+        does not take it, and what `export` and `model` raise.
+        """
+        from fleet_slip.export.files import log_version
+
+        return log_version(self.resolve(model), self.warehouse, uri)
+
+    def registry(self) -> Registry:
+        """Return the registry of models."""
+        return Registry.of(self.warehouse)
+
+    def resolve(self, model: str | ModelVersion | None) -> ModelVersion:
+        """Return the version that a reference names; a version is returned as it is."""
+        return model if isinstance(model, ModelVersion) else self.model(model)
+
+
+# The part of a `Fleet` that judges models: scores, evaluations, the report, pages of drives.
+
+
+class JudgedModels(PublishedModels):
+    """How good published models are. A model is given as `PublishedModels` has it."""
+
+    def score(
+        self,
+        model: str | ModelVersion | None = None,
+        cohort: str | None = None,
+        *,
+        unexamined: bool = False,
+    ) -> "Score":
+        """Evaluate a model on the rows of a cohort; angles are in degrees.
+
+        By default on all drives that it was not trained on, or all if there are no others. Drives
+        that may train no model are left out as in `FleetCohort.select`. Raises `DataError` if no
+        row has the model's signals, `QuestionError` for an invalid condition, and what `model`
+        raises.
+        """
+        from fleet_slip.models.diff import find_seen
+        from fleet_slip.models.score import score
+
+        manifest = self.resolve(model).manifest
+        rows, examined = self.scored_rows(cohort, unexamined=unexamined)
+        with examined.explaining():
+            seen = find_seen(self.warehouse, self.registry(), manifest, rows)
+            found = score(self.warehouse, manifest, rows if cohort else seen.others)
+        without = 0 if cohort or seen.trained == seen.drives else seen.trained or 0
+        return replace(
+            found,
+            drives=seen.drives,
+            drives_trained=seen.trained,
+            drives_left_out=without,
+            examined=str(examined),
+        )
+
+    def scored_rows(
+        self, cohort: str | None = None, *, unexamined: bool = False
+    ) -> "tuple[Condition, Examined]":
+        """Return the rows of a cohort without drives that are not in order, and which these are."""
+        from fleet_slip.models.score import cohort_of_rows
+        from fleet_slip.operations.examined import Examined, leave_out_faulty
+
+        asked = ALL_DRIVES if cohort is None else cohort
+        rows = cohort_of_rows(asked)
+        if unexamined:
+            return rows, Examined(asked)
+        examined = leave_out_faulty(self.warehouse, asked)
+        return replace(rows, sql=cohort_of_rows(examined.cohort).sql), examined
+
+    @record_call
+    def evaluate(
+        self,
+        model: str | ModelVersion | None = None,
+        others: Sequence[str | ModelVersion] = (),
+        *,
+        scenarios: Sequence[str] = (),
+        threads: int | None = None,
+        progress: ShowProgress | None = None,
+    ) -> "Document":
+        """Evaluate models on the paper's test drives and on others; simulate those missing.
+
+        Models of Table I are fitted on the cohort of each and evaluated beside it. `scenarios` are
+        names or paths, by default all that ship. Progress is in simulated rows. Returns the
+        document kept below `evaluations/`. Raises `ConfigError` for an invalid scenario,
+        `RefusedError` for one that changed since it was simulated, `DataError`, and what `model`
+        raises.
+        """
+        from fleet_slip.evaluation.evaluate import evaluate, evaluations_of, keep
+        from fleet_slip.evaluation.scenarios import simulate_scenarios
+        from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
+        from fleet_slip.storage.documents import Document
+
+        chosen = tuple(map(load_scenario, scenarios)) if scenarios else shipped_scenarios()
+        first, *rest = [self.resolve(one) for one in (model, *others)]
+        with open_workers(self.root, threads) as executor:
+            told = count_from_start(progress)
+            simulate_scenarios(self.warehouse, chosen, executor, told)
+            found = evaluate(self.warehouse, chosen, first, rest, executor)
+        content = found.as_dict()
+        kept = keep(evaluations_of(self.warehouse), content)
+        return Document(kept.number, content, kept.sha256)
+
+    @record_call
+    def evaluate_measured(
+        self,
+        model: str | ModelVersion | None = None,
+        cohort: str = TRAINING_DRIVES,
+        others: Sequence[str | ModelVersion] = (),
+        *,
+        vehicle: str | None = None,
+        threads: int | None = None,
+    ) -> "Document":
+        """Evaluate models on measured drives with a label, beside Table I and filters.
+
+        What is fitted or tuned never saw what it is judged by: a quarter of the drives after the
+        other, or of their time, is left out. `vehicle` names the car's file, of which mass and
+        geometry suffice for a car that is identified; without it no filter competes, unless a file
+        ships for the drives' class. Returns the document kept below `evaluations/measured/`.
+        Raises `DataError` without a label, `ConfigError` for an unknown
+        car, and what `model` raises.
+        """
+        from fleet_slip.evaluation.evaluate import keep
+        from fleet_slip.evaluation.own_car import evaluate_own_car, own_car_evaluations
+        from fleet_slip.storage.documents import Document
+
+        versions = [self.resolve(one) for one in (model, *others)]
+        with open_workers(self.root, threads) as executor:
+            found = evaluate_own_car(self.warehouse, versions, cohort, vehicle, executor)
+        content = found.as_dict()
+        kept = keep(own_car_evaluations(self.warehouse), content)
+        return Document(kept.number, content, kept.sha256)
+
+    def evaluate_blind(
+        self,
+        model: str | ModelVersion | None = None,
+        others: Sequence[str | ModelVersion] = (),
+        *,
+        threads: int | None = None,
+    ) -> "tuple[BlindRow, ...]":
+        """Judge models, and all that `evaluate` trains beside them, on drives of the first.
+
+        Roads, cars, weather and noise are drawn from its version's hash, unknown before it was
+        published (`configs/blind.toml`). Nothing is written. Returns figures over all drives, by
+        class of road, by weather and by drive. Raises as `evaluate`.
+        """
+        from fleet_slip.evaluation.blind import judge_blindly
+        from fleet_slip.evaluation.evaluate import train_competitors
+
+        first, *rest = [self.resolve(one) for one in (model, *others)]
+        with open_workers(self.root, threads) as executor:
+            trained = train_competitors(self.warehouse, first, rest, executor)
+        return judge_blindly(first.sha256, trained.estimators)
+
+    def report(
+        self, model: str | ModelVersion | None = None, output: Path | None = None
+    ) -> "Written":
+        """Write one page that lays our figures beside the paper's, from the latest evaluation.
+
+        `output` is a folder, by default `report` in the root. Raises `DataError` without an
+        evaluation on today's data, and what `model` raises.
+        """
+        from fleet_slip.storage.local import LocalFolder
+
+        with needed("report", "the report"):
+            from fleet_slip.evaluation.report import write_report
+
+        folder = LocalFolder(output) if output else self.root / "report"
+        return write_report(self.warehouse, self.resolve(model), folder)
+
+    @record_call
+    def watch(
+        self,
+        what: str,
+        model: str | ModelVersion | None,
+        output: Path,
+        *,
+        from_s: float = 0.0,
+        until_s: float | None = None,
+        threads: int | None = None,
+    ) -> Path:
+        """Write a drive as a page that plays, `.html`; return the file.
+
+        `what` is a scenario's name or path, simulated if missing, or a drive of the logs, shown
+        from `from_s` until `until_s`. Raises `UsageError` for another suffix or an empty part,
+        `QuestionError` for an unknown drive, `ExtraError` without the extra `watch`, and what
+        `model` raises.
+        """
+        with needed("watch", "a page of a drive"):
+            from fleet_slip.evaluation.watch import drive_frames, is_scenario, write_page
+        if output.suffix != ".html":
+            raise UsageError(f"{output}: a drive is shown as a page, which ends with .html.")
+        version = self.resolve(model)
+        if is_scenario(what):
+            from fleet_slip.evaluation.watch import scenario_frames
+
+            with open_workers(self.root, threads) as executor:
+                frames = scenario_frames(self.warehouse, what, version, executor)
+        else:
+            frames = drive_frames(self.warehouse, what, version)
+        write_page(frames.part(from_s, until_s), output)
+        return output

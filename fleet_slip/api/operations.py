@@ -1,0 +1,241 @@
+"""The part of a `Fleet` that watches the warehouse and looks after it."""
+
+from collections.abc import Sequence
+from datetime import date
+from typing import TYPE_CHECKING
+
+from fleet_slip.api.calls import (
+    ShowProgress,
+    Workers,
+    count_from_start,
+    open_workers,
+    record_call,
+    takes,
+    unless_local,
+    within_reach,
+)
+from fleet_slip.api.models import JudgedModels
+from fleet_slip.api.requests import ForgetRequest
+from fleet_slip.base import date_of
+from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.errors import QuestionError, RefusedError, UsageError
+from fleet_slip.storage.runs import step
+
+if TYPE_CHECKING:
+    from fleet_slip.grams.calibration import Calibration
+    from fleet_slip.models.registry import ModelVersion
+    from fleet_slip.operations.find_drives import VacuumReport
+    from fleet_slip.operations.forget import ForgetReport
+    from fleet_slip.operations.monitor import Chart
+    from fleet_slip.operations.quality import QualityReport
+    from fleet_slip.operations.retention import RetentionReport
+    from fleet_slip.operations.rewriting import CompactionReport
+    from fleet_slip.operations.status import WarehouseStatus
+    from fleet_slip.operations.verify import Verification
+
+
+class HealthAndUpkeep(JudgedModels):
+    """Health, quality and drift; checking, compacting, forgetting. Answers say what is wrong."""
+
+    def status(self, max_age_hours: float | None = None) -> "WarehouseStatus":
+        """Return the warehouse's health: freshness, backlog, last runs, disk, champions.
+
+        Data, or a backlog, older than `max_age_hours` is among its `problems`.
+        """
+        from fleet_slip.operations.status import status_of
+
+        return status_of(self.warehouse, max_age_hours)
+
+    def quality(self, cohort: str = TRAINING_DRIVES) -> "QualityReport":
+        """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors by drive.
+
+        The drives of `cohort` are compared with each other, by Gram rows alone; `findings` are
+        those not in order. Raises what `FleetCohort` raises.
+        """
+        from fleet_slip.operations.quality import examine_drives
+
+        return examine_drives(self.warehouse, cohort)
+
+    def calibrate(self, cohort: str = ALL_DRIVES) -> "Calibration":
+        """Return how the sensors of every car are off, and what else its drives tell of it.
+
+        Offsets of gyroscope, accelerometer and steering with uncertainties, label or not, from the
+        Gram rows of `calibration`. Raises `DataError` without these or without drives,
+        and `QuestionError` for an invalid condition.
+        """
+        from fleet_slip.grams.calibration import calibrate
+        from fleet_slip.warehouse.condition import parse_cohort
+
+        return calibrate(self.warehouse, parse_cohort(cohort))
+
+    def monitor(
+        self,
+        model: "str | ModelVersion | None" = None,
+        cohort: str | None = None,
+        *,
+        since: date | str | None = None,
+    ) -> "Chart":
+        """Chart a model's error on each day since it was trained, with control limits, in degrees.
+
+        `cohort` is by default that of its training, `since` the day after its data. `alarms` are
+        the new days beyond the limits. Raises `DataError` for too few training days, `UsageError`
+        for another text than a date such as 2024-05-01, and as `Fleet.model`.
+        """
+        from fleet_slip.operations.monitor import monitor
+
+        return monitor(self.warehouse, self.resolve(model), cohort, date_of(since, "since"))
+
+    def verify(
+        self, *, full: bool = False, workers: Workers = None, progress: ShowProgress | None = None
+    ) -> "Verification":
+        """Verify every byte against its checksum, and everything against everything else.
+
+        `full` computes all Gram rows again. Progress is in bytes. `damage` is what is wrong. Raises
+        `StorageError` without a data root, and `ClusterError`.
+        """
+        from fleet_slip.operations.verify import verify
+
+        with open_workers(self.root, workers) as executor:
+            return verify(
+                within_reach(self.warehouse, executor),
+                full=full,
+                progress=count_from_start(progress),
+                executor=unless_local(executor),
+            )
+
+    @record_call
+    def repair(self, found: "Verification", campaigns: Sequence[str] = ()) -> list[str]:
+        """Rebuild what `verify` found damaged; return the paths, below the root. Then verify again.
+
+        Gram rows come from logs, simulated logs from `campaigns`, files or shipped ones.
+        """
+        from fleet_slip.operations.repair import repair
+
+        return repair(self.warehouse, found, campaigns)
+
+    @record_call
+    def compact(
+        self, target_rows: int | None = None, *, progress: ShowProgress | None = None
+    ) -> "CompactionReport":
+        """Turn the small log files of each day into large ones, of `target_rows` or fewer.
+
+        Progress is in days. Raises `StorageError`, and `ConflictError` if others keep changing
+        files.
+        """
+        from fleet_slip.operations.rewriting import TARGET_ROWS, compact
+
+        told = count_from_start(progress)
+        with step("compact") as figures:
+            report = compact(self.warehouse, target_rows or TARGET_ROWS, told)
+            figures.rows, figures.size_bytes = report.rows_rewritten, report.size_bytes_after
+        return report
+
+    @record_call
+    def vacuum(self, retention_hours: float | None = None) -> "VacuumReport":
+        """Remove replaced files and leftovers of killed jobs that are older than `retention_hours`.
+
+        By default a week. Raises `StorageError`.
+        """
+        from fleet_slip.operations.find_drives import RETENTION_HOURS, vacuum
+
+        hours = RETENTION_HOURS if retention_hours is None else retention_hours
+        with step("vacuum") as figures:
+            report = vacuum(self.warehouse, hours)
+            figures.size_bytes = report.size_bytes
+        return report
+
+    def preview_vacuum(self, retention_hours: float | None = None) -> "VacuumReport":
+        """Return what `vacuum` would remove. Raises `StorageError`."""
+        from fleet_slip.operations.find_drives import RETENTION_HOURS, preview_vacuum
+
+        hours = RETENTION_HOURS if retention_hours is None else retention_hours
+        return preview_vacuum(self.warehouse, hours)
+
+    @record_call
+    @takes(ForgetRequest)
+    def forget(self, request: ForgetRequest) -> "ForgetReport":
+        """Forget a vehicle, a drive, or drives of a name or file; mark their models.
+
+        They leave logs, Gram rows and quarantine, and no job brings them back until `allow`. Others
+        under the same name or file land. While anything is `pending` in the report, repeat it.
+        Progress is in files, or in drives. Raises `UsageError` unless one subject is given,
+        `QuestionError` if there never was such a drive, `StorageError` and `ConflictError`.
+        """
+        from fleet_slip.operations.forget import forget, forget_called
+        from fleet_slip.warehouse.forgotten import Forgettable
+
+        kind, value = request.subject
+        now, told = request.now, count_from_start(request.progress)
+        with step("forget") as figures:
+            match kind:
+                case "drive_name" | "source_file":
+                    report = forget_called(self.warehouse, kind, value, now=now, progress=told)
+                case _:
+                    subject = Forgettable(kind, value)
+                    report = forget(self.warehouse, subject, now=now, progress=told)
+            figures.rows = report.rows
+        return report
+
+    @record_call
+    def allow(
+        self,
+        *,
+        vehicle: str | None = None,
+        drive: str | None = None,
+        source_file: str | None = None,
+    ) -> bool:
+        """Let a forgotten vehicle, drive or file land again; return whether that is new.
+
+        What was forgotten stays so, until `ingest` is given the allowed file, or its drives, again.
+        Raises `UsageError` unless one subject is given, `QuestionError` if it was never forgotten,
+        and `RefusedError` while it is being forgotten.
+        """
+        from fleet_slip.warehouse.forgotten import Audit, Forgettable
+
+        asked = {"vehicle": vehicle, "drive": drive, "source_file": source_file}
+        given = [(kind, name) for kind, name in asked.items() if name is not None]
+        if len(given) != 1:
+            raise UsageError("give one of vehicle, drive and source_file.")
+        [(kind, name)] = given
+        self.warehouse.require()
+        audit, states = Audit(self.root), set[str]()
+        if kind == "source_file":
+            what = f"the file {name!r}"
+            unknown = (
+                f"no drive was forgotten by the name of its file {name!r}. Earlier versions kept "
+                "no such names: allow its drives, or its car."
+            )
+            states.update(audit.allow_from(name).values())
+        else:
+            what = f"{kind} {name!r}"
+            subject = Forgettable("drive" if kind == "drive" else "vehicle", name)
+            unknown = f"{what} was never forgotten."
+            if state := audit.state(subject):
+                states.add(state)
+            if state == "done":
+                audit.allow(subject)
+        if not states:
+            raise QuestionError(unknown)
+        if "begun" in states:
+            raise RefusedError(
+                f"{what} is being forgotten. Give the command that forgets it again, until it is "
+                "done; then allow it."
+            )
+        return "done" in states
+
+    @record_call
+    def retain(
+        self, config: str | None = None, *, progress: ShowProgress | None = None
+    ) -> "RetentionReport":
+        """Forget drives that are older than a retention file says, then vacuum.
+
+        `config` is its path, by default the one that ships. Progress is in files. Raises
+        `RefusedError` if no drive would be left, and as `forget`.
+        """
+        from fleet_slip.operations.retention import load_retention, retain
+
+        told = count_from_start(progress)
+        with step("retain") as figures:
+            report = retain(self.warehouse, load_retention(config), date.today(), told)
+            figures.rows, figures.size_bytes = report.forgotten.rows, report.vacuumed.size_bytes
+        return report

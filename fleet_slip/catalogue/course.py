@@ -1,0 +1,364 @@
+"""The change of the side-slip angle as course and yaw rate tell it, in whole numbers.
+
+Over T ticks, with the course χ in counts of a turn over 65,536 and the yaw rate r in counts,
+
+    J = 2 Σ r(k) − r(t) + r(t−T),  k = t−T+1 .. t,
+
+is twice the integral of the yaw rate by trapezoids: a count of it is half a tick times a count of
+r, 0.5e-6 rad, and a turn is `turn` of them, 12,566,371, which is wrong by 3 parts in 100 million.
+In 65,536ths of that count
+
+    L = turn (χ(t) − χ(t−T)) − 65536 J,
+
+less the nearest multiple of 65536 turn, is the change of the side-slip angle; it is rounded once to
+counts of the label. For T of 10 s at most |J| < 2^27, so that all of it stays below 2^53. A change
+above `LARGEST_RAD` is none: the car spun, or a reflected signal told the course.
+
+Where a car goes straight on at both fixes and has hardly turned between them, its side-slip angle
+is none, and L is what the receiver and the gyroscope are wrong by: columns of their own say it.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
+
+import numpy as np
+
+from fleet_slip.base import FloatArray
+from fleet_slip.catalogue.arithmetic import nearest_sql
+from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S, catalogue
+
+COURSE, YAW_RATE = "course", "yaw_rate"
+TURNED = "turned"
+"""Column of a Gram row: J over `COARSER`, which a scale error of the gyroscope goes with."""
+STRAIGHT, STRAIGHT_COURSE = "straight", "straight_course"
+"""Columns of a Gram row: 1 where the car went straight on, and the label there, else 0."""
+BESIDE = (TURNED, STRAIGHT, STRAIGHT_COURSE)
+"""The columns that tell of the course and are none of a model, in their order."""
+COARSER = 2**8
+"""Keeps `TURNED` within 20 bits: 1.28e-4 rad a count."""
+LONGEST_TICKS = 1000
+LARGEST_RAD = Fraction(1, 2)
+STRAIGHT_RAD_S, STRAIGHT_RAD = Fraction(1, 50), Fraction(1, 20)
+"""Largest yaw rate at both fixes, and angle turned between them, of a car that goes straight on:
+a gyroscope is off by up to 0.01 rad/s."""
+LATE_PARTS = 4
+"""A course's delay is a whole number of these parts of a tick, 2.5 ms: the yaw rate does not change
+by enough in half of it to matter."""
+MOST_LATE, MOST_EARLY = 50, -10
+"""Ticks. A course is early where the accelerometer and gyroscope are later than it."""
+COURSE_LATE = "course_late"
+"""Column of `grams`: by how many parts of a tick the course was taken to be late. And the variable
+of the SQL statement that tells it of each car."""
+
+OVER = "hidden_over"
+"""Column of changes: the place of their time among those of the set."""
+HIDDEN = ("hidden_course", "hidden_turned", "hidden_rest", "hidden_rate")
+HIDDEN_LATE = "hidden_late"
+WHOLE_TICKS = (
+    f"(({HIDDEN_LATE} + {LATE_PARTS // 2 - LATE_PARTS * MOST_EARLY}) // {LATE_PARTS} "
+    f"+ {MOST_EARLY})"
+)
+"""Whole ticks in SQL, whose division is towards zero."""
+
+
+@dataclass(frozen=True)
+class CourseUnits:
+    """Whole numbers that the scales of course, yaw rate and label come to.
+
+    Attributes:
+        turn: counts of J in a turn.
+        divisor: of L, for a count of the label.
+        largest: largest |L| that is a change of the side-slip angle.
+        slow: largest |r|, in counts, of a car that goes straight on.
+        unturned: largest |J| of it.
+    """
+
+    turn: int
+    divisor: int
+    largest: int
+    slow: int
+    unturned: int
+
+
+def course_units() -> CourseUnits:
+    """Return the numbers for the catalogue's scales."""
+    known = catalogue()
+    grain = known[YAW_RATE].exact_scale * SAMPLE_TIME_S / 2
+    turn = round(Fraction(Decimal(2) * Decimal(math.pi)) / grain)
+    divisor = round(2 * HALF_TURN * known[known.label].exact_scale / grain)
+    return CourseUnits(
+        turn,
+        divisor,
+        int(2 * HALF_TURN * LARGEST_RAD / grain),
+        int(STRAIGHT_RAD_S / known[YAW_RATE].exact_scale),
+        int(STRAIGHT_RAD / grain),
+    )
+
+
+def split_late(late: int) -> tuple[int, int]:
+    """Return how many whole ticks late a course is, and what its label gains per count of r."""
+    whole = (late + LATE_PARTS // 2) // LATE_PARTS
+    return whole, (late - whole * LATE_PARTS) * 4 * HALF_TURN // LATE_PARTS
+
+
+def _in_time(rows: str) -> str:
+    """Return a subquery: each course on the tick that it is of, but for a rest, and `HIDDEN_LATE`.
+
+    The variable `course_late` is a map from cars to the delays of their receivers.
+    """
+    after, before = f"greatest({WHOLE_TICKS}, 0)", f"greatest(-{WHOLE_TICKS}, 0)"
+    course = f"max({COURSE}) OVER (PARTITION BY drive_id ORDER BY tick RANGE BETWEEN "
+    return f"""(
+            SELECT * REPLACE (CASE WHEN {HIDDEN_LATE} < 0
+                THEN {course}{before} PRECEDING AND {before} PRECEDING)
+                ELSE {course}{after} FOLLOWING AND {after} FOLLOWING) END AS {COURSE})
+            FROM (
+                SELECT *, coalesce(getvariable('{COURSE_LATE}')[vehicle_id], 0) AS {HIDDEN_LATE}
+                FROM {rows}
+            )
+        )"""
+
+
+def _as_logged(rows: str) -> str:
+    return f"(SELECT *, 0 AS {HIDDEN_LATE} FROM {rows})"
+
+
+def with_changes(
+    rows: str, columns: tuple[str, ...], times: tuple[int, ...], *, in_time: bool
+) -> str:
+    """Return a subquery of the changes over each of some numbers of ticks, `OVER` which it is.
+
+    `rows` has the columns, course and yaw rate, `vehicle_id` and the column `clipped`. With
+    `in_time` the course is moved by what the variable `course_late` says of the car.
+    """
+    moved = _in_time(rows) if in_time else _as_logged(rows)
+    changes = [
+        f"SELECT *, {number} AS {OVER} FROM {_changes(moved, columns, ticks)}"
+        for number, ticks in enumerate(times)
+    ]
+    return f"({' UNION ALL '.join(changes)})"
+
+
+def _changes(rows: str, columns: tuple[str, ...], ticks: int) -> str:
+    """Return a subquery: columns less what they were so many ticks ago, `BESIDE` and the label.
+
+    Only rows that have a fix now and had one then, and the yaw rate all the time between; and the
+    first of a drive, which has no change, so that a drive without a course is known to have none.
+    `rows` has the columns, course and yaw rate, the column `clipped` and `HIDDEN_LATE`.
+    """
+    units, label = course_units(), catalogue().label
+    ago = {name: f"(max({name}) OVER ago)::BIGINT" for name in (*columns, COURSE, YAW_RATE)}
+    changes = ",\n            ".join(f"{name}::BIGINT - {ago[name]} AS {name}" for name in columns)
+    turned = (
+        f"CASE WHEN (count({YAW_RATE}) OVER since) = {ticks} THEN "
+        f"2 * (sum({YAW_RATE}) OVER since)::BIGINT - {YAW_RATE} + {ago[YAW_RATE]} END"
+    )
+    left = f"({units.turn} * {HIDDEN[0]} - {2 * HALF_TURN} * {HIDDEN[1]} + {HIDDEN[2]})"
+    gain = f"({HIDDEN_LATE} - {WHOLE_TICKS} * {LATE_PARTS}) * {4 * HALF_TURN // LATE_PARTS}"
+    whole = 2 * HALF_TURN * units.turn
+    near = f"({left} - {whole} * ({nearest_sql(left, str(whole))}))"
+    change = nearest_sql(label, str(units.divisor))
+    slow = f"{HIDDEN[3]} <= {units.slow} AND abs({HIDDEN[1]}) <= {units.unturned}"
+    straight = f"CASE WHEN {HIDDEN[1]} IS NOT NULL THEN ({slow})::BIGINT END"
+    hidden = ", ".join((*HIDDEN, HIDDEN_LATE))
+    return f"""(
+        SELECT * EXCLUDE ({hidden}) REPLACE ({change} AS {label}),
+            {nearest_sql(HIDDEN[1], str(COARSER))} AS {TURNED},
+            {straight} AS {STRAIGHT},
+            {straight} * ({change}) AS {STRAIGHT_COURSE}
+        FROM (
+            SELECT * REPLACE ({near} AS {label})
+            FROM (
+                SELECT * REPLACE (
+            {changes},
+            0::BIGINT AS {label}
+                ),
+                    {COURSE}::BIGINT - {ago[COURSE]} AS {HIDDEN[0]},
+                    {turned} AS {HIDDEN[1]},
+                    {gain} * ({YAW_RATE}::BIGINT - {ago[YAW_RATE]}) AS {HIDDEN[2]},
+                    greatest(abs({YAW_RATE}), abs({ago[YAW_RATE]})) AS {HIDDEN[3]}
+                FROM {rows}
+                WINDOW ago AS (PARTITION BY drive_id ORDER BY tick
+                        RANGE BETWEEN {ticks} PRECEDING AND {ticks} PRECEDING),
+                    since AS (PARTITION BY drive_id ORDER BY tick
+                        RANGE BETWEEN {ticks - 1} PRECEDING AND CURRENT ROW)
+            )
+        )
+        WHERE abs({label}) <= {units.largest} OR tick = 0
+    )"""
+
+
+# What changes of the course tell of a car: a few figures, whose usual values are known.
+#
+# Over some seconds the course changes by the integral of the yaw rate, `TURNED`, and by the change
+# of the side-slip angle, which on roads is nearly that of a car whose rear axle is l behind the
+# centre of gravity and gives way by K:
+#
+#     label = l Δ(yaw rate / speed) + K Δay + s TURNED + const,    l > 0, K < 0.
+#
+# Least squares finds l and K, the scale 1 + s, and a noise, which times speed is a receiver's. What
+# is no course misses these places: a heading has neither l nor K, one of another sense a scale of
+# -1, one that stands still of 0, an antenna elsewhere or a late fix moves l.
+
+COLUMNS = ("curvature", "ay", YAW_RATE, TURNED)
+"""Of a Gram row of changes, before the label."""
+
+USUAL_LEVER_M, USUAL_COMPLIANCE = 1.35, 0.006
+FEWEST_CHANGES = 100
+LEAST_TURNED_RAD = 0.05
+SCALES = (0.9, 1.1)
+REVERSED, STILL = -0.5, 0.35
+"""Scales below the first are of the other sense, those nearer to 0 than the second stand still."""
+LEAST_SLIP = 0.3
+MOST_NOISE_MPS, LEAST_EXPLAINED = 0.25, 0.15
+"""At the limit of grip slip is not as the two columns say, and much is left; but not nearly all."""
+HARDLY_A_COURSE_MPS = 0.8
+LEVERS_M = (0.6, 2.6)
+"""From a small car with the engine behind to a van."""
+
+
+def turned_scale() -> float:
+    """Return the rad of a count of `TURNED`."""
+    return float(catalogue()[YAW_RATE].exact_scale * SAMPLE_TIME_S / 2) * COARSER
+
+
+@dataclass(frozen=True)
+class CourseFault:
+    """What is wrong with a course: a kind of fault, the signals, what shows it, what to try."""
+
+    kind: str
+    signals: tuple[str, ...]
+    figure: str
+    remedy: str
+
+
+@dataclass(frozen=True)
+class CourseRelation:
+    """What the changes of a course come to.
+
+    Attributes:
+        scale: of the course's change to the yaw rate's integral.
+        lever_m, compliance: l in m and K in rad per m/s².
+        slip: standard deviation of the slip they make, over that of a usual car.
+        slip_error: standard error of `slip`.
+        noise_mps: of one fix, across the car.
+        explained: part of what the yaw rate leaves that they explain.
+    """
+
+    scale: float
+    lever_m: float
+    compliance: float
+    slip: float
+    slip_error: float
+    noise_mps: float
+    explained: float
+
+    @property
+    def fault(self) -> CourseFault | None:
+        """What no course of a car does."""
+        if self.scale < REVERSED:
+            return CourseFault(
+                "reversed",
+                (COURSE,),
+                f"it turns {self.scale:+.2f} times as the yaw rate does",
+                "Turn clockwise_from_north round, or swap north and east.",
+            )
+        if abs(self.scale) < STILL:
+            return CourseFault(
+                "stuck",
+                (COURSE,),
+                f"it turns {self.scale:+.2f} times as the yaw rate does",
+                "Map the course that moves.",
+            )
+        most = MOST_NOISE_MPS if self.explained < LEAST_EXPLAINED else HARDLY_A_COURSE_MPS
+        if self.noise_mps > most:
+            return CourseFault(
+                "noisy",
+                (COURSE,),
+                f"a fix errs by {self.noise_mps:.2f} m/s across the car",
+                "Reflected signals? Leave out fixes that the receiver doubts, by where.",
+            )
+        if not SCALES[0] < self.scale < SCALES[1]:
+            return CourseFault(
+                "scaled",
+                (YAW_RATE, COURSE),
+                f"the course turns {self.scale:.2f} times as the yaw rate does",
+                "Check both units, and the gyroscope.",
+            )
+        if self.slip + 2 * self.slip_error < LEAST_SLIP:
+            return CourseFault(
+                "no slip",
+                (COURSE,),
+                f"beyond the yaw rate it changes by {self.slip:.2f} times what a car slips",
+                "It is a heading, of a compass or the car: map the course over ground.",
+            )
+        return None
+
+    @property
+    def misplaced(self) -> CourseFault | None:
+        """Whether the course is that of a place where no car has its centre of gravity."""
+        if LEVERS_M[0] <= self.lever_m <= LEVERS_M[1]:
+            return None
+        return CourseFault(
+            "place",
+            (COURSE,),
+            f"it is that of a place {self.lever_m:+.1f} m before the rear axle, "
+            f"and a car's centre of gravity is {LEVERS_M[0]:g} to {LEVERS_M[1]:g} m before it",
+            "Check antenna_x_m, delay_s, and whether the car drove backwards.",
+        )
+
+
+def relate(moments: FloatArray, delay_s: float = 0.0) -> CourseRelation | None:
+    """Return what a matrix of sums of products tells, None if it is of too little driving.
+
+    `moments` is of 1, `COLUMNS` and the label in SI units, shape (6, 6). A course that is known to
+    be `delay_s` late is taken as on time: it lacks that times the change of the yaw rate.
+    """
+    changes = float(moments[0, 0])
+    if changes < FEWEST_CHANGES:
+        return None
+    on_time = np.eye(6)
+    on_time[5, 3] = delay_s
+    about = on_time @ moments @ on_time.T / changes
+    about = about - np.outer(about[0], about[0])
+    variances = np.diag(about)
+    if variances[4] < LEAST_TURNED_RAD**2 or not (variances[1:4] > 0).all():
+        return None
+    used = np.array([1, 2, 4])
+    unit = np.sqrt(variances[used])
+    inverse = np.linalg.pinv(about[np.ix_(used, used)] / np.outer(unit, unit), rcond=1e-9)
+    inverse /= np.outer(unit, unit)
+    lever, compliance, scale = inverse @ about[used, 5]
+    fitted = np.array([lever, compliance, scale])
+    left = max(float(variances[5] - fitted @ about[used, 5]), 0.0)
+    turning = float(variances[5] - about[4, 5] ** 2 / variances[4])
+    usual = USUAL_LEVER_M**2 * variances[1] + USUAL_COMPLIANCE**2 * variances[2]
+    errors = left / changes * np.diag(inverse)
+    speed = float(about[2, 3] / variances[3])  # lateral acceleration is yaw rate times speed
+    return CourseRelation(
+        1 + float(scale),
+        float(lever),
+        float(compliance),
+        float(np.sqrt((lever**2 * variances[1] + compliance**2 * variances[2]) / usual)),
+        float(np.sqrt((errors[0] * variances[1] + errors[1] * variances[2]) / usual)),
+        float(np.sqrt(left / 2)) * abs(speed),
+        1 - left / turning if turning > 0 else 0.0,
+    )
+
+
+# Signals that tell which way a car turns.
+
+WITNESSES: Mapping[str, Mapping[str, int]] = {
+    "ay": {"ay": 1},
+    "yaw_rate": {"yaw_rate": 1},
+    "steering_wheel": {"steering_wheel": 1},
+    "steer_fl": {"steer_fl": 1},
+    "steer_fr": {"steer_fr": 1},
+    "front wheels": {"wheel_fl": -1, "wheel_fr": 1},
+    "rear wheels": {"wheel_rl": -1, "wheel_rr": 1},
+}
+"""What is positive in a left turn (ISO 8855), as a combination of signals: right wheels run faster
+than left ones."""

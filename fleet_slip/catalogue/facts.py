@@ -1,0 +1,130 @@
+"""What a car's own drives tell of it without a label: its numbers, by name.
+
+Each is a physical value; models and boards use it as an integer count of its grain, rounded to the
+nearest, halves away from zero. A number that 16 bits cannot count is not known.
+"""
+
+from decimal import Decimal
+from fractions import Fraction
+from typing import Final, Literal
+
+from fleet_slip.catalogue.arithmetic import nearest
+from fleet_slip.catalogue.signals import COUNT_MAX, SIUnit
+from fleet_slip.config import Config
+
+CALIBRATION = "calibration"
+"""The feature set whose Gram rows tell the numbers."""
+
+BY_SATELLITE = "calibration_satellite"
+"""The feature set that tells the speed ratio of cars whose receivers log the speed."""
+
+BY_COURSE = "calibration_course"
+"""The feature set that tells how cars slip whose receivers log the course."""
+
+DELAY = "delay"
+"""The feature set whose Gram rows tell how late a satellite receiver is."""
+
+NumberName = Literal[
+    "yaw_rate_offset",
+    "yaw_rate_offset_by_wheels",
+    "ay_offset",
+    "steering_offset",
+    "speed_ratio",
+    "steer_per_curvature",
+    "understeer",
+    "slip_lever",
+    "slip_compliance",
+]
+
+
+Unit = SIUnit | Literal["1"]
+"""A unit, or none."""
+
+
+class CarNumber(Config):
+    """One number of a car: its unit, its grain and what it means."""
+
+    unit: Unit
+    grain: Decimal
+    description: str
+
+    def count(self, value: Fraction | None) -> int | None:
+        """Return a value as an integer count of the grain; None stays None."""
+        return None if value is None else round_number(value, Fraction(self.grain))
+
+
+def round_number(value: Fraction, grain: Fraction) -> int | None:
+    """Return a value in counts, to the nearest, halves away from zero; None beyond 16 bits."""
+    ratio = value / grain
+    count = nearest(ratio.numerator, ratio.denominator)
+    return count if abs(count) <= COUNT_MAX else None
+
+
+CAR_NUMBERS: dict[NumberName, CarNumber] = {
+    "yaw_rate_offset": CarNumber(
+        unit="rad/s",
+        grain=Decimal("0.00000625"),
+        description="What the gyroscope says when the car does not turn, by ay over speed",
+    ),
+    "yaw_rate_offset_by_wheels": CarNumber(
+        unit="rad/s",
+        grain=Decimal("0.00000625"),
+        description="The same by the differences of the wheels: tells whether both agree",
+    ),
+    "ay_offset": CarNumber(
+        unit="m/s^2",
+        grain=Decimal("0.0000625"),
+        description="What the accelerometer says to the side when the car goes straight",
+    ),
+    "steering_offset": CarNumber(
+        unit="rad",
+        grain=Decimal("0.00000625"),
+        description="Mean steering angle of the front wheels when the car goes straight",
+    ),
+    "speed_ratio": CarNumber(
+        unit="1",
+        grain=Decimal("0.0005"),
+        description="Speed over that of wheels of 0.31 m: the tyres' radius",
+    ),
+    "steer_per_curvature": CarNumber(
+        unit="m",
+        grain=Decimal("0.002"),
+        description="Steering angle for each curvature by wheels of 0.31 m: the wheelbase over "
+        "speed_ratio",
+    ),
+    "understeer": CarNumber(
+        unit="rad*s^2/m",
+        grain=Decimal("0.00002"),
+        description="Steering angle that each lateral acceleration takes beyond: the tyres and the "
+        "load",
+    ),
+    "slip_lever": CarNumber(
+        unit="m",
+        grain=Decimal("0.002"),
+        description="Slip for each curvature by wheels of 0.31 m: how far the rear axle is behind",
+    ),
+    "slip_compliance": CarNumber(
+        unit="rad*s^2/m",
+        grain=Decimal("0.000002"),
+        description="Slip that each lateral acceleration adds: the rear tyres and the load",
+    ),
+}
+"""The numbers, in the order in which they are shown."""
+
+
+# Where a drive comes from, as the column `source` says it, and which drives may train a model.
+
+SCENARIO: Final = "scenario"
+"""Source of the drives that models are evaluated on, and must never be trained on."""
+
+RECEIVED: Final = "received"
+"""Source of the drives whose cars sent Gram rows, and no log."""
+
+RECEIVED_FILES: Final = "received/"
+"""What stands before a digest in the column `file` of Gram rows without a log file."""
+
+LONGEST_PAUSE_S: Final = 600
+"""A pause that is longer begins another trip: road, load and warmth of the tyres may be others."""
+
+ALL_DRIVES: Final = "true"
+TRAINING_DRIVES: Final = f"source <> '{SCENARIO}'"

@@ -1,1 +1,0 @@
-"""The commands that tell how good a model is."""

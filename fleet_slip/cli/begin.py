@@ -1,0 +1,286 @@
+"""The command that does the whole job: simulate what is missing, gram, select, publish."""
+
+import os
+import shlex
+import shutil
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleet_slip.api.calls import open_workers
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.api.requests import RunRequest
+from fleet_slip.api.session import RunReport
+from fleet_slip.base import number_of
+from fleet_slip.catalogue.facts import TRAINING_DRIVES
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.cli.app import record_run
+from fleet_slip.cli.options import (
+    RESAMPLING,
+    Cluster,
+    Cohort,
+    Threads,
+    Unexamined,
+    complete_model,
+    request_options,
+)
+from fleet_slip.cli.output import All, Json, print_json, progress_of_steps, say
+from fleet_slip.cli.selection import print_selection, say_examined
+from fleet_slip.errors import FleetSlipError, RefusedError
+from fleet_slip.models.manifest import require_model_name
+from fleet_slip.models.publish import DryRun, Publication, recipe_for
+from fleet_slip.models.request import SelectionRequest
+from fleet_slip.storage.data_root import data_root
+from fleet_slip.storage.runs import step
+
+# The command that publishes the model that a selection chose.
+
+
+@record_run
+@request_options(SelectionRequest, without=RESAMPLING)
+def publish(
+    context: typer.Context,
+    name: Annotated[
+        str,
+        typer.Argument(help="Name of the model, such as sideslip.", autocompletion=complete_model),
+    ],
+    request: SelectionRequest,
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="SQL condition on the view drives. Default: that of the model's champion; all "
+            "drives, of a new model."
+        ),
+    ] = None,
+    unexamined: Unexamined = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Publish even what is worse than the champion.")
+    ] = False,
+    candidate: Annotated[
+        bool,
+        typer.Option(
+            "--candidate", help="Publish as a candidate, which becomes champion by promote."
+        ),
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be published, and publish nothing.")
+    ] = False,
+    mlflow: Annotated[
+        str | None, typer.Option(help="Also register the version in the MLflow server of this URI.")
+    ] = None,
+    everything: All = False,
+    json: Json = False,
+) -> None:
+    """Select on a cohort and make the winner the next version of a model, and its champion.
+
+    The options are those of select. A model that is there is trained again as its champion was, but
+    for what is asked for.
+
+    Try it first: **fleet-slip publish waterford --dry-run**
+
+    Example: **fleet-slip publish wet --cohort "adhesion < 0.8"**
+    """
+    require_model_name(name)
+    recipe = recipe_for(context.obj.registry(), name, request, cohort)
+    if recipe.told:
+        say(f"{name}: {recipe.told}")
+    drives = context.obj.cohort(recipe.cohort, unexamined=unexamined)
+    with step("select"):
+        selection = drives.select(**vars(recipe.request))
+    say_examined(selection.examined)
+    if dry_run:
+        told = context.obj.would_publish(name, selection, force=force, candidate=candidate)
+        if json:
+            print_json(told)
+        else:
+            print_selection(selection, everything)
+        if told.refused:
+            raise RefusedError(told.reason)
+        if not json:
+            _print_dry_run(told)
+        return
+    publication = context.obj.publish(name, selection, force=force, candidate=candidate)
+    number = context.obj.log_to_mlflow(publication.version, mlflow) if mlflow else None
+    if json:
+        print_json(publication)
+    else:
+        print_selection(selection, everything)
+        print_publication(publication)
+        if number:
+            say(f"in MLflow: {publication.version.manifest.name}, version {number}")
+
+
+def _print_dry_run(told: DryRun) -> None:
+    would = "would be published" if told.publishes else "would not be published"
+    would += " as a candidate" if told.publishes and told.candidate else ""
+    say(f"{told.model} {would}. {told.reason}")
+
+
+def print_publication(publication: Publication) -> None:
+    """Say what was published."""
+    done = "published" if publication.new else "nothing to publish:"
+    say(f"{done} {publication.version.reference}. {publication.reason}")
+
+
+@record_run
+@request_options(RunRequest)
+def run(
+    context: typer.Context,
+    request: RunRequest,
+    threads: Threads = None,
+    cluster: Cluster = None,
+    everything: All = False,
+    json: Json = False,
+) -> None:
+    """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
+
+    It can be repeated at any time, and after any interruption: what is done is not done again. A
+    second run of the campaign at the same time waits for the first. A nightly run appends the next
+    day with --through today.
+
+    Example: **fleet-slip run --campaign smoke**
+    """
+    from fleet_slip.simulation.campaign import load_campaign  # noqa: PLC0415 - the simulator takes a while
+
+    fleet: Fleet = context.obj
+    plan = load_campaign(str(request.campaign))
+    doing = {"simulate": f"simulate {plan.name}", "gram": f"gram {PLAIN}"}
+
+    def tell(name: str, done: int, total: int) -> None:
+        show(doing.get(name, name), done, total)
+
+    with (
+        open_workers(fleet.root, cluster or threads) as executor,
+        progress_of_steps("rows", executor) as show,
+    ):
+        options = {
+            **vars(request),
+            "campaign": plan,
+            "workers": executor,
+            "progress": tell,
+            "waiting": lambda: say(f"{plan.name}: waiting for another run"),
+        }
+        report = fleet.run(**options)
+    if json:
+        print_json(report)
+    else:
+        _print_report(report, everything)
+        if not ((made := report.publication) and made.new):
+            return
+        model = made.version.reference.partition("@")[0]
+        _say_of_lost(fleet, plan.name, model)
+        if made.version.version == 1:
+            say("next:")
+            for line in next_steps(fleet, plan.name, model):
+                say(f"  {line}")
+
+
+def _print_report(report: RunReport, everything: bool) -> None:
+    simulated, gram, publication = report.simulation, report.gram, report.publication
+    if not report.changed:
+        kept = publication.version.reference if publication else report.refusal
+        say(f"{report.campaign}: nothing to do, {kept} is up to date ({report.seconds:.1f} s)")
+        return
+    say(f"simulated {number_of(simulated.drives, 'drive')}, {number_of(simulated.rows, 'row')}")
+    say(f"gram: {number_of(gram.rows_read, 'row')} read, {number_of(gram.gram_rows, 'Gram row')}")
+    if wide := report.gram_features:
+        say(
+            f"gram {wide.feature_set}: {number_of(wide.rows_read, 'row')} read, "
+            f"{number_of(wide.gram_rows, 'Gram row')}"
+        )
+    if report.selection:
+        print_selection(report.selection, everything)
+    if publication:
+        print_publication(publication)
+    else:
+        say(report.refusal)
+    say(f"done in {report.seconds:.1f} s")
+
+
+def next_steps(fleet: Fleet, campaign: str, model: str) -> list[str]:
+    """Return command lines to go on with: a query, the model, a cohort, the test drives."""
+    begin = f"{program()}{_root_option(fleet)}"
+    query = "SELECT drive_id, max(abs(degrees(sideslip_rad))) AS beta_deg FROM log GROUP BY ALL"
+    lines = [f'{begin} sql "{query}"', f"{begin} show {model}"]
+    if cohort := _faster_half(fleet, campaign):
+        lines.append(f'{begin} select --cohort "{cohort}"')
+    lines.append(f"{begin} evaluate {model} && {begin} report {model}")
+    return lines
+
+
+def _say_of_lost(fleet: Fleet, campaign: str, model: str) -> None:
+    """Say in how many drives the car was lost: the model learned from them, too."""
+    query = "SELECT campaign, count(lost_control_s), count(*) FROM drives GROUP BY ALL"
+    counted = {name: (lost, drives) for name, lost, drives in fleet.sql(query).fetchall()}
+    lost, drives = counted.get(campaign, (0, 0))
+    if lost:
+        cohort = f"campaign = '{campaign}' AND lost_control_s IS NULL"
+        say(
+            f"in {lost:,} of {number_of(drives, 'drive')} the car was lost, and the model learned "
+            "from them, too. Without them:"
+        )
+        say(f'  {program()}{_root_option(fleet)} publish {model} --cohort "{cohort}"')
+
+
+def program() -> str:
+    """Return how this program is called from here: by name where that finds it, else by path."""
+    called = Path(sys.argv[0])
+    found = shutil.which(called.name)
+    if found and os.path.realpath(found) == os.path.realpath(called):
+        return called.name
+    here = Path.cwd()
+    path = called.absolute()
+    return shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path))
+
+
+def _root_option(fleet: Fleet) -> str:
+    """Return the option that names the data root, unless it is the usual one."""
+    try:
+        usual = str(data_root())
+    except FleetSlipError:
+        usual = ""
+    return "" if str(fleet.root) == usual else f" --root {shlex.quote(str(fleet.root))}"
+
+
+def _faster_half(fleet: Fleet, campaign: str) -> str | None:
+    """Return a condition that about half of the campaign's drives satisfy; None if none is told."""
+    medians = fleet.sql("SELECT campaign, median(speed_factor) FROM drives GROUP BY ALL").fetchall()
+    speed = dict(medians).get(campaign)
+    return None if speed is None else f"speed_factor > {speed:.2f}"
+
+
+# The command that compares models on a cohort.
+
+
+@request_options(SelectionRequest)
+def select(
+    context: typer.Context,
+    request: SelectionRequest,
+    cohort: Cohort = TRAINING_DRIVES,
+    unexamined: Unexamined = False,
+    everything: All = False,
+    json: Json = False,
+) -> None:
+    """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only.
+
+    Compare a list of models: **fleet-slip select --models table1**
+
+    Find an order and a place to stop: **fleet-slip select --rank backward --criterion bic**
+
+    Choose among many columns: **fleet-slip select --features windows --search exchange --most 12**
+
+    Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
+    """
+    from fleet_slip.cli.selection import (  # noqa: PLC0415
+        print_selection,
+        say_examined,
+    )
+
+    selection = context.obj.cohort(cohort, unexamined=unexamined).select(**vars(request))
+    say_examined(selection.examined)
+    if json:
+        print_json(selection)
+    else:
+        print_selection(selection, everything)

@@ -1,1 +1,0 @@
-"""The commands of the first minutes: run, sql, select, publish."""

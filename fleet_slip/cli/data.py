@@ -1,0 +1,497 @@
+"""Commands that fill the warehouse: simulate and ingest."""
+
+import logging
+import os
+import re
+import shlex
+import sys
+import tempfile
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from fleet_slip.api.calls import open_workers
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.api.requests import RunRequest
+from fleet_slip.base import last_day, number_of
+from fleet_slip.cli.app import record_run
+from fleet_slip.cli.options import Cluster, Threads, complete_config, option
+from fleet_slip.cli.output import Json, print_json, print_table, print_text, progress, say
+from fleet_slip.config import folder as shipped
+from fleet_slip.errors import AlarmError, UsageError
+from fleet_slip.storage.folder import storage_errors
+from fleet_slip.storage.runs import recording
+
+if TYPE_CHECKING:
+    from fleet_slip.ingest.draft import Draft
+    from fleet_slip.ingest.job import IngestReport
+    from fleet_slip.ingest.preview import Preview
+
+
+@record_run
+def simulate(
+    context: typer.Context,
+    campaign: Annotated[
+        str,
+        typer.Argument(
+            help="A campaign of configs/campaigns, or the path of a TOML file.",
+            autocompletion=complete_config("campaigns"),
+        ),
+    ],
+    days: Annotated[int | None, option(RunRequest, "days")] = None,
+    through: Annotated[str | None, option(RunRequest, "through")] = None,
+    threads: Threads = None,
+    cluster: Cluster = None,
+    json: Json = False,
+) -> None:
+    """Simulate what is missing of a campaign and write it to the logs.
+
+    Example: **fleet-slip simulate waterford --days 2**
+    """
+    from fleet_slip.simulation.campaign import load_campaign  # noqa: PLC0415 - takes a while
+
+    fleet: Fleet = context.obj
+    plan, last = load_campaign(campaign), last_day(through)
+    with (
+        open_workers(fleet.root, cluster or threads) as executor,
+        progress(f"simulate {plan.name}", "rows", executor) as show,
+    ):
+        report = fleet.simulate(plan, days=days, through=last, workers=executor, progress=show)
+    if json:
+        print_json(report)
+    elif report.changed:
+        written = (
+            f"{plan.name}: {number_of(report.drives, 'drive')}, {number_of(report.rows, 'row')} in "
+            f"{number_of(report.batches_written, 'file')}, "
+            f"{report.size_bytes / max(report.rows, 1):.1f} bytes a row"
+        )
+        say(_joined(written, forgotten=report.drives_forgotten))
+        seconds = report.seconds
+        shares = ", ".join(
+            f"{name} {getattr(seconds, name) / seconds.tasks:.0%}"
+            for name in ("simulate", "encode", "write")
+        )
+        say(
+            f"{seconds.elapsed:.1f} s, {report.rows / seconds.elapsed:,.0f} rows/s: "
+            f"{seconds.tasks / seconds.elapsed:.1f} workers busy ({shares}), commits "
+            f"{seconds.commit:.1f} s"
+        )
+    else:
+        chosen = plan.chosen_days(days, last)
+        say(f"{plan.name}: nothing to do, {number_of(len(chosen), 'day')} done before")
+
+
+def _joined(*parts: str, replaced: int = 0, forgotten: int = 0) -> str:
+    """Return one sentence of what there is to say, and of drives that gave way or did not come."""
+    allow = "fleet-slip forget --allow lets them come back"
+    parts += (
+        f"in place of {number_of(replaced, 'drive')}" if replaced else "",
+        f"{number_of(forgotten, 'drive')} left out, forgotten ({allow})" if forgotten else "",
+    )
+    return "; ".join(filter(None, parts))
+
+
+def ingest(
+    context: typer.Context,
+    files: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Measured logs (CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, DuckDB), or folders "
+            "of them, of which what is new is taken; also s3://, gs:// and az://.",
+            show_default=False,
+        ),
+    ] = None,
+    mapping: Annotated[
+        str | None,
+        typer.Option(
+            help="A mapping of configs/mappings, or the path of a TOML file: a mapping, or a list "
+            "of them, each for files of its own.",
+            show_default=False,
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="Store nothing; show what would be, and what looks wrong (exit 10)."
+        ),
+    ] = False,
+    plot: Annotated[
+        Path | None,
+        typer.Option(help="With --dry-run and one file, draw its longest drive: .png, .svg, .pdf."),
+    ] = None,
+    as_one: Annotated[
+        bool, typer.Option("--as-one", help="The files of each folder are parts of one log.")
+    ] = False,
+    replace: Annotated[
+        bool,
+        typer.Option(
+            "--replace",
+            help="Drives of the same recordings give way, as after a correction of the mapping.",
+        ),
+    ] = False,
+    undo: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|MAPPING",
+            help="Take out what came from a file or through a mapping, by its name, and no more.",
+            show_default=False,
+        ),
+    ] = None,
+    cluster: Cluster = None,
+    json: Json = False,
+) -> None:
+    """Bring measured logs into the warehouse through a mapping of columns, units and axes.
+
+    Without a mapping, files are tables of Gram rows that cars counted (docs/edge.md).
+
+    Rows that cannot be used go to the quarantine with a reason: fleet-slip sql "FROM quarantine"
+
+    Example: **fleet-slip ingest drive.csv --mapping logger.toml --dry-run**
+    """
+    from fleet_slip.ingest.log_files import names_several  # noqa: PLC0415 - takes a while
+
+    fleet: Fleet = context.obj
+    if undo is not None:
+        _take_back(fleet, undo, json, alone=not (files or mapping or replace or dry_run or as_one))
+        return
+    if not files:
+        raise UsageError("give files; or --undo alone, to take drives out again.")
+    if mapping is None:
+        _ingest_counted(fleet, files, json, alone=not (dry_run or as_one or replace or plot))
+        return
+    if plot is not None and not (dry_run and len(files) == 1):
+        raise UsageError("--plot draws one file, with --dry-run.")
+    if dry_run:
+        _show_previews(fleet.preview(files, mapping, as_one=as_one), plot, json)
+        return
+    folders = any(map(names_several, files)) and not as_one
+    each = remarks(quiet=json or folders)
+    with (
+        recording(fleet.root, "ingest", sys.argv[1:]),
+        progress(*(("ingest", "files") if folders else ("read", "bytes"))) as show,
+    ):
+        reports = fleet.ingest(
+            files,
+            mapping,
+            as_one=as_one,
+            replace="all" if replace else "no",
+            workers=cluster,
+            each=each,
+            progress=show,
+        )
+    if json:
+        print_json(reports)
+    elif folders:
+        say(_summed_up(reports))
+    _require_sound(reports)
+
+
+def _ingest_counted(fleet: Fleet, files: list[str], json: bool, *, alone: bool) -> None:
+    """Bring in tables of Gram rows that cars counted."""
+    if not alone:
+        raise UsageError("give --mapping: without it files are tables of Gram rows (docs/edge.md).")
+    with recording(fleet.root, "ingest", sys.argv[1:]):
+        reports = [fleet.ingest_counted(file) for file in files]
+    if json:
+        print_json([vars(report) for report in reports])
+        return
+    for one in reports:
+        if one.new:
+            what = f"{number_of(one.gram_rows, 'Gram row')} of {number_of(one.drives, 'drive')}"
+            say(f"{one.file}: {what}, {number_of(one.rows, 'row')}")
+        else:
+            say(f"{one.file}: nothing to do, it was ingested before")
+
+
+def _require_sound(reports: "list[IngestReport]") -> None:
+    """Raise `AlarmError` for much that was refused, and for whatever looks wrong and does harm."""
+    from fleet_slip.ingest import suspicion as file_suspicion  # noqa: PLC0415 - takes a while
+
+    for report in reports:
+        refused, read = sum(report.counts.quarantined.values()), report.counts.rows_read
+        many = max(read * file_suspicion.LARGEST_REFUSED, file_suspicion.FEWEST_REFUSED)
+        if report.new and refused > many:
+            raise AlarmError(
+                f"{report.file}: {refused:,} of {number_of(read, 'row')} were refused. See: "
+                'fleet-slip sql "FROM quarantine". Correct the mapping and give the command again '
+                "with --replace."
+            )
+        for one in report.suspicions:
+            if one.kind != "scale":
+                raise AlarmError(
+                    f"{report.file}: {one} Its rows are in. Give the command again with --replace "
+                    "when the mapping is right."
+                )
+
+
+def _take_back(fleet: Fleet, what: str, json: bool, *, alone: bool) -> None:
+    """Take out what came from a file or through a mapping, and say how many drives."""
+    if not alone:
+        raise UsageError("--undo takes out and brings nothing in: give it alone.")
+    with recording(fleet.root, "ingest", sys.argv[1:]):
+        drives = fleet.take_back(what)
+    if json:
+        print_json({"drives_taken_out": drives})
+        return
+    if not drives:
+        say(
+            f"nothing to undo: no drive of the logs came from a file {what!r}, or through a "
+            'mapping of this name. See: fleet-slip sql "SELECT drive_id, source_file FROM drives"'
+        )
+        return
+    say(
+        f"{number_of(drives, 'drive')} taken out, Gram rows and all; to land again, their files "
+        "must be given again"
+    )
+
+
+def _summed_up(reports: "list[IngestReport]") -> str:
+    new = [report for report in reports if report.new]
+    if not new:
+        return "nothing new"
+    held = sum(sum(report.counts.quarantined.values()) for report in new)
+    return _joined(
+        f"{number_of(len(new), 'new file')}: {number_of(sum(r.counts.ticks for r in new), 'row')} "
+        f"in {number_of(sum(r.counts.drives for r in new), 'drive')}",
+        f"in quarantine: {number_of(held, 'row')}" if held else "",
+        replaced=sum(report.drives_replaced for report in new),
+        forgotten=sum(report.drives_forgotten for report in new),
+    )
+
+
+def remarks(*, quiet: bool) -> "Callable[[IngestReport], None]":
+    """Return what says what became of a file, unless `quiet`, and once what looks wrong in some."""
+    told: set[tuple[str, tuple[str, ...]]] = set()
+
+    def tell(report: "IngestReport") -> None:
+        if not quiet:
+            say(_ingested(report.as_dict()))
+        for names in report.look_alikes:
+            say(
+                f"{report.file}: the names {' and '.join(map(ascii, names))} look the same and "
+                "count as several: they differ in their Unicode form. Write such names in one form "
+                "in the files or the mapping, normally NFC.",
+                logging.WARNING,
+            )
+        for one in report.suspicions:
+            if (one.kind, one.signals) not in told:
+                told.add((one.kind, one.signals))
+                say(f"{report.file}: looks wrong: {one}", logging.WARNING)
+
+    return tell
+
+
+def _ingested(report: dict[str, Any]) -> str:
+    if not report["new"] and not report["drives_forgotten"]:
+        return f"{report['file']}: nothing to do, it was ingested before"
+    reasons = ", ".join(f"{n:,} {reason}" for reason, n in report["quarantined"].items())
+    left_out, held = report["rows_left_out"], report["rows_quarantined"]
+    return _joined(
+        f"{report['file']}: {number_of(report['ticks'], 'row')} in "
+        f"{number_of(report['drives'], 'drive')}",
+        f"not as the mapping's conditions ask: {number_of(left_out, 'row')}" if left_out else "",
+        f"in quarantine: {number_of(held, 'row')} ({reasons})" if reasons else "",
+        replaced=report["drives_replaced"],
+        forgotten=report["drives_forgotten"],
+    )
+
+
+def _show_previews(previews: "list[Preview]", plot: Path | None, json: bool) -> None:
+    """Print previews, and draw the only one. Raises `AlarmError` if anything looks wrong."""
+    if plot is not None:
+        from fleet_slip.ingest.preview import draw_preview  # noqa: PLC0415 - draws
+
+        draw_preview(previews[0], plot)
+        say(f"drawn to {plot}")
+    if json:
+        print_json(previews)
+    for preview in () if json else previews:
+        counts = preview.counts
+        rejected = ", ".join(f"{n:,} {reason}" for reason, n in counts.quarantined.items())
+        print_table(
+            f"{preview.file}: {number_of(counts.rows_read, 'row')}; left out by conditions "
+            f"{counts.rows_left_out:,}; rejected {sum(counts.quarantined.values()):,}"
+            f"{f' ({rejected})' if rejected else ''}; {number_of(counts.drives, 'drive')} of "
+            f"{number_of(counts.ticks, 'tick')}",
+            ["signal", "unit", "least", "most", "missing"],
+            [
+                [one.signal, one.unit, f"{one.low:.4g}", f"{one.high:.4g}", f"{one.missing:.1%}"]
+                for one in preview.ranges
+            ],
+            left=2,
+        )
+        for suspicion in preview.suspicions:
+            print_text(f"looks wrong: {suspicion}")
+    if suspicions := sum(len(preview.suspicions) for preview in previews):
+        raise AlarmError(
+            f"{number_of(suspicions, 'thing')} to look at before ingesting. Nothing was stored."
+        )
+
+
+# The command that helps to write mappings.
+
+
+class Action(StrEnum):
+    """What to do."""
+
+    SUGGEST = "suggest"
+
+
+def mapping(
+    _action: Annotated[Action, typer.Argument(metavar="suggest", show_default=False)],
+    file: Annotated[
+        str, typer.Argument(help="A measured log; also s3://, gs:// and az://.", show_default=False)
+    ],
+    output: Annotated[
+        Path | None, typer.Option(help="Write the draft to this file instead of printing it.")
+    ] = None,
+    can: Annotated[
+        Path | None, typer.Option(help="Of a CAN trace, its database: DBC, ARXML, KCD or SYM.")
+    ] = None,
+    table: Annotated[str | None, typer.Option(help="Of a DuckDB file, the table.")] = None,
+    json: Json = False,
+) -> None:
+    """List what is in a measured log, and draft a mapping for it.
+
+    Channels are guessed by name, unit and values; signs, and which wheel is which, by how the car
+    moves. Each guess has its reason as a comment, for a person to check.
+
+    Example: **fleet-slip mapping suggest drive.mf4**
+    """
+    from fleet_slip.ingest.draft import (  # noqa: PLC0415
+        draft_mapping,
+        name_of,
+        write_draft,
+    )
+    from fleet_slip.ingest.formats.can import CanBus, read_can_database  # noqa: PLC0415 - takes a while
+    from fleet_slip.ingest.formats.reading import FileFormats  # noqa: PLC0415
+    from fleet_slip.ingest.formats.tables import DuckdbRows  # noqa: PLC0415
+    from fleet_slip.ingest.log_files import find_logs, local_copy  # noqa: PLC0415
+    from fleet_slip.ingest.profile import profile_file  # noqa: PLC0415
+
+    if output is not None and output.exists():
+        raise UsageError(f"{output}: it exists. Give another name, or remove it.")
+    bus = read_can_database(CanBus(database=str(can.absolute())), can.parent) if can else None
+    formats = FileFormats(can=bus, duckdb=DuckdbRows(table=table) if table else None)
+    logs = find_logs([file])
+    if len(logs) > 1:
+        raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
+    with local_copy(logs[0]) as copy:
+        draft = draft_mapping(copy, profile_file(copy, formats))
+        text = write_draft(draft, name_of(copy.stem), file)
+    if json:
+        print_json({"channels": _channels(draft), "mapping": text})
+    else:
+        _show(file, draft)
+    if output is not None:
+        with storage_errors(output):
+            output.write_text(text, encoding="utf-8")
+        say(f"draft written to {output}")
+    elif not json:
+        print_text("\n" + text)
+
+
+def _channels(draft: "Draft") -> list[dict[str, object]]:
+    signals = {guess.profile.channel.name: name for name, guess in draft.guesses.items()}
+    return [
+        {
+            "channel": one.channel.name,
+            "unit": one.channel.unit,
+            "rate_hz": one.rate_hz or draft.time.rate_hz,
+            "least": one.range[0] if one.is_number else None,
+            "most": one.range[1] if one.is_number else None,
+            "missing": one.missing if one.is_number else None,
+            "texts": one.texts,
+            "signal": signals.get(one.channel.name),
+        }
+        for one in draft.profile.profiles
+    ]
+
+
+def _show(file: str, draft: "Draft") -> None:
+    rows = []
+    for one in draft.profile.profiles:
+        signal = next((n for n, g in draft.guesses.items() if g.profile is one), "")
+        rate_hz = one.rate_hz or draft.time.rate_hz
+        cells = [f"{value:.4g}" for value in one.range] if one.is_number else ["text", ""]
+        missing = f"{one.missing:.1%}" if one.is_number else ""
+        rate = "" if rate_hz is None else f"{rate_hz:.4g}"
+        rows.append([one.channel.name, one.channel.unit, signal, rate, *cells, missing])
+    header = ["channel", "unit", "guess", "Hz", "least", "most", "missing"]
+    print_table(f"{file}: {len(rows)} channels", header, rows, left=3)
+
+
+# The command that writes a project of one's own: init.
+
+NAME = re.compile(r"[a-z][a-z0-9_]*")
+OWN = ("publish.toml", "monitor.toml", "retention.toml")
+"""Configs that a project has of its own from the beginning, as they ship."""
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(help="A new or empty folder.", show_default=False)],
+    model: Annotated[
+        str, typer.Option(help="Name of the model and of the mapping: a-z, 0-9, _.")
+    ] = "fleet",
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            help="A measured log, to draft the mapping from. Default: a mapping to fill in.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Write a project: configs to edit, a draft of a mapping, a schedule, and what to type next.
+
+    It is written whole or not at all.
+
+    Example: **fleet-slip init my_fleet --log drive.mf4**
+    """
+    if not NAME.fullmatch(model):
+        raise UsageError(f"--model {model}: write it in lower-case letters, digits and _.")
+    mapping = _mapping_of(log, model) if log else _template("mapping.toml", model=model)
+    whole = folder.absolute()
+    with storage_errors(folder):
+        if whole.exists() and (not whole.is_dir() or any(whole.iterdir())):
+            raise UsageError(f"{folder}: it is not empty. Name a new folder.")
+        whole.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".init-", dir=whole.parent) as temporary:
+            draft = Path(temporary) / "project"
+            _write(draft, whole, model, mapping)
+            os.rename(draft, whole)  # noqa: PTH104 - takes the place of an empty folder
+    print_text((whole / "README.md").read_text(encoding="utf-8").rstrip())
+
+
+def _write(draft: Path, whole: Path, model: str, mapping: str) -> None:
+    for name in ("configs/mappings", "landing"):
+        (draft / name).mkdir(parents=True)
+    for name in OWN:
+        text = (shipped("configs") / name).read_text(encoding="utf-8")
+        (draft / "configs" / name).write_text(text, encoding="utf-8")
+    (draft / "configs" / "mappings" / f"{model}.toml").write_text(mapping, encoding="utf-8")
+    program = Path(sys.argv[0]).absolute()
+    known = {"folder": shlex.quote(str(whole)), "program": shlex.quote(str(program))}
+    in_cron = {key: text.replace("%", r"\%") for key, text in known.items()}  # else a line's end
+    for name, names in (("README.md", known), ("crontab", in_cron)):
+        (draft / name).write_text(_template(name, model=model, **names), encoding="utf-8")
+
+
+def _mapping_of(log: Path, model: str) -> str:
+    """Return the mapping that a measured log suggests."""
+    from fleet_slip.ingest.draft import (  # noqa: PLC0415
+        draft_mapping,
+        write_draft,
+    )
+    from fleet_slip.ingest.formats.reading import FileFormats  # noqa: PLC0415
+    from fleet_slip.ingest.profile import profile_file  # noqa: PLC0415
+
+    formats = FileFormats(can=None, duckdb=None)
+    return write_draft(draft_mapping(log, profile_file(log, formats)), model)
+
+
+def _template(name: str, **known: str) -> str:
+    text = (shipped("jobs") / "project" / name).read_text(encoding="utf-8")
+    return text.format(**known)

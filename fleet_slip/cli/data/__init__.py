@@ -1,1 +1,0 @@
-"""The commands that bring data in and show it."""

@@ -1,0 +1,263 @@
+"""Reducing logs to Gram rows: the commands gram and check."""
+
+from concurrent.futures import Executor
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleet_slip.api.calls import open_workers
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.base import number_of
+from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, FeatureSet
+from fleet_slip.catalogue.features import features as known_features
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.cli.app import record_run
+from fleet_slip.cli.options import Cluster, complete_feature_set
+from fleet_slip.cli.output import All, Json, print_json, print_table, progress, say
+from fleet_slip.columns.sql import column_query
+from fleet_slip.config import config_files, folder, own_configs, read_named_file
+from fleet_slip.grams.compute import gram_statement
+
+if TYPE_CHECKING:
+    from fleet_slip.grams.job import GramReport
+
+ALL_SETS = "all"
+"""Instead of the name of a feature set: every one."""
+
+
+@record_run
+def gram(
+    context: typer.Context,
+    feature_set: Annotated[
+        str,
+        typer.Option(
+            "--features",
+            autocompletion=complete_feature_set,
+            help="A feature set of configs/features.toml; signals is the logged signals "
+            "themselves, all is every set.",
+        ),
+    ] = PLAIN,
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="Read only the log files that have a drive of this cohort, an SQL condition on "
+            "the view drives. Default: all.",
+            show_default=False,
+        ),
+    ] = None,
+    sql: Annotated[bool, typer.Option("--sql", help="Print the statement and do nothing.")] = False,
+    cluster: Cluster = None,
+    json: Json = False,
+) -> None:
+    """Reduce new log files to Gram rows, and drop the rows of files that are gone.
+
+    A feature set that is asked for the first time costs one pass over the logs; from then on only
+    new files are read.
+
+    Example: **fleet-slip gram --features windows**
+    """
+    names = (PLAIN, *known_features().sets) if feature_set == ALL_SETS else (feature_set,)
+    if sql:
+        for name in names:
+            typer.echo(gram_statement(catalogue(), name))
+        return
+    fleet: Fleet = context.obj
+    with open_workers(fleet.root, cluster) as executor:
+        if cohort:  # which files have its drives is known from the logged signals' Gram rows
+            _run_gram(fleet, executor, PLAIN, None)
+        reports = [_run_gram(fleet, executor, name, cohort) for name in names]
+    if json:
+        print_json(reports if feature_set == ALL_SETS else reports[0])
+        return
+    for report in reports:
+        _say_gram(report)
+    if not (any(one.gram_rows for one in reports) or fleet.warehouse.logs.snapshot().files):
+        say(f"{fleet.root}: there are no logs yet. They come with: fleet-slip run, or ingest")
+
+
+def _run_gram(
+    fleet: Fleet, executor: Executor, feature_set: str, cohort: str | None
+) -> "GramReport":
+    with progress(f"gram {feature_set}", "rows", executor) as show:
+        return fleet.gram(feature_set, cohort=cohort, workers=executor, progress=show)
+
+
+def _say_gram(report: "GramReport") -> None:
+    if report.changed:
+        say(
+            f"gram {report.feature_set}: {number_of(report.files_read, 'new file')}, "
+            f"{number_of(report.rows_read, 'row')} "
+            f"read, {number_of(report.files_dropped, 'file')} dropped; "
+            f"{number_of(report.gram_rows, 'Gram row')} in all"
+        )
+        if report.received_dropped:
+            say(
+                f"{number_of(report.received_dropped, 'Gram row')} that cars had sent dropped: the "
+                "logs of the same drives are here now"
+            )
+    else:
+        say(
+            f"gram {report.feature_set}: nothing to do, {number_of(report.gram_rows, 'Gram row')} "
+            "in all are "
+            "up to date"
+        )
+
+
+def check(
+    context: typer.Context,
+    files: Annotated[
+        int, typer.Option(min=1, help="How many log files to check, evenly chosen.")
+    ] = 4,
+    json: Json = False,
+) -> None:
+    """Compute Gram rows three ways and compare them, bit for bit.
+
+    By the SQL statement, by float64 matrix products on blocks in which every partial sum is an
+    exact integer, and (for one drive of each file) by Python integers; and with the stored rows.
+
+    Example: **fleet-slip check**
+    """
+    with progress("check", "files") as show:
+        report = context.obj.check(files, progress=show)
+    if json:
+        print_json(report)
+    else:
+        ways = {
+            "SQL against stored Gram rows": report.drives,
+            "SQL against float64 blocks": report.drives,
+            "SQL against Python integers": report.drives_by_integers,
+        }
+        if report.wide_sets:
+            ways[f"SQL against the kernel: {', '.join(report.wide_sets)}"] = report.wide_drives
+        rows = [[way, f"{drives}", "yes"] for way, drives in ways.items()]
+        print_table("", ["way", "drives", "equal"], rows)
+
+
+# The command that lists features, feature sets and the config files that define them: features.
+
+
+def features(
+    sets: Annotated[
+        bool, typer.Option("--sets", help="List the feature sets instead of the features.")
+    ] = False,
+    sql: Annotated[
+        str | None,
+        typer.Option(
+            "--sql",
+            help="Print the query over log_counts that computes this feature, window or factor.",
+            show_default=False,
+        ),
+    ] = None,
+    files: Annotated[
+        bool, typer.Option("--files", help="List the config files in force, and whose they are.")
+    ] = False,
+    everything: All = False,
+    json: Json = False,
+) -> None:
+    """List the features and feature sets of configs/features.toml.
+
+    Features are integer functions of the logged counts, such as yaw rate over speed. Compute the
+    Gram rows of a set with: **fleet-slip gram --features NAME**, then use it with: **fleet-slip
+    select --features NAME**
+
+    Example: **fleet-slip features --sql ay_mean_16**
+    """
+    known = known_features()
+    if sql is not None:
+        typer.echo(column_query(known, sql))
+    elif files:
+        _print_files(json)
+    elif json:
+        print_json(
+            {
+                "windows": {
+                    name: one.model_dump(mode="json") for name, one in known.time_columns.items()
+                },
+                "features": {
+                    name: {**one.model_dump(mode="json"), "sql": one.sql}
+                    for name, one in known.features.items()
+                },
+                "sets": {
+                    name: {"identity": known.identity(name), **known.feature_set(name).model_dump()}
+                    for name in (PLAIN, *known.sets)
+                },
+            }
+        )
+    elif sets:
+        print_table(
+            "",
+            ["set", "columns", "rows of a drive", "description"],
+            [
+                [name, " ".join(one.inputs), _parts(one), one.description]
+                for name, one in ((n, known.feature_set(n)) for n in (PLAIN, *known.sets))
+            ],
+            left=4,
+        )
+    elif not everything:
+        _print_families(known)
+    else:
+        print_table(
+            "",
+            ["feature", "unit", "scale", "from", "description"],
+            [
+                [name, one.unit, str(one.scale), " ".join(one.inputs), one.description]
+                for name, one in known.features.items()
+            ],
+            left=5,
+        )
+        print_table(
+            "\ncolumns over time",
+            ["column", "unit", "scale", "of", "description"],
+            [
+                [name, one.unit, str(one.scale), one.definition.of, one.description]
+                for name, one in known.time_columns.items()
+            ],
+            left=5,
+        )
+
+
+def _print_families(known: FeatureCatalogue) -> None:
+    """Print features, and columns over time by family: one by one they are hundreds."""
+    print_table(
+        "",
+        ["feature", "unit", "description"],
+        [[name, one.unit, one.description] for name, one in known.features.items()],
+        left=3,
+    )
+    families = {
+        name: (" ".join(map(str, window.members(name).values())), window.description)
+        for name, window in known.windows.items()
+    }
+    single = {**known.factors, **known.calibrated}
+    families |= {name: ("", known.time_columns[name].description) for name in single}
+    families |= {f"COLUMN_{name}_…": ("", gate.description) for name, gate in known.gates.items()}
+    print_table(
+        f"\n{number_of(len(known.time_columns), 'column')} over time; one by one: --all",
+        ["column", "over ticks", "description"],
+        [[name, *told] for name, told in families.items()],
+        left=3,
+    )
+
+
+def _print_files(json: bool) -> None:
+    own = own_configs()
+    found = {name: file for name, file in config_files().items() if read_named_file(file)}
+    whose = {
+        name: "own" if own and str(file).startswith(str(own)) else "shipped"
+        for name, file in found.items()
+    }
+    if json:
+        print_json({name: {"from": whose[name], "path": str(file)} for name, file in found.items()})
+        return
+    heading = f"own configs: {own or 'none'}\nshipped ones: {folder('configs')}"
+    print_table(heading, ["file", "from"], [*map(list, whose.items())], left=2)
+
+
+def _parts(one: FeatureSet) -> str:
+    if one.regimes:
+        return f"by {' and '.join(one.regimes)}"
+    if one.block_s:
+        return f"in blocks of {one.block_s:f} s"
+    if one.row_folds:
+        return f"{number_of(one.row_folds, 'fold')} of rows"
+    return "with the one before" if one.lagged else "together"

@@ -1,0 +1,416 @@
+"""Commands that serve models: models, show, promote, rollback, pin, unpin."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.base import number_of
+from fleet_slip.catalogue.definitions import Definition
+from fleet_slip.cli.app import record_run
+from fleet_slip.cli.options import OnlyModel, complete_model
+from fleet_slip.cli.output import All, Json, print_json, print_table, print_text, say
+from fleet_slip.errors import UsageError
+from fleet_slip.export.costs import costs_content, describe_costs
+from fleet_slip.export.files import Target
+from fleet_slip.models.diff import Difference, Term
+from fleet_slip.models.manifest import CrossValidated, LearnedFrom, ModelTerm
+from fleet_slip.models.registry import CHAMPION, ModelVersion
+from fleet_slip.models.score import score as score_rows
+from fleet_slip.warehouse.condition import Condition, parse_condition, row_columns
+from fleet_slip.warehouse.tables import Warehouse
+
+Reference = Annotated[
+    str,
+    typer.Argument(
+        help="NAME, NAME@VERSION or NAME@ALIAS. NAME alone is its champion.",
+        autocompletion=complete_model,
+    ),
+]
+Alias = Annotated[str, typer.Option(help="The alias to move.")]
+
+
+def models(
+    context: typer.Context,
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help="Show one model's versions and history. Or: import, and a FILE that export --to "
+            "json wrote, to bring its version in."
+        ),
+    ] = None,
+    file: Annotated[Path | None, typer.Argument(help="The file to import.")] = None,
+    everything: All = False,
+    json: Json = False,
+) -> None:
+    """List the published model versions, or bring one in from elsewhere: models import FILE.
+
+    Example: **fleet-slip models**
+    """
+    fleet: Fleet = context.obj
+    if file is not None:
+        _import_model(fleet, name, file, json)
+        return
+    if name == "import" and name not in fleet.registry().names():
+        raise UsageError("which file? Run: fleet-slip models import FILE")
+    rows = fleet.models(name).to_pylist()
+    if json:
+        print_json(rows)
+        return
+    if not rows:
+        say("no model has been published yet. Run: fleet-slip publish NAME")
+        return
+    _print_models(rows, everything)
+    for row in rows:
+        if row["trained_on_forgotten"]:
+            say(f"{row['name']}@{row['version']} was trained on drives that were forgotten since")
+    if name:
+        print_table(
+            "\nhistory of aliases",
+            ["at", "command", "alias", "version"],
+            [
+                [f"{move.at:%Y-%m-%d %H:%M:%S}", move.command, move.alias, str(move.version)]
+                for move in fleet.registry().history(name).moves()
+            ],
+            left=3,
+        )
+
+
+def _print_models(rows: Sequence[Mapping[str, Any]], everything: bool) -> None:
+    """Print a line for each version; with the names of its signals if all is asked for."""
+    more = ["error std deg", "rows"] if everything else []
+    print_table(
+        "",
+        ["model", "aliases", "signals", "published", "correlation", "RMSE deg", "drives", *more],
+        [
+            [
+                f"{row['name']}@{row['version']}",
+                row["aliases"].replace(",", ", "),
+                row["signals"].replace(",", " ")
+                if everything
+                else str(len(row["signals"].split(","))),
+                f"{row['published_at']:%Y-%m-%d %H:%M}" if row["published_at"] else "",
+                f"{row['correlation']:.4f}",
+                f"{row['rmse_deg']:.4f}",
+                f"{row['drives']:,}",
+                *([f"{row['error_std_deg']:.4f}", f"{row['rows']:,}"] if everything else []),
+            ]
+            for row in rows
+        ],
+        left=4,
+    )
+
+
+def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> None:
+    if word != "import":
+        raise UsageError(f"{word!r}: a file is for import. Run: fleet-slip models import {file}")
+    version = fleet.import_model(file)
+    origin = version.manifest.imported_from
+    if json:
+        told = origin.model_dump() if origin else None
+        print_json({"model": version.reference, "sha256": version.sha256, "imported_from": told})
+        return
+    came = f"imported from {origin.reference}" if origin else "is there already, made here"
+    say(f"{version.reference}: {came}. To use it: fleet-slip promote {version.reference}")
+
+
+def show(
+    context: typer.Context, model: OnlyModel = None, everything: All = False, json: Json = False
+) -> None:
+    """Show one model version: figures, the data that made it, and coefficients.
+
+    With --all, coefficients to the last digit, and what each column is.
+
+    Example: **fleet-slip show waterford**
+    """
+    version: ModelVersion = context.obj.model(model)
+    if json:
+        content = version.manifest.model_dump(mode="json")
+        facts = {
+            "version": version.version,
+            "sha256": version.sha256,
+            "on_board": costs_content(version.manifest),
+        }
+        print_json({**facts, **content})
+    else:
+        _print_version(version, everything)
+
+
+def _definition_row(term: ModelTerm, one: Definition) -> list[str]:
+    times = [one.fact.name] if one.fact else []
+    if gate := one.gate:
+        knots = [str(knot) for knot in (gate.low, gate.peak, gate.high) if knot is not None]
+        times.append(f"{gate.by.over or ''} {gate.by.of} {gate.by.ticks or ''}: {' '.join(knots)}")
+    window = [one.of, one.over or "", str(one.ticks or ""), str(one.bits)]
+    return [term.signal, f"{term.scale} {term.unit}", *window, ", ".join(times).strip()]
+
+
+def _teacher(learned: LearnedFrom) -> str:
+    """Say what stood for a label, and where the intercept is from."""
+    times = learned.change_s
+    over = ", ".join(f"{one:g}" for one in (times if isinstance(times, tuple) else (times,)))
+    told = f"changes of the {learned.label} over {over} s: the figures are of changes"
+    if not learned.cars:
+        return f"{told}. No intercept: it goes through the origin"
+    unsure = learned.intercept_uncertainty_deg
+    uncertain = "not known how surely" if unsure is None else f"uncertain by {unsure:.2g} deg"
+    return (
+        f"{told}. Intercept where {number_of(learned.cars, 'car')} "
+        f"{'goes' if learned.cars == 1 else 'go'} straight, {uncertain}, between cars "
+        f"{learned.intercept_spread_deg:.3f} deg"
+    )
+
+
+def _print_version(version: ModelVersion, everything: bool) -> None:
+    manifest = version.manifest
+    label, origin = manifest.label, manifest.through_origin
+    print_text(
+        f"{version.reference}: {label.column} = {'' if origin else 'intercept + '}"
+        f"sum of coefficient * signal{', through the origin' if origin else ''}"
+    )
+    facts = {**_facts(version), **({"sha256": version.sha256} if everything else {})}
+    print_table("", ["", ""], facts.items(), left=2)
+    form = repr if everything else "{:.6g}".format
+    terms = [] if origin else [["intercept", label.unit, form(manifest.intercept), ""]]
+    for term in manifest.terms:
+        per_count = f"{float(term.coefficient_exact * term.scale_exact):.9g}"
+        terms.append([term.column, term.unit, form(term.coefficient), per_count])
+    shown = 4 if everything else 3
+    header = ["signal", "unit", "coefficient", "per count"]
+    print_table("", header[:shown], [row[:shown] for row in terms], left=2)
+    if not everything:
+        return
+    print_text("per count: coefficient times scale, for an ECU that works on raw counts")
+    if manifest.features:
+        print_table(
+            "\nfeatures: SQL over the counts of log_counts, clipped to +-32767, times the scale",
+            ["feature", "scale", "SQL"],
+            [[t.signal, f"{t.scale} {t.unit}", t.sql] for t in manifest.terms if t.sql],
+            left=3,
+        )
+    if manifest.definitions:
+        print_table(
+            "\ncolumns over time (docs/memory.md): counts, times the scale",
+            ["column", "scale", "of", "over", "ticks", "bits", "times"],
+            [_definition_row(term, own) for term in manifest.terms if (own := term.definition)],
+            left=4,
+        )
+
+
+def _facts(version: ModelVersion) -> dict[str, str]:
+    """Return what a version says of itself in sentences."""
+    manifest = version.manifest
+    figures, trained, chosen = (
+        manifest.cross_validation,
+        manifest.trained_on,
+        manifest.selected_by,
+    )
+    cars = "" if trained.vehicles is None else f" of {number_of(trained.vehicles, 'car')}"
+    drives = f"{number_of(trained.drives, 'drive')}{cars}, {number_of(trained.rows, 'row')}"
+    facts = {
+        "correlation": f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})",
+        "RMSE": f"{figures.rmse_deg:.4f} deg",
+        "label noise": _label_noise(figures),
+        "error std": f"{figures.error_std_deg:.4f} deg",
+        "error mean": f"{figures.error_mean_deg:+.4f} deg",
+        "on board": describe_costs(manifest),
+        "cross-validation": f"{number_of(figures.folds, 'fold')} by {figures.folds_by}",
+        "cohort": f"{trained.cohort}: {drives}",
+        "tables": f"logs version {trained.logs_version}, grams {trained.grams_version}",
+        "selected": f"model {chosen.model} of {chosen.model_list}",
+        "why": chosen.reason,
+    }
+    if learned := manifest.learned_from:
+        facts["learned from"] = _teacher(learned)
+    if one := manifest.imported_from:
+        facts["imported"] = f"from {one.reference} of another data root, sha256 {one.sha256}"
+    return facts
+
+
+def _label_noise(figures: CrossValidated) -> str:
+    """Return how much of the RMSE is noise of the label."""
+    if figures.label_noise_deg is None:
+        return "not known, and part of the RMSE"
+    left = figures.beyond_label_noise_deg
+    return f"{figures.label_noise_deg:.4f} deg, without which the RMSE is {left:.4f} deg"
+
+
+@record_run
+def promote(
+    context: typer.Context,
+    reference: Annotated[
+        str,
+        typer.Argument(help="NAME@VERSION to point the alias at.", autocompletion=complete_model),
+    ],
+    alias: Alias = CHAMPION,
+) -> None:
+    """Point an alias, the champion unless told otherwise, at a version.
+
+    Example: **fleet-slip promote waterford@2**
+    """
+    version = context.obj.promote(reference, alias)
+    say(f"{version.manifest.name}@{alias} is now version {version.version}")
+
+
+@record_run
+def rollback(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
+    alias: Alias = CHAMPION,
+) -> None:
+    """Point an alias back at the version that it had before; no publication moves it from there.
+
+    Until promote or unpin.
+
+    Example: **fleet-slip rollback waterford**
+    """
+    version = context.obj.rollback(name, alias)
+    say(
+        f"{name}@{alias} is version {version.version} again, and stays so until: fleet-slip "
+        f"promote, or fleet-slip unpin {name}"
+    )
+
+
+@record_run
+def pin(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
+    alias: Alias = CHAMPION,
+) -> None:
+    """Keep an alias where it is: publications become candidates, until promote or unpin.
+
+    Example: **fleet-slip pin waterford**
+    """
+    version = context.obj.pin(name, alias)
+    say(f"{name}@{alias} is pinned to version {version.version}")
+
+
+@record_run
+def unpin(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
+    alias: Alias = CHAMPION,
+) -> None:
+    """Let publications move an alias again, after pin or rollback.
+
+    Example: **fleet-slip unpin waterford**
+    """
+    version = context.obj.unpin(name, alias)
+    say(f"{name}@{alias} is version {version.version}; the next publication may move it")
+
+
+# Two model versions beside each other: the command diff, and score --against.
+
+
+def diff(context: typer.Context, one: Reference, other: Reference, json: Json = False) -> None:
+    """Tell two model versions apart: their data, signals, coefficients and figures.
+
+    Example: **fleet-slip diff waterford@1 waterford@2**
+    """
+    found = context.obj.diff(one, other)
+    if json:
+        print_json(found)
+    else:
+        _print_difference(found)
+
+
+def _print_difference(found: Difference) -> None:
+    one, other = found.one.reference, found.other.reference
+    if not found.facts and all(term.same for term in found.terms):
+        say(f"{one} and {other} are the same estimator from the same data")
+        return
+    terms = []
+    for term in found.terms:
+        here, there = _coefficients(term)
+        terms.append([term.signal, term.unit, here, "the same" if term.same else there])
+    print_table("", ["signal", "unit", one, other], terms, left=2)
+    if found.drives is not None:
+        shared = found.drives
+        say(
+            f"drives: {shared.both:,} made both, {shared.only_one:,} only {one}, "
+            f"{shared.only_other:,} only {other}"
+        )
+    rows = [
+        [name.rpartition(".")[2].replace("_", " "), _shown(a), _shown(b)]
+        for name, (a, b) in found.facts.items()
+        if not name.endswith("sha256")  # for machines: --json
+    ]
+    print_table("", ["what differs", one, other], rows, left=3)
+
+
+def _coefficients(term: Term) -> list[str]:
+    """Return the two coefficients of a term, with more digits where few would hide a difference."""
+    values = (term.one, term.other)
+    short = ["" if value is None else f"{value:.6g}" for value in values]
+    return short if term.same or short[0] != short[1] else [repr(value) for value in values]
+
+
+def _shown(value: Any) -> str:
+    match value:
+        case None:
+            return ""
+        case dict():
+            return ", ".join(f"{name} {inner}" for name, inner in value.items())
+        case float():
+            return f"{value:.6g}"
+        case _:
+            return str(value)
+
+
+def score_against(
+    warehouse: Warehouse, one: ModelVersion, other: ModelVersion, rows: Condition, json: bool
+) -> None:
+    """Print the figures of two versions on the rows that have the signals of both."""
+    needed = {*one.manifest.columns, *other.manifest.columns}
+    complete = " AND ".join(f"{name} IS NOT NULL" for name in sorted(needed))
+    both = rows & parse_condition(complete, row_columns())
+    first, second = (
+        score_rows(warehouse, version.manifest, both).as_dict() for version in (one, other)
+    )
+    if json:
+        models = {one.reference: first, other.reference: second}
+        print_json({"cohort": rows.text, "models": models})
+        return
+    print_table(
+        f"{one.reference} and {other.reference} on the same {number_of(first['rows'], 'row')}",
+        ["figure", one.reference, other.reference, "difference"],
+        [
+            [
+                name.replace("_deg", ", deg").replace("_", " "),
+                *(f"{number:,}" if isinstance(number, int) else f"{number:.4f}" for number in pair),
+                f"{pair[0] - pair[1]:+.4f}",
+            ]
+            for name, pair in ((name, (first[name], second[name])) for name in first)
+            if name != "rows" and None not in pair and any(pair)
+        ],
+    )
+
+
+# The command that brings a published version into other programs: export.
+
+
+def export(
+    context: typer.Context,
+    to: Annotated[Target, typer.Option(help="What to export to.")],
+    model: OnlyModel = None,
+    output: Annotated[
+        Path, typer.Option(help="Folder to write into; files of the same names are replaced.")
+    ] = Path(),
+    with_gram: Annotated[
+        bool,
+        typer.Option("--with-gram", help="With --to c: also what counts Gram rows in the car."),
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Write a version as a program for elsewhere, with checks: vectors of inputs and angles.
+
+    Example: **fleet-slip export waterford --to c --output export**
+    """
+    written = context.obj.export(model, to, output, with_gram=with_gram)
+    if json:
+        print_json({"files": [str(path) for path in written]})
+        return
+    for path in written:
+        say(f"{path}: {path.stat().st_size:,} bytes")

@@ -1,0 +1,464 @@
+"""The command that tells the health of the warehouse: status."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from datetime import date
+from pathlib import Path
+from statistics import median, pstdev
+from typing import Annotated
+
+import typer
+
+from fleet_slip.api.calls import open_workers
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.api.requests import NightRequest
+from fleet_slip.base import date_of, needed, number_of
+from fleet_slip.catalogue.facts import ALL_DRIVES, CAR_NUMBERS, TRAINING_DRIVES, NumberName
+from fleet_slip.cli.app import record_run
+from fleet_slip.cli.options import Cluster, Cohort, OnlyModel, Threads, request_options
+from fleet_slip.cli.output import (
+    Json,
+    cell,
+    print_json,
+    print_table,
+    print_text,
+    progress_of_steps,
+    say,
+)
+from fleet_slip.cli.selection import say_without_log
+from fleet_slip.errors import AlarmError, UsageError
+from fleet_slip.grams.calibration import SURE_ERRORS, Calibration, ChangedNumber
+from fleet_slip.grams.car_evidence import FEWEST_CARS, CalibratedNumber, Roads
+from fleet_slip.operations.monitor import Chart
+from fleet_slip.operations.quality import QualityReport
+from fleet_slip.operations.status import WarehouseStatus
+
+
+def status(
+    context: typer.Context,
+    max_age_hours: Annotated[
+        float | None, typer.Option(min=0, help="Data, or a backlog, older than this is a problem.")
+    ] = None,
+    prometheus: Annotated[
+        bool,
+        typer.Option("--prometheus", help="Print metrics, for the textfile collector of a node."),
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Tell the warehouse's health: freshness, backlog, last runs, disk, champions.
+
+    Exit code 10 if something calls for attention.
+
+    Example: **fleet-slip status --max-age-hours 26**
+    """
+    if json and prometheus:
+        raise UsageError("give one of --json and --prometheus.")
+    found: WarehouseStatus = context.obj.status(max_age_hours)
+    if prometheus:
+        from fleet_slip.operations.metrics import as_openmetrics  # noqa: PLC0415 - seldom asked
+
+        print_text(as_openmetrics(found).removesuffix("\n"))
+    elif json:
+        print_json(found)
+    else:
+        _print_status(found)
+    _complain(found.problems)
+
+
+def _complain(problems: Sequence[str]) -> None:
+    """Say what calls for attention, a line each, if anything does."""
+    for problem in problems:
+        say(f"- {problem}", logging.ERROR)
+    if problems:
+        raise AlarmError(f"{number_of(len(problems), 'matter')}, above, to be looked after.")
+
+
+def _print_status(found: WarehouseStatus) -> None:
+    print_table(
+        f"{found.root} at {found.checked_at:%Y-%m-%d %H:%M} UTC",
+        ["table", "last commit", "version", "files", "rows", "size MB"],
+        [
+            [
+                name,
+                f"{one.committed_at:%Y-%m-%d %H:%M}" if one.committed_at else "never",
+                cell(one.version),
+                f"{one.files:,}",
+                f"{one.rows:,}",
+                f"{one.size_bytes / 1e6:,.1f}",
+            ]
+            for name, one in found.tables.items()
+        ],
+        left=2,
+    )
+    backlog = f"{number_of(found.backlog_files, 'file')}, {number_of(found.backlog_rows, 'row')}"
+    facts = {"newest day": str(found.newest_day or "none"), "waiting for the Gram job": backlog}
+    if found.disk_free_bytes is not None and found.disk_free_fraction is not None:
+        free = f"{found.disk_free_bytes / 1e9:,.1f} GB free, {found.disk_free_fraction:.0%}"
+        facts["disk"] = free
+    print_table("", ["", ""], facts.items(), left=2)
+    if found.last_runs:
+        print_table(
+            "\nlast runs",
+            ["command", "started", "state", "seconds", "rows"],
+            [
+                [
+                    run["command"],
+                    f"{run['started_at']:%Y-%m-%d %H:%M:%S}",
+                    run["state"],
+                    cell(run["seconds"], ".1f"),
+                    cell(run["rows"], ","),
+                ]
+                for run in found.last_runs
+            ],
+            left=3,
+        )
+    if found.champions:
+        print_table(
+            "\nchampions",
+            ["model", "published", "age h", "logs behind", "grams behind"],
+            [
+                [
+                    f"{one.model}@{one.version}",
+                    cell(one.published_at, "%Y-%m-%d %H:%M"),
+                    cell(one.age_hours, ",.1f"),
+                    str(one.logs_behind),
+                    str(one.grams_behind),
+                ]
+                for one in found.champions
+            ],
+            left=2,
+        )
+
+
+# How the sensors of cars are off: the command calibrate.
+
+
+def calibrate(
+    context: typer.Context,
+    car: Annotated[
+        str | None,
+        typer.Option(help="Show this car's numbers, and how they go on board.", show_default=False),
+    ] = None,
+    cohort: Cohort = ALL_DRIVES,
+    since: Annotated[
+        str | None,
+        typer.Option(
+            help="Show instead what has changed in cars from this day on, such as 2024-06-15.",
+            show_default=False,
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Tell from each car's own drives how its sensors are off: no label, no log row is read.
+
+    Offsets of gyroscope, accelerometer and steering, tyre radius, steering and understeer, each
+    with its uncertainty and how fast it shrinks with drives. Needs the Gram rows of: **fleet-slip
+    gram --features calibration**. SQL sees the same: **fleet-slip sql "FROM calibration"**
+
+    Example: **fleet-slip calibrate**
+    """
+    day = date_of(since, "--since")
+    found: Calibration = context.obj.calibrate(cohort)
+    if car is not None:
+        found.car(car)  # that there is such a car
+    changed = [one for one in found.changed(day) if car in (None, one.car)] if day else []
+    if json:
+        shown = found.as_dict()
+        if day:
+            shown["changed"] = [vars(one) for one in changed]
+        if car is not None:
+            shown["cars"] = {car: shown["cars"][car]}
+        print_json(shown)
+    elif day:
+        _print_changed(changed, day)
+    elif car is not None:
+        _print_car(car, found.car(car), found.evidence.refusals(car))
+        _say_of_roads(found.roads)
+    else:
+        _print_fleet(found)
+        _say_of_roads(found.roads)
+
+
+def _print_car(
+    car: str,
+    numbers: Mapping[NumberName, CalibratedNumber],
+    refusals: Mapping[NumberName, str],
+) -> None:
+    print_table(
+        f"{car}, by its own drives",
+        ["number", "unit", "value", "+-", "drives", "count on board", "of"],
+        [
+            [
+                name,
+                CAR_NUMBERS[name].unit,
+                f"{one.value:.6g}",
+                cell(one.uncertainty, ".2g"),
+                str(one.drives),
+                str(one.count),
+                str(CAR_NUMBERS[name].grain),
+            ]
+            for name, one in numbers.items()
+        ],
+        left=2,
+    )
+    for reason in dict.fromkeys(refusals.values()):
+        names = [name for name, why in refusals.items() if why == reason]
+        say(f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} missing: {reason}")
+
+
+def _print_fleet(found: Calibration) -> None:
+    by_number = {
+        name: [cars[name] for cars in found.cars.values() if name in cars] for name in CAR_NUMBERS
+    }
+    print_table(
+        f"{number_of(len(found.cars), 'car')}, by their own drives",
+        ["number", "unit", "cars", "median", "differs by", "known to +-"],
+        [
+            [
+                name,
+                CAR_NUMBERS[name].unit,
+                f"{len(cars):,}",
+                f"{median(one.value for one in cars):.3g}",
+                f"{pstdev(one.value for one in cars):.2g}",
+                cell(_median([one.uncertainty for one in cars]), ".2g"),
+            ]
+            for name, cars in by_number.items()
+            if cars
+        ],
+        left=2,
+    )
+    if not any(one.uncertainty for cars in found.cars.values() for one in cars.values()):
+        return say("no car has two drives: how sure the numbers are cannot be told")
+    print_table(
+        "\nhow sure after so many drives of a car; measured: by the next so many drives",
+        ["number", "drives", "cars", "known to +-", "measured"],
+        [
+            [
+                row.number,
+                str(row.drives),
+                f"{row.cars:,}",
+                f"{row.stated:.2g}",
+                cell(row.measured, ".2g"),
+            ]
+            for row in found.convergence()
+        ],
+    )
+
+
+def _print_changed(changed: Sequence[ChangedNumber], since: date) -> None:
+    if not changed:
+        return say(f"no number of a car is another since {since}, as far as its drives tell")
+    print_table(
+        f"changed since {since}, by more than {SURE_ERRORS:g} standard errors",
+        ["car", "number", "unit", "before", "after", "+-"],
+        [
+            [
+                one.car,
+                one.number,
+                CAR_NUMBERS[one.number].unit,
+                f"{one.before:.5g}",
+                f"{one.after:.5g}",
+                f"{one.uncertainty:.2g}",
+            ]
+            for one in changed
+        ],
+        left=3,
+    )
+
+
+def _say_of_roads(roads: Roads) -> None:
+    if roads.hide_offsets:
+        say(
+            "bends look banked, and roads may always lean to one side, which fewer than "
+            f"{FEWEST_CARS} cars with offsets cannot tell from their own: no car has ay_offset"
+        )
+    elif roads.banked and roads.lean:
+        say(
+            f"bends are banked, and the roads lean: {float(roads.lean):+.3f} m/s^2 +- "
+            f"{roads.uncertainty:.2g} of ay in all {number_of(roads.cars, 'car')}, which ay_offset "
+            "is without"
+        )
+    elif not roads.banked:
+        say(
+            "bends are seen not to be banked: a road that always leans to one side counts as "
+            f"ay_offset. {FEWEST_CARS} cars or more tell the one from the other"
+        )
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return median(known) if known else None
+
+
+# The command that charts a model's error by day: monitor.
+
+
+def monitor(
+    context: typer.Context,
+    model: OnlyModel = None,
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="SQL condition on the view drives. Default: the condition of its training."
+        ),
+    ] = None,
+    since: Annotated[
+        str | None,
+        typer.Option(
+            help="First new day, YYYY-MM-DD. Default: the one after the days it was trained on."
+        ),
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="Draw the chart to an SVG, PDF or PNG file.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Chart a model's error on each day since it was trained, with control limits.
+
+    Reads Gram rows only. Exit code 10 if a new day is beyond the limits.
+
+    Example: **fleet-slip monitor waterford --since 2024-05-03**
+    """
+    chart: Chart = context.obj.monitor(model, cohort, since=date_of(since, "--since"))
+    if plot:
+        with needed("report", "a chart"):
+            from fleet_slip.operations.monitor import save_chart  # noqa: PLC0415
+        save_chart(chart, plot)
+    if json:
+        print_json(chart)
+    else:
+        _print_chart(chart)
+        say_without_log(chart.drives_left_out, chart.feature_set)
+    if chart.alarms:
+        days = ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in chart.alarms)
+        raise AlarmError(f"the error of {chart.model} is beyond its limits on {days}")
+
+
+def _print_chart(chart: Chart) -> None:
+    mean, std = chart.mean_limits, chart.std_limits
+    print_table(
+        f"{chart.model}, drives where {chart.cohort}; limits from the training days: "
+        f"mean {mean.lower:+.4f} to {mean.upper:+.4f}, std up to {std.upper:.4f} deg",
+        ["day", "", "drives", "rows", "RMSE deg", "mean deg", "std deg"],
+        [
+            [
+                str(day.day),
+                "training" if day.training else "new, alarm" if day.alarms else "new",
+                f"{day.drives:,}",
+                f"{day.rows:,}",
+                f"{day.rmse_deg:.4f}",
+                f"{day.error_mean_deg:+.4f}" + ("*" if "mean" in day.alarms else ""),
+                f"{day.error_std_deg:.4f}" + ("*" if "std" in day.alarms else ""),
+            ]
+            for day in chart.days
+        ],
+        left=2,
+    )
+
+
+# The command of every night with real cars.
+
+
+@record_run
+@request_options(NightRequest, name="--model")
+def nightly(
+    context: typer.Context,
+    request: NightRequest,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the summary there: NIGHT.txt, NIGHT.json, NIGHT.html. It names drives; "
+            "forget does not reach it.",
+            show_default=False,
+        ),
+    ] = None,
+    threads: Threads = None,
+    cluster: Cluster = None,
+    json: Json = False,
+) -> None:
+    """Do all of a night with real cars: ingest what is new, examine it, train again, verify.
+
+    Drives with faulty sensors train no model. The winner becomes champion if it is not worse, else
+    a candidate. Killed at any moment and given again, it ends where it would have ended. Exits with
+    10 if something calls for attention, else with the code of the first step that failed.
+
+    Example: **fleet-slip nightly --landing /srv/logs --mapping logger.toml --model fleet**
+    """
+    fleet: Fleet = context.obj
+    with (
+        open_workers(fleet.root, cluster or threads) as executor,
+        progress_of_steps("rows", executor) as show,
+    ):
+        options = {
+            **vars(request),
+            "workers": executor,
+            "progress": show,
+            "waiting": lambda: say(f"{request.name}: waiting for another night"),
+        }
+        report = fleet.nightly(**options)
+    if output is not None:
+        with needed("report", "a summary in files"):
+            from fleet_slip.operations.night import write_summary  # noqa: PLC0415 - draws
+
+        write_summary(report, output)
+    if json:
+        print_json(report)
+    else:
+        print_text(report.as_text())
+    if problem := report.problem:
+        problem.headline = f"the night of {report.night}: {report.verdict}"
+        raise problem
+
+
+# The command that finds faulty sensors: quality.
+
+
+def quality(
+    context: typer.Context,
+    cohort: Annotated[
+        str,
+        typer.Option(help="SQL condition on the view drives: which drives to examine together."),
+    ] = TRAINING_DRIVES,
+    json: Json = False,
+) -> None:
+    """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors, drive by drive.
+
+    Reads Gram rows only. Exit code 10 if a drive's sensors are not in order.
+
+    Example: **fleet-slip quality --cohort "day >= '2024-05-02'"**
+    """
+    found: QualityReport = context.obj.quality(cohort)
+    if json:
+        print_json(found)
+    else:
+        _print_quality(found)
+    if found.findings:
+        raise AlarmError(
+            f"{len(found.findings)} of {number_of(found.drives, 'drive')} are not in order"
+        )
+
+
+def _print_quality(found: QualityReport) -> None:
+    examined = (
+        f"{number_of(found.drives, 'drive')} examined, {found.compared:,} of them beside their "
+        f"peers ({'other' if found.compared else 'too few'} drives of a car or vehicle model)"
+    )
+    if not found.findings:
+        order = "all are in order" if found.drives else "none is long enough"
+        print_text(f"{examined}: {order}")
+        return
+    print_table(
+        examined,
+        ["drive", "car", "fault", "signals", "what shows it"],
+        [
+            [
+                finding.drive_id,
+                finding.vehicle_id,
+                finding.fault.kind,
+                " ".join(finding.fault.signals),
+                finding.fault.figure,
+            ]
+            for finding in found.findings
+        ],
+        left=5,
+    )

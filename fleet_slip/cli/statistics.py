@@ -1,0 +1,230 @@
+"""The command diagnose: a model's coefficients on a cohort, and how far to trust them."""
+
+import math
+
+import typer
+
+from fleet_slip.api.requests import DiagnosisRequest, RegimesRequest, WhatIfRequest
+from fleet_slip.base import number_of
+from fleet_slip.catalogue.facts import TRAINING_DRIVES
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.cli.options import Cohort, request_options
+from fleet_slip.cli.output import Json, figures_cells, print_json, print_line, print_table, say
+from fleet_slip.cli.selection import say_influential
+from fleet_slip.models.diagnose import CohortComparison, Diagnosis, WhatIf
+from fleet_slip.models.regimes import RegimeComparison
+from fleet_slip.regression.inference import INTERCEPT, Estimate
+
+
+@request_options(DiagnosisRequest, argument="model")
+def diagnose(
+    context: typer.Context,
+    request: DiagnosisRequest,
+    cohort: Cohort = TRAINING_DRIVES,
+    json: Json = False,
+) -> None:
+    """Fit a model's signals to a cohort and examine the fit, from Gram rows.
+
+    Standard errors by drives, or by cars where there are several, are the ones to believe: at
+    100 Hz a row says little that the one before did not say, and a car's drives share its biases.
+
+    Example: **fleet-slip diagnose waterford**
+    """
+    result = context.obj.cohort(cohort).diagnose(**vars(request))
+    if json:
+        print_json({"cohort": cohort, **result.as_dict()})
+    else:
+        _print_diagnosis(result)
+
+
+def _print_diagnosis(result: Diagnosis) -> None:
+    coefficients = _coefficients(result)
+    print_table(
+        f"{number_of(result.drives, 'drive')}, {number_of(result.fitted.gram.n, 'row')}, worth "
+        f"{result.evidence.rows:,.0f} independent ones; R squared {result.fitted.r_squared:.4f}, "
+        f"condition number {result.condition_number:.3g} (1: no signal tells what another tells)",
+        list(coefficients[0]),
+        [list(row.values()) for row in coefficients],
+        left=2,
+    )
+    if result.cluster == "row":
+        say(
+            "there is one drive only: its rows are taken for independent evidence, which they are "
+            "not at 100 Hz, so that the standard errors are far too small."
+        )
+    say_influential(result.influential, "would be left out by select --robust")
+    if result.serial is not None:
+        found = result.serial
+        print_line(
+            f"residuals: correlation {found.correlation.rho:.4f} with the row before, "
+            f"Durbin-Watson {found.correlation.durbin_watson:.4f} (2 if independent); AR(1) with "
+            f"rho {found.autoregressive.rho:.4f}."
+        )
+    if result.comparison is not None:
+        _print_comparison(result, result.comparison)
+
+
+def _coefficients(result: Diagnosis) -> list[dict[str, str]]:
+    """Return what is told of each coefficient, by heading."""
+    rows = []
+    both = zip(result.robust.estimates, result.naive.estimates, strict=True)
+    for i, (robust, naive) in enumerate(both):
+        name, constant = robust.name, robust.name == INTERCEPT
+        row = {
+            "signal": name,
+            "unit": (catalogue()[catalogue().label] if constant else features().of(name)).unit,
+            "coefficient": f"{robust.value:.6g}",
+            f"s.e. by {result.cluster}s": f"{robust.standard_error:.2g}",
+            "t": f"{robust.t:.1f}",
+            "s.e. by rows": f"{naive.standard_error:.2g}",
+            "VIF": "" if constant else f"{result.inflation[name]:.3g}",
+        }
+        if result.serial is not None:
+            slope = result.serial.inference.estimates[i]
+            row["AR(1)"] = "" if constant else f"{slope.value:.6g}"
+            row["s.e. AR(1)"] = "" if constant else f"{slope.standard_error:.2g}"
+        if (free := result.noise_free) is not None:
+            row["without noise"] = f"{free.offset if constant else free.weights[name]:.6g}"
+        rows.append(row)
+    return rows
+
+
+def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
+    print_table(
+        f"\nthe same signals where {found.condition}",
+        ["signal", "coefficient here", "there", "s.e. there", "difference / s.e."],
+        [
+            [
+                here.name,
+                f"{here.value:.6g}",
+                f"{there.value:.6g}",
+                f"{there.standard_error:.2g}",
+                f"{_standardised(here, there):+.1f}",
+            ]
+            for here, there in zip(result.robust.estimates, found.other.estimates, strict=True)
+        ],
+    )
+    for test, kind in (found.drives, f"Wald, by {result.cluster}s"), (found.rows, "Chow, by rows"):
+        if test is not None:
+            degrees = f"{test.numerator}, {_degrees(test.denominator)}"
+            print_line(
+                f"the same coefficients? {kind}: F({degrees}) = {test.f:,.2f}, p = {test.p:.2g}."
+            )
+    if found.drives is None:
+        say(
+            f"there are too few {result.cluster}s to compare so many coefficients by them. Chow's "
+            "test takes neighbouring rows for independent evidence, which they are not: its p is "
+            "far too small, and only a large one says something."
+        )
+    elif found.drives.p > 0.05 >= found.rows.p:
+        say(
+            f"by {result.cluster}s, the difference is no more than chance: the rows only look like "
+            "evidence."
+        )
+
+
+def _degrees(many: float) -> str:
+    return f"{many:.0f}" if many == round(many) else f"{many:.1f}"
+
+
+def _standardised(here: Estimate, there: Estimate) -> float:
+    spread = float((here.standard_error**2 + there.standard_error**2) ** 0.5)
+    return (there.value - here.value) / spread
+
+
+# The command that shows a model's error by regime: regimes.
+
+
+@request_options(RegimesRequest, argument="model")
+def regimes(
+    context: typer.Context,
+    request: RegimesRequest,
+    cohort: Cohort = TRAINING_DRIVES,
+    json: Json = False,
+) -> None:
+    """Show a model's error by speed and lateral acceleration, and whether to split it there.
+
+    One model for all rows is cross-validated against one for each regime. Needs Gram rows by
+    regime: **fleet-slip gram --features regimes**
+
+    Example: **fleet-slip regimes --over speed**
+    """
+    result: RegimeComparison = context.obj.cohort(cohort).regimes(**vars(request))
+    if json:
+        print_json({"cohort": cohort, **result.as_dict()})
+    else:
+        _print_regimes(result, request.by)
+
+
+def _print_regimes(result: RegimeComparison, by: str) -> None:
+    print_table(
+        f"{number_of(result.drives, 'drive')}, {number_of(result.folds, 'fold')} by {by}: "
+        f"{' '.join(result.signals)}",
+        ["regime", "rows", "share", "pooled RMSE deg", "std", "split RMSE deg", "std", ""],
+        [
+            [
+                one.name,
+                f"{one.rows:,}",
+                f"{one.share:.1%}",
+                f"{one.pooled.rmse_deg:.4f}",
+                f"{one.pooled.error_std_deg:.4f}",
+                f"{one.split.rmse_deg:.4f}",
+                f"{one.split.error_std_deg:.4f}",
+                "" if one.own else "too few rows",
+            ]
+            for one in result.regimes
+        ],
+    )
+    one, own = result.pooled, result.split
+    better = "a model for each regime" if result.split_wins else "one model for all"
+    print_line(
+        f"one model: correlation {one.correlation:.4f}, RMSE {one.rmse_deg:.4f} deg; one for each "
+        f"regime: {own.correlation:.4f}, {own.rmse_deg:.4f} deg. Over the folds, splitting adds "
+        f"{result.gain:+.4f} +- {result.gain_standard_error:.4f} to the correlation and takes "
+        f"{math.degrees(result.rmse_gain):.4f} +- "
+        f"{math.degrees(result.rmse_gain_standard_error):.4f} deg from the RMSE; worth having is "
+        f"{result.worth}. Choose {better}."
+    )
+
+
+# The command that predicts a model's error with worse sensors: what-if.
+
+
+@request_options(WhatIfRequest, argument="model")
+def what_if(
+    context: typer.Context,
+    request: WhatIfRequest,
+    cohort: Cohort = TRAINING_DRIVES,
+    json: Json = False,
+) -> None:
+    """Predict a model's error with worse sensors, in closed form; nothing is simulated.
+
+    Bias and noise come on top of what the logs have. Shown too: the best model for such sensors.
+
+    Example: **fleet-slip what-if waterford --noise ay=0.2 --bias yaw_rate=0.02**
+    """
+    result: WhatIf = context.obj.cohort(cohort).what_if(**vars(request))
+    if json:
+        added = {"noise": request.noise, "bias": request.bias}
+        print_json({"cohort": cohort, **added, **result.as_dict()})
+    else:
+        _print_what_if(result)
+
+
+def _print_what_if(result: WhatIf) -> None:
+    print_table(
+        f"{number_of(result.drives, 'drive')}, {number_of(result.before.rows, 'row')}",
+        ["", "correlation", "RMSE deg", "mean deg", "std deg"],
+        [
+            ["as logged", *figures_cells(result.before)],
+            ["with these sensors", *figures_cells(result.after)],
+            ["best model for these sensors", *figures_cells(result.refitted_after)],
+        ],
+    )
+    print_table(
+        "\nbest model for these sensors",
+        ["signal", "coefficient"],
+        [[INTERCEPT, f"{result.refitted.offset:.6g}"]]
+        + [[name, f"{weight:.6g}"] for name, weight in result.refitted.weights.items()],
+    )

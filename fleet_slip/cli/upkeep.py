@@ -1,0 +1,295 @@
+"""Commands that look after the warehouse: verify, compact, vacuum, forget, retain."""
+
+import sys
+from concurrent.futures import Executor
+from contextlib import nullcontext
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import typer
+
+from fleet_slip.api.calls import open_workers
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.api.requests import ForgetRequest
+from fleet_slip.base import number_of
+from fleet_slip.cli.app import record_run
+from fleet_slip.cli.options import Cluster, request_options
+from fleet_slip.cli.output import Json, print_json, print_table, progress, say
+from fleet_slip.errors import DamageError, PendingError, UsageError
+from fleet_slip.operations.find_drives import RETENTION_HOURS, VacuumReport
+from fleet_slip.operations.forget import ForgetReport
+from fleet_slip.operations.rewriting import TARGET_ROWS
+from fleet_slip.operations.verify import Verification
+from fleet_slip.storage.runs import recording
+
+PENDING_SHOWN = 5
+"""So many are named on a line; --json names all."""
+
+
+def verify(
+    context: typer.Context,
+    full: Annotated[
+        bool, typer.Option("--full", help="Compute the Gram rows of all log files again.")
+    ] = False,
+    repair: Annotated[
+        bool,
+        typer.Option(
+            "--repair", help="Rebuild Gram rows from the logs, and simulated logs from campaigns."
+        ),
+    ] = False,
+    campaign: Annotated[
+        list[str] | None,
+        typer.Option(help="A campaign's TOML file for --repair, besides those that ship."),
+    ] = None,
+    cluster: Cluster = None,
+    json: Json = False,
+) -> None:
+    """Verify every byte against its checksum, and everything against everything else.
+
+    Exits with 9 if there is damage that was not repaired.
+
+    Example: **fleet-slip verify --full**
+    """
+    fleet: Fleet = context.obj
+    # What repairs changes the warehouse; what only looks leaves no record.
+    recorded = recording(fleet.root, "verify", sys.argv[1:]) if repair else nullcontext()
+    with recorded, open_workers(fleet.root, cluster) as executor:
+        report = _verify(fleet, executor, full=full)
+        rebuilt: list[str] = []
+        if repair:
+            rebuilt = fleet.repair(report, campaign or ())
+            report = _verify(fleet, executor, full=full)
+    if json:
+        print_json(_verified(report, rebuilt))
+    else:
+        _print_verification(report, rebuilt)
+    if report.damage:
+        advice = (
+            "What is left cannot be rebuilt here: restore these files from a backup. Data files "
+            "may be copied below their table under any name; then give the command again."
+            if repair
+            else "Rebuild what can be rebuilt with: fleet-slip verify --repair"
+        )
+        raise DamageError(f"{context.obj.root}: {len(report.damage)} damaged. {advice}")
+
+
+def _verify(fleet: Fleet, executor: Executor, *, full: bool) -> Verification:
+    with progress("verify", "bytes", executor) as show:
+        return fleet.verify(full=full, workers=executor, progress=show)
+
+
+def _verified(report: Verification, rebuilt: list[str]) -> dict[str, Any]:
+    counts = asdict(report)
+    del counts["findings"]
+    return {
+        **counts,
+        "damage": [asdict(finding) for finding in report.damage],
+        "remarks": [asdict(finding) for finding in report.findings if not finding.damage],
+        "rebuilt": rebuilt,
+    }
+
+
+def _print_verification(report: Verification, rebuilt: list[str]) -> None:
+    for path in rebuilt:
+        say(f"rebuilt {path}")
+    remarks = [finding for finding in report.findings if not finding.damage]
+    for title, findings in (("damage", report.damage), ("remarks", remarks)):
+        if findings:
+            rows = ([finding.path, finding.problem] for finding in findings)
+            print_table(title, ["where", "problem"], rows, left=2)
+    say(
+        f"{number_of(report.files, 'file')} with {report.size_bytes:,} bytes and "
+        f"{number_of(report.documents, 'document')} "
+        f"were read, the Gram rows of {number_of(report.log_files_recomputed, 'log file')} "
+        f"computed again: "
+        + (f"{len(report.damage)} damaged" if report.damage else "all is as it must be")
+    )
+
+
+@record_run
+def compact(
+    context: typer.Context,
+    target_rows: Annotated[
+        int, typer.Option(min=1, help="Rows of a file after it, or fewer.")
+    ] = TARGET_ROWS,
+    json: Json = False,
+) -> None:
+    """Turn the small log files of each day into large ones. Readers and jobs are not disturbed.
+
+    Example: **fleet-slip compact**
+    """
+    with progress("compact", "days") as show:
+        report = context.obj.compact(target_rows, progress=show)
+    if json:
+        print_json(report)
+    elif report.changed:
+        say(
+            f"{number_of(report.files_before, 'file')} became {report.files_after}; "
+            f"{report.rows_rewritten:,} "
+            f"rows were written again, {report.size_bytes_before:,} bytes became "
+            f"{report.size_bytes_after:,}"
+        )
+    else:
+        say(f"nothing to do: {number_of(report.files_after, 'file')}, large or alone in the day")
+
+
+@record_run
+def vacuum(
+    context: typer.Context,
+    retention_hours: Annotated[
+        int,
+        typer.Option(
+            min=1, max=RETENTION_HOURS, help="Keep what a version of the last hours refers to."
+        ),
+    ] = RETENTION_HOURS,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="List the files and remove nothing.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Remove replaced files and leftovers of killed jobs when they are old enough.
+
+    Example: **fleet-slip vacuum --dry-run**
+    """
+    fleet: Fleet = context.obj
+    report = (fleet.preview_vacuum if dry_run else fleet.vacuum)(retention_hours)
+    if json:
+        print_json(report)
+        return
+    if dry_run and report.files:
+        print_table("", ["would be removed"], ([file] for file in report.files))
+    say(_vacuumed(report))
+
+
+def _vacuumed(report: VacuumReport) -> str:
+    done = "would be removed" if report.dry_run else "removed"
+    return f"{number_of(len(report.files), 'file')} with {report.size_bytes:,} bytes {done}"
+
+
+@record_run
+@request_options(ForgetRequest)
+def forget(
+    context: typer.Context,
+    request: ForgetRequest,
+    allow: Annotated[
+        bool, typer.Option("--allow", help="Let it come back: land its new rows again from now on.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Forget a vehicle or drives: in logs, Gram rows and quarantine; mark the models they trained.
+
+    No job brings it back, nor one that is under way: its rows are left out, until --allow.
+    `fleet-slip run` retrains. With --now it exits with 12 while anything may be left: repeat it.
+
+    Example: **fleet-slip forget --vehicle car-7 --now**
+    """
+    name, value = request.subject
+    if allow and name == "drive_name":
+        raise UsageError("give --allow with --vehicle, --drive or --source-file.")
+    if allow and request.now:
+        raise UsageError("give one of --allow and --now.")
+    fleet: Fleet = context.obj
+    if allow:
+        changed = fleet.allow(**{name: value})
+        if json:
+            print_json({"allowed": True, "changed": changed})
+        else:
+            say(
+                "its new rows are landed again from now on; what was forgotten stays forgotten"
+                + (" until the file is ingested again" if name == "source_file" else "")
+            )
+        return
+    with progress("forget", "files") as show:
+        report = fleet.forget(**{**vars(request), "progress": show})
+    if json:
+        print_json(report)
+    else:
+        _say_forgotten(report)
+    if request.now and report.pending:
+        raise PendingError(
+            f"{len(report.pending)} may still have its rows, in files that no reader sees: "
+            f"{', '.join(report.pending[:PENDING_SHOWN])}. Repeat this command when they have "
+            "ended, or for files of killed jobs after an hour."
+        )
+
+
+def _say_forgotten(report: ForgetReport) -> None:
+    if not report.changed:
+        say("nothing to do, it was forgotten before")
+        return
+    say(
+        f"{number_of(report.drives, 'drive')} forgotten, {number_of(report.rows, 'row')}: "
+        f"{number_of(report.files_rewritten, 'file')} "
+        f"written again without them, {report.files_removed} removed"
+    )
+    if report.old_files_deleted:
+        say(f"{report.old_files_deleted} old files with them deleted")
+    if report.old_files_left:
+        say(
+            f"{report.old_files_left} old files still have them until fleet-slip vacuum is due; "
+            "repeat with --now to delete them at once"
+        )
+    if report.models:
+        say(f"trained on them: {', '.join(report.models)}. Train again with: fleet-slip run")
+
+
+@record_run
+def retain(
+    context: typer.Context,
+    config: Annotated[
+        str | None,
+        typer.Option(help="A retention TOML file. Default: configs/retention.toml as it ships."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Forget drives that are older than the retention says, then vacuum. For a schedule.
+
+    Example: **fleet-slip retain**
+    """
+    with progress("retain", "files") as show:
+        report = context.obj.retain(config, progress=show)
+    if json:
+        print_json(report)
+        return
+    if report.forgotten.changed:
+        _say_forgotten(report.forgotten)
+        say(
+            "their files do not land again; drives as old that come in other files do, until the "
+            "next retain"
+        )
+    else:
+        say(f"no drive is older than {report.before}")
+    say(_vacuumed(report.vacuumed))
+
+
+# The command that brings the logs to the signal catalogue: migrate.
+
+
+@record_run
+def migrate(context: typer.Context, json: Json = False) -> None:
+    """Bring the logs to the signal catalogue: add columns, convert counts to other scales.
+
+    See docs/schema.md before widening a scale. It can be repeated after any interruption.
+
+    Example: **fleet-slip migrate**
+    """
+    with progress("migrate", "rows") as show:
+        report = context.obj.migrate(progress=show)
+    if json:
+        print_json(report)
+        return
+    if not report.changed:
+        say("migrate: nothing to do, the logs agree with the signal catalogue")
+    if report.added:
+        say(f"added: {', '.join(report.added)}; null in the files that are there")
+    for name, (old, new) in report.rescaled.items():
+        say(f"{name}: counts of {old} are now counts of {new}")
+    if report.files_without_names:
+        files = number_of(report.files_without_names, "file")
+        say(f"{files} written anew, without names that none of their rows has")
+    if report.files_rewritten:
+        say(
+            f"{number_of(report.files_rewritten, 'file')}, "
+            f"{number_of(report.rows_rewritten, 'row')} rewritten. Run: "
+            "fleet-slip gram"
+        )

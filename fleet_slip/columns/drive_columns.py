@@ -1,0 +1,264 @@
+"""From the counts of one drive to the integer columns of a feature set, sample by sample.
+
+Gram rows, scores, evaluations and predictions with windows come through it, and it computes what
+the SQL of `fleet_slip.columns.column_sql` says.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.base import BoolArray, FloatArray, IntArray
+from fleet_slip.catalogue.definitions import Definition, limit_of
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.kernel import GAPS, run
+from fleet_slip.columns.operations import (
+    OPERATIONS,
+    CarFact,
+    Lowering,
+    operands_of,
+    operation_of,
+    plain_of,
+)
+from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan, Region, padded
+from fleet_slip.errors import DataError
+
+_EXACT = 2**53
+_COUNTS = np.iinfo(np.int16)
+
+
+@dataclass(frozen=True)
+class DriveCounts:
+    """One drive in the order of time.
+
+    Attributes:
+        ticks: rising, shape (rows,).
+        counts, present: by signal, shape (rows,); a signal that never is missing has no `present`.
+        facts: what the car knows of itself, by drive column.
+        numbers: counts of what the car's drives before told of it; those that are known.
+    """
+
+    ticks: NDArray[Any]
+    counts: Mapping[str, NDArray[Any]]
+    present: Mapping[str, BoolArray] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    numbers: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def whole(self) -> bool:
+        """Whether no tick between the first and the last is missing."""
+        return bool(int(self.ticks[-1]) - int(self.ticks[0]) + 1 == len(self.ticks))
+
+    def part(
+        self, rows: Any, facts: Mapping[str, Any], numbers: Mapping[str, int]
+    ) -> "DriveCounts":
+        """Return some of the rows, as those of a drive of which that is known."""
+        counts = {name: values[rows] for name, values in self.counts.items()}
+        present = {name: values[rows] for name, values in self.present.items()}
+        return DriveCounts(self.ticks[rows], counts, present, facts, numbers)
+
+
+def as_counts(
+    values: Mapping[str, FloatArray], names: Sequence[str], facts: Mapping[str, Any]
+) -> DriveCounts:
+    """Return the counts of some signals of a drive that has a row for every tick.
+
+    The values are by SI column, shape (ticks,), NaN where null.
+    """
+    counts, present = {}, {}
+    for name in names:
+        given = values[catalogue()[name].column]
+        present[name] = np.isfinite(given)
+        scaled = np.where(present[name], given, 0.0) / float(catalogue()[name].scale)
+        counts[name] = np.rint(scaled).astype(np.int64)
+    ticks = np.arange(len(next(iter(counts.values()))))
+    return DriveCounts(ticks, counts, present, facts)
+
+
+class Workspace:
+    """The memory of a plan's columns, for one drive after the other and one thread.
+
+    `rows` are of the drive loaded last, `rows_at_most` those that memory was taken for.
+    """
+
+    def __init__(self, plan: ColumnPlan) -> None:
+        """Take a plan; memory is taken when a drive comes."""
+        self.plan, self._program = plan, plan.program
+        size = padded(len(plan.names))
+        self._products = np.zeros((size + 1, size))
+        self.rows_at_most = -1
+        self.rows = 0
+
+    def load(self, drive: DriveCounts) -> None:
+        """Take a drive. Raises `DataError` for one that cannot be looked back on."""
+        _require_exact(self.plan, drive)
+        program, self.rows = self._program, len(drive.ticks)
+        if self.rows > self.rows_at_most:
+            self.rows_at_most = self.rows
+            self._steps, self._regions = program.steps(self.rows), program.regions(self.rows)
+            self._memory = np.zeros(self._regions[-1, 0])
+        for number, name in enumerate(program.signals):
+            counts = self._part(Region.SIGNAL, number, self.rows)
+            counts[:] = drive.counts[name]
+            if name in drive.present:
+                counts[~drive.present[name]] = np.nan
+        self._part(Region.TICK, 0, self.rows)[:] = drive.ticks
+        for number, one in enumerate(program.told):
+            known = (
+                one.count(drive.facts[one.name])
+                if isinstance(one, CarFact)
+                else drive.numbers.get(one.name)
+            )
+            self._part(Region.TOLD, number, 1)[:] = np.nan if known is None else known
+        self._flags = np.zeros((2, max(program.slots, program.kinds, 1)), dtype=np.bool_)
+        self._flags[GAPS] = not drive.whole
+
+    def block(self, first: int) -> tuple[FloatArray, FloatArray]:
+        """Return the last block's columns, (columns, rows) with NaN, and its clipping."""
+        place, stride = self._regions[Region.REGISTER]
+        rows, columns = min(BLOCK_ROWS, self.rows - first), len(self.plan.names)
+        registers = self._memory[place : place + columns * stride].reshape(columns, stride)
+        return registers[:, :rows], self._memory[:rows]
+
+    def beside(self, first: int) -> dict[str, FloatArray]:
+        """Return the columns that the plan has beside its own, as `block` does."""
+        place, stride = self._regions[Region.REGISTER]
+        rows, begin = min(BLOCK_ROWS, self.rows - first), padded(len(self.plan.names))
+        parts = (place + (begin + i) * stride for i in range(len(self.plan.also)))
+        found = (self._memory[part : part + rows] for part in parts)
+        return dict(zip(self.plan.also, found, strict=True))
+
+    def compute_block(self, first: int) -> None:
+        """Compute the block that begins with a row; blocks are computed in the order of time."""
+        self._run(first, 0, self._products.astype(np.int64))
+
+    def add_blocks(self, first: int, exact_rows: int, totals: NDArray[np.int64]) -> "Added":
+        """Add blocks from a row on to `totals` (`kernel.run`), until one lacks a value."""
+        return self._run(first, exact_rows, totals)
+
+    def totals(self) -> NDArray[np.int64]:
+        """Return zeros for `add_blocks`, shape (columns + 1, columns), padded."""
+        return np.zeros(self._products.shape, dtype=np.int64)
+
+    def _run(self, first: int, exact_rows: int, totals: NDArray[np.int64]) -> "Added":
+        place, stride = self._regions[Region.REGISTER]
+        found = run(
+            self._steps,
+            self._program.ratios,
+            self._memory,
+            self._flags,
+            self.rows,
+            self._regions[Region.TICK, 0],
+            first,
+            len(self.plan.names),
+            place,
+            stride,
+            exact_rows,
+            self._products,
+            totals,
+        )
+        return Added(*found)
+
+    def _part(self, region: Region, number: int, size: int) -> FloatArray:
+        begin, stride = self._regions[region]
+        return self._memory[begin + number * stride :][:size]
+
+
+class Added(NamedTuple):
+    """The first row not added, whether its block lacks a value, rows added, values clipped."""
+
+    following: int
+    lacks: bool
+    rows: int
+    clipped: int
+
+
+def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
+    """Raise `DataError` for a drive of which not every sum would be exact."""
+    rows = len(drive.ticks)
+    if (drive.ticks[1:] <= drive.ticks[:-1]).any():
+        raise DataError(
+            "the ticks of a drive do not rise: it cannot be looked back on. Run: fleet-slip verify"
+        )
+    for one in plan.windows.values():
+        summed = one.over not in {None, "lag"}
+        if summed and 2 * (rows + 1) * limit_of(one.of_bits) * one.ratio.numerator >= _EXACT:
+            raise DataError(f"the drive has {rows:,} rows: too many to look back on.")
+    for name in plan.program.signals:
+        counts = drive.counts[name]
+        if counts.dtype == np.int16 or not rows:
+            continue
+        if not _COUNTS.min <= counts.min() <= counts.max() <= _COUNTS.max:
+            raise DataError(f"{name} has counts beyond 16 bits.")
+
+
+class DriveColumns:
+    """The columns of one drive; `clipped`, (rows,), counts those that `compute` clipped."""
+
+    def __init__(self, plan: ColumnPlan, drive: DriveCounts) -> None:
+        """Take a drive. Raises `DataError` for one that cannot be looked back on."""
+        self._workspace = Workspace(plan)
+        self._workspace.load(drive)
+        self.clipped = np.zeros(len(drive.ticks))
+
+    def compute(self) -> FloatArray:
+        """Return all columns, shape (columns, rows), NaN where missing; count what was clipped."""
+        out = np.empty((len(self._workspace.plan.names), len(self.clipped)))
+        for first in range(0, len(self.clipped), BLOCK_ROWS):
+            self._workspace.compute_block(first)
+            block, clipped = self._workspace.block(first)
+            out[:, first : first + block.shape[1]] = block
+            self.clipped[first : first + block.shape[1]] = clipped
+        return out
+
+
+# The counts of a feature of a row by numpy; without a database or a compiler.
+
+
+def row_counts(
+    one: Definition, counts: Mapping[str, IntArray], present: BoolArray
+) -> tuple[IntArray, BoolArray]:
+    """Return a feature's counts and where it has one, (rows,), from int64 counts and presence."""
+    lowered = Lowering({name: place for place, name in enumerate(one.signals)})
+    last = lowered.row(one)
+    there = present.copy()
+    found: list[IntArray] = []
+    for step in lowered.steps:
+        name, of = operation_of(step), [found[i] for i in operands_of(step)]
+        if name == "signal":
+            found.append(counts[one.signals[plain_of(step)[0]]])
+        elif name == "constant":
+            found.append(np.asarray(plain_of(step)[0], dtype=np.int64))
+        else:
+            missing = OPERATIONS[name].missing
+            there &= of[1] > 0 if missing == "divisor" else True
+            there &= of[0] >= of[1] if missing == "less" else True
+            found.append(_NUMPY[name](*of))
+    return np.broadcast_to(found[last], present.shape), there
+
+
+def _divided(a: IntArray, b: IntArray) -> IntArray:
+    """Return a / b truncated towards zero; anything where b is not positive."""
+    size = np.abs(a) // np.maximum(b, 1)
+    return np.where(a < 0, -size, size)
+
+
+def _first(a: IntArray, _: IntArray) -> IntArray:
+    return a
+
+
+_NUMPY: Mapping[str, Callable[..., IntArray]] = {
+    "+": np.add,
+    "-": np.subtract,
+    "*": np.multiply,
+    "//": _divided,
+    "negative": np.negative,
+    "abs": np.abs,
+    "sign": np.sign,
+    "clip": lambda a, limit: np.clip(a, -limit, limit),
+    "at_least": _first,
+    "where": _first,
+}

@@ -1,0 +1,618 @@
+"""Writes the program over blocks of rows that computes columns, from their steps.
+
+Each operation is a loop, but for `_FUSED` ones; values are binary64, or int64 beyond 53 bits.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import cache, cached_property, lru_cache, reduce
+from math import inf
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.base import FloatArray
+from fleet_slip.catalogue.course import COURSE, YAW_RATE
+from fleet_slip.catalogue.definitions import Definition, limit_of, plain_column
+from fleet_slip.catalogue.features import FeatureCatalogue
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.operations import (
+    GIVEN,
+    OPERATIONS,
+    CarCount,
+    CarFact,
+    operands_of,
+    operation_of,
+    plain_of,
+    size_of,
+)
+from fleet_slip.columns.sql import CountedColumns, parts_of, rows_of
+from fleet_slip.errors import QuestionError
+
+# The operations of a program over blocks of rows: whole numbers, and one of four ratios or limits.
+#
+# `kernel` runs them, `program` writes them; `block_arithmetic` and `lookback` define them.
+
+BLOCK_ROWS = 2**10
+"""Rows of a block: small, so that its columns stay in the processor's cache."""
+
+TILE = 4
+"""Columns are padded to a multiple of this; see `product_sums`."""
+
+(
+    COPY, ADD, SUBTRACT, MULTIPLY, NEGATE, ABSOLUTE, SIGN,  # the same for binary64 and int64
+    LEAST, MOST, DIVIDE, NEAREST, FILL, BROADCAST, AT_LEAST, WHERE, ELSE, TO_BINARY64, CLIP, SHARE,
+    SCALE,
+    ADD_UP, KEEP, QUOTIENT, AGO,  # on the rows of before
+) = range(24)  # fmt: skip
+
+INTEGERS = 30
+"""An operation plus this writes int64; that of `COPY` reads binary64."""
+
+OPERATION, OUT, A, B, C, D = 0, 1, 2, 3, 4, 5
+"""Columns of a step: the operation, and the places of what it writes and reads."""
+
+MOVES = 5
+"""So many columns behind a place: whether it moves on with the rows of a drive."""
+
+SLOT, KIND, TICKS, NUMBER = 11, 12, 13, 14
+"""Further columns of a step: what is summed up, a kind of window, its ticks, and a constant, or how
+often a value that is clipped counts."""
+
+NUMERATOR, FIXED, EACH, LIMIT = 0, 1, 2, 3
+"""Ratios and limits of a step. A sum over n rows is multiplied by the first and divided by the
+second plus the third times n."""
+
+
+class Region(IntEnum):
+    """Parts of a program's memory.
+
+    The first counts columns clipped by row; `TOLD` is what is known of the car; signals, sums,
+    counts, values, begins and ticks are of all rows (`lookback`).
+    """
+
+    CLIPPED = 0
+    REGISTER = 1
+    TOLD = 2
+    SIGNAL = 3
+    TICK = 4
+    SUM = 5
+    COUNT = 6
+    VALUE = 7
+    BEGIN = 8
+
+
+# A program of vector operations: how it is written, and put into a memory.
+
+Place = tuple[Region, int]
+"""A part of the memory, and its number there."""
+
+Value = int | Place
+"""What an operation reads: the result of an earlier one, by its number, or a part of the memory."""
+
+MOST_READ = 4
+"""So many values an operation reads at most."""
+
+NOWHERE: Place = (Region.CLIPPED, 0)
+
+STRIDE = BLOCK_ROWS + 2 * 8
+"""Registers are so many numbers apart: if it were a power of two, the cache would have one place
+for all of them."""
+
+
+@dataclass(frozen=True)
+class VectorOperation:
+    """One operation; `operations` says what it reads and does."""
+
+    operation: int
+    reads: tuple[Value, ...] = ()
+    slot: int = 0
+    kind: int = 0
+    ticks: int = 0
+    number: int = 0
+    ratio: tuple[float, float, float, float] = (0.0, 1.0, 0.0, np.inf)
+
+
+@dataclass
+class Code:
+    """Operations in order, equal ones once, and what they number.
+
+    Attributes:
+        signals, told: what the program reads of a drive and its car, with their numbers.
+        summed, kept: what is summed up, and what is kept, over a drive.
+        kinds: windows of different lengths in ticks.
+    """
+
+    operations: list[VectorOperation] = field(default_factory=list)
+    signals: dict[str, int] = field(default_factory=dict)
+    told: dict[CarFact | CarCount, int] = field(default_factory=dict)
+    summed: dict[Value, int] = field(default_factory=dict)
+    kept: dict[Value, int] = field(default_factory=dict)
+    kinds: dict[int, int] = field(default_factory=dict)
+    _known: dict[VectorOperation, int] = field(default_factory=dict)
+
+    def add(self, one: VectorOperation) -> int:
+        """Add an operation if there is no equal one; return its number."""
+        if one not in self._known:
+            self._known[one] = self._append(one)
+        return self._known[one]
+
+    def _append(self, one: VectorOperation) -> int:
+        self.operations.append(one)
+        return len(self.operations) - 1
+
+    def assemble(self, results: Sequence[Value], also: Sequence[Value] = ()) -> "BlockProgram":
+        """Return the program with results in the first registers, then `also`, padded to tiles."""
+        columns: list[int] = []
+        for one in results:
+            if isinstance(one, int) and one not in columns:
+                columns.append(one)
+            else:
+                columns.append(self._append(VectorOperation(COPY, (one,))))
+        beside = [self._append(VectorOperation(COPY, (one,))) for one in also]
+        registers = {value: register for register, value in enumerate(columns)}
+        registers |= {value: padded(len(columns)) + i for i, value in enumerate(beside)}
+        last = {read: number for number, one in enumerate(self.operations) for read in one.reads}
+        count, free = padded(len(columns)) + len(beside), list[int]()
+        for number, operation in enumerate(self.operations):
+            if number not in registers and operation.operation not in {ADD_UP, KEEP}:
+                if not free:
+                    free, count = [count], count + 1
+                registers[number] = free.pop()
+            # Given back after the result has a register: loops do not write what they read.
+            ended = {r for r in operation.reads if isinstance(r, int) and last[r] == number}
+            free += [registers[read] for read in ended.difference(columns, beside)]
+        places = [
+            [(Region.REGISTER, registers[number]) if number in registers else NOWHERE]
+            + [(Region.REGISTER, registers[r]) if isinstance(r, int) else r for r in one.reads]
+            + [NOWHERE] * (MOST_READ - len(one.reads))
+            for number, one in enumerate(self.operations)
+        ]
+        return BlockProgram(self, np.array(places, dtype=np.int64), len(columns), count)
+
+
+def padded(columns: int) -> int:
+    """Return how many columns whole tiles have."""
+    return -(-columns // TILE) * TILE
+
+
+@dataclass(frozen=True)
+class BlockProgram:
+    """Operations with `places`, (steps, 5, 2): region and number of what each writes and reads.
+
+    The first `columns` of the `registers` are columns.
+    """
+
+    code: Code
+    places: NDArray[np.int64]
+    columns: int
+    registers: int
+
+    @cached_property
+    def ratios(self) -> FloatArray:
+        """The ratio of each step, shape (steps, 4)."""
+        return np.array([one.ratio for one in self.code.operations])
+
+    @cached_property
+    def signals(self) -> tuple[str, ...]:
+        """The signals that it reads, in the order of their numbers."""
+        return tuple(self.code.signals)
+
+    @cached_property
+    def told(self) -> tuple[CarFact | CarCount, ...]:
+        """What it is told of a car, in the order of their numbers."""
+        return tuple(self.code.told)
+
+    @property
+    def slots(self) -> int:
+        """How many values it sums up over a drive."""
+        return len(self.code.summed)
+
+    @property
+    def kinds(self) -> int:
+        """How many windows of different lengths it has."""
+        return len(self.code.kinds)
+
+    def regions(self, rows: int) -> NDArray[np.int64]:
+        """Return each region's begin and stride for so many rows, and the memory's size last."""
+        code = self.code
+        shapes = {
+            Region.CLIPPED: (1, STRIDE),
+            Region.REGISTER: (self.registers, STRIDE),
+            Region.TOLD: (len(code.told), 1),
+            Region.SIGNAL: (len(code.signals), rows),
+            Region.TICK: (1, rows),
+            Region.SUM: (len(code.summed), rows + 1),
+            Region.COUNT: (len(code.summed), rows + 1),
+            Region.VALUE: (len(code.kept), rows),
+            Region.BEGIN: (len(code.kinds), rows),
+        }
+        # Whoever reads what is told as a block must not read beyond the end.
+        sizes = [parts * size for parts, size in shapes.values()] + [BLOCK_ROWS]
+        begins = np.cumsum([0, *sizes])
+        strides = [shapes[region][1] for region in Region] + [0]
+        return np.column_stack([begins[: len(strides)], strides])
+
+    def steps(self, rows: int) -> NDArray[np.int64]:
+        """Return the table of `operations` for a memory for so many rows."""
+        regions = self.regions(rows)
+        begins, strides = regions[self.places[..., 0]].transpose(2, 0, 1)
+        moves = self.places[..., 0] == Region.SIGNAL
+        others = [[one.slot, one.kind, one.ticks, one.number] for one in self.code.operations]
+        operations = [[one.operation] for one in self.code.operations]
+        return np.hstack([operations, begins + strides * self.places[..., 1], moves, others])
+
+
+# Patterns of steps that one loop over a block does together, for speed.
+
+Pattern = Any
+"""A step: its operation and operands; names stand for steps, #names for constants, numbers too."""
+
+ROUNDED = ("//", ("+", ("*", 2, "c"), ("*", ("sign", "c"), "d")), ("*", 2, "d"))
+"""A quotient to the nearest, as the SQL of a feature says it."""
+
+
+def _times(step: Pattern) -> list[Pattern]:
+    return [("*", step, "#numerator"), step]
+
+
+_TOTAL = ("sum", "row", "ticks", "most")
+_SHARED = ("#fixed", ("*", "#each", ("values", "row", "ticks", "most")))
+SCALED: list[Pattern] = [("nearest", x, "#fixed") for x in _times("x")]
+SCALED.append(("//", ("+", ("*", 2, "x"), ("*", ("sign", "x"), "#fixed")), ("*", 2, "#fixed")))
+"""A value times a ratio of constants, rounded."""
+
+QUOTIENTS = [
+    ("clip", ("where", ("nearest", total, divisor), "row"), "#limit")
+    for total in _times(_TOTAL)
+    for divisor in _SHARED
+]
+"""A sum or mean over a window, times a ratio, rounded and clipped."""
+
+_EXACT = 2**53
+
+_LOOPS = {
+    **{"+": ADD, "-": SUBTRACT, "*": MULTIPLY, "//": DIVIDE, "nearest": NEAREST},
+    **{"negative": NEGATE, "abs": ABSOLUTE, "sign": SIGN, "min": LEAST},
+    **{"max": MOST, "at_least": AT_LEAST, "where": WHERE, "else": ELSE},
+}
+"""Operations of which each value is made of values of its own row."""
+
+_INTEGERS = ("+", "-", "*", "//", "nearest", "negative", "abs", "sign")
+"""Those that there are for int64, too."""
+
+Found = Mapping[str, int]
+
+
+def compile_plan(
+    counted: CountedColumns, names: Sequence[str], also: Sequence[str] = ()
+) -> BlockProgram:
+    """Return the program of columns, with `also`. Raises `QuestionError` for a bad divisor."""
+    writer = _Writer(counted)
+    for place in sorted({*counted.places.values(), *counted.times}):
+        writer.value(place)
+    results = [[writer.value(counted.places[name]) for name in some] for some in (names, also)]
+    return writer.code.assemble(*results)
+
+
+class _Writer:
+    """Writes the operations of steps, those that are asked for and what they need."""
+
+    def __init__(self, counted: CountedColumns) -> None:
+        self.code = Code(signals={name: n for n, name in enumerate(counted.lowered.signals)})
+        self._told = [*counted.lowered.facts, *counted.lowered.numbers]
+        self._counted, self._steps, self._ranges = counted, counted.steps, counted.ranges
+        self._facts = len(counted.lowered.facts)
+        self.value = cache(self._value)
+        self.integers = cache(self._integers)
+        self._whole = cache(self._needs_integers)
+
+    def _value(self, number: int, guard: int | None = None) -> Value:
+        """Return a step in binary64, NaN where missing; `guard` is positive wherever it is used."""
+        step = self._steps[number]
+        name, plain = operation_of(step), plain_of(step)
+        if (constant := self._constant(number)) is not None:
+            return self._do(FILL, ratio=(float(constant), 1.0, 0.0, inf))
+        if name in GIVEN:
+            return self._signal_or_told(name, plain[0])
+        if self._whole(number):
+            found = self._do(TO_BINARY64, self.integers(number, guard))
+            return self._do(WHERE, found, self._present(number, guard))
+        fused = None
+        if not any(self._whole(one) for one in operands_of(step)):
+            fused = self._fused(number, guard)
+        return self._plain(number, guard) if fused is None else fused
+
+    def _signal_or_told(self, name: str, place: int) -> Value:
+        if name == "signal":
+            return (Region.SIGNAL, place)
+        told = self._told[place + (self._facts if name == "number" else 0)]
+        return self._do(BROADCAST, (Region.TOLD, _number(self.code.told, told)))
+
+    def _fused(self, number: int, guard: int | None) -> Value | None:
+        """Return what one loop computes of several steps; None if there is no such loop."""
+        for pattern, write in _FUSED:
+            found: dict[str, int] = {}
+            if self._matches(pattern, number, found):
+                return write(self, number, found, guard)
+        return None
+
+    def _plain(self, number: int, guard: int | None) -> Value:
+        name, plain = operation_of(self._steps[number]), plain_of(self._steps[number])
+        if name == "at_least" and self._whole(plain[0]):
+            # Rounded to binary64, the difference keeps its sign.
+            pair = [self.integers(one, guard) for one in plain]
+            excess = self._do(TO_BINARY64, self._do(INTEGERS + SUBTRACT, *pair))
+            excess = self._do(WHERE, excess, self._present(plain[0], guard))
+            return self._do(AT_LEAST, excess, self._do(FILL, ratio=(0.0, 1.0, 0.0, inf)))
+        if name == "ago":
+            return self._ago(plain[0], plain[1])
+        if name == "clip":
+            return self._clip(number, plain[0], self._ranges[plain[1]][1], guard)
+        if name == "where":
+            guard = self._guarded_by(plain[1])
+        found = self._do(_LOOPS[name], *(self.value(one, guard) for one in plain))
+        if name in ("//", "nearest"):
+            return self._divided(found, plain[1], guard)
+        return found
+
+    def _guarded_by(self, there: int) -> int | None:
+        """Return the step that is above zero wherever another one is there."""
+        found: dict[str, int] = {}
+        guards = self._matches(("at_least", "guard", "#least"), there, found)
+        return found["guard"] if guards and found["#least"] > 0 else None
+
+    def _divided(self, quotient: Value, divisor: int, guard: int | None) -> Value:
+        if self._is_positive(divisor, guard):
+            return quotient
+        return self._do(WHERE, quotient, self._above_zero(divisor, guard))
+
+    def _above_zero(self, number: int, guard: int | None) -> Value:
+        one = self._do(FILL, ratio=(1.0, 1.0, 0.0, inf))
+        return self._do(AT_LEAST, self.value(number, guard), one)
+
+    def _is_positive(self, number: int, guard: int | None) -> bool:
+        if (constant := self._constant(number)) is not None:
+            _require_positive(constant)
+            return True
+        if number == guard or self._ranges[number][0] > 0:
+            return True
+        step = self._steps[number]
+        return step[0] in ("+", "*") and all(
+            self._is_positive_term(one, guard) for one in operands_of(step)
+        )
+
+    def _is_positive_term(self, number: int, guard: int | None) -> bool:
+        constant = self._constant(number)
+        return self._is_positive(number, guard) if constant is None else constant > 0
+
+    def _constant(self, number: int) -> int | None:
+        step = self._steps[number]
+        if step[0] == "constant":
+            return plain_of(step)[0]
+        if step[0] in _INTEGERS and all(self._constant(n) is not None for n in operands_of(step)):
+            if step[0] in ("//", "nearest"):
+                self._is_positive(operands_of(step)[1], None)
+            return self._ranges[number][0]
+        return None
+
+    def _needs_integers(self, number: int) -> bool:
+        """Whether an operation on the counts of a row, or what it works on, may reach 2^53."""
+        step = self._steps[number]
+        if step[0] not in _INTEGERS or self._constant(number) is not None:
+            return False
+        if any(OPERATIONS[operation_of(self._steps[n])].over_time for n in operands_of(step)):
+            return False  # a drive with so many rows is refused
+        size = size_of(self._ranges[number])
+        return size >= _EXACT or any(self._whole(one) for one in operands_of(step))
+
+    def _integers(self, number: int, guard: int | None) -> Value:
+        """Return a step in int64; anything where it is missing."""
+        if (constant := self._constant(number)) is not None:
+            return self._do(INTEGERS + FILL, number=constant)
+        if not self._whole(number):
+            return self._do(INTEGERS + COPY, self.value(number, guard))
+        found: dict[str, int] = {}
+        name, of = operation_of(self._steps[number]), operands_of(self._steps[number])
+        if self._matches(ROUNDED, number, found):
+            name, of = "nearest", (found["c"], found["d"])
+        if name in ("//", "nearest"):
+            self._is_positive(of[1], guard)
+        parts = [self.integers(one, guard) for one in of]
+        return self._do(INTEGERS + _LOOPS[name], *parts)
+
+    def _present(self, number: int, guard: int | None) -> Value:
+        """Return what is NaN where a step in int64 is missing."""
+        step = self._steps[number]
+        parts: list[Value] = []
+        for one in operands_of(step):
+            if self._whole(one):
+                parts.append(self._present(one, guard))
+            elif self._constant(one) is None:
+                parts.append(self.value(one, guard))
+        divisor = operands_of(step)[-1]
+        if step[0] in ("//", "nearest") and not self._is_positive(divisor, guard):
+            parts.append(self._above_zero(divisor, guard))
+        return reduce(lambda a, b: self._do(WHERE, a, b), parts)
+
+    def _matches(self, pattern: Pattern, number: int, found: dict[str, int]) -> bool:
+        """Return whether a step is what a pattern says, and what its names stand for."""
+        if isinstance(pattern, int):
+            return self._constant(number) == pattern
+        if isinstance(pattern, str):
+            value = self._constant(number) if pattern.startswith("#") else number
+            return value is not None and found.setdefault(pattern, value) == value
+        step = self._steps[number]
+        name, plain = operation_of(step), plain_of(step)
+        if name != pattern[0]:
+            return False
+        steps = OPERATIONS[name].steps
+        return all(
+            self._matches(one, of, found) if i < steps else found.setdefault(one, of) == of
+            for i, (one, of) in enumerate(zip(pattern[1:], plain, strict=True))
+        )
+
+    def _scale(self, number: int, found: Found, guard: int | None) -> Value:
+        value, limit = self.value(found["x"], guard), float(found.get("#limit", inf))
+        numerator, fixed = found.get("#numerator", 1), found["#fixed"]
+        _require_positive(fixed)
+        if numerator == fixed and size_of(self._ranges[found["x"]]) <= limit:
+            return value
+        times = self._counted.times.get(number, 0)
+        ratio = (float(numerator), float(fixed), 0.0, limit)
+        return self._do(SCALE, value, ratio=ratio, number=times)
+
+    def _clip(self, number: int, of: int, limit: int, guard: int | None) -> Value:
+        value = self.value(of, guard)
+        if size_of(self._ranges[of]) <= limit:
+            return value
+        times = self._counted.times.get(number, 0)
+        return self._do(CLIP, value, ratio=(0.0, 1.0, 0.0, float(limit)), number=times)
+
+    def _share(self, _: int, found: Found, guard: int | None) -> Value:
+        factors = (self.value(found[one], guard) for one in "xy")
+        return self._do(SHARE, *factors, ratio=(1.0, float(found["#fixed"]), 0.0, inf))
+
+    def _round(self, _: int, found: Found, guard: int | None) -> Value:
+        quotient = self._do(NEAREST, *(self.value(found[one], guard) for one in "cd"))
+        return self._divided(quotient, found["d"], guard)
+
+    def _quotient(self, number: int, found: Found, _: int | None) -> Value:
+        """Write a sum over a window times numerator / (fixed + each * its values), rounded."""
+        value = self.value(found["row"])
+        ticks, limit = found["ticks"], float(found["#limit"])
+        fixed, each = (float(found.get(one, 0)) for one in ("#fixed", "#each"))
+        slot, kind = _number(self.code.summed, value), _number(self.code.kinds, ticks)
+        sums, counts, begins = (Region.SUM, slot), (Region.COUNT, slot), (Region.BEGIN, kind)
+        self._do(ADD_UP, value, sums, counts, slot=slot)
+        return self._do(
+            QUOTIENT,
+            *(value, sums, begins, counts),
+            slot=slot,
+            kind=kind,
+            ticks=ticks,
+            number=self._counted.times.get(number, 0),
+            ratio=(float(found.get("#numerator", 1)), fixed, each, limit),
+        )
+
+    def _ago(self, row: int, ticks: int) -> Value:
+        """Write the value so many ticks ago: its window begins there, one tick longer."""
+        value = self.value(row)
+        slot, kind = _number(self.code.kept, value), _number(self.code.kinds, ticks + 1)
+        kept, begins = (Region.VALUE, slot), (Region.BEGIN, kind)
+        self._do(KEEP, value, kept)
+        return self._do(AGO, kept, NOWHERE, begins, kind=kind, ticks=ticks)
+
+    def _do(self, operation: int, *operands: Value, **more: Any) -> int:
+        return self.code.add(VectorOperation(operation, operands, **more))
+
+
+_FUSED: Sequence[tuple[Pattern, Callable[[_Writer, int, Found, int | None], Value]]] = [
+    *((one, _Writer._quotient) for one in QUOTIENTS),
+    *((("clip", one, "#limit"), _Writer._scale) for one in SCALED),
+    *((one, _Writer._scale) for one in SCALED if one[1] != "x"),
+    (("nearest", ("*", "x", "y"), "#fixed"), _Writer._share),
+    (ROUNDED, _Writer._round),
+]
+"""What one loop does: several steps, and what writes them."""
+
+
+def _require_positive(divisor: int) -> None:
+    if divisor <= 0:
+        raise QuestionError("a feature divides by a number that is not positive.")
+
+
+def _number(known: dict[Any, int], key: object) -> int:
+    return known.setdefault(key, len(known))
+
+
+# What to compute of a drive: columns of single rows, and columns that look back.
+
+
+@dataclass(frozen=True)
+class ColumnPlan:
+    """What to compute of a drive: columns by `names`, of `rows` (one row each) and `windows`.
+
+    `rows` has what is looked back on and tells parts; `also` of them come beside the columns.
+    """
+
+    names: tuple[str, ...]
+    rows: Mapping[str, Definition]
+    windows: Mapping[str, Definition]
+    also: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        names: Sequence[str],
+        features: Mapping[str, Definition],
+        windows: Mapping[str, Definition],
+        also: Sequence[str] = (),
+    ) -> "ColumnPlan":
+        """Plan columns by name: of `features`, of `windows`, or logged; `also` are beside them.
+
+        Raises `DataError` for a feature that is defined in two ways.
+        """
+        rows = {
+            name: features.get(name, plain_column(name))
+            for name in (*names, *also)
+            if name not in windows
+        }
+        return cls(tuple(names), rows_of(rows, windows), dict(windows), tuple(also))
+
+    @classmethod
+    def of_set(cls, known: FeatureCatalogue, name: str) -> "ColumnPlan":
+        """Plan the columns of a feature set, the label last; of changes, what makes it."""
+        one = known.feature_set(name)
+        divided_by = [known.regimes[regime].of for regime in one.regimes]
+        features = known.rows((*one.features, *divided_by))
+        inputs = (*one.signals, *one.features, *one.windows)
+        columns = (*inputs, COURSE, YAW_RATE) if one.change_ticks else one.columns
+        return cls.of(columns, features, known.definitions(name), divided_by)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The logged signals that are needed, in catalogue order."""
+        used = {name for row in self.rows.values() for name in row.signals}
+        return tuple(name for name in catalogue().signals if name in used)
+
+    @property
+    def facts(self) -> tuple[str, ...]:
+        """The drive columns that are needed."""
+        parts = [part for one in self.windows.values() for part in parts_of(one)]
+        return tuple(dict.fromkeys(part.fact.name for part in parts if part.fact))
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """What the drives of a car must have told of it, or running means stand for."""
+        found = (one.number.name for one in self.windows.values() if one.number)
+        return tuple(dict.fromkeys(found))
+
+    @property
+    def limits(self) -> tuple[int, ...]:
+        """The largest size that each column can have."""
+        return tuple(
+            limit_of(self.windows[name].bits)
+            if name in self.windows
+            else limit_of(self.rows[name].of_bits) + (not self.rows[name].sql)
+            for name in self.names
+        )
+
+    @cached_property
+    def program(self) -> BlockProgram:
+        """The program that computes the columns, one for equal plans. Raises `QuestionError`."""
+        return _program(
+            self.names, tuple(self.rows.items()), tuple(self.windows.items()), self.also
+        )
+
+
+@lru_cache(maxsize=64)
+def _program(
+    names: tuple[str, ...],
+    rows: tuple[tuple[str, Definition], ...],
+    windows: tuple[tuple[str, Definition], ...],
+    also: tuple[str, ...],
+) -> BlockProgram:
+    return compile_plan(CountedColumns.of(dict(rows), dict(windows)), names, also)

@@ -1,0 +1,319 @@
+"""What each operation is in SQL: plain SQL of many engines, and what DuckDB writes otherwise.
+
+Null is a missing value. Integers have 64 bits.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from fleet_slip.catalogue.arithmetic import nearest_sql
+from fleet_slip.catalogue.definitions import LARGEST_FACT, Definition, features_behind, plain_column
+from fleet_slip.catalogue.features import FeatureCatalogue
+from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
+from fleet_slip.columns.operations import (
+    GIVEN,
+    OPERATIONS,
+    CarFact,
+    Lowering,
+    Range,
+    Step,
+    operands_of,
+    operation_of,
+    plain_of,
+    size_of,
+)
+from fleet_slip.errors import DataError, QuestionError
+
+QUOTIENT = "CAST(ROUND(({0} - {0} % {1}) / {1}) AS BIGINT)"
+"""{0} / {1}, truncated; exact in floating point too: a small multiple of the divisor."""
+
+_NEAREST = QUOTIENT.format("(2 * ABS({0}) + {1})", "(2 * {1})")
+
+PLAIN_SQL: Mapping[str, str] = {
+    "+": "({0} + {1})",
+    "-": "({0} - {1})",
+    "*": "({0} * {1})",
+    "//": QUOTIENT,
+    "nearest": f"(CASE WHEN {{0}} < 0 THEN -{_NEAREST} ELSE {_NEAREST} END)",
+    "min": "(CASE WHEN {0} <= {1} THEN {0} WHEN {1} < {0} THEN {1} END)",
+    "max": "(CASE WHEN {0} >= {1} THEN {0} WHEN {1} > {0} THEN {1} END)",
+    "negative": "(-{0})",
+    "abs": "ABS({0})",
+    "sign": "(CASE WHEN {0} > 0 THEN 1 WHEN {0} < 0 THEN -1 ELSE 0 * {0} END)",
+    "clip": "(CASE WHEN {0} > {1} THEN {1} WHEN {0} < -{1} THEN -{1} ELSE {0} END)",
+    "at_least": "(CASE WHEN {0} >= {1} THEN {0} END)",
+    "where": "(CASE WHEN {1} IS NOT NULL THEN {0} END)",
+    "else": "COALESCE({0}, {1})",
+    "ago": "MAX({0}) OVER ({drive} RANGE BETWEEN {1} PRECEDING AND {1} PRECEDING)",
+    "sum": "CAST(COALESCE(SUM({0}) OVER ({drive} {frame}), 0) AS BIGINT)",
+    "values": "COUNT({0}) OVER ({drive} {frame})",
+}
+
+DUCKDB_SQL: Mapping[str, str] = {
+    **PLAIN_SQL,
+    "//": "({0} // {1})",
+    "nearest": f"({nearest_sql('{0}', '{1}')})",
+    "sign": "sign({0})",
+}
+
+DIVIDES = ("//", "nearest")
+
+
+def sql_constant(value: int) -> str:
+    """Return a constant; a negative one may stand behind a minus."""
+    return str(value) if value >= 0 else f"({value})"
+
+
+def fact_sql(one: CarFact) -> str:
+    """Return the whole number of a fact, given the column of the drive; null if not known."""
+    if one.equals is None:
+        known = f"ABS({one.name}) <= {LARGEST_FACT}"
+        return f"CASE WHEN {known} THEN CAST(ROUND({one.name}) AS BIGINT) END"
+    is_it = f"{one.name} = '{one.equals}'"
+    return f"CASE WHEN {is_it} THEN 1 WHEN {one.name} IS NOT NULL THEN 0 END"
+
+
+def sql_of(
+    operation: str, operands: list[str], *plain: int, divides_by: int, table: Mapping[str, str]
+) -> str:
+    """Return an operation on operands in SQL; `divides_by` is the least that the divisor can be."""
+    frame = f"RANGE BETWEEN {plain[0] - 1} PRECEDING AND CURRENT ROW" if plain and plain[0] else ""
+    text = table[operation].format(
+        *operands,
+        *plain,
+        drive="PARTITION BY drive_id ORDER BY tick",
+        frame=frame or "RANGE BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW",
+    )
+    if operation in DIVIDES and divides_by <= 0:
+        return f"(CASE WHEN {operands[1]} > 0 THEN {text} END)"
+    return text
+
+
+INLINE = ("+", "-", "*", "negative")
+"""What may stand within another step, where it is used once."""
+
+
+class SqlLayers:
+    """The layers of steps; those that are asked for are written, with what they need.
+
+    Attributes:
+        layers: the columns of each, by its number from 1.
+    """
+
+    def __init__(
+        self,
+        steps: Sequence[Step],
+        ranges: Sequence[Range],
+        table: Mapping[str, str],
+        given: Callable[[str, int], str],
+    ) -> None:
+        self._steps, self._ranges, self._table, self._given = steps, ranges, table, given
+        self.layers: defaultdict[int, list[str]] = defaultdict(list)
+        self._uses = Counter(of for step in steps for of in operands_of(step))
+        self._texts: dict[int, tuple[str, int]] = {}
+
+    def text(self, number: int) -> tuple[str, int]:
+        """Return a step in SQL, and the layer that has all columns in it."""
+        if number not in self._texts:
+            self._texts[number] = self._written(number)
+        return self._texts[number]
+
+    def column(self, number: int) -> tuple[str, int]:
+        """Return a step as one word."""
+        text, layer = self.text(number)
+        if " " in text:
+            self._texts[number] = self._named(number, text, layer)
+        return self._texts[number]
+
+    def _written(self, number: int) -> tuple[str, int]:
+        step = self._steps[number]
+        name, plain = operation_of(step), plain_of(step)
+        if name == "constant":
+            return sql_constant(plain[0]), 0
+        if name in GIVEN:
+            return self._given(name, plain[0]), 0
+        one = OPERATIONS[name]
+        own = plain[: one.steps]
+        inline = name in INLINE
+        parts = [self.text(i) if inline else self.column(i) for i in own]
+        text = sql_of(
+            name,
+            [part for part, _ in parts],
+            *plain[one.steps :],
+            divides_by=self._ranges[own[-1]][0],
+            table=self._table,
+        )
+        layer = max(layer for _, layer in parts)
+        if inline and self._uses[number] == 1:
+            return text, layer
+        return self._named(number, text, layer)
+
+    def _named(self, number: int, text: str, layer: int) -> tuple[str, int]:
+        self.layers[layer + 1].append(f"{text} AS step_{number}")
+        return f"step_{number}", layer + 1
+
+
+# Columns lowered for the warehouse, which counts how often a value is clipped.
+#
+# Clipping comes last, lest what is missing be counted; exported programs clip first: the same.
+
+LOGGED: Range = (-(2**15), 2**15 - 1)
+"""What 16 bits of a log can hold."""
+
+
+class _ClippedLast(Lowering):
+    def clip_where(self, step: int, limit: int, there: Callable[[], int]) -> int:
+        return self.clip(self.do("where", step, there()), limit)
+
+
+@dataclass(frozen=True)
+class CountedColumns:
+    """Steps, and how often what they clip counts.
+
+    Attributes:
+        steps: those of `lowered` by their numbers, with the range of each in `ranges`.
+        places: the step of each column of one row, and of each column over time, by name.
+        times: how often a step's clipping counts: once for each feature or column over time that
+            it is in; for gates and what they gate, once in all.
+    """
+
+    lowered: Lowering
+    steps: tuple[Step, ...]
+    ranges: list[Range]
+    places: Mapping[str, int]
+    times: Mapping[int, int]
+
+    @classmethod
+    def of(
+        cls, rows: Mapping[str, Definition], over_time: Mapping[str, Definition]
+    ) -> "CountedColumns":
+        """Lower columns over time, and the `rows` that they look back on with others."""
+        signals = dict.fromkeys(name for one in rows.values() for name in one.signals)
+        lowered = _ClippedLast({name: place for place, name in enumerate(signals)})
+        parts = [part for one in over_time.values() if not one.gate for part in parts_of(one)]
+        gated = [part for one in over_time.values() if one.gate for part in parts_of(one)]
+        parts += dict.fromkeys(gated)
+        places = {}
+        for name, row in rows.items():  # a row, and all that looks back on it, stand together
+            places[name] = lowered.row(row)
+            for part in parts:
+                if part.of == name:
+                    lowered.column(part)
+        found = {name: lowered.column(one) for name, one in over_time.items()}
+        steps = tuple(lowered.steps)
+        ends = {*places.values()}
+        times = Counter(places[name] for name, row in rows.items() if row.sql)
+        for part in parts:
+            times.update(_clips(steps, lowered.column(part), ends))
+        ranges = lowered.ranges([LOGGED] * len(signals))
+        return cls(lowered, steps, ranges, places | found, times)
+
+
+def parts_of(one: Definition) -> Iterator[Definition]:
+    """Yield what a column is made of, each without a gate or a number."""
+    if one.number is not None:
+        yield from parts_of(one.model_copy(update={"number": None}))
+        if one.number.running is not None:
+            yield one.number.running
+    else:
+        yield from one.parts
+
+
+def rows_of(
+    rows: Mapping[str, Definition], over_time: Mapping[str, Definition]
+) -> dict[str, Definition]:
+    """Return columns of one row, looked back on ones too. Raises `QuestionError`, `DataError`."""
+    found = dict(rows)
+    features_behind(over_time)
+    for one in (part for window in over_time.values() for part in parts_of(window)):
+        row = plain_column(one.of, one.sql, one.of_bits)
+        if found.setdefault(one.of, row) != row:
+            raise DataError(f"the feature {one.of} is defined in two ways.")
+    return found
+
+
+def _clips(steps: tuple[Step, ...], of: int, ends: Iterable[int]) -> set[int]:
+    """Return the steps that clip on the way to a step from `ends`, which are not looked into."""
+    found, waiting = set[int](), [of]
+    while waiting:
+        step = waiting.pop()
+        if step not in ends:
+            found |= {step} if steps[step][0] == "clip" else set()
+            waiting += operands_of(steps[step])
+    return found
+
+
+# The SQL of columns of counts, of a row and over time, as subqueries of `log_counts`.
+
+_SEPARATOR = ",\n            "
+
+
+def with_absent(rows: str, absent: Sequence[str]) -> str:
+    """Return a table expression with stored columns that none of its files has, as nulls."""
+    if not absent:
+        return rows
+    nulls = ", ".join(map(catalogue().null_sql, absent))
+    return f"(SELECT *, {nulls} FROM {rows})"
+
+
+def with_columns(
+    rows: str, features: Mapping[str, Definition], over_time: Mapping[str, Definition]
+) -> str:
+    """Return a subquery: the rows of a table expression with features and columns over time.
+
+    `clipped` counts what was out of range in a row. Raises `QuestionError` or `DataError` for a
+    feature that is defined in two ways.
+    """
+    if not features and not over_time:
+        return rows
+    known = rows_of(features, over_time)
+    counted = CountedColumns.of(known, over_time)
+    signals, facts = list(counted.lowered.signals), list(counted.lowered.facts)
+    layers = SqlLayers(
+        counted.steps,
+        counted.ranges,
+        DUCKDB_SQL,
+        lambda name, place: (
+            f"{signals[place]}::BIGINT" if name == "signal" else f"({fact_sql(facts[place])})"
+        ),
+    )
+    columns, clips = [], []
+    for name, place in counted.places.items():
+        if name not in signals:
+            size = size_of(counted.ranges[place])
+            kind = "SMALLINT" if size <= COUNT_MAX else "INTEGER"
+            columns.append(f"{layers.column(place)[0]}::{kind} AS {name}")
+    for place, times in counted.times.items():
+        value, limit = plain_of(counted.steps[place])
+        most = plain_of(counted.steps[limit])[0]
+        if size_of(counted.ranges[value]) > most:
+            outside = f"coalesce(abs({layers.column(value)[0]}) > {most}, false)::INTEGER"
+            clips.append(f"{times} * {outside}" if times > 1 else outside)
+    hidden = []
+    for number in sorted(layers.layers):
+        made = _SEPARATOR.join(layers.layers[number])
+        rows = f"(SELECT *,\n            {made}\n        FROM {rows})"
+        hidden += [one.rpartition(" AS ")[2] for one in layers.layers[number]]
+    exclude = f" EXCLUDE ({', '.join(hidden)})" if hidden else ""
+    columns.append(f"{' + '.join(clips) or '0'} AS clipped")
+    return f"(SELECT *{exclude},\n            {_SEPARATOR.join(columns)}\n        FROM {rows})"
+
+
+def column_query(known: FeatureCatalogue, name: str) -> str:
+    """Return the query of `log_counts` for a feature or windowed column. Raises `QuestionError`."""
+    definition = known.definition(name)
+    if definition is not None and definition.number is not None:
+        raise QuestionError(
+            f"{name} is {known.calibrated[name].of} times {definition.number.name} of each car, in "
+            "counts: see fleet-slip features --sql of the one, and the view calibration."
+        )
+    if definition is not None and name not in known.features:
+        rows = with_columns("log_counts", {}, {name: definition})
+    elif name in known.features:
+        rows = with_columns("log_counts", known.rows([name]), {})
+    else:
+        raise QuestionError(
+            f"no feature, window or factor is called {name!r}. See: fleet-slip features"
+        )
+    return f"SELECT drive_id, tick, {name}\nFROM {rows}\nORDER BY drive_id, tick"

@@ -1,1 +1,0 @@
-"""Evaluation of estimators on test drives: what they see, how far they are off, and where."""

@@ -1,1 +1,0 @@
-"""A drive to look at: as a page that plays."""

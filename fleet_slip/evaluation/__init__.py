@@ -1,0 +1,1 @@
+"""Estimators on drives, beside their rivals, and the report."""

@@ -1,0 +1,304 @@
+"""Reads the drives of scenarios: what estimators see, and the truth."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.base import BoolArray, FloatArray, float_column
+from fleet_slip.catalogue.facts import SCENARIO
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.config import read_sql
+from fleet_slip.errors import DataError, QuestionError, RefusedError
+from fleet_slip.simulation.job import MOTION, DriveLog, exact_motion, simulate_logs
+from fleet_slip.simulation.scenario import Failure, Scenario
+from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
+from fleet_slip.vehicle.parameters import VehicleParameters, constants
+from fleet_slip.vehicle.tyre import brush_force
+from fleet_slip.views import connect
+from fleet_slip.warehouse.database import reading_files
+from fleet_slip.warehouse.tables import Warehouse
+
+SLOWEST_MPS = 2.0
+"""Speed below which a side-slip angle is not evaluated: at standstill there is none."""
+
+
+@dataclass(frozen=True)
+class EvaluatedDrive:
+    """One drive. Arrays have shape (ticks,).
+
+    Attributes:
+        scenario: what it is a test of.
+        time_s: time since the drive began.
+        signals: what an estimator may see, by SI column: the inputs of the catalogue and satellite
+            navigation; NaN where null.
+        vx_mps, vy_mps: true velocity of the centre of gravity.
+        station_m: distance along the track within the lap.
+        lateral_offset_m: distance from the track's centre line, positive to the left.
+        lost_control_s: when the driver lost the car; None where he did not.
+    """
+
+    scenario: Scenario
+    time_s: FloatArray
+    signals: Mapping[str, FloatArray]
+    vx_mps: FloatArray
+    vy_mps: FloatArray
+    station_m: FloatArray
+    lateral_offset_m: FloatArray
+    lost_control_s: float | None
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What the car knows of itself: its model and its stated mass, by drive column."""
+        scenario = self.scenario
+        return {"vehicle_model": scenario.vehicle.name, "mass_kg": scenario.car.body.sprung_mass_kg}
+
+    @cached_property
+    def sideslip_rad(self) -> FloatArray:
+        """True side-slip angle arctan(vy / vx)."""
+        return np.arctan2(self.vy_mps, self.vx_mps)
+
+    @cached_property
+    def speed_mps(self) -> FloatArray:
+        """True speed."""
+        return np.hypot(self.vx_mps, self.vy_mps)
+
+    @cached_property
+    def evaluated(self) -> BoolArray:
+        """Where the car moves forward, so that it has a side-slip angle."""
+        return self.vx_mps > SLOWEST_MPS
+
+
+def visible_signals() -> tuple[str, ...]:
+    """Return the names of the signals that an estimator may see: never a truth."""
+    return (*catalogue().inputs, *GPS_SIGNALS)
+
+
+def load_drives(warehouse: Warehouse, scenarios: Sequence[Scenario]) -> tuple[EvaluatedDrive, ...]:
+    """Read the drives of scenarios, failures applied; the truth is the simulator's, not the log's.
+
+    A log keeps vy in steps of 0.005 m/s, which at 25 m/s is half of what good estimates err. Raises
+    `DataError` if a drive is not there, and `RefusedError` if this program drives it otherwise.
+    """
+    signals = catalogue().signals
+    names = [name for name in signals if name != catalogue().label]
+    statement = read_sql("jobs", "scenario.sql").format(
+        columns=",\n    ".join(signals[name].column for name in names), source=SCENARIO
+    )
+    drives = sorted({scenario.drive_id for scenario in scenarios})
+    with (
+        connect(warehouse.root, query=statement) as database,
+        reading_files(database, "reading the drives of scenarios"),
+    ):
+        rows = database.sql(statement, params={"drives": drives}).to_arrow_table()
+    logged = [_drive(scenario, rows) for scenario in scenarios]
+    once = {one.scenario.drive_id: one.scenario for one in logged}
+    motions = exact_motion([scenario.batch().drives[0] for scenario in once.values()])
+    exact = dict(zip(once, motions, strict=True))
+    return tuple(_exact(one, exact[one.scenario.drive_id]) for one in logged)
+
+
+def _exact(drive: EvaluatedDrive, truth: Mapping[str, FloatArray]) -> EvaluatedDrive:
+    """Return a logged drive with the exact truth, from which the log may differ by its rounding."""
+    for name, exact in truth.items():
+        logged, signal = getattr(drive, name), catalogue()[name.rpartition("_")[0]]
+        seen = np.clip(exact, float(signal.min), float(signal.max))
+        if len(logged) != len(exact) or np.abs(logged - seen).max() > float(signal.scale):
+            raise RefusedError(
+                f"the drive {drive.scenario.drive_id} of the logs is not the one that this version "
+                "of the program drives, so that its exact angle is not known. Evaluate in another "
+                "data root, or forget the drive."
+            )
+    vx_mps, vy_mps, station_m, lateral_offset_m = (truth[name] for name in MOTION)
+    return replace(
+        drive, vx_mps=vx_mps, vy_mps=vy_mps, station_m=station_m, lateral_offset_m=lateral_offset_m
+    )
+
+
+def simulate_drives(scenarios: Sequence[Scenario]) -> tuple[EvaluatedDrive, ...]:
+    """Simulate the drives of scenarios for this evaluation alone: nothing is written.
+
+    Estimators see what the log would hold; the truth is exact.
+    """
+    specs = [scenario.batch().drives[0] for scenario in scenarios]
+    logs, truths = simulate_logs(specs), exact_motion(specs)
+    return tuple(
+        _measured(scenario, log, truth)
+        for scenario, log, truth in zip(scenarios, logs, truths, strict=True)
+    )
+
+
+def _measured(scenario: Scenario, log: DriveLog, truth: Mapping[str, FloatArray]) -> EvaluatedDrive:
+    signals = {}
+    for name in visible_signals():
+        values = log.measurement.counts[name] * float(catalogue()[name].scale)
+        missing = name in GPS_SIGNALS and ~log.measurement.gps_fix
+        signals[catalogue()[name].column] = np.where(missing, np.nan, values)
+    return EvaluatedDrive(
+        scenario=scenario,
+        time_s=np.arange(log.rows) / SAMPLE_RATE_HZ,
+        signals=signals,
+        **truth,
+        lost_control_s=log.lost_control_s,
+    )
+
+
+def _drive(scenario: Scenario, all_rows: pa.Table) -> EvaluatedDrive:
+    rows = all_rows.filter(pc.equal(all_rows["drive_id"], scenario.drive_id))
+    if not rows.num_rows:
+        raise DataError(
+            f"the drive {scenario.drive_id} is not in the logs. Run: fleet-slip evaluate"
+        )
+    time_s = float_column(rows, "time_s")
+    measured = {name: float_column(rows, catalogue()[name].column) for name in visible_signals()}
+    for failure in scenario.failures:
+        measured = apply_failure(measured, time_s, failure)
+    return EvaluatedDrive(
+        scenario=scenario,
+        time_s=time_s,
+        signals={catalogue()[name].column: values for name, values in measured.items()},
+        vx_mps=float_column(rows, "vx_mps"),
+        vy_mps=float_column(rows, "vy_mps"),
+        station_m=float_column(rows, "station_m"),
+        lateral_offset_m=float_column(rows, "lateral_offset_m"),
+        lost_control_s=rows["lost_control_s"][0].as_py(),
+    )
+
+
+def apply_failure(
+    signals: Mapping[str, FloatArray], time_s: FloatArray, failure: Failure
+) -> dict[str, FloatArray]:
+    """Return signals, by name, as a car with the failure logs them; the given ones stay.
+
+    Raises `QuestionError` if the drive ends before the failure begins.
+    """
+    until_s = np.inf if failure.until_s is None else failure.until_s
+    failed = (time_s >= failure.from_s) & (time_s < until_s)
+    if not failed.any():
+        raise QuestionError(
+            f"the drive lasts {time_s[-1]:.1f} s, and its failure begins at {failure.from_s} s. "
+            "Choose an earlier from_s."
+        )
+    changed = dict(signals)
+    for name in failure.signals:
+        kept = signals[name][np.argmax(failed)] if failure.kind == "stuck" else np.nan
+        changed[name] = np.where(failed, kept, signals[name])
+    return changed
+
+
+# Where a car is unstable on a drive, and how far its axles slip.
+#
+# It is unstable where the tyres of an axle slip beyond their peak. Past the slip at which its
+# lateral force is largest, an axle gives less force the more it slips: a front axle no longer
+# turns the car into its path, a rear axle no longer holds it from spinning (Pacejka 2012, section
+# 1.3). The slip angles follow from the true velocity, the yaw rate and the road wheel angles:
+#
+#     tan(alpha_rear) = (vy - b r) / vx,    alpha_front = arctan((vy + a r) / vx) - delta.
+
+SMALLEST_GAP_S = 1.0
+"""Unstable stretches with less time between them are one."""
+
+PEAK_SPEED_MPS = 15.0
+"""Rolling speed at which the peak is looked up; from 10 to 30 m/s it moves by a tenth."""
+
+SLIPS = np.linspace(0.0, 0.5, 2001)
+
+CRITERION = (
+    "an axle's tyres slip beyond the peak of their lateral force (brush tyre, static load, "
+    f"stretches less than {SMALLEST_GAP_S:g} s apart joined)"
+)
+
+
+@dataclass(frozen=True)
+class PeakSlip:
+    """Slip angles at which the axles' lateral forces are largest, in rad."""
+
+    front_rad: float
+    rear_rad: float
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A stretch of a drive, in time and along the track."""
+
+    from_s: float
+    until_s: float
+    from_m: float
+    until_m: float
+
+
+@cache
+def peak_slip(vehicle: VehicleParameters, adhesion: float) -> PeakSlip:
+    """Return the slip angles of the peaks, both wheels at their static load, without drive."""
+    c = constants(vehicle, adhesion)
+
+    def peak(load: float, stiffness: float) -> float:
+        v = PEAK_SPEED_MPS
+        forces = [abs(brush_force(v, slip * v, v, load, stiffness, c).y) for slip in SLIPS]
+        return float(np.arctan(SLIPS[np.argmax(forces)]))
+
+    return PeakSlip(peak(c.static_front, c.stiffness_front), peak(c.static_rear, c.stiffness_rear))
+
+
+def slip_angles(drive: EvaluatedDrive) -> tuple[FloatArray, FloatArray]:
+    """Return the slip angles of front and rear axle in rad, positive when sliding to the left.
+
+    The yaw rate is the gyroscope's, less the bias that the scenario states; where it is null there
+    is no slip angle.
+    """
+    body, sensors = drive.scenario.car.body, drive.scenario.sensors
+    yaw_rate = drive.signals["yaw_rate_rad_s"] - sensors.yaw_rate_bias_rad_s
+    steer = (drive.signals["steer_fl_rad"] + drive.signals["steer_fr_rad"]) / 2
+    front = np.arctan2(drive.vy_mps + body.front_axle_m * yaw_rate, drive.vx_mps) - steer
+    rear = np.arctan2(drive.vy_mps - body.rear_axle_m * yaw_rate, drive.vx_mps)
+    return front, rear
+
+
+def find_unstable(drive: EvaluatedDrive) -> BoolArray:
+    """Return for each tick whether the car is within an unstable stretch."""
+    peak = peak_slip(drive.scenario.car, drive.scenario.adhesion)
+    front, rear = slip_angles(drive)
+    beyond = (np.abs(front) > peak.front_rad) | (np.abs(rear) > peak.rear_rad)
+    return join(beyond & drive.evaluated, round(SMALLEST_GAP_S * SAMPLE_RATE_HZ))
+
+
+def join(mask: BoolArray, gap: int) -> BoolArray:
+    """Return a mask with the gaps between its runs filled that are shorter than so many entries."""
+    joined = mask.copy()
+    runs = list(_runs(mask))
+    for (_, end), (begin, _) in pairwise(runs):
+        if begin - end < gap:
+            joined[end:begin] = True
+    return joined
+
+
+def find_stretches(drive: EvaluatedDrive, mask: BoolArray) -> tuple[Stretch, ...]:
+    """Return where a mask over the ticks of a drive is true."""
+    return tuple(
+        Stretch(
+            from_s=float(drive.time_s[begin]),
+            until_s=float(drive.time_s[end - 1]),
+            from_m=float(drive.station_m[begin]),
+            until_m=float(drive.station_m[end - 1]),
+        )
+        for begin, end in _runs(mask)
+    )
+
+
+def _runs(mask: BoolArray) -> Iterator[tuple[int, int]]:
+    """Yield begin and end (exclusive) of each run of true entries."""
+    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
+    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+
+
+def rear_compliance(drive: EvaluatedDrive) -> float:
+    """Return the rear slip angle per lateral acceleration, rad s²/m, fitted through the origin."""
+    rear = -slip_angles(drive)[1]
+    ay = drive.signals["ay_mps2"] - drive.scenario.sensors.ay_bias_mps2
+    there = drive.evaluated & np.isfinite(rear) & np.isfinite(ay)
+    return float(rear[there] @ ay[there] / (ay[there] @ ay[there]))

@@ -1,0 +1,217 @@
+"""An extended Kalman filter on the nonlinear single-track model, without GPS.
+
+After Best, Gordon and Dixon, "An extended adaptive Kalman filter for real-time state estimation of
+vehicle handling dynamics", Vehicle System Dynamics 34 (2000); instead of adapting the tyres it
+follows the wheels' loads (`axle_forces`). The state is x = [vx, vy, r, b], with b the bias of the
+lateral accelerometer; ax and the steering angle δ drive it, and wheel speed, yaw rate and ay
+correct it. With the lateral forces F of the axles:
+
+    v̇x = ax + r vy                         z1 = vx
+    v̇y = (Ff cos δ + Fr)/m − r vx          z2 = r
+    ṙ  = (a Ff cos δ − b Fr)/I             z3 = (Ff cos δ + Fr)/m + b
+    ḃ  = 0
+
+The gyroscope's bias is a state of the yaw rate filter (`yaw_rate`) before it. A drive may begin in
+a bend: at first the rear wheels are taken to roll without slip, vy = b r. From vy = 0 the rear
+tyres would slide there, where their force has no slope that leads back.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field, FiniteFloat
+
+from fleet_slip.base import FloatArray
+from fleet_slip.compiling import kernel
+from fleet_slip.config import Config
+from fleet_slip.evaluation import belief
+from fleet_slip.evaluation.belief import Belief, Row, YawRateNoise, belief_of, condition, spread
+from fleet_slip.evaluation.single_track import (
+    STEP_S,
+    Axles,
+    Chassis,
+    DriveSignals,
+    hold_last,
+    loaded_axles,
+    measured_speed_mps,
+    measured_steer_rad,
+    rates,
+    sideslip_angle,
+)
+from fleet_slip.vehicle.parameters import VehicleParameters
+
+INITIAL_STD = (1.0, 1.0, 0.1)
+"""Of vx, vy (m/s) and r (rad/s) at the first row."""
+
+
+class EkfNoise(Config):
+    """Standard deviations: the paper's initial noise; how far the model errs is judgement."""
+
+    ax_std_mps2: FiniteFloat = Field(default=0.1, ge=0)
+    lateral_model_std_mps2: FiniteFloat = Field(default=0.3, ge=0)
+    yaw_model_std_rad_s2: FiniteFloat = Field(default=0.3, ge=0)
+    wheel_speed_std_mps: FiniteFloat = Field(default=0.005, gt=0)
+    yaw_rate_std_rad_s: FiniteFloat = Field(default=0.01, gt=0)
+    ay_std_mps2: FiniteFloat = Field(default=0.1, gt=0)
+    ay_bias_std_mps2: FiniteFloat = Field(default=0.15, ge=0)
+    """Of the accelerometer's bias before the drive; 0 leaves it out of the state."""
+    stiffness_front_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
+    """Cornering stiffness of the front axle over what the car's parameters say."""
+    stiffness_rear_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
+    adhesion: FiniteFloat = Field(default=1.0, gt=0)
+    """What the filter is told of the road."""
+    yaw_rate: YawRateNoise = YawRateNoise()
+
+
+TUNABLE = (
+    "lateral_model_std_mps2",
+    "yaw_model_std_rad_s2",
+    "wheel_speed_std_mps",
+    "yaw_rate_std_rad_s",
+    "ay_std_mps2",
+    "ay_bias_std_mps2",
+    "stiffness_front_factor",
+    "stiffness_rear_factor",
+    *belief.TUNABLE,
+)
+"""The parameters that `tuning.tune` should search."""
+
+
+class Variances(NamedTuple):
+    """Variances of a step of the state, and of the measurements."""
+
+    q_vx: float
+    q_vy: float
+    q_r: float
+    r_vx: float
+    r_r: float
+    r_ay: float
+
+
+@kernel
+def predict(
+    x: Belief, ax: float, steer: float, dt: float, axles: Axles, c: Chassis, v: Variances
+) -> None:
+    """Carry the belief one step on: x ← x + Δt f(x), P ← F P Fᵀ + Q, F = I + Δt ∂f/∂x."""
+    vx, vy, r, _ = x.mean
+    d = rates(vx, vy, r, steer, axles, c)
+    x.mean[0] = vx + dt * (ax + r * vy)
+    x.mean[1] = vy + dt * (d.ay - r * vx)
+    x.mean[2] = r + dt * d.yaw
+    f = (
+        (1.0, dt * r, dt * vy, 0.0),
+        (dt * (d.ay_vx - r), 1.0 + dt * d.ay_vy, dt * (d.ay_r - vx), 0.0),
+        (dt * d.yaw_vx, dt * d.yaw_vy, 1.0 + dt * d.yaw_r, 0.0),
+        (0.0, 0.0, 0.0, 1.0),
+    )
+    spread(x, f, (v.q_vx, v.q_vy, v.q_r, 0.0))
+
+
+@kernel
+def update(
+    x: Belief,
+    vx: float,
+    yaw_rate: float,
+    ay: float,
+    steer: float,
+    axles: Axles,
+    c: Chassis,
+    v: Variances,
+) -> None:
+    """Take in wheel speed, yaw rate and lateral acceleration, whose noises are independent."""
+    condition(x, (1.0, 0.0, 0.0, 0.0), vx - x.mean[0], v.r_vx)
+    condition(x, (0.0, 0.0, 1.0, 0.0), yaw_rate - x.mean[2], v.r_r)
+    d = rates(x.mean[0], x.mean[1], x.mean[2], steer, axles, c)
+    condition(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), ay - d.ay - x.mean[3], v.r_ay)
+
+
+@kernel
+def _filter(
+    ax: FloatArray,
+    ay: FloatArray,
+    yaw_rate: FloatArray,
+    vx: FloatArray,
+    steer: FloatArray,
+    loaded: FloatArray,
+    first_mean: Row,
+    first_variances: Row,
+    c: Chassis,
+    v: Variances,
+) -> FloatArray:
+    found = np.empty((2, len(ax)))
+    x = belief_of(first_mean, first_variances)
+    for k in range(len(ax)):
+        axles = Axles(loaded[0, k], loaded[1, k], loaded[2, k], loaded[3, k])
+        if k > 0:
+            predict(x, ax[k], steer[k], STEP_S, axles, c, v)
+        update(x, vx[k], yaw_rate[k], ay[k], steer[k], axles, c, v)
+        found[:, k] = x.mean[:2]
+    return found
+
+
+def variances(noise: EkfNoise) -> Variances:
+    """Return the variances per step."""
+    return Variances(
+        q_vx=(noise.ax_std_mps2 * STEP_S) ** 2,
+        q_vy=(noise.lateral_model_std_mps2 * STEP_S) ** 2,
+        q_r=(noise.yaw_model_std_rad_s2 * STEP_S) ** 2,
+        r_vx=noise.wheel_speed_std_mps**2,
+        r_r=noise.yaw_rate_std_rad_s**2,
+        r_ay=noise.ay_std_mps2**2,
+    )
+
+
+def chassis(car: VehicleParameters) -> Chassis:
+    """Return what the filter knows of a car beside its tyres."""
+    body = car.body
+    return Chassis(body.mass_kg, body.yaw_inertia_kgm2, body.front_axle_m, body.rear_axle_m)
+
+
+def axles_of(
+    car: VehicleParameters, ax_mps2: FloatArray, ay_mps2: FloatArray, noise: EkfNoise
+) -> FloatArray:
+    """Return `loaded_axles` under the measured accelerations, as stiff as the parameters say."""
+    axles = loaded_axles(car, ax_mps2, ay_mps2, noise.adhesion)
+    axles[0] *= noise.stiffness_front_factor
+    axles[1] *= noise.stiffness_rear_factor
+    return axles
+
+
+def estimate(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> FloatArray:
+    """Estimate side-slip in rad by row. Raises `DataError` without a sensor."""
+    vx_mps, vy_mps = _filter(*inputs_of(drive, car, noise))
+    return sideslip_angle(vx_mps, vy_mps)
+
+
+class Inputs(NamedTuple):
+    """What the filter reads: measurements by row, what axles can do, how it begins, the car."""
+
+    ax_mps2: FloatArray
+    ay_mps2: FloatArray
+    yaw_rate_rad_s: FloatArray
+    vx_mps: FloatArray
+    steer_rad: FloatArray
+    axles: FloatArray
+    first_mean: Row
+    first_variances: Row
+    chassis: Chassis
+    variances: Variances
+
+
+def inputs_of(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Inputs:
+    """Return what the filter reads of a drive, gaps bridged. Raises `DataError`."""
+    turning = belief.estimate(drive, car, noise.yaw_rate).yaw_rate_rad_s
+    vx_mps = measured_speed_mps(drive, car)
+    ax_mps2, ay_mps2 = hold_last(drive.ax_mps2, "ax"), hold_last(drive.ay_mps2, "ay")
+    return Inputs(
+        ax_mps2,
+        ay_mps2,
+        turning,
+        vx_mps,
+        measured_steer_rad(drive),
+        axles_of(car, ax_mps2, ay_mps2, noise),
+        (vx_mps[0], car.body.rear_axle_m * turning[0], turning[0], 0.0),  # vy: rear wheels roll
+        (*(std**2 for std in INITIAL_STD), noise.ay_bias_std_mps2**2),
+        chassis(car),
+        variances(noise),
+    )

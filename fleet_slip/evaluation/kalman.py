@@ -1,0 +1,167 @@
+"""The paper's Kalman filter: GPS velocity fused with the accelerometers, Section IV.
+
+The state is x = [u_x, b_x, u_y, b_y]: velocity of the centre of gravity in the car's frame and the
+biases a_x,bias and a_y,bias of the accelerometers. The paper's (6b) prints the term ψ̇ u_x Δt with a
+plus; (5b), from which it follows, and the mechanics ask for a minus, which stands here.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field, FiniteFloat
+
+from fleet_slip.base import FloatArray
+from fleet_slip.compiling import kernel
+from fleet_slip.config import Config
+from fleet_slip.errors import DataError
+from fleet_slip.evaluation import belief
+from fleet_slip.evaluation.belief import Belief, YawRateNoise, belief_of, condition, spread
+from fleet_slip.evaluation.single_track import STEP_S, DriveSignals, hold_last, sideslip_angle
+from fleet_slip.vehicle.parameters import VehicleParameters
+
+
+class FilterNoise(Config):
+    """Standard deviations that make Q and R; the defaults are the paper's initial noise."""
+
+    ax_std_mps2: FiniteFloat = Field(default=0.1, ge=0)
+    ay_std_mps2: FiniteFloat = Field(default=0.1, ge=0)
+    bias_std_mps2: FiniteFloat = Field(default=0.15, gt=0)
+    """Of the accelerometers' biases before the drive."""
+    bias_walk_mps2_per_sqrt_s: FiniteFloat = Field(default=0.0, ge=0)
+    """How much a bias wanders in 1 s. The paper has no noise on biases."""
+    gps_vx_std_mps: FiniteFloat = Field(default=0.05, gt=0)
+    gps_vy_std_mps: FiniteFloat = Field(default=0.05, gt=0)
+    yaw_rate: YawRateNoise = YawRateNoise()
+
+
+TUNABLE = (
+    "ax_std_mps2",
+    "ay_std_mps2",
+    "gps_vx_std_mps",
+    "gps_vy_std_mps",
+    "bias_std_mps2",
+    *belief.TUNABLE,
+)
+"""The parameters of Q, R and the first P that `tuning.tune` should search."""
+
+
+class Covariances(NamedTuple):
+    """The diagonals of Q and R, and of P at the first fix, as variances per step."""
+
+    q_ux: float
+    q_uy: float
+    q_bias: float
+    r_ux: float
+    r_uy: float
+    bias: float
+
+
+def covariances(noise: FilterNoise) -> Covariances:
+    """Return Q = B1 W B1ᵀ, where B1 multiplies the acceleration noise by Δt, and R."""
+    return Covariances(
+        q_ux=(noise.ax_std_mps2 * STEP_S) ** 2,
+        q_uy=(noise.ay_std_mps2 * STEP_S) ** 2,
+        q_bias=noise.bias_walk_mps2_per_sqrt_s**2 * STEP_S,
+        r_ux=noise.gps_vx_std_mps**2,
+        r_uy=noise.gps_vy_std_mps**2,
+        bias=noise.bias_std_mps2**2,
+    )
+
+
+@kernel
+def first_belief(gps_vx: float, gps_vy: float, c: Covariances) -> Belief:
+    """Return the belief at the first fix: its velocity, and biases around zero."""
+    return belief_of((gps_vx, 0.0, gps_vy, 0.0), (c.r_ux, c.bias, c.r_uy, c.bias))
+
+
+@kernel
+def predict(x: Belief, ax: float, ay: float, yaw_rate: float, dt: float, c: Covariances) -> None:
+    """Carry the belief one step on, equations (6), (7) and (9).
+
+        | 1      −Δt  ψ̇Δt   0  |            | Δt  0 |
+    F = | 0       1    0    0  |   B1, B2 = | 0   0 |   x ← F x + B2 u
+        | −ψ̇Δt    0    1   −Δt |            | 0  Δt |   P ← F P Fᵀ + Q
+        | 0       0    0    1  |            | 0   0 |
+    """
+    turn = yaw_rate * dt
+    ux, bx, uy, by = x.mean
+    x.mean[0] = ux + dt * (ax - bx) + turn * uy
+    x.mean[2] = uy + dt * (ay - by) - turn * ux
+    f = ((1.0, -dt, turn, 0.0), (0.0, 1.0, 0.0, 0.0), (-turn, 0.0, 1.0, -dt), (0.0, 0.0, 0.0, 1.0))
+    spread(x, f, (c.q_ux, c.q_bias, c.q_uy, c.q_bias))
+
+
+@kernel
+def update(x: Belief, gps_vx: float, gps_vy: float, c: Covariances) -> None:
+    """Take in a fix, equations (10) and (11); the noises of its two velocities are independent."""
+    condition(x, (1.0, 0.0, 0.0, 0.0), gps_vx - x.mean[0], c.r_ux)
+    condition(x, (0.0, 0.0, 1.0, 0.0), gps_vy - x.mean[2], c.r_uy)
+
+
+@kernel
+def _filter(
+    ax: FloatArray,
+    ay: FloatArray,
+    yaw_rate: FloatArray,
+    gps_vx: FloatArray,
+    gps_vy: FloatArray,
+    first_fix: int,
+    dt: float,
+    c: Covariances,
+) -> FloatArray:
+    means = np.full((4, len(ax)), np.nan)
+    belief = first_belief(gps_vx[first_fix], gps_vy[first_fix], c)
+    for k in range(first_fix, len(ax)):
+        if k > first_fix:
+            predict(belief, ax[k], ay[k], yaw_rate[k], dt, c)
+            if not np.isnan(gps_vx[k] + gps_vy[k]):
+                update(belief, gps_vx[k], gps_vy[k], c)
+        means[:, k] = belief.mean
+    return means
+
+
+@dataclass(frozen=True)
+class KalmanEstimate:
+    """The filter's mean at every row; NaN before the first fix."""
+
+    vx_mps: FloatArray
+    ax_bias_mps2: FloatArray
+    vy_mps: FloatArray
+    ay_bias_mps2: FloatArray
+
+
+def fuse(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) -> KalmanEstimate:
+    """Run the filter over a drive with a yaw rate that is known.
+
+    It begins at the first GPS fix, predicts at every row and updates at every fix. Gaps of the
+    accelerometers are bridged by the value before. Raises `DataError` if the drive has no fix.
+    """
+    fixes = np.flatnonzero(np.isfinite(drive.gps_vx_mps) & np.isfinite(drive.gps_vy_mps))
+    if not len(fixes):
+        raise DataError(
+            "the drive has no GPS fix, which the Kalman filter begins with. Choose drives with GPS."
+        )
+    means = _filter(
+        hold_last(drive.ax_mps2, "ax"),
+        hold_last(drive.ay_mps2, "ay"),
+        yaw_rate_rad_s,
+        drive.gps_vx_mps,
+        drive.gps_vy_mps,
+        fixes[0],
+        STEP_S,
+        covariances(noise),
+    )
+    return KalmanEstimate(*means)
+
+
+def estimate(drive: DriveSignals, car: VehicleParameters, noise: FilterNoise) -> FloatArray:
+    """Estimate side-slip in rad at every row, NaN before the first fix. Raises as `fuse`.
+
+    Of the car, only the geometry counts that turns wheel speeds into a yaw rate. All of it is
+    compiled and releases the interpreter's lock: many drives run on threads, as in
+    `executor.map(partial(estimate, car=car, noise=noise), drives)`.
+    """
+    turning = belief.estimate(drive, car, noise.yaw_rate)
+    motion = fuse(drive, turning.yaw_rate_rad_s, noise)
+    return sideslip_angle(motion.vx_mps, motion.vy_mps)

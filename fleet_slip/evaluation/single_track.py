@@ -1,0 +1,304 @@
+"""The single-track model of the extended Kalman filter, with the forces of its axles.
+
+The lateral forces follow the loads of the moment: bends load the outer wheels and braking the front
+ones. Two wheels with different loads hold less than two with their mean, because a tyre's stiffness
+and grip grow less than its load (Pacejka, "Tire and Vehicle Dynamics" (2012), sections 1.2.3 and
+4.E25).
+"""
+
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple, cast
+
+import duckdb
+import numpy as np
+
+from fleet_slip.base import FloatArray
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.compiling import kernel
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.vehicle.parameters import VehicleParameters, constants
+from fleet_slip.vehicle.tyre import cornering_stiffness
+from fleet_slip.warehouse.database import reading_files
+
+# What an estimator may read of one drive, in SI units at 100 Hz, and what its wheels tell.
+#
+# Dead reckoning by wheel speeds: Carlson, Gerdes and Powell, "Error sources when land vehicle dead
+# reckoning with differential wheelspeeds", Navigation 51 (2004): the axle without drive torque
+# rolls with the least slip.
+
+STEP_S = float(SAMPLE_TIME_S)
+"""Time Δt between two rows."""
+
+
+@dataclass(frozen=True)
+class DriveSignals:
+    """One drive in float64, axes as in docs/conventions.md; NaN where nothing was measured."""
+
+    ax_mps2: FloatArray
+    ay_mps2: FloatArray
+    yaw_rate_rad_s: FloatArray
+    wheel_fl_rad_s: FloatArray
+    wheel_fr_rad_s: FloatArray
+    wheel_rl_rad_s: FloatArray
+    wheel_rr_rad_s: FloatArray
+    steer_fl_rad: FloatArray
+    steer_fr_rad: FloatArray
+    gps_vx_mps: FloatArray
+    gps_vy_mps: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.ax_mps2)
+
+
+@dataclass(frozen=True)
+class LabelledDrive:
+    """A drive with its true side-slip, for evaluation and tuning; no estimator sees it."""
+
+    drive_id: str
+    signals: DriveSignals
+    sideslip_rad: FloatArray
+    car: VehicleParameters | None = None
+    """The car as filters know it; None where it is that of all drives."""
+
+    def beginning(self, rows: int) -> "LabelledDrive":
+        """Return its first rows."""
+        arrays = {name: values[:rows] for name, values in vars(self.signals).items()}
+        return replace(self, signals=DriveSignals(**arrays), sideslip_rad=self.sideslip_rad[:rows])
+
+
+def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDrive:
+    """Read a drive from the view `log`. Raises `QuestionError` if there is no such drive."""
+    label = catalogue()[catalogue().label].column
+    columns = [*(field.name for field in fields(DriveSignals)), label]
+    with reading_files(database, f"reading the drive {drive_id!r}"):
+        found = database.execute(
+            f"SELECT {', '.join(columns)} FROM log WHERE drive_id = $drive_id ORDER BY time_s",
+            {"drive_id": drive_id},
+        ).fetchnumpy()
+    if not len(found[label]):
+        raise QuestionError(f"no drive is called {drive_id!r}. The view drives lists them.")
+    arrays = {name: np.ma.filled(found[name].astype(np.float64), np.nan) for name in columns}
+    sideslip_rad = arrays.pop(label)
+    return LabelledDrive(drive_id, DriveSignals(**arrays), sideslip_rad)
+
+
+def hold_last(values: FloatArray, name: str) -> FloatArray:
+    """Return a signal, gaps filled by the last value. Raises `DataError` without any value."""
+    valid = np.isfinite(values)
+    if valid.all():
+        return values
+    if not valid.any():
+        raise DataError(
+            f"the drive has no {name}, which this estimator needs. Choose drives that have it, or "
+            "another estimator."
+        )
+    latest = np.maximum.accumulate(np.where(valid, np.arange(len(values)), valid.argmax()))
+    return values[latest]
+
+
+@dataclass(frozen=True)
+class AxleSpeeds:
+    """Rolling velocity of the two wheels of one axle over cos δ, and their distance."""
+
+    left_mps: FloatArray
+    right_mps: FloatArray
+    track_m: FloatArray | float
+    turned_m: FloatArray | float = 0.0
+    """Mean of tan δ times the axle's distance before the centre of gravity."""
+
+    @property
+    def vx_mps(self) -> FloatArray:
+        """Longitudinal velocity of the centre of gravity."""
+        return (self.left_mps + self.right_mps) / 2 - self.turned_m * self.yaw_rate_rad_s
+
+    @property
+    def yaw_rate_rad_s(self) -> FloatArray:
+        """Yaw rate of the line through the wheels."""
+        return (self.right_mps - self.left_mps) / self.track_m
+
+
+def undriven_axle(drive: DriveSignals, car: VehicleParameters) -> AxleSpeeds:
+    """Return the speeds of the axle that takes the smaller share of the drive torque.
+
+    A wheel that rolls without slip at a hub with velocity (vx ∓ t/2 r, vy + a r), steered by δ, has
+
+        R ω / cos δ = vx ∓ t/2 r + tan δ (vy + a r).
+
+    At the rear δ = 0. At the front the wheels travel with the yaw of the car, too: tan δ a r is
+    taken off their mean. tan δ vy, a thousandth of vx, is neglected.
+    """
+    radius, front = car.tyre.rolling_radius_m, car.body.front_axle_m
+    if car.drivetrain.front_drive_share >= 0.5:
+        return AxleSpeeds(
+            radius * drive.wheel_rl_rad_s, radius * drive.wheel_rr_rad_s, car.body.track_rear_m
+        )
+    left, right = np.tan(drive.steer_fl_rad), np.tan(drive.steer_fr_rad)
+    return AxleSpeeds(
+        radius * drive.wheel_fl_rad_s / np.cos(drive.steer_fl_rad),
+        radius * drive.wheel_fr_rad_s / np.cos(drive.steer_fr_rad),
+        car.body.track_front_m + front * (right - left),
+        front * (left + right) / 2,
+    )
+
+
+DRIVE_SIGNALS_SLOWEST_MPS = 1.0
+"""Longitudinal velocity below which the angle is taken as if the car drove so fast."""
+
+
+def sideslip_angle(vx_mps: FloatArray, vy_mps: FloatArray) -> FloatArray:
+    """Return β = arctan(vy / vx) in rad, equations (12) and (13).
+
+    At rest the quotient has no limit and noise would turn the angle by up to π. Below
+    `SLOWEST_MPS`, and in reverse, vx is therefore replaced by `SLOWEST_MPS`: β stays continuous and
+    goes to zero with vy. NaN stays NaN.
+    """
+    return np.arctan2(vy_mps, np.maximum(vx_mps, DRIVE_SIGNALS_SLOWEST_MPS))
+
+
+SLOWEST_MPS = 5.0
+"""Speed below which slip is measured against this speed; the poles stay within 100/s."""
+
+
+def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> FloatArray:
+    """Return the longitudinal velocity from wheel speeds. Raises `DataError` without them."""
+    return hold_last(undriven_axle(drive, car).vx_mps, "wheel speeds")
+
+
+def measured_steer_rad(drive: DriveSignals) -> FloatArray:
+    """Return the mean angle of the front wheels, or that of the one that a car logs.
+
+    Raises `DataError` without any.
+    """
+    logged = [one for one in (drive.steer_fl_rad, drive.steer_fr_rad) if np.isfinite(one).any()]
+    mean = sum(logged, np.zeros(len(drive))) / max(len(logged), 1)
+    return hold_last(mean if logged else drive.steer_fl_rad, "steer_fl and steer_fr")
+
+
+LEAST_LOAD = 0.05
+"""Smallest load of a wheel over that at rest: noise lifts none."""
+
+
+class Axles(NamedTuple):
+    """What both tyres of an axle can do together."""
+
+    stiffness_front_n: float
+    """Cornering stiffness per unit of slip."""
+    stiffness_rear_n: float
+    grip_front_n: float
+    """Largest lateral force."""
+    grip_rear_n: float
+
+
+def loaded_axles(
+    car: VehicleParameters, ax_mps2: FloatArray, ay_mps2: FloatArray, adhesion: float
+) -> FloatArray:
+    """Return the `Axles` of a car under accelerations of shape (rows,), as measured.
+
+    The shape is (4, rows): a row for each of their fields. The body leans with the lag of its
+    suspension, which takes the accelerations' noise away.
+    """
+    c = constants(car, adhesion)
+    pitch = c.pitch_transfer * follow(ax_mps2, c.inverse_pitch_lag * STEP_S)
+    leaning = follow(ay_mps2, c.inverse_roll_lag * STEP_S)
+
+    def axle(mean: FloatArray, roll: FloatArray, peak: float) -> tuple[FloatArray, FloatArray]:
+        loads = np.maximum(np.stack([mean - roll, mean + roll]), LEAST_LOAD * c.static_rear)
+        stiffness = cast(FloatArray, cornering_stiffness(cast(float, loads), peak, c))
+        grip = (c.friction - c.friction_per_load * loads) * loads
+        return stiffness.sum(axis=0), grip.sum(axis=0)
+
+    front = axle(c.static_front - pitch, c.roll_transfer_front * leaning, c.stiffness_front)
+    rear = axle(c.static_rear + pitch, c.roll_transfer_rear * leaning, c.stiffness_rear)
+    return np.stack([front[0], rear[0], front[1], rear[1]])
+
+
+@kernel
+def follow(values: FloatArray, gain: float) -> FloatArray:
+    """Return what follows values with a lag, x ← x + gain (value − x), from the first value on."""
+    lagged = np.empty(len(values))
+    x = values[0]
+    for k in range(len(values)):
+        x += gain * (values[k] - x)
+        lagged[k] = x
+    return lagged
+
+
+class LateralForce(NamedTuple):
+    """Lateral force of an axle across the car, and its derivatives."""
+
+    force: float
+    per_vx: float
+    per_vy: float
+    per_r: float
+
+
+@kernel
+def lateral_force(
+    vx: float, vy: float, r: float, steer: float, lever: float, stiffness: float, grip: float
+) -> LateralForce:
+    """Return the force of an axle at the distance `lever` before the centre of gravity.
+
+    With slip σ = −across / along of the axle's velocity in the wheel's frame, the brush tyre of
+    Fiala gives, up to the slip where all of it slides,
+
+        F = C σ − C² |σ| σ / (3 G) + C³ σ³ / (27 G²),   dF/dσ = C (1 − C |σ| / (3 G))²
+
+    and beyond it ±G (Pacejka, "Tire and Vehicle Dynamics" (2012), section 3.2.1).
+    """
+    cosine, sine = np.cos(steer), np.sin(steer)
+    side = vy + lever * r
+    across = cosine * side - sine * vx
+    along = cosine * vx + sine * side
+    rolling = max(along, SLOWEST_MPS)
+    turning = 1.0 if along > SLOWEST_MPS else 0.0
+    slip = -across / rolling
+    use = stiffness * slip / (3.0 * grip)
+    stuck = max(1.0 - abs(use), 0.0)
+    force = 3.0 * grip * use * (1.0 - abs(use) + use * use / 3.0)
+    if stuck == 0.0:
+        force = grip if slip > 0.0 else -grip
+    per_slip = stiffness * stuck * stuck / rolling
+    # dσ = −(d across + σ d along) / rolling
+    per_side = -per_slip * (cosine + turning * slip * sine) * cosine
+    per_vx = -per_slip * (-sine + turning * slip * cosine) * cosine
+    return LateralForce(cosine * force, per_vx, per_side, lever * per_side)
+
+
+class Chassis(NamedTuple):
+    """Mass, yaw inertia and the axles' distances from the centre of gravity."""
+
+    mass_kg: float
+    yaw_inertia_kgm2: float
+    front_m: float
+    rear_m: float
+
+
+class Rates(NamedTuple):
+    """Lateral acceleration and yaw acceleration, with their derivatives."""
+
+    ay: float
+    ay_vx: float
+    ay_vy: float
+    ay_r: float
+    yaw: float
+    yaw_vx: float
+    yaw_vy: float
+    yaw_r: float
+
+
+@kernel
+def rates(vx: float, vy: float, r: float, steer: float, axles: Axles, c: Chassis) -> Rates:
+    """Return (Ff cos δ + Fr)/m and (a Ff cos δ − b Fr)/I, linearised."""
+    f = lateral_force(vx, vy, r, steer, c.front_m, axles.stiffness_front_n, axles.grip_front_n)
+    b = lateral_force(vx, vy, r, 0.0, -c.rear_m, axles.stiffness_rear_n, axles.grip_rear_n)
+    return Rates(
+        (f.force + b.force) / c.mass_kg,
+        (f.per_vx + b.per_vx) / c.mass_kg,
+        (f.per_vy + b.per_vy) / c.mass_kg,
+        (f.per_r + b.per_r) / c.mass_kg,
+        (c.front_m * f.force - c.rear_m * b.force) / c.yaw_inertia_kgm2,
+        (c.front_m * f.per_vx - c.rear_m * b.per_vx) / c.yaw_inertia_kgm2,
+        (c.front_m * f.per_vy - c.rear_m * b.per_vy) / c.yaw_inertia_kgm2,
+        (c.front_m * f.per_r - c.rear_m * b.per_r) / c.yaw_inertia_kgm2,
+    )

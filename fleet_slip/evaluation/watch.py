@@ -1,0 +1,255 @@
+"""A drive as a page that plays: one file without a server."""
+
+import json
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from markupsafe import Markup
+
+from fleet_slip.base import FloatArray, float_column
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.config import config_names
+from fleet_slip.errors import DataError, QuestionError, UsageError
+from fleet_slip.evaluation.drives import load_drives
+from fleet_slip.evaluation.evaluate import gates_on
+from fleet_slip.evaluation.scenarios import simulate_scenarios
+from fleet_slip.models.registry import ModelVersion
+from fleet_slip.pages.page import fill_in
+from fleet_slip.simulation.roads import load_track
+from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
+
+# What is to be seen of a drive: where the car is, its angles, its wheels, and its gates.
+
+FRAMES_PER_S = 25
+SPACING_M = 3.0
+SMOOTHED_TICKS = 51
+WHEELS = ("fl", "fr", "rl", "rr")
+FACTS = ("vehicle_model", "mass_kg")
+
+
+@dataclass(frozen=True)
+class DriveFrames:
+    """A drive at 25 frames a second; arrays have shape (frames,).
+
+    Attributes:
+        model: the version that estimates, NAME@VERSION.
+        x_m, y_m, heading_rad: place and direction of the car on the ground.
+        sideslip_deg: the reference; NaN where the drive has none.
+        estimate_deg: the estimate; NaN where the model lacks a signal.
+        wheel_rad_s: speeds of fl, fr, rl, rr; NaN where they were not logged.
+        steer_rad: mean angle of the front wheels.
+        gates: how far each gate of the model is open, from 0 to 1.
+        track: x and y of the track's centre line; empty where no track is known.
+    """
+
+    title: str
+    model: str
+    time_s: FloatArray
+    speed_mps: FloatArray
+    x_m: FloatArray
+    y_m: FloatArray
+    heading_rad: FloatArray
+    sideslip_deg: FloatArray
+    estimate_deg: FloatArray
+    wheel_rad_s: Mapping[str, FloatArray]
+    steer_rad: FloatArray
+    gates: Mapping[str, FloatArray]
+    track: tuple[FloatArray, FloatArray]
+
+    def part(self, from_s: float, until_s: float | None) -> "DriveFrames":
+        """Return the frames of a part of the drive. Raises `UsageError` if it has none."""
+        wanted = self.time_s >= from_s
+        if until_s is not None:
+            wanted &= self.time_s <= until_s
+        if wanted.sum() < 2:
+            raise UsageError(
+                f"the drive lasts from {self.time_s[0]:.1f} to {self.time_s[-1]:.1f} s; choose a "
+                "part of it."
+            )
+        changed: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                changed[name] = value[wanted]
+            elif isinstance(value, Mapping):
+                changed[name] = {key: array[wanted] for key, array in value.items()}
+        return replace(self, **changed)
+
+
+def is_scenario(what: str) -> bool:
+    """Whether a name or path is that of a scenario, not of a drive."""
+    return what.endswith(".toml") or what in config_names("scenarios")
+
+
+def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> DriveFrames:
+    """Return the frames of a drive of the logs. Raises `QuestionError`."""
+    names = [one.column for one in catalogue().signals.values()]
+    query = f"SELECT time_s, track, vehicle_model, mass_kg, {', '.join(names)} FROM log"
+    with connect(warehouse.root, query=query, scenarios=True) as database:
+        statement = f"{query} WHERE drive_id = $drive ORDER BY time_s"
+        rows = database.sql(statement, params={"drive": drive_id}).to_arrow_table()
+    if not rows.num_rows:
+        raise QuestionError(
+            f"{drive_id!r} is no drive of the logs, and no scenario. See: "
+            'fleet-slip sql "SELECT drive_id FROM drives"'
+        )
+    columns = {name: float_column(rows, name) for name in names}
+    facts = {name: rows[name][0].as_py() for name in (*FACTS, "track")}
+    facts["drive_id"] = drive_id
+    return frames_of(drive_id, columns, facts, float_column(rows, "time_s"), version)
+
+
+def frames_of(
+    title: str,
+    columns: Mapping[str, FloatArray],
+    facts: Mapping[str, Any],
+    time_s: FloatArray,
+    version: ModelVersion,
+) -> DriveFrames:
+    """Return the frames of a drive. Raises `DataError` if nothing of it can be shown.
+
+    The columns are those of the catalogue, shape (ticks,), NaN where null; `facts` tell the model
+    and mass of the car, its `drive_id`, and its `track` if that is known.
+    """
+    seen = np.flatnonzero(np.diff(np.floor((time_s - time_s[0]) * FRAMES_PER_S + 1e-6), prepend=-1))
+    # The drive as the view `log` has it; NaN is null there.
+    arrays = {name: pa.array(values, from_pandas=True) for name, values in columns.items()}
+    known = {name: pa.array([value] * len(time_s)) for name, value in facts.items()}
+    estimate = version.predict(pa.table({**known, "time_s": time_s, **arrays}))
+    vx, vy = _velocity(columns)
+    x, y, heading, track = _places(columns, facts, time_s, vx, vy)
+    gates = gates_on(version.manifest, columns, facts)
+    return DriveFrames(
+        title=title,
+        model=version.reference,
+        time_s=time_s[seen],
+        speed_mps=np.hypot(vx, vy)[seen],
+        x_m=x[seen],
+        y_m=y[seen],
+        heading_rad=heading[seen],
+        sideslip_deg=np.degrees(columns["sideslip_rad"])[seen],
+        estimate_deg=np.degrees(np.asarray(estimate, dtype=np.float64))[seen],
+        wheel_rad_s={wheel: columns[f"wheel_{wheel}_rad_s"][seen] for wheel in WHEELS},
+        steer_rad=((columns["steer_fl_rad"] + columns["steer_fr_rad"]) / 2)[seen],
+        gates={name: values[seen] for name, values in gates.items()},
+        track=track,
+    )
+
+
+def _velocity(columns: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return vx and vy: true, else by wheels and the reference angle. Raises `DataError`."""
+    vx, vy = columns["vx_mps"], columns["vy_mps"]
+    if np.isfinite(vx).any():
+        return np.nan_to_num(vx), np.nan_to_num(vy)
+    wheels = [columns[f"wheel_{wheel}_rad_s"] for wheel in WHEELS]
+    if not np.isfinite(wheels).any():
+        raise DataError("the drive has neither a velocity nor wheel speeds: nothing can be shown.")
+    here = np.isfinite(wheels)  # a tick may lack them all, of which nanmean would warn
+    mean = np.where(here, wheels, 0.0).sum(axis=0) / np.maximum(here.sum(axis=0), 1)
+    rolling = 0.31 * mean
+    return rolling, rolling * np.tan(np.nan_to_num(columns["sideslip_rad"]))
+
+
+def _smooth(values: FloatArray) -> FloatArray:
+    """Return the mean over half a second around each tick, over less at the ends."""
+    window = np.ones(SMOOTHED_TICKS)
+    weights = np.convolve(np.ones(len(values)), window, "same")
+    smoothed: FloatArray = values[0] + np.convolve(values - values[0], window, "same") / weights
+    return smoothed
+
+
+def _places(
+    columns: Mapping[str, FloatArray],
+    facts: Mapping[str, Any],
+    time_s: FloatArray,
+    vx: FloatArray,
+    vy: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
+    """Return x, y and heading of the car, and the line of the track, if that is known."""
+    station, offset = columns["station_m"], columns["lateral_offset_m"]
+    empty = np.empty(0)
+    if facts.get("track") and np.isfinite(station).all():
+        track = load_track(str(facts["track"]))
+        line = track.centre_line(SPACING_M)
+        # The log has stations in steps of 0.25 m, which the car would jump.
+        smooth_m, offset = _smooth(np.unwrap(station, period=track.length_m)), _smooth(offset)
+        x, y, along = (
+            np.interp(smooth_m % track.length_m, line.station_m, values)
+            for values in (line.x_m, line.y_m, line.heading_rad)
+        )
+        x, y = x - offset * np.sin(along), y + offset * np.cos(along)
+        course = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
+        return x, y, course - np.arctan2(vy, np.maximum(vx, 0.5)), (line.x_m, line.y_m)
+    step = np.diff(time_s, prepend=time_s[0] - float(SAMPLE_TIME_S))
+    heading = np.cumsum(np.nan_to_num(columns["yaw_rate_rad_s"]) * step)
+    x = np.cumsum((vx * np.cos(heading) - vy * np.sin(heading)) * step)
+    y = np.cumsum((vx * np.sin(heading) + vy * np.cos(heading)) * step)
+    return x, y, heading, (empty, empty)
+
+
+def write_page(frames: DriveFrames, file: Path) -> None:
+    """Write the page as a whole, or not at all. Raises `StorageError`."""
+    LocalFolder(file.parent).put(file.name, render_watch(frames).encode("utf-8"))
+
+
+def render_watch(frames: DriveFrames) -> str:
+    """Return the page."""
+    text = json.dumps(_data(frames), separators=(",", ":"), allow_nan=False)
+    # Within a script element only this could end it.
+    data = Markup(text.replace("<", "\\u003c"))  # noqa: S704
+    return fill_in("watch.html.j2", frames=frames, data=data)
+
+
+def _data(frames: DriveFrames) -> dict[str, Any]:
+    wheels = np.array([frames.wheel_rad_s[name] for name in WHEELS])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = wheels.mean(axis=0)
+        excess = 100 * np.where(mean > 1, wheels / mean - 1, np.nan)
+    return {
+        "t": _listed(frames.time_s, 2),
+        "speed": _listed(frames.speed_mps, 2),
+        "x": _listed(frames.x_m, 2),
+        "y": _listed(frames.y_m, 2),
+        "heading": _listed(frames.heading_rad, 4),
+        "beta": _listed(frames.sideslip_deg, 3),
+        "estimate": _listed(frames.estimate_deg, 3),
+        "steer": _listed(frames.steer_rad, 4),
+        "wheels": [_listed(one, 2) for one in excess],
+        "gates": [_listed(one, 3) for one in frames.gates.values()],
+        "track": [_listed(one, 1) for one in frames.track],
+    }
+
+
+def _listed(values: FloatArray, digits: int) -> list[float | None]:
+    """Return numbers for JSON, None for what is not finite."""
+    return [round(value, digits) if np.isfinite(value) else None for value in values.tolist()]
+
+
+# What is to be seen of a test drive, which is simulated if it is missing.
+
+
+def scenario_frames(
+    warehouse: Warehouse, name: str, version: ModelVersion, executor: Executor
+) -> DriveFrames:
+    """Return the frames of a test drive, simulated if missing. Raises `ConfigError`."""
+    scenario = load_scenario(name)
+    simulate_scenarios(warehouse, [scenario], executor)
+    (drive,) = load_drives(warehouse, [scenario])
+    columns = {
+        **drive.signals,
+        "sideslip_rad": drive.sideslip_rad,
+        "vx_mps": drive.vx_mps,
+        "vy_mps": drive.vy_mps,
+        "station_m": drive.station_m,
+        "lateral_offset_m": drive.lateral_offset_m,
+    }
+    facts = {**drive.facts, "track": scenario.track.name, "drive_id": scenario.drive_id}
+    title = f"{scenario.name}: {scenario.description}"
+    return frames_of(title, columns, facts, drive.time_s, version)

@@ -1,0 +1,382 @@
+"""How the sensors of every car are off, from the Gram rows of its drives: no label, no log row.
+
+The numbers of a car are exact functions of the sum of its drives' Gram rows (`car_numbers`) and of
+what the roads of all cars have in common (`road_lean`), so that they are the same in whatever order
+drives came, and a drive that is forgotten is gone from them. `car_evidence` tells how sure they
+are, `numbers_over_drives` what more drives make of them.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import date
+from math import sqrt
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.base import FloatArray, date_of
+from fleet_slip.catalogue.course import COLUMNS, turned_scale
+from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, CAR_NUMBERS, NumberName
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.car_estimates import KINDS, kinds_by_set
+from fleet_slip.grams.car_evidence import (
+    CalibratedNumber,
+    CarEvidence,
+    Piece,
+    Roads,
+    three_digits,
+    with_others,
+)
+from fleet_slip.grams.gram_rows import by_signals, gram_table
+from fleet_slip.grams.reader import GramReader, OpenedGrams, collect_sums, open_grams
+from fleet_slip.grams.receiver_delay import (
+    LASTING_S,
+    RECEIVER_DELAY,
+    SPREAD,
+    ReceiverDelays,
+    receiver_delays,
+)
+from fleet_slip.regression.gram import GramTable
+from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.tables import Warehouse
+
+# What more drives of a car make of its numbers: how sure they become, and which have changed.
+
+SURE_ERRORS = 5.0
+"""Standard errors by which a number has changed. Of 6,300 numbers of simulated cars in which
+nothing changed, before and after some day, none differed by more."""
+
+STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+"""Numbers of drives that a convergence is shown for."""
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """How sure a number is after so many drives of a car.
+
+    Attributes:
+        drives: the first so many of each car that has them.
+        cars: how many have.
+        stated: root mean square of the standard errors.
+        measured: the same by how much the next so many drives of a car differ; None if no car has.
+    """
+
+    number: NumberName
+    drives: int
+    cars: int
+    stated: float
+    measured: float | None
+
+
+@dataclass(frozen=True)
+class ChangedNumber:
+    """A number of which a car's drives from a day on tell otherwise than those before.
+
+    `uncertainty` is the standard error of the difference; all in the number's unit.
+    """
+
+    car: str
+    number: NumberName
+    before: float
+    after: float
+    uncertainty: float
+
+
+def changed_numbers(evidence: CarEvidence, since: date) -> list[ChangedNumber]:
+    """Return the numbers that are others from a day on, surely; by car.
+
+    Errors that no drive of a car takes away are in both, and not in the difference. How drives
+    differ is told by each half by itself: a car that changed would pass for one that is uneven.
+    Of a car that is more uneven than others, such as by its loads, its own drives tell it.
+    """
+    halves = {car: _halves(evidence, car, since) for car in evidence.cars}
+    variances = evidence.variances_of(half for both in halves.values() for half in both)
+    found = []
+    for car, (before, after) in halves.items():
+        (was, _), (now, _) = before, after
+        own = evidence.variances_of((before, after))
+        uneven = {name: max(one, own.get(name, 0.0)) for name, one in variances.items()}
+        of_was, of_now = (
+            with_others(half[0], evidence.scatter(half, uneven, same_roads=True))
+            for half in (before, after)
+        )
+        for name in CAR_NUMBERS:
+            if name in of_was and name in of_now:
+                error = three_digits(sqrt(of_was[name] + of_now[name]))
+                one, other = float(evidence.level(was[name])), float(evidence.level(now[name]))
+                if abs(other - one) > SURE_ERRORS * error:
+                    found.append(ChangedNumber(car, name, one, other, error))
+    return found
+
+
+def _halves(evidence: CarEvidence, car: str, since: date) -> tuple[Piece, Piece]:
+    before, after = {}, {}
+    for kind, at in evidence.slices(car).items():
+        early = sum(day < since for _, day, _ in evidence.sums[kind].drives[at])
+        before[kind] = slice(at.start, at.start + early)
+        after[kind] = slice(at.start + early, at.stop)
+    return (evidence.tell(before), before), (evidence.tell(after), after)
+
+
+def convergence(evidence: CarEvidence) -> tuple[Convergence, ...]:
+    """Return how sure the numbers are after so many drives of a car."""
+    most = max(
+        (
+            len(range(*s.indices(s.stop)))
+            for one in evidence.sums.values()
+            for s in one.cars.values()
+        ),
+        default=0,
+    )
+    return tuple(row for step in STEPS if step <= most for row in _converged(evidence, step))
+
+
+def _converged(evidence: CarEvidence, step: int) -> list[Convergence]:
+    stated: dict[NumberName, list[float]] = {}
+    differences: dict[NumberName, list[float]] = {}
+    for car in evidence.cars:
+        first, others = evidence.slices(car, 0, step), evidence.slices(car, step, 2 * step)
+        if any(at.stop - at.start < step for at in first.values()):
+            continue
+        told = evidence.tell(first)
+        for name, error in evidence.uncertainties(told, first).items():
+            stated.setdefault(name, []).append(error)
+        if all(at.stop - at.start == step for at in others.values()):
+            for name, other in evidence.tell(others).items():
+                if name in told:
+                    apart = float(told[name].value - other.value)
+                    differences.setdefault(name, []).append(apart)
+    return [
+        Convergence(
+            name,
+            step,
+            len(stated[name]),
+            three_digits(_root_mean_square(stated[name])),
+            three_digits(_root_mean_square(differences[name]) / sqrt(2))
+            if name in differences
+            else None,
+        )
+        for name in CAR_NUMBERS
+        if name in stated
+    ]
+
+
+def _root_mean_square(values: Sequence[float]) -> float:
+    squares: FloatArray = np.square(values)
+    return float(np.sqrt(squares.mean()))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The numbers of every car of a cohort.
+
+    Attributes:
+        cars: the numbers of each car, by its `vehicle_id`; a number is missing that its drives do
+            not tell.
+        logs_version, grams_version: versions of the Delta tables that were read.
+        evidence: sums and variances that the numbers came from.
+    """
+
+    cars: Mapping[str, Mapping[NumberName, CalibratedNumber]]
+    logs_version: int
+    grams_version: int
+    evidence: CarEvidence
+
+    def car(self, vehicle_id: str) -> Mapping[NumberName, CalibratedNumber]:
+        """Return the numbers of a car. Raises `QuestionError` if no drive is of it."""
+        if vehicle_id not in self.cars:
+            raise QuestionError(
+                f"no drive of a car {vehicle_id!r} tells its numbers. See: fleet-slip sql "
+                '"SELECT DISTINCT vehicle_id FROM drives"'
+            )
+        return self.cars[vehicle_id]
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Return the integer counts of every car's numbers."""
+        return {
+            car: {name: one.count for name, one in numbers.items()}
+            for car, numbers in self.cars.items()
+        }
+
+    @property
+    def roads(self) -> Roads:
+        """What the roads of all cars have in common."""
+        return self.evidence.roads
+
+    def changed(self, since: date | str) -> list[ChangedNumber]:
+        """Return the numbers of cars that are others from a day on."""
+        return changed_numbers(self.evidence, date_of(since, "since"))
+
+    def convergence(self) -> tuple[Convergence, ...]:
+        """Return how sure the numbers are after 1, 2, 5, 10 ... drives of a car."""
+        return convergence(self.evidence)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `calibrate --json` prints."""
+        return {
+            "logs_version": self.logs_version,
+            "grams_version": self.grams_version,
+            "numbers": {name: one.model_dump(mode="json") for name, one in CAR_NUMBERS.items()},
+            "cars": {
+                car: {name: vars(one) for name, one in numbers.items()}
+                for car, numbers in self.cars.items()
+            },
+            "missing": {
+                car: refused for car in self.cars if (refused := self.evidence.refusals(car))
+            },
+            "roads": {
+                "banked": self.roads.banked,
+                "lean_mps2": None if self.roads.lean is None else float(self.roads.lean),
+                "uncertainty": self.roads.uncertainty,
+                "cars": self.roads.cars,
+            },
+            "convergence": [vars(one) for one in self.convergence()],
+        }
+
+
+TABLE = pa.schema(
+    [
+        ("vehicle_id", pa.string()),
+        ("receiver", pa.string()),
+        ("number", pa.string()),
+        ("value", pa.float64()),
+        ("uncertainty", pa.float64()),
+        ("unit", pa.string()),
+        ("count", pa.int64()),
+        ("grain", pa.float64()),
+        ("drives", pa.int64()),
+        ("rows", pa.int64()),
+        ("cars", pa.int64()),
+    ]
+)
+"""The table `calibration`. A row of a type of receiver has no `vehicle_id`, but `cars`."""
+
+
+def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
+    """Return the numbers that Gram rows of `calibration` tell of every car of a cohort.
+
+    With those of the sets that satellites tell more by, as far as there are any.
+    """
+    sums = collect_sums(opened.batches(condition), KINDS)
+    known = features()
+    for name, kinds in kinds_by_set().items():
+        if name in known.sets:
+            beside = replace(opened, identity=known.identity(name))
+            sums |= collect_sums(beside.batches(condition), kinds)
+    evidence = CarEvidence(sums)
+    cars = {car: evidence.calibrated(car) for car in evidence.cars}
+    return Calibration(cars, opened.logs_version, opened.grams_version, evidence)
+
+
+def calibration_table(opened: OpenedGrams, of_delay: OpenedGrams) -> pa.Table:
+    """Return the table `calibration` that SQL sees: a row for each car and number.
+
+    Of the Gram rows that there are: none are required. `of_delay` are those of the set `delay`,
+    which tell how late satellite receivers are: also a row for each type, and one for its spread.
+    """
+    told = receiver_delays(of_delay.batches(parse_condition(ALL_DRIVES)))
+    found = calibration_of(opened, parse_condition(ALL_DRIVES))
+    rows = [
+        {
+            "vehicle_id": car,
+            "number": name,
+            **vars(one),
+            "unit": CAR_NUMBERS[name].unit,
+            "grain": float(CAR_NUMBERS[name].grain),
+        }
+        for car, numbers in found.cars.items()
+        for name, one in numbers.items()
+    ]
+    return pa.Table.from_pylist([*rows, *_rows_of_delay(told)], schema=TABLE)
+
+
+def _rows_of_delay(told: ReceiverDelays) -> Iterator[dict[str, Any]]:
+    rows = [{"vehicle_id": car, **vars(one)} for car, one in told.cars.items()]
+    for name, one in told.types.items():
+        cars = [car for car in told.cars.values() if car.receiver == name]
+        of_type = {
+            "receiver": name,
+            "cars": len(cars),
+            "drives": sum(car.drives for car in cars),
+            "rows": sum(car.rows for car in cars),
+        }
+        error = math.hypot(one.mean_error, LASTING_S)
+        rows.append({**of_type, "value": one.mean, "uncertainty": error})
+        spread = {"number": SPREAD, "value": one.spread, "uncertainty": one.spread_error}
+        rows.append({**of_type, **spread})
+    grain = float(SAMPLE_TIME_S)
+    for row in rows:
+        count = round(row["value"] / grain)
+        yield {"number": RECEIVER_DELAY, "unit": "s", "count": count, "grain": grain, **row}
+
+
+def calibrate(
+    source: Warehouse | GramReader, condition: str | Condition = ALL_DRIVES
+) -> Calibration:
+    """Return the numbers of every car that has drives of a cohort, from their Gram rows.
+
+    Drives without a label count as others do. Raises `QuestionError` for an invalid condition,
+    and `DataError` if no drive satisfies it or the Gram rows of `calibration` are missing.
+    """
+    condition = parse_condition(condition)
+    with open_grams(source, CALIBRATION, condition) as opened:
+        found = calibration_of(opened, condition)
+    if not found.cars:
+        of = "" if condition.text == ALL_DRIVES else f" of {condition.text!r}"
+        raise DataError(f"no drive{of} has yaw rate, ay and wheel speeds. Choose another cohort.")
+    return found
+
+
+# What the course of each drive comes to, from the Gram rows of any set of changes that tell it.
+
+Moments = Mapping[str, Mapping[str, FloatArray]]
+"""Sums of products of 1, `COLUMNS` and the label in SI units, by car and drive, shape (6, 6)."""
+
+
+def course_moments(reader: GramReader, condition: Condition) -> Moments:
+    """Return the moments of each drive that has changes of the course.
+
+    Of the first feature set whose Gram rows are there for the whole cohort; empty without one.
+    """
+    for name in features().sets:
+        one = features().feature_set(name)
+        if one.change_ticks and set(COLUMNS) <= set(one.columns):
+            try:
+                opened = reader.opened(name, condition)
+            except DataError:  # it has not been computed, or not for all
+                continue
+            found: dict[str, dict[str, FloatArray]] = {}
+            for batch in opened.batches(condition):
+                for names, rows, _ in by_signals(batch):
+                    if not set(COLUMNS) <= set(names.split(",")):
+                        continue
+                    cars, drives = (rows[key].to_pylist() for key in ("vehicle_id", "drive_id"))
+                    for car, drive, own in zip(
+                        cars, drives, _moments(gram_table(names, rows)), strict=True
+                    ):
+                        of_car = found.setdefault(str(car), {})
+                        of_car[drive] = of_car.get(drive, 0.0) + own
+            if found:
+                return found
+    return {}
+
+
+def _moments(table: GramTable) -> FloatArray:
+    """Return the moments of each row, shape (rows, 6, 6)."""
+    label = catalogue().label
+    columns = (*COLUMNS, label)
+    known = {name: float(scale) for name, scale in input_scales().items()}
+    known |= {COLUMNS[-1]: turned_scale(), label: float(catalogue()[label].scale)}
+    scales = np.array([1.0, *(known[name] for name in columns)])
+    some, size = table.restrict(columns), len(columns) + 1
+    full = np.empty((len(table), size, size))
+    full[:, 0, 0] = some.n
+    full[:, 0, 1:] = full[:, 1:, 0] = some.sums
+    lower = np.tril_indices(len(columns))
+    full[:, 1 + lower[0], 1 + lower[1]] = some.products
+    full[:, 1 + lower[1], 1 + lower[0]] = some.products
+    return np.asarray(full * np.outer(scales, scales))

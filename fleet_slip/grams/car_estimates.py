@@ -1,0 +1,376 @@
+"""From the sums of a car's drives to its numbers: three relations between its sensors.
+
+A car without side-slip of its own accord turns as fast as its velocity does, and a road that is
+banked in bends takes a part of the lateral acceleration that grows with their curvature:
+ay = d + rho v (r - b) + s r/v, with the offsets d and b, and the true speed rho v. On flat roads s
+is zero, and what is left is a plane, r = b + (ay/v)/rho - (d/rho)/v. The same yaw
+rate is one of the wheels' differences; unequal radii add wheel speed times their difference, tyres
+under load ay times speed: r = b + (differences)/track + e v + f ay v. And a steering angle is one
+of curvature and of ay (Ackermann angle and understeer). Means over drives make the changes of
+side-slip vanish. The gyroscope's noise is in r and in r/v. Where both are inputs beside each other
+it is taken out of their squares.
+"""
+
+from collections.abc import Mapping
+from fractions import Fraction
+from functools import cache
+
+from fleet_slip.catalogue.course import (
+    FEWEST_CHANGES,
+    LEAST_TURNED_RAD,
+    LEVERS_M,
+    TURNED,
+    turned_scale,
+)
+from fleet_slip.catalogue.facts import BY_COURSE, BY_SATELLITE, NumberName
+from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.grams.telling import (
+    ALIKE,
+    EVEN,
+    NO_COURSE,
+    NO_STEERING,
+    NO_TYRE,
+    STRAIGHT,
+    TIGHT_BENDS,
+    Telling,
+    Told,
+)
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms, solve
+
+LEAST_TURNING_RAD_S = Fraction(2, 100)
+"""Standard deviation of how fast the direction changes, below which a car drove too straight. The
+noise of accelerometers is a third of it."""
+
+LEAST_CHANGE_OF_SPEED = {False: Fraction(5, 100), True: Fraction(10, 100)}
+"""Standard deviation of one over speed over its mean, below which a car drove too evenly to tell
+the offset of one sensor from that of the other; on banked roads also the bank from speed."""
+
+TIGHT_1PM = Fraction(1, 50)
+"""Standard deviation of curvature beyond which bends are mostly so tight that their bank does not
+grow with curvature any more: it looks like speed."""
+
+OF_COURSE: tuple[NumberName, ...] = ("yaw_rate_offset", "ay_offset", "speed_ratio")
+OF_WHEELS: tuple[NumberName, ...] = ("yaw_rate_offset_by_wheels",)
+OF_STEERING: tuple[NumberName, ...] = ("steering_offset", "steer_per_curvature", "understeer")
+"""The numbers of each relation."""
+
+LEAST_CURVATURE_1PM = Fraction(1, 1000)
+SPEED_RATIOS = {False: (Fraction(4, 5), Fraction(5, 4)), True: (Fraction(3, 4), Fraction(4, 3))}
+"""What tyres there are; on roads as they are, also what bodies that roll make of ay. A ratio beyond
+it says that noise, not driving, made the fit."""
+
+FLAT = Relation(
+    instruments=(ONE, "course_rate", "slowness"),
+    left=(
+        ((ONE, ONE), ("course_rate", ONE), ("slowness", ONE)),
+        (("course_rate", ONE), ("course_rate", "course_rate"), ("course_rate", "slowness")),
+        (("slowness", ONE), ("course_rate", "slowness"), ("slowness", "slowness")),
+    ),
+    right=(("yaw_rate", ONE), ("yaw_rate", "course_rate"), ("yaw_rate", "slowness")),
+    noise={},
+)
+"""The yaw rate by 1, ay/v and 1/v: the unknowns b, 1/rho and -d/rho. Least squares."""
+
+COURSE = Relation(
+    instruments=(ONE, "slowness", "course_rate", "curvature"),
+    left=(
+        ((ONE, ONE), ("yaw_rate", "speed"), ("speed", ONE), ("curvature", ONE)),
+        (("slowness", ONE), ("yaw_rate", ONE), (ONE, ONE), ("curvature", "slowness")),
+        (("course_rate", ONE), ("yaw_rate", "ay"), ("ay", ONE), ("curvature", "course_rate")),
+        (("curvature", ONE), ("yaw_rate", "yaw_rate"), ("yaw_rate", ONE), ("curvature",) * 2),
+    ),
+    right=(("ay", ONE), ("course_rate", ONE), ("ay", "course_rate"), ("ay", "curvature")),
+    noise={(3, 1): (ONE, ONE), (3, 3): ("slowness", "slowness")},
+)
+"""ay by 1, r v, v and r/v: the unknowns d, rho, -rho b and the bank of bends."""
+
+WHEELS = Relation(
+    instruments=COURSE.instruments,
+    left=(
+        ((ONE, ONE), ("wheels", ONE), ("speed", ONE), ("ay", "speed")),
+        (("slowness", ONE), ("wheels", "slowness"), (ONE, ONE), ("ay", ONE)),
+        (("course_rate", ONE), ("wheels", "course_rate"), ("ay", ONE), ("ay", "ay")),
+        (("curvature", ONE), ("wheels", "curvature"), ("yaw_rate", ONE), ("ay", "yaw_rate")),
+    ),
+    right=(
+        ("yaw_rate", ONE),
+        ("yaw_rate", "slowness"),
+        ("yaw_rate", "course_rate"),
+        ("yaw_rate", "curvature"),
+    ),
+    noise={(3, 4): (ONE, "slowness")},
+)
+"""The yaw rate by 1, the wheels' differences, v and ay v: the unknowns b and three of the tyres."""
+
+STEERING = Relation(
+    instruments=(ONE, "bend", "ay"),
+    left=(
+        ((ONE, ONE), ("bend", ONE), ("ay", ONE)),
+        (("bend", ONE), ("bend", "bend"), ("bend", "ay")),
+        (("ay", ONE), ("bend", "ay"), ("ay", "ay")),
+    ),
+    right=(("steer", ONE), ("steer", "bend"), ("steer", "ay")),
+    noise={(1, 1): ("slowness", "slowness")},
+)
+"""The steering by 1, curvature without the gyroscope's offset, and ay."""
+
+WHEEL_SPEEDS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
+_COURSE = ("yaw_rate", "ay", *WHEEL_SPEEDS, "curvature", "course_rate", "slowness")
+KINDS: Mapping[str, tuple[str, ...]] = {
+    "course": _COURSE,
+    "steering": (*_COURSE, "steer_fl", "steer_fr"),
+}
+"""The columns of each kind of sums."""
+
+
+def _si(**weights: int) -> dict[str, Fraction]:
+    scales = input_scales()
+    return {name: weight * scales[name] for name, weight in weights.items()}
+
+
+@cache
+def course_terms() -> Terms:
+    """Return the terms of the relations of course and wheels."""
+    speed = input_scales()["speed"] / 4
+    return {
+        **{name: _si(**{name: 1}) for name in ("yaw_rate", "ay", *_COURSE[-3:])},
+        "speed": dict.fromkeys(WHEEL_SPEEDS, speed),
+        "wheels": _si(wheel_rr=1, wheel_rl=-1, wheel_fr=1, wheel_fl=-1),
+    }
+
+
+def steering_terms(yaw_rate_offset: Fraction) -> Terms:
+    """Return the terms of the relation of steering."""
+    slowness = {name: -yaw_rate_offset * w for name, w in _si(slowness=1).items()}
+    return {
+        **course_terms(),
+        "steer": {name: weight / 2 for name, weight in _si(steer_fl=1, steer_fr=1).items()},
+        "bend": {**_si(curvature=1), **slowness},
+    }
+
+
+def tell_numbers(sums: Mapping[str, Gram | None], banked: bool) -> Told:
+    """Return the numbers that the sums of a car's drives tell, by kind; exactly.
+
+    `banked`: whether bends are, on the fleet's roads (`road_lean`). A number is missing where its
+    columns are, where the sums do not determine it, or where the car drove too straight or too
+    evenly to tell it from noise.
+    """
+    told = Told()
+    course, steering = sums.get("course"), sums.get("steering")
+    if course is None or course.n == 0:
+        told.take((*OF_WHEELS, *OF_COURSE, *OF_STEERING), NO_COURSE)
+        return told
+    of_course = ExactSums(course, course_terms())
+    noise = gyroscope_noise(course, steering)
+    if of_course.variance("course_rate") < LEAST_TURNING_RAD_S**2 or noise is None:
+        told.take((*OF_WHEELS, *OF_COURSE, *OF_STEERING), STRAIGHT)
+        return told
+    told.take(OF_WHEELS, _tell_wheels(of_course, noise))
+    change = LEAST_CHANGE_OF_SPEED[banked] * of_course.mean("slowness")
+    if of_course.variance("slowness") < change**2:
+        told.take((*OF_COURSE, *OF_STEERING), EVEN)
+        return told
+    found = _tell_course(of_course, noise if banked else None)
+    told.take(OF_COURSE, found)
+    if isinstance(found, str):
+        told.take(OF_STEERING, found)
+    elif steering is None or steering.n == 0:
+        told.take(OF_STEERING, NO_STEERING)
+    else:
+        told.take(OF_STEERING, _tell_steering(found, steering, noise if banked else Fraction(0)))
+    if of_course.variance("curvature") > TIGHT_1PM**2 and "speed_ratio" in told.numbers:
+        del told.numbers["speed_ratio"]
+        told.take(("speed_ratio",), TIGHT_BENDS)
+    return told
+
+
+def bank_of_bends(sums: Mapping[str, Gram]) -> Fraction | None:
+    """Return s, what of ay grows with curvature, m^2/s^2; None if a car's drives do not tell it."""
+    course = sums.get("course")
+    if course is None or (noise := gyroscope_noise(course, sums.get("steering"))) is None:
+        return None
+    solution = solve(COURSE.system(ExactSums(course, course_terms()), noise))
+    return solution[-1] if solution else None
+
+
+def gyroscope_noise(course: Gram, steering: Gram | None) -> Fraction | None:
+    """Return what no other sensor says of the yaw rate: the variance of the gyroscope's noise."""
+    inputs = ("wheels", "speed", "course_rate")
+    if steering is None:
+        return ExactSums(course, course_terms()).residual_variance("yaw_rate", inputs)
+    sums = ExactSums(steering, steering_terms(Fraction(0)))
+    return sums.residual_variance("yaw_rate", (*inputs, "steer"))
+
+
+def _tell_course(sums: ExactSums, noise: Fraction | None) -> dict[NumberName, Telling] | str:
+    """Tell by the relation of flat roads, or with a noise by that of banked ones."""
+    relation, noise = (FLAT, Fraction(0)) if noise is None else (COURSE, noise)
+    solution = solve(relation.system(sums, noise))
+    if solution is None or not solution[1]:
+        return ALIKE
+    gradients: dict[NumberName, tuple[float, ...]]
+    if relation is FLAT:
+        yaw_rate_offset, slope, of_slowness = solution
+        ay_offset, ratio = -of_slowness / slope, 1 / slope
+        gradients = {
+            "yaw_rate_offset": (1.0, 0.0, 0.0),
+            "ay_offset": (0.0, float(of_slowness / slope**2), float(-ratio)),
+            "speed_ratio": (0.0, float(-(ratio**2)), 0.0),
+        }
+    else:
+        ay_offset, ratio, of_speed, _ = solution
+        yaw_rate_offset = -of_speed / ratio
+        gradients = {
+            "yaw_rate_offset": (0.0, float(of_speed / ratio**2), float(-1 / ratio), 0.0),
+            "ay_offset": (1.0, 0.0, 0.0, 0.0),
+            "speed_ratio": (0.0, 1.0, 0.0, 0.0),
+        }
+    least, most = SPEED_RATIOS[relation is COURSE]
+    if not least <= ratio <= most:
+        return NO_TYRE
+    found: dict[NumberName, Telling] = {}
+    values = (yaw_rate_offset, ay_offset, ratio)
+    for (name, gradient), value in zip(gradients.items(), values, strict=True):
+        lean, terms = Fraction(name == "ay_offset"), course_terms()
+        found[name] = Telling("course", relation, terms, noise, value, gradient, {}, lean)
+    return found
+
+
+def _tell_wheels(sums: ExactSums, noise: Fraction) -> dict[NumberName, Telling] | str:
+    solution = solve(WHEELS.system(sums, noise))
+    if solution is None:
+        return ALIKE
+    of_wheels = ("course", WHEELS, course_terms(), noise)
+    told = Telling(*of_wheels, solution[0], (1.0, 0.0, 0.0, 0.0), {})
+    return {"yaw_rate_offset_by_wheels": told}
+
+
+def _tell_steering(
+    found: Mapping[NumberName, Telling], gram: Gram, noise: Fraction
+) -> dict[NumberName, Telling] | str:
+    yaw_rate_offset, ay_offset = found["yaw_rate_offset"].value, found["ay_offset"].value
+    terms = steering_terms(yaw_rate_offset)
+    sums = ExactSums(gram, terms)
+    solution = solve(STEERING.system(sums, noise))
+    if solution is None or sums.variance("bend") < LEAST_CURVATURE_1PM**2:
+        return STRAIGHT
+    straight, by_bend, understeer = solution
+
+    also: dict[NumberName, float] = {
+        "yaw_rate_offset": float(by_bend * sums.mean("slowness")),
+        "ay_offset": float(understeer),
+    }
+    of_plane = ("steering", STEERING, terms, noise)
+    value = straight + understeer * ay_offset
+    gradient = (1.0, 0.0, float(ay_offset))
+    return {
+        "steering_offset": Telling(*of_plane, value, gradient, also, by_lean=understeer),
+        "steer_per_curvature": Telling(*of_plane, by_bend, (0.0, 1.0, 0.0), {}),
+        "understeer": Telling(*of_plane, understeer, (0.0, 0.0, 1.0), {}),
+    }
+
+
+# What a satellite receiver tells of a car beyond its own sensors: its speed, and how it slips.
+#
+# The satellite's speed over that of the wheels is the speed ratio, whatever a body that rolls or a
+# bank adds to the accelerometer. And the course changes by more than the yaw rate's integral as
+# the side-slip angle does, which on roads is l r/v + K ay: the rear axle is l behind the centre of
+# gravity, and gives way by K (`catalogue/course_relation.py`). Both are of speeds by wheels of .31
+# m.
+
+SATELLITE = "satellite_speed"
+"""The kind of sums that tells the speed ratio, and its column."""
+SLIP = "slip"
+"""The kind of sums that tells how a car slips: changes over some seconds."""
+
+LASTING_BY_SATELLITE: Mapping[str, Mapping[NumberName, float]] = {
+    SATELLITE: {"speed_ratio": 0.0012},
+    SLIP: {"slip_lever": 0.1, "slip_compliance": 0.0003},
+}
+"""Standard errors that no drive takes away, by kind: tyres slip and wear; a receiver of which we
+know to 5 ms how late it is moves l by the way of that time."""
+
+NO_RECEIVER = (
+    "no course by satellite: none is logged, or its Gram rows are missing (fleet-slip gram "
+    "--features calibration_course)"
+)
+FEW_TURNS = "its course by satellite has too few turns"
+NO_CAR = "its course by satellite is none of a car: look at the receiver, and where its antenna is"
+"""Why a number is missing."""
+
+SPEED = Relation(instruments=(ONE,), left=((("speed", ONE),),), right=((SATELLITE, ONE),), noise={})
+"""The satellite's speed by that of the wheels. Neither delay nor noise changes a mean."""
+
+_BY = (ONE, "curvature", "ay", TURNED)
+CHANGE = Relation(
+    instruments=_BY,
+    left=tuple(tuple((a, b) for b in _BY) for a in _BY),
+    right=tuple((SLIP, a) for a in _BY),
+    noise={},
+)
+"""The label's change by 1, r/v, ay and the angle turned: the gyroscope's bias, l, K and its scale.
+Least squares."""
+
+
+def kinds_by_set() -> dict[str, dict[str, tuple[str, ...]]]:
+    """Return the columns of each kind of sums, by the feature set that has them."""
+    return {
+        BY_SATELLITE: {SATELLITE: (*WHEEL_SPEEDS, "slowness", SATELLITE)},
+        BY_COURSE: {SLIP: ("curvature", "ay", TURNED, catalogue().label)},
+    }
+
+
+def tell_by_satellite(sums: Mapping[str, Gram], told: Told) -> None:
+    """Add the numbers that satellites tell of a car, from the sums of its drives; exactly.
+
+    They replace what its own sensors tell.
+    """
+    told.numbers.update(_speed_ratio(sums.get(SATELLITE)))
+    told.take(("slip_lever", "slip_compliance"), _slip(sums.get(SLIP)))
+
+
+def _speed_ratio(gram: Gram | None) -> dict[NumberName, Telling]:
+    if gram is None or gram.n == 0:
+        return {}
+    scales = input_scales()
+    terms = {
+        "speed": dict.fromkeys(WHEEL_SPEEDS, scales["speed"] / 4),
+        SATELLITE: {SATELLITE: catalogue()[SATELLITE].exact_scale},
+    }
+    solution = solve(SPEED.system(ExactSums(gram, terms), 0))
+    least, most = SPEED_RATIOS[True]
+    if solution is None or not least <= solution[0] <= most:
+        return {}
+    told = Telling(SATELLITE, SPEED, terms, Fraction(0), solution[0], (1.0,), {})
+    return {"speed_ratio": told}
+
+
+def _slip(gram: Gram | None) -> dict[NumberName, Telling] | str:
+    if gram is None or gram.n == 0:
+        return NO_RECEIVER
+    terms = slip_terms()
+    sums = ExactSums(gram, terms)
+    if gram.n < FEWEST_CHANGES or sums.variance(TURNED) < Fraction(LEAST_TURNED_RAD) ** 2:
+        return FEW_TURNS
+    solution = solve(CHANGE.system(sums, 0))
+    if solution is None or not LEVERS_M[0] <= solution[1] <= LEVERS_M[1]:
+        return NO_CAR
+    of_plane = (SLIP, CHANGE, terms, Fraction(0))
+    return {
+        "slip_lever": Telling(*of_plane, solution[1], (0.0, 1.0, 0.0, 0.0), {}),
+        "slip_compliance": Telling(*of_plane, solution[2], (0.0, 0.0, 1.0, 0.0), {}),
+    }
+
+
+def slip_terms() -> Terms:
+    """Return the terms of the relation of the course's changes."""
+    scales = input_scales()
+    return {
+        "curvature": {"curvature": scales["curvature"]},
+        "ay": {"ay": scales["ay"]},
+        TURNED: {TURNED: Fraction(turned_scale())},
+        SLIP: {catalogue().label: catalogue()[catalogue().label].exact_scale},
+    }

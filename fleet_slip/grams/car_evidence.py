@@ -1,0 +1,368 @@
+"""What a car's drives are evidence of: its numbers, and how sure they are.
+
+How sure they are is told by how much single drives move them: drives are the independent pieces of
+evidence. One drive has no other to differ from, so that the variance of residuals, as drives
+differ, is that of the whole fleet; how much a car's driving tells is its own. Drives go over the
+same roads again, so that there is a limit to what more of them tell.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from math import hypot, sqrt
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.catalogue.facts import CAR_NUMBERS, NumberName
+from fleet_slip.grams.car_estimates import (
+    LASTING_BY_SATELLITE,
+    bank_of_bends,
+    tell_by_satellite,
+    tell_numbers,
+)
+from fleet_slip.grams.reader import DriveSums
+from fleet_slip.grams.telling import Telling, Told
+from fleet_slip.regression.exact import sqrt as sqrt_exact
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import DriveTermSums, Influence, influence
+
+# What the roads of a fleet have in common: they lean to one side, and are banked in bends.
+#
+# No car alone tells a road that always leans from an accelerometer that is off. The offsets of many
+# cars are of both signs; the road's lean is not. So what all cars share is the road's: the median.
+
+FEWEST_CARS = 10
+"""Fewer do not tell the road's lean from their own offsets."""
+
+BANKED_M2PS2 = Fraction(-5)
+"""Lateral acceleration that bends take per curvature, from which on roads are banked: half a
+percent in bends of 100 m. Noise and slip make a fifth of it on flat ones."""
+
+USUAL_LEAN_MPS2 = 0.2
+"""A crown of 2 %: the standard error of a lean that nobody can tell."""
+
+SURE = Fraction(31)
+"""Square of three standard errors of a median over that of the median deviation and over one less
+the number of cars: 3 x 1.2533 x 1.4826, of normal numbers."""
+
+
+@dataclass(frozen=True)
+class Roads:
+    """The roads of a fleet.
+
+    Attributes:
+        banked: whether bends are, as far as anybody can tell.
+        lean: m/s^2, what they add to every car's lateral acceleration; None if nobody can tell.
+        uncertainty: standard error of the lean.
+        cars: how many told it.
+    """
+
+    banked: bool
+    lean: Fraction | None
+    uncertainty: float
+    cars: int
+
+    @property
+    def hide_offsets(self) -> bool:
+        """Whether nobody can tell how an accelerometer is off from how the roads lean."""
+        return self.banked and self.lean is None
+
+
+def are_banked(banks: Sequence[Fraction]) -> bool:
+    """Tell by the bank that each car met whether roads are banked: unless they surely are flat.
+
+    Sure are three standard errors; fewer than `FEWEST_CARS` go by their median. The relation of
+    banked roads holds on flat ones, too, but not the other way round.
+    """
+    if not banks:
+        return False
+    beyond = median(banks) - BANKED_M2PS2
+    if beyond <= 0 or len(banks) < FEWEST_CARS:
+        return beyond < 0
+    return beyond**2 <= _square_of_three_errors(banks)
+
+
+def roads_of(banked: bool, offsets: Sequence[Fraction]) -> Roads:
+    """Return the roads by what each car's accelerometer says when it goes straight.
+
+    The median less the part that may be of the cars: with m the median and e its standard error,
+    m - (3 e)^2 / m, zero within three standard errors. So no car's number jumps as a fleet grows.
+    What is left of it is uncertain as well.
+    """
+    if not banked:
+        return Roads(banked, None, 0.0, len(offsets))
+    if len(offsets) < FEWEST_CARS:
+        return Roads(banked, None, USUAL_LEAN_MPS2, len(offsets))
+    middle, square = median(offsets), _square_of_three_errors(offsets)
+    left = middle if middle**2 <= square else square / middle
+    return Roads(banked, middle - left, hypot(sqrt_exact(square) / 3, float(left)), len(offsets))
+
+
+def _square_of_three_errors(values: Sequence[Fraction]) -> Fraction:
+    middle = median(values)
+    return SURE * median([abs(value - middle) for value in values]) ** 2 / len(values)
+
+
+ROADS = 8
+"""So many drives are as good as endless ones: more are on the same roads again, whose slopes are
+the same."""
+
+LEAST_PART = 1e-9
+"""A drive of which the others of its car are less than this part has no other to differ from."""
+
+PAIRS = 300
+"""Cars of which two drives are compared: enough to tell a variance to a tenth."""
+
+LASTING: Mapping[bool, Mapping[NumberName, float]] = {
+    False: {
+        "yaw_rate_offset_by_wheels": 0.001,
+        "steering_offset": 0.00004,
+        "speed_ratio": 0.0015,
+    },
+    True: {
+        "yaw_rate_offset": 0.0007,
+        "yaw_rate_offset_by_wheels": 0.001,
+        "steering_offset": 0.0002,
+        "speed_ratio": 0.03,
+    },
+}
+"""Standard errors that no drive takes away, on flat and on banked roads: noise flattens and wheels
+slip. Where bends are banked, a body that leans 2 to 6 degrees per g makes its accelerometer say 3
+to 10 % more, which is no speed."""
+
+OF_A_DRIVE: Mapping[NumberName, float] = {"yaw_rate_offset_by_wheels": 0.002}
+"""Standard error that each drive adds however much it tells: a circuit turns to one side more than
+to the other, and makes wheels slip to that side. Two drives on one circuit do not show it."""
+
+
+Piece = tuple[Mapping[NumberName, Telling], Mapping[str, slice]]
+"""Some drives of a car: what they tell, and where they stand by kind."""
+
+
+@dataclass(frozen=True)
+class CalibratedNumber:
+    """One number of one car.
+
+    Attributes:
+        value: in its SI unit; the exact rational rounded once.
+        count: the integer count of its grain that models and boards use.
+        uncertainty: standard error in the same unit; None if no car has two drives.
+        drives, rows: what tells it.
+    """
+
+    value: float
+    count: int
+    uncertainty: float | None
+    drives: int
+    rows: int
+
+
+LEANS = (
+    "roads are banked, and may always lean to one side, which nobody can tell from the car's own "
+    f"offset: {FEWEST_CARS} cars or more can"
+)
+BEYOND = "it is beyond what 16 bits count of its grain"
+"""Why a number is missing."""
+
+
+class CarEvidence:
+    """Sums of the drives of all cars, and the variance of residuals as drives differ."""
+
+    def __init__(self, sums: Mapping[str, DriveSums]) -> None:
+        """Take the sums by kind of plane, and learn the variances."""
+        self.sums = sums
+        self._moments = {kind: one.moments() for kind, one in sums.items()}
+        self.cars = sorted({car for one in sums.values() for car in one.cars})
+        banks = [bank_of_bends(self._totals(self.slices(car))) for car in self.cars]
+        self._banked = are_banked([bank for bank in banks if bank is not None])
+        self._whole = {car: self._tell(self.slices(car)) for car in self.cars}
+        self.told = {car: whole.numbers for car, whole in self._whole.items()}
+        offsets = [told["ay_offset"].value for told in self.told.values() if "ay_offset" in told]
+        self.roads = roads_of(self._banked, offsets)
+        self.variances = self.variances_of((self.told[car], self.slices(car)) for car in self.cars)
+        self.variances_of_one = self._variances_of_one()
+
+    def slices(self, car: str, first: int = 0, last: int | None = None) -> dict[str, slice]:
+        """Return where the drives `first` to `last` of a car stand, by kind."""
+        found = {}
+        for kind, one in self.sums.items():
+            if car in one.cars:
+                every = range(*one.cars[car].indices(len(one.drives)))[first:last]
+                found[kind] = slice(every.start, every.stop)
+        return found
+
+    def _totals(self, slices: Mapping[str, slice]) -> dict[str, Gram]:
+        return {
+            kind: self.sums[kind].table.take(_range(at)).total()
+            for kind, at in slices.items()
+            if at.stop > at.start
+        }
+
+    def tell(self, slices: Mapping[str, slice]) -> dict[NumberName, Telling]:
+        """Return the numbers that some drives tell, with the lean of their roads."""
+        return self._tell(slices).numbers
+
+    def _tell(self, slices: Mapping[str, slice]) -> Told:
+        totals = self._totals(slices)
+        told = tell_numbers(totals, self._banked)
+        tell_by_satellite(totals, told)
+        return told
+
+    def influence(self, telling: Telling, at: slice) -> Influence | None:
+        """Return how drives move a number."""
+        signals = self.sums[telling.kind].table.signals
+        sums = DriveTermSums(self._moments[telling.kind][at], signals, telling.terms)
+        return influence(telling.relation, sums, float(telling.noise), telling.gradient)
+
+    def variances_of(self, pieces: Iterable[Piece]) -> dict[NumberName, float]:
+        """Return the variance of residuals, as drives differ, of each number's plane.
+
+        A drive's shift, about the number of its piece, has the variance times its share times one
+        less the part of the share in the piece's. Every drive counts the same: errors do not grow
+        with shares as noise does, and drives that tell little would decide for those that tell
+        much.
+        """
+        ratios: dict[NumberName, list[float]] = {}
+        for told, slices in pieces:
+            for name, telling in told.items():
+                found = self.influence(telling, slices[telling.kind])
+                if found is None:
+                    continue
+                expected = found.shares * (1 - found.shares / found.shares.sum())
+                alone = expected <= LEAST_PART * found.shares
+                ratios.setdefault(name, []).extend(
+                    (found.shifts[~alone] ** 2 / expected[~alone]).tolist()
+                )
+        return {name: sum(some) / len(some) for name, some in ratios.items() if some}
+
+    def _variances_of_one(self) -> dict[NumberName, float]:
+        """Return the same of the numbers that one drive tells: how far a car's first two differ.
+
+        What makes roads differ, such as the bank of their bends, moves a number that several roads
+        tell at once; one road alone explains its own.
+        """
+        ratios: dict[NumberName, list[float]] = {}
+        pairs = [
+            car for car in self.cars if all(s.stop - s.start > 1 for s in self.slices(car).values())
+        ]
+        for car in pairs[:PAIRS]:
+            one, other = (self._of_drive(car, drive) for drive in (0, 1))
+            for name in one.keys() & other.keys():
+                apart = one[name][0] - other[name][0]
+                ratios.setdefault(name, []).append(apart**2 / (one[name][1] + other[name][1]))
+        return {name: sum(some) / len(some) for name, some in ratios.items()}
+
+    def _of_drive(self, car: str, drive: int) -> dict[NumberName, tuple[float, float]]:
+        """Return the numbers that a drive alone tells, and their shares."""
+        at = self.slices(car, drive, drive + 1)
+        found = {}
+        for name, telling in self.tell(at).items():
+            influence_of_it = self.influence(telling, at[telling.kind])
+            if influence_of_it is not None:
+                found[name] = float(telling.value), float(influence_of_it.shares.sum())
+        return found
+
+    def scatter(
+        self, piece: Piece, variances: Mapping[NumberName, float], *, same_roads: bool = False
+    ) -> dict[NumberName, float]:
+        """Return the variances of what some drives tell, as drives differ.
+
+        With `same_roads`, of what they tell beside other drives on these roads: that they go over
+        them again is no error then.
+        """
+        told, slices = piece
+        own: dict[NumberName, float] = {}
+        for name, telling in told.items():
+            found = self.influence(telling, slices[telling.kind])
+            if found is None or name not in variances:
+                continue
+            drives = len(found.shares)
+            of_one = self.variances_of_one if drives == 1 else variances
+            again = 1 if same_roads else 1 + drives / ROADS
+            told_by_it = of_one.get(name, variances[name]) * float(found.shares.sum())
+            own[name] = told_by_it * again + OF_A_DRIVE.get(name, 0.0) ** 2 / drives
+        return own
+
+    def uncertainties(
+        self, told: Mapping[NumberName, Telling], slices: Mapping[str, slice]
+    ) -> dict[NumberName, float]:
+        """Return the standard errors of what some drives tell."""
+        own = self.scatter((told, slices), self.variances)
+        for name in own:
+            by_satellite = LASTING_BY_SATELLITE.get(told[name].kind, {})
+            own[name] += {**LASTING[self._banked], **by_satellite}.get(name, 0.0) ** 2
+        common = self.roads.uncertainty
+        return {
+            name: sqrt(variance + (common * float(told[name].by_lean)) ** 2)
+            for name, variance in with_others(told, own).items()
+        }
+
+    def level(self, telling: Telling) -> Fraction:
+        """Return a number as it is without the lean of the roads."""
+        return telling.value - (self.roads.lean or 0) * telling.by_lean
+
+    def calibrated(
+        self, car: str, drives: int | None = None, *, leaning: bool = False
+    ) -> dict[NumberName, CalibratedNumber]:
+        """Return the numbers of a car, by all of its drives or by the first so many.
+
+        `ay_offset` is missing where nobody can tell it from the lean of the roads; with `leaning`
+        it is there with it, as the accelerometer says on these roads.
+        """
+        slices = self.slices(car, 0, drives)
+        told = self.told[car] if drives is None else self.tell(slices)
+        sure = self.uncertainties(told, slices)
+        found: dict[NumberName, CalibratedNumber] = {}
+        for name in CAR_NUMBERS:
+            if name in told and (leaning or not self._hidden(name)):
+                at = slices[told[name].kind]
+                rows = int(self.sums[told[name].kind].table.n[at].sum())
+                value = self.level(told[name])
+                count = CAR_NUMBERS[name].count(value)
+                if count is None:
+                    continue
+                found[name] = CalibratedNumber(
+                    value=float(value),
+                    count=count,
+                    uncertainty=three_digits(sure[name]) if name in sure else None,
+                    drives=at.stop - at.start,
+                    rows=rows,
+                )
+        return found
+
+    def _hidden(self, name: NumberName) -> bool:
+        return name == "ay_offset" and self.roads.hide_offsets
+
+    def refusals(self, car: str) -> dict[NumberName, str]:
+        """Return why numbers of a car are missing."""
+        whole = self._whole[car]
+        found: dict[NumberName, str] = {}
+        for name in CAR_NUMBERS:
+            if name not in whole.numbers:
+                found[name] = whole.missing[name]
+            elif self._hidden(name):
+                found[name] = LEANS
+            elif CAR_NUMBERS[name].count(self.level(whole.numbers[name])) is None:
+                found[name] = BEYOND
+        return found
+
+
+def with_others(
+    told: Mapping[NumberName, Telling], own: Mapping[NumberName, float]
+) -> dict[NumberName, float]:
+    """Return variances of numbers with those of others that they depend on."""
+    return {
+        name: variance + sum(d**2 * own.get(n, 0.0) for n, d in told[name].also.items())
+        for name, variance in own.items()
+    }
+
+
+def _range(at: slice) -> Any:
+    return np.arange(at.start, at.stop)
+
+
+def three_digits(value: float) -> float:
+    """Return an uncertainty as it is stated, which is the same on every machine."""
+    return float(f"{value:.3g}")

@@ -1,1 +1,0 @@
-"""From Gram rows to the sums of cohorts, folds, days and cars."""

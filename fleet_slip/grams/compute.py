@@ -1,0 +1,859 @@
+"""Computes the Gram rows of log files: plain sets by `jobs/gram.sql`, windows by the kernel."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import partial
+from itertools import pairwise
+from math import ceil
+from os import cpu_count
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from fleet_slip.base import BoolArray, FloatArray, IntArray, Progress, no_progress, number_of
+from fleet_slip.catalogue.course import (
+    COARSER,
+    COURSE,
+    COURSE_LATE,
+    OVER,
+    course_units,
+    split_late,
+    with_changes,
+)
+from fleet_slip.catalogue.definitions import COUNT_BITS
+from fleet_slip.catalogue.features import LAG, PLAIN, FeatureCatalogue, FeatureSet, features
+from fleet_slip.catalogue.signals import HALF_TURN, SignalCatalogue
+from fleet_slip.columns.drive_columns import DriveCounts, Workspace
+from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
+from fleet_slip.columns.sql import with_absent, with_columns
+from fleet_slip.compute.tasks import LocalThreads, in_flight, run_tasks
+from fleet_slip.config import read_sql
+from fleet_slip.errors import DataError, StorageError
+from fleet_slip.storage.table import TableFile, absent_columns
+from fleet_slip.warehouse.database import open_database, reading_files
+from fleet_slip.warehouse.tables import Warehouse
+
+# The rows of drives, one drive at a time in the order of time: from log files, or from a query.
+
+
+@dataclass(frozen=True)
+class LoggedDrive:
+    """A drive of a log file: what it is, its metadata, and its counts."""
+
+    drive_id: str
+    metadata: Mapping[str, Any]
+    counts: DriveCounts
+
+
+def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iterator[LoggedDrive]:
+    """Yield a log file's drives in the order of time; as in SQL, none without a row of tick 0."""
+    drive_columns = tuple(warehouse.catalogue.drive)
+    present = warehouse.logs.read_metadata(file.path).schema.to_arrow_schema().names
+    wanted = [name for name in (*drive_columns, "tick", *plan.signals) if name in present]
+    rows = warehouse.logs.read(file.path, wanted)
+    for one in rows_by_drive(rows):
+        ticks = one["tick"].to_numpy()
+        if (ticks[1:] < ticks[:-1]).any():
+            order = np.argsort(ticks, kind="stable")
+            one, ticks = one.take(order), ticks[order]  # noqa: PLW2901
+        at = int(np.searchsorted(ticks, 0))
+        if at < len(ticks) and ticks[at] == 0:
+            metadata = {
+                name: one[name][at].as_py() if name in wanted else None for name in drive_columns
+            }
+            yield LoggedDrive(str(metadata["drive_id"]), metadata, counts_of(one, plan, metadata))
+
+
+def counts_of(
+    rows: pa.Table,
+    plan: ColumnPlan,
+    facts: Mapping[str, Any] | None = None,
+    numbers: Mapping[str, int] | None = None,
+) -> DriveCounts:
+    """Return a drive's rows, in the order of time, as what a plan is computed from.
+
+    Facts are by default the first row's; `numbers` are what the car's drives told of it.
+    """
+    counts, present = {}, {}
+    for name in plan.signals:
+        if name not in rows.column_names:
+            counts[name] = np.zeros(len(rows), dtype=np.int16)
+            present[name] = np.zeros(len(rows), dtype=np.bool_)
+            continue
+        column = rows[name].combine_chunks()
+        if column.null_count:
+            present[name] = column.is_valid().to_numpy(zero_copy_only=False)
+            column = column.fill_null(0)
+        counts[name] = column.to_numpy()
+    known = facts if facts is not None else {name: rows[name][0].as_py() for name in plan.facts}
+    return DriveCounts(rows["tick"].to_numpy(), counts, present, known, numbers or {})
+
+
+def drives_of_stream(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
+    """Yield the rows of each drive from batches that are sorted by drive."""
+    waiting: list[pa.Table] = []
+    for batch in batches:
+        for part in rows_by_drive(pa.Table.from_batches([batch])):
+            if waiting and waiting[0]["drive_id"][0] != part["drive_id"][0]:
+                yield pa.concat_tables(waiting)
+                waiting = []
+            waiting.append(part)
+    if waiting:
+        yield pa.concat_tables(waiting)
+
+
+def rows_by_drive(rows: pa.Table) -> Iterator[pa.Table]:
+    """Yield the rows of each drive, in their order."""
+    ids = rows["drive_id"].combine_chunks()
+    if not pa.types.is_dictionary(ids.type):
+        ids = pc.dictionary_encode(ids)
+    drive_of_row = ids.indices.to_numpy()
+    starts = np.flatnonzero(np.diff(drive_of_row, prepend=-1))
+    if len(starts) > len(np.unique(drive_of_row[starts])):  # the rows of drives are mixed
+        order = np.argsort(drive_of_row, kind="stable")
+        rows, drive_of_row = rows.take(order), drive_of_row[order]
+        starts = np.flatnonzero(np.diff(drive_of_row, prepend=-1))
+    for start, stop in pairwise([*starts.tolist(), rows.num_rows]):
+        yield rows.slice(start, stop - start)
+
+
+# What divides a drive into several Gram rows, in SQL and for arrays: bands, blocks, row folds.
+
+UNKNOWN_PART = "unknown"
+"""Part of the rows whose regime is not known because a signal is absent."""
+
+UNKNOWN = -1
+
+BLOCK_FORMAT = "block %04d"
+"""Names that sort as numbers do."""
+
+
+@dataclass(frozen=True)
+class Bands:
+    """The bands of a signal or feature, or of its size: the least count of all but the first."""
+
+    of: str
+    absolute: bool
+    bounds: tuple[int, ...]
+    names: tuple[str, ...]
+
+    @property
+    def sql(self) -> str:
+        """The SQL of a row's band; null where the signal is."""
+        value = f"abs({self.of}::INTEGER)" if self.absolute else self.of
+        return "(" + " + ".join(f"({value} >= {bound})::INTEGER" for bound in self.bounds) + ")"
+
+    def __call__(self, counts: FloatArray) -> FloatArray:
+        """Return the band of each row, shape (rows,); NaN where the count is."""
+        size = np.abs(counts) if self.absolute else counts
+        reached = np.searchsorted(np.array(self.bounds, dtype=np.float64), size, side="right")
+        return np.where(np.isnan(counts), np.nan, reached)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """How the rows of a drive are divided: by at most one of bands, blocks, folds and times.
+
+    Combined bands run with the last fastest. `times` are what columns change over, if several; each
+    has all rows.
+    """
+
+    bands: tuple[Bands, ...] = ()
+    block_ticks: int | None = None
+    row_folds: int | None = None
+    times: tuple[str, ...] = ()
+
+    @classmethod
+    def of_set(cls, known: FeatureCatalogue, one: FeatureSet) -> "Parts":
+        """Return what divides the rows of a feature set."""
+        bands = []
+        for name in one.regimes:
+            regime = known.regimes[name]
+            scale = known.of(regime.of).exact_scale
+            # Counts are whole, so that reaching a bound is reaching the next whole count.
+            bounds = tuple(math.ceil(Fraction(bound) / scale) for bound in regime.bounds)
+            bands.append(Bands(regime.of, regime.absolute, bounds, regime.bands))
+        times = tuple(f"{time_s:f} s" for time_s in one.change_s)
+        return cls(tuple(bands), one.block_ticks, one.row_folds, times if len(times) > 1 else ())
+
+    def __bool__(self) -> bool:
+        return bool(self.bands or self.block_ticks or self.row_folds or self.times)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the times, or of the combinations of bands."""
+        if self.times:
+            return self.times
+        names = [""]
+        for bands in self.bands:
+            names = [f"{name}, {band}".removeprefix(", ") for name in names for band in bands.names]
+        return tuple(names)
+
+    @property
+    def number_sql(self) -> str:
+        """SQL of a row's part, a number from 0; null where it is not known."""
+        if self.row_folds:
+            return _row_fold_sql(self.row_folds)
+        if self.block_ticks:
+            return f"tick // {self.block_ticks}"
+        if self.times:
+            return OVER
+        number = "0"
+        for bands in self.bands:
+            number = f"({number}) * {len(bands.names)} + {bands.sql}"
+        return number
+
+    def name_sql(self, number: str) -> str:
+        """Return the SQL of a part's name, given that of its number."""
+        if self.row_folds:
+            return f"({number} + 1)::VARCHAR"
+        if self.block_ticks:
+            return f"printf('{BLOCK_FORMAT}', {number} + 1)"
+        names = ", ".join(f"'{name}'" for name in self.names)
+        return f"coalesce([{names}][{number} + 1], '{UNKNOWN_PART}')"
+
+    def numbers(self, ticks: NDArray[Any], counts: Mapping[str, FloatArray]) -> IntArray:
+        """Return each row's part, (rows,), or `UNKNOWN`; `columns` are what the bands are of."""
+        if self.row_folds:
+            raise ValueError("rows are dealt into folds by SQL alone")
+        if self.block_ticks:
+            return ticks.astype(np.int64) // self.block_ticks
+        number: FloatArray = np.zeros(len(ticks))
+        for bands in self.bands:
+            number = number * len(bands.names) + bands(counts[bands.of])
+        return np.where(np.isnan(number), UNKNOWN, number).astype(np.int64)
+
+    def name(self, number: int) -> str | None:
+        """Return the name of a part; None where rows are not divided."""
+        if self.block_ticks:
+            return BLOCK_FORMAT % (number + 1)
+        if not (self.bands or self.times):
+            return None
+        return UNKNOWN_PART if number == UNKNOWN else self.names[number]
+
+
+def _row_fold_sql(count: int) -> str:
+    """Number the folds by MD5 of the drive and the 32-bit hash of Thomas Mueller of the tick."""
+    value = "((md5_number_lower(drive_id) % 4294967296)::BIGINT + tick) % 4294967296"
+    for _ in range(2):
+        value = f"xor({value}, ({value}) >> 16) * 73244475 % 4294967296"
+    return f"({value}) % {count}"
+
+
+# Fills in `jobs/gram.sql` for a feature set: its columns, and what divides a drive's rows.
+
+LOGS = "read_parquet(getvariable('log_files'), union_by_name => true, hive_partitioning => false)"
+
+_SEPARATOR = ",\n            "
+
+BITS = 63
+"""Bits of a BIGINT that are no sign."""
+
+MOST_SUMS = 8_000
+"""Sums of one grouping: DuckDB 2.0.0 ends with SIGFPE where those of a group, 24 bytes each, are
+longer than its block of 262,144 bytes."""
+
+
+def gram_statement(
+    signals: SignalCatalogue,
+    feature_set: str = PLAIN,
+    *,
+    whole: bool = False,
+    absent: Sequence[str] = (),
+) -> str:
+    """Return the statement that computes the Gram rows of a feature set.
+
+    `whole`: no file has a column in only some rows; `absent` are later columns, which none has.
+    Raises `QuestionError` for an unknown set.
+    """
+    known = features()
+    one = known.feature_set(feature_set)
+    names = one.columns
+    windows = known.definitions(feature_set)
+    regimes = [known.regimes[name].of for name in one.regimes]
+    used = known.rows(dict.fromkeys([*one.features, *regimes]))
+    logs = with_absent(LOGS, absent)
+    rows = _lagged(names, logs) if one.lagged else with_columns(logs, used, windows)
+    if one.change_ticks:
+        columns = (*one.signals, *one.features, *one.windows)
+        rows = with_changes(rows, columns, one.change_ticks, in_time=one.in_time)
+    wide = windows or any(feature.bits > COUNT_BITS for feature in used.values())
+    kind = "BIGINT" if wide else "INTEGER"
+    parts = Parts.of_set(known, one)
+    absent_sql, part = "0" if whole else _absent(names), parts.number_sql if parts else "NULL"
+    sums = [f"sum({name})" for name in names]
+    products = [
+        f"sum({a}::{kind} * {b}::{kind})" for i, a in enumerate(names) for b in names[: i + 1]
+    ]
+    first = MOST_SUMS - len(sums)
+    further = [products[i : i + MOST_SUMS] for i in range(first, len(products), MOST_SUMS)]
+    group = ", ".join(_group(whole=whole, divided=bool(parts)))
+    counted = ""
+    if further:
+        clipped = ", clipped" if used or windows else ""
+        kept = f"{absent_sql} AS absent, {part} AS part{clipped}, {', '.join(names)}"
+        counted = f"counted AS MATERIALIZED (\n    SELECT drive_id, {kept}\n    FROM {rows}\n),\n\n"
+        rows, absent_sql, part, group = "counted", "absent", "part", "drive_id, absent, part"
+    return read_sql("jobs", "gram.sql").format(
+        drive_columns=", ".join(
+            signals.null_sql(name) if name in absent else name for name in signals.drive
+        ),
+        qualified_drive_columns=", ".join(f"drive.{name}" for name in signals.drive),
+        absent=absent_sql,
+        part=part,
+        counted=counted,
+        clipped="sum(clipped)::BIGINT" if used or windows else "0",
+        sums=_SEPARATOR.join(sums),
+        products=_SEPARATOR.join(products[:first]),
+        counts=rows,
+        group=group,
+        further="".join(_further(i, some) for i, some in enumerate(further)),
+        joined="".join(_joined(i) for i in range(len(further))),
+        all_products=" || ".join(
+            ["gram.products", *(f"further_{i}.products" for i in range(len(further)))]
+        ),
+        course_late=_course_late(one.in_time),
+        part_name=parts.name_sql("gram.part") if parts else "NULL::VARCHAR",
+        names=", ".join(f"'{name}'" for name in names),
+    )
+
+
+def _course_late(in_time: bool) -> str:
+    """Return what a Gram row records of the delay that was corrected in it."""
+    known = f"getvariable('{COURSE_LATE}')[drive.vehicle_id]"
+    return f",\n    {known}::BIGINT AS {COURSE_LATE}" if in_time else ""
+
+
+def _further(number: int, products: Sequence[str]) -> str:
+    """Return further products of the groups, which have their keys to be joined by."""
+    return (
+        f",\n\nfurther_{number} AS (\n    SELECT\n        drive_id,\n        absent,\n"
+        f"        part,\n        [\n            {_SEPARATOR.join(products)}\n"
+        "        ]::BIGINT[] AS products\n    FROM counted\n    GROUP BY drive_id, absent, part\n)"
+    )
+
+
+def _joined(number: int) -> str:
+    other = f"further_{number}"
+    return (
+        f"\nJOIN {other} ON {other}.drive_id = gram.drive_id AND {other}.absent = gram.absent "
+        f"AND {other}.part IS NOT DISTINCT FROM gram.part"
+    )
+
+
+def _group(*, whole: bool, divided: bool) -> list[str]:
+    """Return the columns to group by, no constant, lest DuckDB hash a dictionary row by row."""
+    return ["drive_id", *([] if whole else ["absent"]), *(["part"] if divided else [])]
+
+
+def _absent(names: Sequence[str]) -> str:
+    """Return SQL of a number with a bit for each column that a row lacks; of many, a list."""
+    if len(names) < BITS:
+        kind = "INTEGER" if len(names) < 32 else "BIGINT"
+        return " + ".join(f"({name} IS NULL)::{kind} * {1 << i}" for i, name in enumerate(names))
+    parts = [_absent(names[first : first + BITS - 1]) for first in range(0, len(names), BITS - 1)]
+    # The last columns come first, so that lists sort as the one large number would.
+    return f"[{', '.join(f'({part})::BIGINT' for part in reversed(parts))}]"
+
+
+def _lagged(names: Sequence[str], logs: str) -> str:
+    """Return the rows that have a predecessor in their drive, with both rows' counts."""
+    now = [name for name in names if not name.endswith(LAG)]
+    lags = _SEPARATOR.join(f"lag({name}) OVER before AS {name}{LAG}" for name in now)
+    return (
+        f"(\n        SELECT\n            drive_id,\n            {', '.join(now)},\n"
+        f"            {lags}\n        FROM {logs}\n"
+        "        WINDOW before AS (PARTITION BY drive_id ORDER BY tick)\n"
+        "        QUALIFY lag(tick) OVER before = tick - 1\n    )"
+    )
+
+
+FILES_PER_QUERY = 16
+"""Planning 77 aggregates costs 20 ms, so that one query takes many files."""
+
+Late = Mapping[str, int] | None
+"""By how many parts of a tick the course of each car is late; in time where it says nothing."""
+
+LAGGED_FILES_PER_QUERY = 2
+"""Rows are sorted to find the one before, which takes memory for all rows of a query."""
+
+
+def aggregate(
+    warehouse: Warehouse,
+    files: Sequence[TableFile],
+    progress: Progress = no_progress,
+    threads: int | None = None,
+    feature_set: str = PLAIN,
+    executor: Executor | None = None,
+    late: Late = None,
+) -> pa.Table:
+    """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive."""
+    in_time = features().feature_set(feature_set).in_time
+    empty = warehouse.computed_schema(in_time=in_time).empty_table()
+    return pa.concat_tables(
+        [empty, *compute_grams(warehouse, files, progress, threads, feature_set, executor, late)]
+    )
+
+
+def compute_grams(
+    warehouse: Warehouse,
+    files: Sequence[TableFile],
+    progress: Progress = no_progress,
+    threads: int | None = None,
+    feature_set: str = PLAIN,
+    executor: Executor | None = None,
+    late: Late = None,
+) -> Iterator[pa.Table]:
+    """Yield the Gram rows of log files, one file after the other, in the schema of `grams`.
+
+    `late` is the delay of each car's course in parts of a tick. The work is done here, on all cores
+    or `threads`, or by an executor as tasks of some files and one thread each.
+    """
+    if features().feature_set(feature_set).windows:
+        own = LocalThreads(threads or cpu_count() or 1) if executor is None else None
+        with own or nullcontext():
+            task = partial(wide_grams, warehouse, feature_set=feature_set, late=late)
+            yield from _by_tasks(executor or own, task, _groups(files, 1), progress)
+        return
+    step = LAGGED_FILES_PER_QUERY if features().feature_set(feature_set).lagged else FILES_PER_QUERY
+    if executor is not None:
+        groups = _groups(files, min(step, max(1, ceil(len(files) / in_flight(executor)))))
+        task = partial(_aggregate_group, warehouse, feature_set)
+        yield from _by_tasks(executor, task, groups, progress)
+        return
+    total = sum(file.rows for file in files)
+    with open_database(reading=warehouse.logs.folder, threads=threads) as database:
+        for group in _groups(files, step):
+            yield _query(database, warehouse, group, feature_set)
+            progress(sum(file.rows for file in group), total)
+
+
+def _by_tasks(
+    executor: Executor | None,
+    task: Callable[[Sequence[TableFile]], pa.Table],
+    groups: list[Sequence[TableFile]],
+    progress: Progress,
+) -> Iterator[pa.Table]:
+    """Yield the results of tasks in the order of their files; those that are early wait."""
+    total = sum(file.rows for group in groups for file in group)
+    done: dict[str, pa.Table] = {}
+    following = iter(groups)
+    awaited = next(following, None)
+    for group, rows in run_tasks(executor, task, groups, _group_name):
+        done[group[0].path] = rows
+        progress(sum(file.rows for file in group), total)
+        while awaited is not None and awaited[0].path in done:
+            yield done.pop(awaited[0].path)
+            awaited = next(following, None)
+
+
+def _groups(files: Sequence[TableFile], step: int) -> list[Sequence[TableFile]]:
+    return [files[first : first + step] for first in range(0, len(files), step)]
+
+
+def _group_name(group: Sequence[TableFile]) -> str:
+    return f"the Gram rows of {number_of(len(group), 'log file')} from {group[0].path}"
+
+
+def _aggregate_group(
+    warehouse: Warehouse, feature_set: str, files: Sequence[TableFile]
+) -> pa.Table:
+    with open_database(reading=warehouse.logs.folder, threads=1) as database:
+        return _query(database, warehouse, files, feature_set)
+
+
+def by_sql(
+    warehouse: Warehouse, files: Sequence[TableFile], feature_set: str, late: Late = None
+) -> pa.Table:
+    """Return the Gram rows of log files as `jobs/gram.sql` defines them, of any feature set."""
+    with open_database(reading=warehouse.logs.folder) as database:
+        return _query(database, warehouse, files, feature_set, late)
+
+
+def _query(
+    database: duckdb.DuckDBPyConnection,
+    warehouse: Warehouse,
+    files: Sequence[TableFile],
+    feature_set: str,
+    late: Late = None,
+) -> pa.Table:
+    paths = {warehouse.logs.uri(file.path): file.path for file in files}
+    # Whether each signal is in all rows of a file or in none, by the Delta log's statistics.
+    whole = feature_set == PLAIN and all(
+        file.null_counts.get(signal, file.rows) in (0, file.rows)
+        for file in files
+        for signal in warehouse.catalogue.gram_signals
+    )
+    absent = absent_columns(files, warehouse.catalogue.stored_columns)
+    statement = gram_statement(warehouse.catalogue, feature_set, whole=whole, absent=absent)
+    identity = features().identity(feature_set)
+    doing = f"the Gram query over {number_of(len(files), 'log file')} in {warehouse.logs.folder}"
+    with reading_files(database, doing):
+        database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
+        set_late(database, late)
+        rows = database.sql(statement, params={"feature_set": identity}).to_arrow_table()
+    relative = pa.array([paths[path] for path in rows["file"].to_pylist()], pa.string())
+    in_time = features().feature_set(feature_set).in_time
+    return rows.set_column(rows.schema.get_field_index("file"), "file", relative).cast(
+        warehouse.computed_schema(in_time=in_time)
+    )
+
+
+def set_late(database: duckdb.DuckDBPyConnection, late: Late) -> None:
+    """Tell the statements of a connection how late the course of each car is."""
+    cars = sorted(late or {})
+    database.execute(
+        f"SET VARIABLE {COURSE_LATE} = map($cars::VARCHAR[], $late::INTEGER[])",
+        {"cars": cars, "late": [(late or {})[car] for car in cars]},
+    )
+
+
+# Sums of the changes from fix to fix of one drive, as `catalogue/course_change.py` says it in SQL.
+#
+# Only rows with a fix are kept, at most one in ten: they fit into memory.
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """The rows of a drive that have a fix.
+
+    Attributes:
+        ticks, yaw_rate: of all rows, shape (rows,); NaN where the rate is missing.
+        at, course: the rows with a fix and their courses in counts, shape (fixes,).
+        gain: what the label gains per count of r, see `split_late`.
+        counts, clipped: the columns of those rows, (columns, fixes), and how many were clipped.
+        first_clipped: how many columns of the first row were clipped.
+    """
+
+    ticks: IntArray
+    yaw_rate: FloatArray
+    at: IntArray
+    course: IntArray
+    gain: int
+    counts: FloatArray
+    clipped: FloatArray
+    first_clipped: FloatArray
+
+
+@dataclass(frozen=True)
+class Changes:
+    """The changes of a drive's columns between fixes that are so many ticks apart.
+
+    `rows` are those with a change; `columns` end in `BESIDE` and the label, NaN where missing.
+    """
+
+    rows: IntArray
+    columns: FloatArray
+    clipped: FloatArray
+
+
+def find_fixes(workspace: Workspace, drive: DriveCounts, late: int = 0) -> Fixes:
+    """Return the fixes of the loaded drive, its course and yaw rate last, `late` by so much."""
+    ticks = drive.ticks.astype(np.int64)
+    whole, gain = split_late(late)
+    at, course = _fixes(drive, ticks, whole)
+    yaw_rate = np.empty(workspace.rows)
+    values: list[FloatArray] = []
+    clipped: list[FloatArray] = []
+    first_clipped = np.zeros(0)
+    for first in range(0, workspace.rows, BLOCK_ROWS):
+        workspace.compute_block(first)
+        block, here = workspace.block(first)
+        yaw_rate[first : first + block.shape[1]] = block[-1]
+        begin, end = np.searchsorted(at, (first, first + block.shape[1]))
+        fixed = at[begin:end] - first
+        values.append(block[:-2].take(fixed, axis=1))
+        clipped.append(here[fixed])
+        first_clipped = here[:1].copy() if first == 0 else first_clipped
+    return Fixes(
+        ticks,
+        yaw_rate,
+        at,
+        course,
+        gain,
+        np.concatenate(values, axis=1),
+        np.concatenate(clipped),
+        first_clipped,
+    )
+
+
+def course_changes(fixes: Fixes, apart: int) -> Changes:
+    """Return the changes of a drive's columns between fixes that are so many ticks apart."""
+    at, yaw_rate = fixes.at, fixes.yaw_rate
+    before, now = _pairs(fixes.ticks[at], apart)
+    turned, known = _twice_turned(fixes.ticks, yaw_rate, at[before], at[now])
+    before, now, turned = before[known], now[known], turned[known]
+    rest = fixes.gain * (yaw_rate[at[now]] - yaw_rate[at[before]]).astype(np.int64)
+    change, sound = _change(fixes.course[now] - fixes.course[before], turned, rest)
+    before, now, turned, change = before[sound], now[sound], turned[sound], change[sound]
+    straight = _straight(yaw_rate[at[before]], yaw_rate[at[now]], turned)
+    beside = [_rounded(turned, COARSER), straight, straight * change]  # `BESIDE`
+    began = fixes.ticks[:1] == 0  # no change: so a drive without a course is remembered
+    first, size = int(began.sum()), len(fixes.counts)
+    columns = np.full((size + len(beside) + 1, first + len(now)), np.nan)
+    columns[:size, first:] = fixes.counts.take(now, axis=1)
+    columns[:size, first:] -= fixes.counts.take(before, axis=1)
+    columns[size:, first:] = [*beside, change]
+    return Changes(
+        np.concatenate([np.flatnonzero(began), at[now]]),
+        columns,
+        np.concatenate([fixes.first_clipped[began], fixes.clipped[now]]),
+    )
+
+
+def _fixes(drive: DriveCounts, ticks: IntArray, whole: int) -> tuple[IntArray, IntArray]:
+    fixed = np.flatnonzero(drive.present.get(COURSE, np.ones(len(ticks), dtype=np.bool_)))
+    place = np.searchsorted(ticks, ticks[fixed] - whole)
+    there = ticks[np.minimum(place, len(ticks) - 1)] == ticks[fixed] - whole
+    return place[there], drive.counts[COURSE][fixed[there]].astype(np.int64)
+
+
+def _straight(before: FloatArray, now: FloatArray, turned: IntArray) -> IntArray:
+    """Return 1 where the car went straight on, by the yaw rate at both fixes and in between."""
+    units = course_units()
+    slow = np.maximum(np.abs(before), np.abs(now)) <= units.slow
+    straight: IntArray = (slow & (np.abs(turned) <= units.unturned)).astype(np.int64)
+    return straight
+
+
+def _pairs(ticks: IntArray, apart: int) -> tuple[IntArray, IntArray]:
+    if not ticks.size:
+        return ticks, ticks
+    place = np.minimum(np.searchsorted(ticks, ticks - apart), ticks.size - 1)
+    later = np.flatnonzero(ticks[place] == ticks - apart)
+    return place[later], later
+
+
+def _twice_turned(
+    ticks: IntArray, yaw_rate: FloatArray, before: IntArray, now: IntArray
+) -> tuple[IntArray, BoolArray]:
+    """Return J between pairs of rows, and where no tick's yaw rate is missing in between."""
+    missing = np.isnan(yaw_rate)
+    counts = np.where(missing, 0.0, yaw_rate).astype(np.int64)
+    total, gaps = np.cumsum(counts), np.cumsum(missing)
+    turned = 2 * (total[now] - total[before]) - counts[now] + counts[before]
+    whole = ticks[now] - ticks[before] == now - before
+    return turned, whole & (gaps[now] == gaps[before]) & ~missing[before]
+
+
+def _change(course: IntArray, turned: IntArray, rest: IntArray) -> tuple[IntArray, BoolArray]:
+    """Return the change of the side-slip angle in counts of the label, and where it is one."""
+    units = course_units()
+    left = units.turn * course - 2 * HALF_TURN * turned + rest
+    whole = 2 * HALF_TURN * units.turn
+    left -= whole * _rounded(left, whole)
+    return _rounded(left, units.divisor), np.abs(left) <= units.largest
+
+
+def _rounded(number: IntArray, divisor: int) -> IntArray:
+    half: IntArray = (2 * np.abs(number) + divisor) // (2 * divisor)
+    return np.sign(number) * half
+
+
+# Gram rows of feature sets with windows, from the columns of log files: what SQL says, faster.
+#
+# Drives are gone through once, in time. Columns are integers below 2^19 in binary64, whose products
+# and block sums stay below 2^53: exact in any order. Sums of blocks have 64 bits.
+
+_EXACT = 2**53
+_INT64 = 2**63
+
+
+def wide_grams(
+    warehouse: Warehouse,
+    files: Sequence[TableFile],
+    feature_set: str,
+    late: Mapping[str, int] | None = None,
+) -> pa.Table:
+    """Return the Gram rows of log files for a feature set, as `jobs/gram.sql` would, sorted.
+
+    `late` is the course's delay of cars, in parts of a tick. Raises `DataError` for a drive that
+    cannot be looked back on, `StorageError` for sums of more than 64 bits.
+    """
+    one = features().feature_set(feature_set)
+    workspace = Workspace(ColumnPlan.of_set(features(), feature_set))
+    plan = workspace.plan
+    identity = features().identity(feature_set)
+    schema = warehouse.computed_schema(in_time=one.in_time)
+    columns: dict[str, list[Any]] = {name: [] for name in schema.names}
+    # Files are shared out among threads; a BLAS with threads of its own would be in their way.
+    with threadpool_limits(1, user_api="blas"):
+        for file in sorted(files, key=lambda one: one.path):
+            for drive in sorted(read_drives(warehouse, file, plan), key=lambda one: one.drive_id):
+                _append_rows(
+                    columns,
+                    workspace,
+                    one,
+                    drive,
+                    {
+                        "feature_set": identity,
+                        "file": file.path,
+                        "day": file.day,
+                        COURSE_LATE: (late or {}).get(drive.metadata["vehicle_id"]),
+                    },
+                )
+    return pa.table(columns, schema=schema)
+
+
+def _append_rows(
+    columns: dict[str, list[Any]],
+    workspace: Workspace,
+    one: FeatureSet,
+    drive: LoggedDrive,
+    known: Mapping[str, Any],
+) -> None:
+    parts = Parts.of_set(features(), one)
+    where = f"{known['file']}: drive {drive.drive_id}"
+    try:
+        if one.change_ticks:
+            late = (known[COURSE_LATE] or 0) if one.in_time else 0
+            found = change_sums(workspace, drive.counts, one.change_ticks, late)
+        else:
+            found = drive_sums(workspace, parts, drive.counts)
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from None
+    for absent, part in sorted(found, key=_last_if_unknown):
+        sums = found[absent, part]
+        names = [name for i, name in enumerate(one.columns) if not absent >> i & 1]
+        lower = np.tril_indices(len(names))
+        row = {
+            **drive.metadata,
+            **known,
+            "part": parts.name(part),
+            "signals": ",".join(names),
+            "n": sums.n,
+            "clipped": sums.clipped,
+            "sums": sums.sums,
+            "products": sums.products[lower],
+        }
+        for name, values in columns.items():
+            values.append(row[name])
+
+
+@dataclass
+class PartSums:
+    """Sums of the rows of a drive, or of a part of it, that have the same columns."""
+
+    size: int
+    n: int = 0
+    clipped: int = 0
+    sums: NDArray[np.int64] = field(init=False)
+    products: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.sums = np.zeros(self.size, dtype=np.int64)
+        self.products = np.zeros((self.size, self.size), dtype=np.int64)
+
+    def add(self, block: FloatArray, clipped: FloatArray) -> None:
+        """Add complete rows, shape (columns, rows), and what was clipped in each."""
+        self.n += block.shape[1]
+        self.clipped += int(clipped.sum())
+        self.sums += block.sum(axis=1).astype(np.int64)
+        self.products += (block @ block.T).astype(np.int64)
+
+    def add_totals(self, totals: NDArray[np.int64]) -> None:
+        """Add what `Workspace.add_blocks` has added up: a lower triangle, and sums."""
+        lower = np.tril(totals[: self.size, : self.size])
+        self.products += lower + np.tril(lower, -1).T
+        self.sums += totals[-1, : self.size]
+
+
+Kind = tuple[int, int]
+"""Which columns rows lack, a number of one bit each, and which part of the drive they are."""
+
+
+def _last_if_unknown(kind: Kind) -> tuple[int, bool, int]:
+    """Sort as SQL does: an unknown part, which is null there, comes last."""
+    absent, part = kind
+    return absent, part == UNKNOWN, part
+
+
+def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[Kind, PartSums]:
+    """Return the sums of a drive's rows, by columns missing and part; raises as `wide_grams`."""
+    plan, total = workspace.plan, len(counts.ticks)
+    largest = max(plan.limits)
+    exact_rows = (_EXACT - 1) // largest**2
+    if exact_rows < BLOCK_ROWS or total * largest**2 >= _INT64:
+        raise StorageError(f"the drive has {total:,} rows: too many for 64-bit sums.")
+    workspace.load(counts)
+    complete, totals = PartSums(len(plan.names)), workspace.totals()
+    found = {(0, 0): complete}
+    first = 0
+    while first < total:
+        if parts:
+            workspace.compute_block(first)
+        else:
+            first, lacks, rows, clipped = workspace.add_blocks(first, exact_rows, totals)
+            complete.n += rows
+            complete.clipped += clipped
+            if not lacks:
+                continue
+        first += _add_by_kind(found, workspace, parts, counts.ticks, first)
+    complete.add_totals(totals)
+    return {kind: sums for kind, sums in found.items() if sums.n}
+
+
+def change_sums(
+    workspace: Workspace, counts: DriveCounts, times: Sequence[int], late: int = 0
+) -> dict[Kind, PartSums]:
+    """Return the sums of a drive's changes, by columns missing and time; the course is `late`."""
+    largest = 2 * max(workspace.plan.limits)
+    exact_rows = (_EXACT - 1) // largest**2
+    if len(counts.ticks) * largest**2 >= _INT64:
+        raise StorageError(f"the drive has {len(counts.ticks):,} rows: too many for 64-bit sums.")
+    workspace.load(counts)
+    fixes = find_fixes(workspace, counts, late)
+    found: dict[Kind, PartSums] = {}
+    for part, apart in enumerate(times):
+        changes = course_changes(fixes, apart)
+        for (absent, _), rows in _kinds(changes.columns, None):
+            has = [i for i in range(len(changes.columns)) if not absent >> i & 1]
+            sums = found.setdefault((absent, part), PartSums(len(has)))
+            for first in range(0, len(rows), exact_rows):
+                some = rows[first : first + exact_rows]
+                block = changes.columns.take(some, axis=1)
+                sums.add(block if len(has) == len(block) else block[has], changes.clipped[some])
+    return found
+
+
+def _add_by_kind(
+    found: dict[Kind, PartSums],
+    workspace: Workspace,
+    parts: Parts,
+    ticks: NDArray[Any],
+    first: int,
+) -> int:
+    """Add the rows of a block, which are of several kinds; return how many there are."""
+    block, clipped = workspace.block(first)
+    last = first + len(clipped)
+    numbers = parts.numbers(ticks[first:last], workspace.beside(first)) if parts else None
+    for (absent, part), rows in _kinds(block, numbers):
+        has = [i for i in range(len(block)) if not absent >> i & 1]
+        few = block[np.ix_(np.array(has, dtype=np.int64), rows)]
+        found.setdefault((absent, part), PartSums(len(has))).add(few, clipped[rows])
+    return len(clipped)
+
+
+def _kinds(block: FloatArray, numbers: IntArray | None) -> Iterator[tuple[Kind, NDArray[np.int64]]]:
+    lacks = np.isnan(block)
+    some = np.flatnonzero(lacks.any(axis=0))  # few, as a rule: patterns take sorting
+    pattern_of_row, absents = np.zeros(block.shape[1], dtype=np.int64), [0]
+    if len(some):
+        packed = np.packbits(lacks[:, some], axis=0, bitorder="little")
+        patterns, of_some = np.unique(packed, axis=1, return_inverse=True)
+        absents += [int.from_bytes(one.tobytes(), "little") for one in patterns.T]
+        pattern_of_row[some] = 1 + of_some.reshape(-1)
+    part = 0 if numbers is None else numbers
+    kind_of_row = part * len(absents) + pattern_of_row
+    for kind in np.unique(kind_of_row).tolist():
+        number, pattern = divmod(kind, len(absents))
+        yield (absents[pattern], number), np.flatnonzero(kind_of_row == kind)

@@ -1,0 +1,327 @@
+"""Makes the table `grams` agree with the active files of `logs`.
+
+One commit adds Gram rows of new log files and drops those of inactive ones: one rule for new days,
+interrupted and repeated runs, deletions and compaction.
+"""
+
+import json
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from datetime import date
+
+import pyarrow as pa
+import pyarrow.compute as pc
+from deltalake.transaction import AddAction
+
+from fleet_slip.base import Progress, no_progress, number_of
+from fleet_slip.catalogue.facts import DELAY, RECEIVED_FILES
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.errors import ConflictError, StorageError
+from fleet_slip.grams.compute import aggregate, compute_grams
+from fleet_slip.grams.gram_files import (
+    LoggedDrives,
+    files_to_rewrite,
+    has_received,
+    is_of_received,
+    rows_to_keep,
+    write_rows,
+)
+from fleet_slip.grams.receiver_delay import course_delays, files_of_other_delay
+from fleet_slip.storage.table import Change, Snapshot, TableFile, Unit, retry_conflicts
+from fleet_slip.warehouse.tables import Warehouse
+
+# How the tables `logs` and `grams` differ.
+
+BEING_WRITTEN_HOURS = 1.0
+"""A file that no commit ever knew and that is younger may belong to a job that is running."""
+
+
+@dataclass(frozen=True)
+class Backlog:
+    """How `grams` and `logs` differ."""
+
+    missing: tuple[TableFile, ...]
+    stale: frozenset[str]
+    """Paths in `grams`, of any set, that are no active log file, and none that may become one."""
+
+
+def find_backlog(logs: Snapshot, grams: Snapshot, identity: str = PLAIN) -> Backlog:
+    """Compare active log files with those that Gram rows of a feature set's `identity` name."""
+    done, named = named_files(grams, identity)
+    active = {file.path for file in logs.files}
+    return Backlog(
+        missing=tuple(file for file in logs.files if file.path not in done),
+        stale=frozenset(named - active - _about_to_land(logs, named - active)),
+    )
+
+
+def named_files(grams: Snapshot, identity: str) -> tuple[set[str], set[str]]:
+    """Return the log files that Gram rows of a feature set name, and those that any name."""
+    done: set[str] = set()
+    named: set[str] = set()
+    for file in grams.files:
+        if is_of_received(file):  # of no log
+            continue
+        pairs = grams.table.read_combinations(file.path, ["feature_set", "file"])
+        named.update(name for name in pairs["file"].to_pylist() if _has_log(name))
+        done.update(pairs["file"].filter(pc.equal(pairs["feature_set"], identity)).to_pylist())
+    return done, named
+
+
+def _has_log(file: str) -> bool:
+    """Whether a Gram row is of a log file, rather than sent by a car."""
+    return not file.startswith(RECEIVED_FILES)
+
+
+def _about_to_land(logs: Snapshot, paths: Collection[str]) -> set[str]:
+    """Return the log files that a job has written and not committed: their Gram rows land first."""
+    if not paths:
+        return set()
+    written = {
+        file.path
+        for file in logs.table.folder.files()
+        if file.path in paths and file.age_hours < BEING_WRITTEN_HOURS
+    }
+    return written - logs.removed() if written else set()
+
+
+def require_active(logs: Snapshot, files: Collection[TableFile]) -> None:
+    """Raise `ConflictError` if the logs have lost a file whose Gram rows are landing."""
+    lost = {file.path for file in files} - {file.path for file in logs.files}
+    if lost:
+        raise ConflictError(
+            f"{logs.table.folder}: other processes keep removing files, such as {min(lost)}. Run "
+            "the same command again."
+        )
+
+
+@dataclass(frozen=True)
+class GramReport:
+    """What a run of the job did for one feature set."""
+
+    feature_set: str
+    files_read: int
+    rows_read: int
+    files_dropped: int
+    gram_rows: int
+    logs_version: int | None
+    grams_version: int | None
+    received_dropped: int = 0
+    """Gram rows that cars had sent, of drives whose logs have come since."""
+
+    @property
+    def changed(self) -> bool:
+        """Whether there was anything to do."""
+        return bool(self.files_read or self.files_dropped)
+
+
+def update_grams(
+    warehouse: Warehouse,
+    progress: Progress = no_progress,
+    feature_set: str = PLAIN,
+    executor: Executor | None = None,
+    among: Collection[str] | None = None,
+) -> GramReport:
+    """Bring the Gram rows of a feature set up to date. Running it again does nothing.
+
+    For an executor see `compute_grams`; `among` limits the log files read. Sets corrected for
+    receivers' delays bring `delay` up to date first, and are computed again where these moved.
+    Raises `QuestionError` for an unknown set, `StorageError`, `ConflictError` and `ClusterError`.
+    """
+    if features().feature_set(feature_set).in_time and DELAY in features().sets:
+        update_grams(warehouse, progress, DELAY, executor, among)
+    return retry_conflicts(lambda: _update_once(warehouse, progress, feature_set, executor, among))
+
+
+def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list[GramReport]:
+    """Bring up to date what was computed here before, but for `unreadable` log files."""
+    grams = warehouse.grams.snapshot()
+    identities = {name: features().identity(name) for name in (PLAIN, *features().sets)}
+    used = [n for n, i in identities.items() if grams.landed(unit_name(i)) is not None]
+    over_time = [name for name in used if features().feature_set(name).windows]
+    drives = {name: _unique(grams, identities[name], "drive_id") for name in over_time}
+    reports = []
+    for name in used:
+        among = None
+        if name in drives:
+            plain = warehouse.grams.snapshot()
+            among = set(_unique(plain, PLAIN, "file", drives[name]).to_pylist())
+        if unreadable:
+            active = {file.path for file in warehouse.logs.snapshot().files}
+            among = (active if among is None else among).difference(unreadable)
+        reports.append(update_grams(warehouse, feature_set=name, among=among))
+    return reports
+
+
+def _unique(
+    grams: Snapshot, identity: str, column: str, drives: pa.Array | None = None
+) -> pa.Array:
+    found = [pa.array([], pa.string())]
+    for file in grams.files:
+        rows = grams.table.read(file.path, list({"feature_set", "drive_id", column}))
+        mine = pc.equal(rows["feature_set"], identity)
+        if drives is not None:
+            mine = pc.and_(mine, pc.is_in(rows["drive_id"].cast(pa.string()), drives))
+        found.append(rows.filter(mine)[column].cast(pa.string()).unique())
+    return pa.concat_arrays(found).unique()
+
+
+def unit_name(identity: str) -> str:
+    """Return the name of the unit of work that lands Gram rows of a feature set."""
+    return f"gram/{identity}"
+
+
+def _update_once(
+    warehouse: Warehouse,
+    progress: Progress,
+    feature_set: str,
+    executor: Executor | None,
+    among: Collection[str] | None,
+) -> GramReport:
+    # The logs are looked at last: if they lose a drive from now on, whoever removed it changes its
+    # Gram rows after this snapshot of them, and this job's commit is a conflict.
+    grams = warehouse.grams.snapshot()
+    logs = warehouse.logs.snapshot()
+    identity = features().identity(feature_set)
+    backlog = find_backlog(logs, grams, identity)
+    if logs.version is None and backlog.stale:
+        raise StorageError(
+            f"{warehouse.logs.folder}: the logs that Gram rows were computed from are gone, of "
+            f"{number_of(len(backlog.stale), 'file')}. Nothing is changed: restore the folder from "
+            "a backup."
+        )
+    late, others = None, frozenset[str]()
+    if features().feature_set(feature_set).in_time:
+        active = {file.path: file for file in logs.files}
+        late = course_delays(grams, frozenset(active))
+        others = frozenset(files_of_other_delay(grams, identity, late) & active.keys())
+        again = [active[path] for path in sorted(others)]
+        backlog = Backlog((*backlog.missing, *again), backlog.stale)
+    if among is not None:
+        others &= frozenset(among)
+        chosen = tuple(file for file in backlog.missing if file.path in among)
+        backlog = Backlog(chosen, backlog.stale)
+    version, gram_rows = grams.version, grams.rows
+    logs_version = logs.version
+    dropped = 0
+    if backlog.missing or backlog.stale:
+        new_rows = compute_grams(
+            warehouse, backlog.missing, progress, None, feature_set, executor, late
+        )
+        merged = _Merged(grams, backlog.stale, LoggedDrives(), identity, others)
+        grams.commit_or_discard(
+            Change(
+                add=write_rows(warehouse, merged.parts(new_rows)),
+                remove=merged.replaced,
+                units=[Unit(unit_name(identity), logs_version or 0)],
+                note={
+                    "job": "gram",
+                    "feature_set": identity,
+                    "logs_version": logs_version,
+                },
+            )
+        )
+        # Who removed a file may have found no Gram row of its drives, and so have changed none; the
+        # next attempt drops those that landed.
+        require_active(logs.renewed(), backlog.missing)
+        after = warehouse.grams.snapshot()
+        version, gram_rows = after.version, after.rows
+        dropped = merged.logged.found
+    return GramReport(
+        feature_set=identity,
+        files_read=len(backlog.missing),
+        rows_read=sum(file.rows for file in backlog.missing),
+        files_dropped=len(backlog.stale),
+        gram_rows=gram_rows,
+        logs_version=logs_version,
+        grams_version=version,
+        received_dropped=dropped,
+    )
+
+
+@dataclass
+class _Merged:
+    """New Gram rows, and those of the files that are written again with them.
+
+    Attributes:
+        grams, stale: what there is, and the log files that are gone.
+        logged: the drives of the new rows: what cars sent of them goes.
+        identity, again: the feature set, and the log files that it is computed again for.
+        replaced: the files that are written again, once all parts were taken.
+    """
+
+    grams: Snapshot
+    stale: frozenset[str]
+    logged: LoggedDrives
+    identity: str
+    again: frozenset[str]
+    replaced: list[TableFile] = field(default_factory=list)
+
+    def parts(self, new_rows: Iterable[pa.Table]) -> Iterator[pa.Table]:
+        """Yield the new rows, then those that stay of the files that are written again."""
+        looked_for = has_received(self.grams)
+        for rows in new_rows:
+            if looked_for:
+                self.logged.add(rows)
+            yield rows
+        paths = {file.path for file in files_to_rewrite(self.grams, self.stale | self.again)}
+        if looked_for:
+            paths.update(file.path for file in self.logged.files_with_received(self.grams))
+        self.replaced += [file for file in self.grams.files if file.path in paths]
+        again = pa.array(sorted(self.again), pa.string())
+        for rows in rows_to_keep(self.grams, self.replaced, self.stale):
+            old = pc.and_(
+                pc.equal(rows["feature_set"], self.identity), pc.is_in(rows["file"], again)
+            )
+            kept = rows.filter(pc.invert(old)) if self.again else rows
+            yield self.logged.without_received(kept) if looked_for else kept
+
+
+# Lands the Gram rows of log files before the files themselves, where others are written again.
+#
+# They count while their log file is active: one commit exchanges both.
+
+
+def land_ahead(
+    warehouse: Warehouse, new: Sequence[AddAction], replaced: Collection[TableFile]
+) -> None:
+    """Land the Gram rows of new log files, of the feature sets that replaced ones have.
+
+    Raises `ConflictError` if a replaced file is gone, or the Gram rows change at that moment.
+    """
+    files = [_as_file(action) for action in new]
+    for name in (PLAIN, *features().sets):
+        identity = features().identity(name)
+        grams = warehouse.grams.snapshot()
+        done, _ = named_files(grams, identity)
+        missing = [file for file in files if file.path not in done]
+        if done.isdisjoint(file.path for file in replaced) or not missing:
+            continue
+        # The logs are looked at last. Whoever removes a file from them fences the Gram rows after
+        # it: a commit of Gram rows that has not seen the file go is in conflict.
+        logs = Snapshot(warehouse.logs, warehouse.logs.open_delta())  # in whatever scales
+        require_active(logs, replaced)
+        late = None
+        if features().feature_set(name).in_time:
+            late = course_delays(grams, frozenset(file.path for file in logs.files))
+        rows = aggregate(warehouse, missing, feature_set=name, late=late)
+        grams.commit_or_discard(
+            Change(
+                add=write_rows(warehouse, [rows]),
+                units=[Unit(unit_name(identity), logs.version or 0)],
+                note={"job": "gram", "feature_set": identity, "logs_version": logs.version},
+            )
+        )
+
+
+def _as_file(action: AddAction) -> TableFile:
+    stated = json.loads(action.stats)
+    day = action.partition_values.get("day")
+    return TableFile(
+        action.path,
+        stated["numRecords"],
+        action.size,
+        stated["nullCount"],
+        date.fromisoformat(day) if day else None,
+    )

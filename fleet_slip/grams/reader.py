@@ -1,0 +1,330 @@
+"""Opens the Gram rows of a warehouse, once for cohort after cohort."""
+
+import contextlib
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import date
+from functools import partial
+from typing import Any, Self
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.base import FloatArray
+from fleet_slip.catalogue.course import TURNED
+from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, LONGEST_PAUSE_S, TRAINING_DRIVES
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.config import read_sql
+from fleet_slip.errors import DataError, NotComputedError
+from fleet_slip.grams.gram_rows import by_signals, gram_table
+from fleet_slip.grams.job import find_backlog
+from fleet_slip.grams.receiver_delay import RECEIVER
+from fleet_slip.regression.gram import GramTable, packed_position, packed_size
+from fleet_slip.storage.table import Snapshot
+from fleet_slip.warehouse.condition import Condition, asking
+from fleet_slip.warehouse.tables import Warehouse, gram_snapshots, lock, open_tables
+
+# Which Gram rows a cohort is made of.
+
+
+@dataclass(frozen=True, kw_only=True)
+class CohortOrigin:
+    """Which Gram rows a cohort is made of, and which drives it leaves out.
+
+    Attributes:
+        condition: which drives, by the columns of the view `drives`.
+        logs_version, grams_version, feature_set: what was read.
+        left_out: drives of the condition that have no such Gram rows: their cars sent no log.
+    """
+
+    condition: Condition
+    logs_version: int
+    grams_version: int
+    feature_set: str = PLAIN
+    left_out: int = 0
+
+    def inputs_among(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Return the inputs that are among some columns, in the order of the feature set."""
+        known = set(names)
+        return tuple(n for n in features().feature_set(self.feature_set).inputs if n in known)
+
+    def gram_condition(self, inputs: Sequence[str]) -> str:
+        """Return the SQL condition on the view `grams` of the rows that a model is made of."""
+        known = features().calibrated
+        stored = dict.fromkeys(known[name].of if name in known else name for name in inputs)
+        wanted = ", ".join(f"'{name}'" for name in [*stored, catalogue().label])
+        return (
+            f"feature_set = '{features().identity(self.feature_set)}' AND {self.condition.sql} AND "
+            f"list_has_all(string_split(signals, ','), [{wanted}])"
+        )
+
+
+BATCH_ROWS = 2**13
+"""Gram rows of one batch: some 700 bytes each."""
+
+BATCH_NUMBERS = 2**20
+"""Most sums and products of one batch: wide rows come in smaller ones."""
+
+
+@dataclass(frozen=True)
+class OpenedGrams:
+    """A connection to Gram rows."""
+
+    database: duckdb.DuckDBPyConnection
+    identity: str
+    logs_version: int
+    grams_version: int
+
+    def statement(self, name: str, condition: Condition, **values: str) -> str:
+        """Return a statement from `jobs/` for a condition."""
+        trips = read_sql("jobs", "trips.sql").format(
+            feature_set=self.identity, longest_pause_s=LONGEST_PAUSE_S
+        )
+        values |= {"condition": condition.sql, "feature_set": self.identity, "trips": trips}
+        values |= {"receiver": RECEIVER if RECEIVER in catalogue().drive else f"NULL AS {RECEIVER}"}
+        return read_sql("jobs", name).format(**values)
+
+    def origin(self, condition: Condition) -> CohortOrigin:
+        """Return which Gram rows a cohort is made of."""
+        return CohortOrigin(
+            condition=condition,
+            logs_version=self.logs_version,
+            grams_version=self.grams_version,
+            feature_set=features().name_of(self.identity),
+            left_out=self.count_left_out(condition),
+        )
+
+    def batches(self, condition: Condition) -> Iterator[pa.RecordBatch]:
+        """Yield the Gram rows of a cohort, in any order, with the columns that tell their fold."""
+        statement = self.statement("cohort_sums.sql", condition)
+        with asking(self.database, condition):
+            yield from self.database.sql(statement).to_arrow_reader(self._batch_rows)
+
+    def count_left_out(self, condition: Condition) -> int:
+        """Return how many drives of a cohort have no Gram rows, since their cars sent no log."""
+        if self.identity == features().identity(PLAIN):
+            return 0
+        [(count,)] = self._rows(self.statement("count_without_log.sql", condition), condition)
+        return int(count)
+
+    def label_sources(self, condition: Condition) -> list[tuple[str, str | None, int]]:
+        """Return source, campaign and number of the rows of a cohort that have the label."""
+        statement = self.statement("label_sources.sql", condition, label=catalogue().label)
+        return [(source, name, int(n)) for source, name, n in self._rows(statement, condition)]
+
+    def files(self, condition: Condition) -> set[str]:
+        """Return the log files that have a drive of a cohort."""
+        return {f for (f,) in self._rows(self.statement("cohort_files.sql", condition), condition)}
+
+    def _rows(self, statement: str, condition: Condition) -> list[tuple[Any, ...]]:
+        with asking(self.database, condition):
+            return self.database.execute(statement).fetchall()
+
+    def course_delays(self, condition: Condition) -> Iterator[tuple[str, tuple[int, int]]]:
+        """Yield cars with a course, and the least and largest delay of their Gram rows in ticks."""
+        statement = self.statement("course_delays.sql", condition, turned=TURNED)
+        with asking(self.database, condition):
+            for car, least, largest in self.database.execute(statement).fetchall():
+                yield car, (least, largest)
+
+    @property
+    def _batch_rows(self) -> int:
+        name = features().name_of(self.identity)
+        numbers = packed_size(len(features().feature_set(name).columns))
+        return max(1, min(BATCH_ROWS, BATCH_NUMBERS // numbers))
+
+
+class GramReader:
+    """The newest Gram rows of a warehouse, for one cohort after another of one thread.
+
+    What was opened is used again until somebody commits: a cohort then costs its query alone.
+    """
+
+    def __init__(self, warehouse: Warehouse) -> None:
+        self._warehouse = warehouse
+        self._logs: Snapshot | None = None
+        self._grams: Snapshot | None = None
+        self._database: duckdb.DuckDBPyConnection | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
+    def opened(self, feature_set: str, condition: Condition) -> OpenedGrams:
+        """Return the Gram rows of a feature set; they are valid until the next call.
+
+        Raises `DataError` for missing Gram rows, or a set incomplete for a cohort.
+        """
+        grams, logs = gram_snapshots(self._warehouse, self._grams, self._logs)
+        if grams is not self._grams or logs is not self._logs:
+            self._close()
+        self._logs, self._grams = logs, grams
+        if not grams.rows:
+            fill = "fleet-slip simulate CAMPAIGN (or fleet-slip ingest FILE --mapping M), then "
+            raise DataError(
+                f"{self._warehouse.root}: there are no Gram rows yet. "
+                f"Run: {'' if logs.rows else fill}fleet-slip gram."
+            )
+        one = features().feature_set(feature_set)
+        for name in (feature_set, *([CALIBRATION] if one.calibrated else [])):
+            if name != PLAIN:
+                rows = partial(self._opened, grams, logs, name)
+                _require_complete(logs, grams, rows, name, condition)
+        return self._opened(grams, logs, feature_set)
+
+    def _opened(self, grams: Snapshot, logs: Snapshot, feature_set: str) -> OpenedGrams:
+        if self._database is None:
+            self._database = open_tables(self._warehouse, {"grams"}, [grams, logs])
+            lock(self._database, grams.paths)
+        return OpenedGrams(
+            self._database,
+            features().identity(feature_set),
+            logs.version or 0,
+            grams.version or 0,
+        )
+
+    def _close(self) -> None:
+        if self._database is not None:
+            self._database.close()
+            self._database = None
+
+
+@contextlib.contextmanager
+def open_grams(
+    source: Warehouse | GramReader,
+    feature_set: str,
+    condition: Condition,
+) -> Iterator[OpenedGrams]:
+    """Open the Gram rows of a feature set, anew unless by a reader; see `opened`."""
+    if isinstance(source, GramReader):
+        yield source.opened(feature_set, condition)
+    else:
+        with GramReader(source) as reader:
+            yield reader.opened(feature_set, condition)
+
+
+def _require_complete(
+    logs: Snapshot,
+    grams: Snapshot,
+    opened: Callable[[], OpenedGrams],
+    feature_set: str,
+    condition: Condition,
+) -> None:
+    backlog = find_backlog(logs, grams, features().identity(feature_set))
+    if not backlog.missing and not backlog.stale:
+        return
+    files = opened().files(condition)
+    if not files and feature_set != CALIBRATION:  # that may come from another root
+        unknown = find_backlog(logs, grams, features().identity(PLAIN)).missing
+        if unknown:
+            raise NotComputedError(
+                f"which drives satisfy {condition.text!r} is not known: {len(unknown)} log files "
+                "have no Gram rows yet. Run: fleet-slip gram && fleet-slip gram "
+                f"--features {feature_set}"
+            )
+    missing = [file for file in backlog.missing if file.path in files]
+    if missing or backlog.stale & files:
+        everything = condition.text in {ALL_DRIVES, TRAINING_DRIVES}
+        cohort = "" if everything else f" --cohort {shlex.quote(condition.text)}"
+        raise NotComputedError(
+            f"the feature set {feature_set}, as it is defined now, has not been computed for "
+            f"{len(missing)} of {len(files)} log files of the cohort. Run: fleet-slip gram "
+            f"--features {feature_set}{cohort}"
+        )
+
+
+def cohort_files(source: Warehouse | GramReader, condition: Condition) -> set[str]:
+    """Return the log files that have a drive of a cohort. Raises `DataError` without a drive."""
+    with open_grams(source, PLAIN, condition) as opened:
+        found = opened.files(condition)
+    if not found:
+        raise DataError(f"no drive satisfies {condition.text!r}.")
+    return found
+
+
+# The sums of every drive of every car, from Gram rows that are read batch by batch.
+
+Drive = tuple[str, date, str]
+"""Car, day and name: the order in which a car drove."""
+
+
+@dataclass(frozen=True)
+class DriveSums:
+    """Sums of columns over rows that have them all, by drive; `cars` tells where each begins."""
+
+    drives: tuple[Drive, ...]
+    table: GramTable
+    cars: Mapping[str, slice]
+
+    def moments(self) -> FloatArray:
+        """Return the moments of (1, columns) of each drive, shape (drives, k+1, k+1)."""
+        k = len(self.table.signals)
+        found = np.empty((len(self.table), k + 1, k + 1))
+        found[:, 0, 0] = self.table.n
+        found[:, 0, 1:] = found[:, 1:, 0] = self.table.sums
+        at = np.array([[packed_position(i, j) for j in range(k)] for i in range(k)])
+        found[:, 1:, 1:] = self.table.products[:, at]
+        return found
+
+
+@dataclass
+class SumCollector:
+    """Adds up Gram rows, drive by drive, for several sets of columns at once."""
+
+    kinds: Mapping[str, tuple[str, ...]]
+    parts: dict[str, list[GramTable]] = field(default_factory=dict)
+    drives: dict[str, list[Drive]] = field(default_factory=dict)
+
+    def add(self, batch: pa.RecordBatch) -> None:
+        """Add a batch of Gram rows; those that do not say whose they are count for nobody."""
+        for names, rows, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
+            table = gram_table(names, rows) if len(rows) else None
+            drives = list(zip(*(rows[c].to_pylist() for c in _KEY), strict=True))
+            for kind, columns in self.kinds.items():
+                if table is not None and set(columns) <= set(names.split(",")):
+                    self.parts.setdefault(kind, []).append(table.restrict(columns))
+                    self.drives.setdefault(kind, []).extend(drives)
+
+    def sums(self) -> dict[str, DriveSums]:
+        """Return what was added, by kind."""
+        return {
+            kind: _sorted(parts, self.drives[kind])
+            for kind, parts in self.parts.items()
+            if self.drives[kind]
+        }
+
+
+_KEY = ("vehicle_id", "day", "drive_id")
+
+
+def collect_sums(
+    batches: Iterable[pa.RecordBatch], kinds: Mapping[str, tuple[str, ...]]
+) -> dict[str, DriveSums]:
+    """Return the sums of the columns of each kind over every drive."""
+    collector = SumCollector(kinds)
+    for batch in batches:
+        if len(batch):
+            collector.add(batch)
+    return collector.sums()
+
+
+def _sorted(parts: Sequence[GramTable], rows: Sequence[Drive]) -> DriveSums:
+    drives = sorted(set(rows))
+    number = {drive: i for i, drive in enumerate(drives)}
+    at = np.array([number[row] for row in rows], dtype=np.int64)
+    order = np.argsort(at, kind="stable")
+    first = np.searchsorted(at[order], np.arange(len(drives)))
+    stacked = (
+        np.concatenate([getattr(part, name) for part in parts])[order]
+        for name in ("n", "sums", "products")
+    )
+    table = GramTable(parts[0].signals, *(np.add.reduceat(values, first) for values in stacked))
+    cars: dict[str, slice] = {}
+    for i, (car, _, _) in enumerate(drives):
+        cars[car] = slice(cars[car].start if car in cars else i, i + 1)
+    return DriveSums(tuple(drives), table, cars)

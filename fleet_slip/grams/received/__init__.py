@@ -1,1 +1,0 @@
-"""Gram rows that cars send instead of logs."""

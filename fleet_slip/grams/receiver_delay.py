@@ -1,0 +1,379 @@
+"""How late the satellite receiver of each car is, from Gram rows: its speed against acceleration.
+
+A receiver's speed is as late as its course. The change of speed over 0.4 s is the integral of the
+longitudinal acceleration; changes of both over 0.4 s more are free of its offset. The lag of the
+integral with the smallest sum of squares, by a parabola, is the delay. The integral k ticks late is
+that of 40 + k ticks less that of k, which Gram rows have. Its uncertainty is a jackknife over
+drives, and what all have in common. Cars with one type of receiver are drawn towards its delay, the
+more so the fewer drives they have (`regression/shrinkage/partial_pooling.py`).
+"""
+
+import math
+import statistics
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.base import FloatArray
+from fleet_slip.catalogue.course import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOST_LATE
+from fleet_slip.catalogue.facts import DELAY, RECEIVED_FILES
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.grams.gram_rows import by_signals, gram_table
+from fleet_slip.regression.gram import GramTable
+from fleet_slip.regression.shrinkage import Pooled, pool
+from fleet_slip.storage.table import Snapshot
+
+RECEIVER_DELAY = "receiver_delay"
+SPREAD = f"{RECEIVER_DELAY}_spread"
+"""What the view `calibration` calls it, and by how much cars of one type of receiver differ."""
+RECEIVER = "receiver"
+"""The drive column that says of which type a receiver is."""
+
+SPAN, STEP, STEPS = 40, 5, 12
+"""Ticks of the integral, between two lags, and how many lags there are beside the first. Receivers
+of 5 Hz have fixes that are so far apart."""
+EARLY = 20
+"""So many ticks before its fix a speed may be of: an accelerometer may be later than a receiver."""
+SPEEDS = (f"satellite_speed_late_{EARLY}", f"satellite_speed_late_{EARLY + SPAN}")
+LASTING_S = 0.003
+"""Standard error that is the same in all drives: tilt and low-pass of the accelerometer."""
+SURE_ERRORS = 5.0
+"""Standard errors, of a usual car and of the car itself, by which a delay has changed."""
+TINY = 1e-9
+"""Share of the sum of squares that a drive's bend has at least: it may tell nothing."""
+FEWEST_DRIVES = 3
+WILD = 100.0
+"""Variances of half of the cars that a car's drives may differ by."""
+"""Of fewer the uncertainty is that of a usual drive of other cars."""
+
+
+@dataclass(frozen=True)
+class ReceiverDelay:
+    """The delay of a car's receiver behind its accelerometer, s; few drives tell no error.
+
+    `information` is how much a wrong lag adds to the sum of squares, per s^2; `differing` the sum
+    over drives of their own pulls by it: on average the noise times one less than the drives.
+    `receiver` is its type; None if no drive says it, or drives say several.
+    """
+
+    value: float
+    uncertainty: float | None
+    drives: int
+    rows: int
+    information: float
+    differing: float
+    receiver: str | None = None
+
+
+@dataclass(frozen=True)
+class ReceiverDelays:
+    """The delay of each car's receiver, and of the types of which there are enough, by name."""
+
+    cars: dict[str, ReceiverDelay]
+    types: dict[str, Pooled]
+
+
+@dataclass(frozen=True)
+class ChangedDelay:
+    """A car's receiver that is later, or less late, than it was, in s, from the day `since` on."""
+
+    before: float
+    after: float
+    since: str
+    drives: tuple[str, ...]
+
+
+def delay_columns() -> tuple[str, ...]:
+    """Return the columns of Gram rows that tell a delay: speeds, then sums of acceleration."""
+    lags = range(0, STEP * STEPS + 1, STEP)
+    ticks = sorted({*lags[1:], *(SPAN + lag for lag in lags)})
+    return (*SPEEDS, *(f"ax_sum_{n}" for n in ticks))
+
+
+def _weights() -> FloatArray:
+    """Return what the change of speed, and its integrals that are late, are of the columns."""
+    columns = delay_columns()
+    weights = np.zeros((2 + STEPS, len(columns)))
+    weights[0, :2] = 1, -1
+    for late in range(STEPS + 1):
+        weights[1 + late, columns.index(f"ax_sum_{SPAN + STEP * late}")] = 1
+        if late:
+            weights[1 + late, columns.index(f"ax_sum_{STEP * late}")] = -1
+    return weights
+
+
+def receiver_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> ReceiverDelays:
+    """Return the delays of cars and of types that Gram rows of the feature set `delay` tell."""
+    found = {}
+    for car, told in _by_car(rows_of_delay).items():
+        one = _delay(np.array(list(told.products.values())), told.rows)
+        if one is not None:
+            receiver = told.receivers.pop() if len(told.receivers) == 1 else None
+            found[car] = replace(one, receiver=receiver)
+    return with_types(with_pooled(found))
+
+
+def changed_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, ChangedDelay]:
+    """Return the cars whose receivers are later from some drive on than they were before.
+
+    Looked at is the place where both sides differ by most standard errors, as usual drives do.
+    """
+    halves = {
+        car: split
+        for car, told in _by_car(rows_of_delay).items()
+        if (split := _best_split(told.products)) is not None
+    }
+    squares = [
+        one.drives * ((one.uncertainty or 0.0) ** 2 - LASTING_S**2)
+        for _, *both in halves.values()
+        for one in both
+    ]
+    usual_s = math.sqrt(float(np.median(squares))) if squares else 0.0
+    found = {}
+    for car, (keys, before, after) in halves.items():
+        usual = usual_s * math.sqrt(1 / before.drives + 1 / after.drives)
+        own = math.hypot(before.uncertainty or 0.0, after.uncertainty or 0.0)
+        if abs(after.value - before.value) > SURE_ERRORS * max(usual, own):
+            names = tuple(name for _, name in keys)
+            found[car] = ChangedDelay(before.value, after.value, keys[before.drives][0], names)
+    return found
+
+
+@dataclass
+class _Told:
+    """What one car's drives tell: products about their means, by day and name, and its rows."""
+
+    products: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
+    receivers: set[str] = field(default_factory=set)
+    rows: int = 0
+
+
+def _by_car(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, _Told]:
+    columns = delay_columns()
+    found: dict[str, _Told] = {}
+    for batch in rows_of_delay:
+        for names, some, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
+            if not set(columns) <= set(names.split(",")):
+                continue
+            table = gram_table(names, some).restrict(columns)
+            names_of = ("vehicle_id", "day", "drive_id", RECEIVER)
+            keys = (some[name].to_pylist() for name in names_of)
+            for (car, day, drive, receiver), about, n in zip(
+                zip(*keys, strict=True), _about_means(table), table.n.tolist(), strict=True
+            ):
+                told = found.setdefault(car, _Told())
+                told.products[str(day), drive] = told.products.get((str(day), drive), 0.0) + about
+                told.receivers |= {receiver} - {None}
+                told.rows += n
+    for told in found.values():
+        told.products = dict(sorted(told.products.items()))
+    return dict(sorted(found.items()))
+
+
+def _about_means(table: GramTable) -> FloatArray:
+    """Return products about the means of drives, (drives, 2 + STEPS, 2 + STEPS)."""
+    weights, k = _weights(), len(table.signals)
+    full = np.zeros((len(table), k, k))
+    full[:, *np.tril_indices(k)] = table.products
+    full += np.tril(full, -1).transpose(0, 2, 1)
+    sums = table.sums.astype(np.float64) @ weights.T
+    squares = sums[:, :, None] * sums[:, None, :] / table.n[:, None, None]
+    about: FloatArray = weights @ full @ weights.T - squares
+    return about
+
+
+def with_pooled(delays: dict[str, ReceiverDelay]) -> dict[str, ReceiverDelay]:
+    """Add the spread of other cars' drives to cars with few; None if all have too few."""
+    noise = _noise(delays.values())
+    return {
+        car: one
+        if one.drives >= FEWEST_DRIVES and one.uncertainty is not None
+        else replace(
+            one,
+            uncertainty=None
+            if noise is None
+            else math.sqrt(noise / one.information + LASTING_S**2),
+        )
+        for car, one in delays.items()
+    }
+
+
+def with_types(delays: dict[str, ReceiverDelay]) -> ReceiverDelays:
+    """Return the delays with those of cars of one type of receiver drawn towards the type's.
+
+    Their variances follow from how much drives of the type differ. What is the same in all drives
+    of a car is no part of what drawing makes smaller.
+    """
+    cars, types = dict(delays), {}
+    for name in sorted({one.receiver for one in delays.values() if one.receiver is not None}):
+        of_type = {car: one for car, one in delays.items() if one.receiver == name}
+        noise = _noise(of_type.values())
+        own = np.array([(one.value, one.information) for one in of_type.values()])
+        pooled = pool(own[:, 0], noise / own[:, 1]) if noise else None
+        if pooled is not None:
+            types[name] = pooled
+            for (car, one), value, error in zip(
+                of_type.items(), pooled.values.tolist(), pooled.errors.tolist(), strict=True
+            ):
+                cars[car] = replace(one, value=value, uncertainty=math.hypot(error, LASTING_S))
+    return ReceiverDelays(cars, types)
+
+
+def _noise(delays: Iterable[ReceiverDelay]) -> float | None:
+    """Return the variance of a delay times information, as drives of cars differ, or None.
+
+    Without cars whose drives differ wildly more than those of half of the cars: their receivers or
+    logs are faulty, and one of them would make the delays of all others uncertain.
+    """
+    known = [one for one in delays if one.drives > 1]
+    usual = statistics.median([one.differing / (one.drives - 1) for one in known] or [0.0])
+    known = [one for one in known if one.differing <= WILD * usual * (one.drives - 1)]
+    free = sum(one.drives - 1 for one in known)
+    return math.fsum(one.differing for one in known) / free if free >= FEWEST_DRIVES - 1 else None
+
+
+def _best_split(
+    products: dict[tuple[str, str], FloatArray],
+) -> tuple[list[tuple[str, str]], ReceiverDelay, ReceiverDelay] | None:
+    """Return the two parts of a car's drives that differ most for their numbers, None for few."""
+    values = np.array(list(products.values()))
+    so_far, count, most = np.cumsum(values, axis=0), 0, 0.0
+    for some in range(FEWEST_DRIVES, len(values) - FEWEST_DRIVES + 1):
+        before, after = _best_lag(so_far[some - 1]), _best_lag(so_far[-1] - so_far[some - 1])
+        if before is not None and after is not None:
+            errors = abs(after - before) / math.sqrt(1 / some + 1 / (len(values) - some))
+            count, most = (some, errors) if errors > most else (count, most)
+    first, then = (_delay(some, 0) if len(some) else None for some in np.split(values, [count]))
+    if first is None or then is None or not (first.uncertainty and then.uncertainty):
+        return None
+    return list(products), first, then
+
+
+def _delay(products: FloatArray, rows: int) -> ReceiverDelay | None:
+    drives, total = len(products), products.sum(axis=0)
+    lag = _best_lag(total)
+    if lag is None:
+        return None
+    slope, bend = _parabolas(products)
+    without = [found for one in products if (found := _best_lag(total - one)) is not None]
+    uncertainty = None
+    if len(without) == drives > 1:
+        mean = math.fsum(without) / drives
+        square = math.fsum((one - mean) ** 2 for one in without)
+        scatter = math.sqrt(square * (drives - 1) / drives) * float(SAMPLE_TIME_S)
+        uncertainty = math.hypot(scatter, LASTING_S)
+    return ReceiverDelay(
+        value=lag * float(SAMPLE_TIME_S),
+        uncertainty=uncertainty,
+        drives=drives,
+        rows=rows,
+        information=float(bend.sum()),
+        differing=float(((slope - bend * slope.sum() / bend.sum()) ** 2 / bend).sum()),
+    )
+
+
+def _parabolas(products: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the slope and bend of each drive's sum of squares by the delay of all, in s."""
+    total = products.sum(axis=0)
+    middle = _middle(total)
+    at = np.arange(middle, middle + 3)  # the first is of the speed
+    ratio = total[0, middle + 1] / total[middle + 1, middle + 1]
+    squares = ratio**2 * products[:, at, at] - 2 * ratio * products[:, 0, at]
+    before, here, after = squares.T
+    step = STEP * float(SAMPLE_TIME_S)
+    bend = np.maximum(after - 2 * here + before, TINY * abs(total[0, 0]))
+    return (after - before) / (2 * step), bend / step**2
+
+
+def _middle(products: FloatArray) -> int:
+    """Return the lag that explains most of the speed's changes, and has one on either side."""
+    explained = products[0, 1:] ** 2 / np.diag(products)[1:]
+    return min(max(int(np.argmax(explained)), 1), STEPS - 1)
+
+
+def _best_lag(products: FloatArray) -> float | None:
+    """Return the lag in ticks that explains most of the speed's changes; None without any."""
+    sizes = np.diag(products)[1:]
+    if not (sizes > 0).all():
+        return None
+    explained = products[0, 1:] ** 2 / sizes
+    middle = _middle(products)
+    before, here, after = explained[middle - 1 : middle + 2]
+    bend = 2 * here - before - after
+    if bend <= 0:
+        return None
+    # A sum of ticks is the integral up to half a tick after the last one.
+    return STEP * (middle + 0.5 * float(after - before) / float(bend)) - 0.5 - EARLY
+
+
+# How late the course of each car is, and which Gram rows were computed with another delay.
+#
+# The delay is a whole number of parts of a tick, a pure function of the Gram rows of the set
+# `delay`: the same drives in any order give the same rows, and forgotten ones leave nothing.
+
+GRAIN_S = float(SAMPLE_TIME_S) / LATE_PARTS
+"""What a delay is a whole number of, s."""
+_OF_DELAY = ("file", "day", "vehicle_id", "drive_id", "signals", "n", "sums", "products")
+
+
+def course_delays(grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
+    """Return each car's course delay in parts of a tick, of Gram rows of the `active` log files."""
+    told = receiver_delays(_of_delay(grams, active)).cars
+    return {car: in_parts(one) for car, one in told.items()}
+
+
+def in_parts(one: ReceiverDelay) -> int:
+    """Return a delay as Gram rows are corrected by it."""
+    least, most = LATE_PARTS * MOST_EARLY, LATE_PARTS * MOST_LATE
+    return min(max(round(one.value / GRAIN_S), least), most)
+
+
+def _of_delay(grams: Snapshot, active: frozenset[str]) -> Iterator[pa.RecordBatch]:
+    identity = features().identity(DELAY)
+    for rows in _rows_of(grams, identity, *_OF_DELAY, RECEIVER):
+        files = rows["file"].cast(pa.string())
+        counts = pc.is_in(files, pa.array(sorted(active), pa.string()))
+        counts = pc.or_(counts, pc.starts_with(files, RECEIVED_FILES))
+        yield from rows.filter(counts).to_batches()
+
+
+def files_of_other_delay(grams: Snapshot, identity: str, late: Mapping[str, int]) -> set[str]:
+    """Return the log files that have Gram rows of a set with another delay than their cars have."""
+    return {
+        name
+        for name, car, told in _recorded(grams, identity)
+        if told != late.get(car, 0) and not name.startswith(RECEIVED_FILES)
+    }
+
+
+def recorded_cars(grams: Snapshot, identity: str, log_file: str) -> dict[str, int]:
+    """Return the delays that the Gram rows of a set of one log file were corrected by, by car."""
+    return {
+        car: told for name, car, told in _recorded(grams, identity) if name == log_file and told
+    }
+
+
+def _recorded(grams: Snapshot, identity: str) -> set[tuple[str, str, int]]:
+    """Return each log file, car and delay that Gram rows of a set are of; 0 where none was told."""
+    found: set[tuple[str, str, int]] = set()
+    for rows in _rows_of(grams, identity, "file", "vehicle_id", COURSE_LATE):
+        files, cars, told = (rows[name].to_pylist() for name in ("file", "vehicle_id", COURSE_LATE))
+        found.update(zip(files, cars, (late or 0 for late in told), strict=True))
+    return found
+
+
+def _rows_of(grams: Snapshot, identity: str, *columns: str) -> Iterator[pa.Table]:
+    """Yield the Gram rows of a feature set, file by file; null in columns that came later."""
+    for file in grams.files:
+        mine = pc.equal(grams.table.read(file.path, ["feature_set"])["feature_set"], identity)
+        if not pc.any(mine).as_py():
+            continue
+        there = grams.table.read_metadata(file.path).schema.to_arrow_schema().names
+        rows = grams.table.read(file.path, [name for name in columns if name in there])
+        for name in sorted(set(columns).difference(there)):
+            rows = rows.append_column(name, pa.nulls(len(rows)))
+        yield rows.filter(mine)

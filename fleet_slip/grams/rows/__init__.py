@@ -1,1 +1,0 @@
-"""Gram rows: computed from log files, kept beside them, checked."""

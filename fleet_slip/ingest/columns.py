@@ -1,0 +1,541 @@
+"""How one column of a file becomes a signal: unit, sign, gain, offset, table, delay.
+
+Course and speed over ground are two columns: an angle with a speed, or two velocities.
+"""
+
+import itertools
+import operator
+import re
+import warnings
+from collections.abc import Callable, Collection, Sequence
+from collections.abc import Mapping as Named
+from datetime import UTC, datetime
+from functools import cache, reduce
+from typing import Annotated, Any, Literal
+from zoneinfo import available_timezones
+
+import numpy as np
+import pint
+import polars as pl
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from fleet_slip.base import FloatArray
+from fleet_slip.catalogue.signals import HALF_TURN, Identifier, Signal, catalogue
+from fleet_slip.config import Config, Name, PositiveFloat, added
+from fleet_slip.ingest.formats.source import OWN_TIME
+
+# Factors from the units that people log in to the catalogue's SI units.
+
+_TERM = r"(?:°|[^\W\d]+\d?)(?:(?:\^|\*\*)-?\d)?"
+_UNITS_UNIT = re.compile(rf"(?:1/)?{_TERM}(?:[*/ ]{_TERM})*")
+_POWER = re.compile(r"(?<=[^\W\d_])([2-9])(?!\w)")
+_LONGEST_UNIT = 40
+
+_NEEDS = {
+    "rad": "an angle, such as 'deg'",
+    "rad/s": "an angular velocity, such as 'deg/s' or 'rpm'",
+    "m": "a length, such as 'm'",
+    "m/s": "a velocity, such as 'km/h'",
+    "m/s^2": "an acceleration, such as 'g' or 'm/s^2'",
+    "s": "a time, such as 'ms'",
+    "Pa": "a pressure, such as 'bar'",
+    "1": "a number: '1', or '%'",
+}
+_NUMBERS = {"1": 1.0, "%": 0.01, "percent": 0.01}
+
+
+def require_unit(unit: str, si_unit: str, quantity: str = "it") -> None:
+    """Raise `ValueError` for a unit that has no `conversion_factor`."""
+    conversion_factor(unit, si_unit, quantity)
+
+
+@cache
+def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
+    """Return f in `value in si_unit = f * value in unit`; `quantity` is what messages call it.
+
+    In an acceleration `g` is standard gravity, 9.80665 m/s² (elsewhere it would be the gram). The
+    radian counts as a dimension, so that neither a ratio passes for an angle nor Hz for rad/s:
+    what fits in dimension only is off by 2π or by 100 and would never be noticed.
+
+    Raises `ValueError`, with a message that ends in what is needed instead.
+    """
+    needs = f"{quantity} needs {_NEEDS.get(si_unit, f'a unit like {si_unit!r}')}"
+    if si_unit == "1" and unit in _NUMBERS:
+        return _NUMBERS[unit]
+    # The pattern keeps pint from evaluating arithmetic: '9^9^9^9' would never end.
+    if len(unit) > _LONGEST_UNIT or not _UNITS_UNIT.fullmatch(unit):
+        raise ValueError(f"is in {unit[:_LONGEST_UNIT]!r}, which is not a unit; {needs}")
+    registry = pint.application_registry
+    name = "standard_gravity" if unit == "g" and si_unit == "m/s^2" else unit
+    if name not in registry:  # a digit after a letter is a power, as in m/s2
+        name = _POWER.sub(r"^\1", name)
+    try:
+        root = registry.Quantity(1.0, name).to_root_units()
+        wanted = registry.Quantity(1.0, si_unit).to_root_units()
+    except (pint.PintError, ValueError, TypeError, AttributeError):
+        raise ValueError(f"is in {unit!r}, which is not a known unit; {needs}") from None
+    if root.units != wanted.units:
+        raise ValueError(f"is in {unit!r}, {needs}")
+    return float(root.magnitude) / float(wanted.magnitude)
+
+
+FiniteFloat = Annotated[float, Field(allow_inf_nan=False)]
+OffsetM = Annotated[FiniteFloat, Field(ge=-15, le=15)]
+WHEELS = "wheel_"
+"""How the names of wheel speeds begin."""
+VELOCITY = "m/s"
+MAX_TABLE = 10_000
+
+COURSE, SPEED = "course", "satellite_speed"
+
+
+def _increasing(table: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    if table and len(table) < 2:
+        raise ValueError("needs two points at least")
+    if any(left >= right for (left, _), (right, _) in itertools.pairwise(table)):
+        raise ValueError("needs points in ascending order of their first number, each once")
+    return table
+
+
+Table = Annotated[
+    tuple[tuple[FiniteFloat, FiniteFloat], ...],
+    Field(max_length=MAX_TABLE),
+    AfterValidator(_increasing),
+]
+
+
+class SignBit(Config):
+    """The column that says the sign of another one, which has the magnitude alone."""
+
+    column: Name
+    negative: int | Name = 1
+    """What stands there where the value is negative."""
+
+
+class SignalColumn(Config):
+    """One column of the file: `signal = factor(unit) * (±gain * table(value) + offset) / radius`.
+
+    Keys at their default are left out of the mapping's identity where they came after the first
+    release, so that a file is not ingested twice because a program learned a word.
+    """
+
+    column: Name
+    unit: str
+    negate: bool = False
+    """For axes that are not ISO 8855, such as y to the right."""
+    sign: SignBit | None = added(None)
+    """Where a column of its own says the sign, as on the buses of some cars."""
+    offset: FiniteFloat = 0.0
+    """Added after the sign, in the column's unit."""
+    gain: FiniteFloat = added(1.0)
+    """Multiplies the value, such as the ratio of a steering gear."""
+    radius_m: Annotated[FiniteFloat, Field(ge=0.05, le=2)] | None = added(None)
+    """Rolling radius of a wheel whose speed is logged as a velocity."""
+    table: Table = added(())
+    """Points (value, value in `unit`), straight lines between them; outside is out of range."""
+    delay_s: FiniteFloat = added(0.0, ge=-10, le=10)
+    """How much later than it happened a value stands in the file."""
+    interpolate: bool = added(True)
+    """False: samples stand at the nearest tick, and ticks between them have no value."""
+    longest_gap_s: Annotated[FiniteFloat, Field(gt=0, le=10)] | None = added(None)
+    """Instead of the mapping's, for a signal with a rate of its own."""
+    time: Name | None = added(None)
+    """The column of this signal's times, where the file has several, in the unit of the others."""
+
+    component: Literal["north", "east"] | None = added(None)
+    """Of the velocity over ground, if it is one: set for `course = { north = …, east = … }`."""
+    clockwise_from_north: bool | None = added(None)
+    """Whether the course is told so; False: counterclockwise from east."""
+    antenna_x_m: OffsetM | None = added(None)
+    """How far the receiver's antenna is before the centre of gravity."""
+    antenna_y_m: OffsetM | None = added(None)
+    """How far it is to the left of the centre of gravity."""
+
+    @property
+    def is_of_satellites(self) -> bool:
+        """Whether it has keys that are for the course."""
+        told = (self.clockwise_from_north, self.antenna_x_m, self.antenna_y_m, self.component)
+        return any(one is not None for one in told)
+
+    @model_validator(mode="after")
+    def _gain_is_something(self) -> "SignalColumn":
+        if self.gain == 0:
+            raise ValueError("gain cannot be 0")
+        return self
+
+    def require_unit_of(self, signal: str, si_unit: str) -> None:
+        """Raise `ValueError` if the column cannot be this signal."""
+        is_wheel = signal.startswith(WHEELS)
+        if self.radius_m is not None and not is_wheel:
+            raise ValueError("has a radius_m, and radius_m is for wheel speeds")
+        if self.radius_m is None and is_wheel and self._is_velocity():
+            raise ValueError(
+                f"is a velocity in {self.unit!r}; {signal} needs an angular velocity: add "
+                "radius_m, the rolling radius of the wheel"
+            )
+        require_unit(self.unit, self._measured_in(si_unit), signal)
+
+    def linear(self, si_unit: str) -> tuple[float, float]:
+        """Return (gain, bias): `value in SI = gain * table(value in the file) + bias`."""
+        factor = conversion_factor(self.unit, self._measured_in(si_unit))
+        if self.radius_m is not None:
+            factor /= self.radius_m
+        return (-factor if self.negate else factor) * self.gain, factor * self.offset
+
+    def looked_up(self, number: pl.Expr) -> pl.Expr:
+        """Return table(value), NaN outside of the table; the value itself without one."""
+        return number.map_batches(self._interpolate, pl.Float64) if self.table else number
+
+    def is_outside_table(self, number: pl.Expr) -> pl.Expr:
+        """Whether a value is below or above all that the table has."""
+        if not self.table:
+            return pl.lit(value=False)
+        return (number < self.table[0][0]) | (number > self.table[-1][0])
+
+    def _interpolate(self, numbers: pl.Series) -> pl.Series:
+        points: FloatArray = np.array(self.table)
+        values = numbers.to_numpy().astype(np.float64)
+        found = np.interp(values, points[:, 0], points[:, 1], left=np.nan, right=np.nan)
+        found[np.isnan(values)] = np.nan
+        return pl.Series(numbers.name, found).set(numbers.is_null(), None)
+
+    def _measured_in(self, si_unit: str) -> str:
+        return si_unit if self.radius_m is None and not self.component else VELOCITY
+
+    def _is_velocity(self) -> bool:
+        try:
+            require_unit(self.unit, VELOCITY)
+        except ValueError:
+            return False
+        return True
+
+
+Component = Literal["north", "east"]
+
+
+def split_components(signals: Any) -> Any:
+    """Return the signals with `course = { north, east }` as a column each. Raises `ValueError`."""
+    course = signals.get(COURSE) if isinstance(signals, dict) else None
+    if not isinstance(course, dict) or not {"north", "east"} & set(course):
+        return signals
+    if missing := [key for key in ("north", "east") if key not in course]:
+        raise ValueError(f"course: {missing[0]} is missing: it needs both velocities")
+    if SPEED in signals or "column" in course:
+        raise ValueError("course: north and east tell the speed too: leave the other columns out")
+    shared = {key: value for key, value in course.items() if key not in {"north", "east"}}
+    return {
+        **signals,
+        COURSE: {**shared, "column": course["north"], "component": "north"},
+        SPEED: {**shared, "column": course["east"], "component": "east"},
+    }
+
+
+def require_satellites(signals: Named[str, SignalColumn]) -> None:
+    """Raise `ValueError` unless the course, if there is one, comes with all that it needs."""
+    for name, column in signals.items():
+        if column.is_of_satellites and name not in {COURSE, SPEED}:
+            raise ValueError(f"signals.{name}: antenna and direction are keys of the course")
+    course = signals.get(COURSE)
+    if course is None:
+        return
+    if course.component is None and course.clockwise_from_north is None:
+        raise ValueError(
+            "signals.course: say whether it is clockwise_from_north = true, as receivers tell it, "
+            "or false, counterclockwise from east"
+        )
+    if course.antenna_x_m is None or course.antenna_y_m is None:
+        raise ValueError(
+            "signals.course: say where the antenna is, in m: antenna_x_m before the centre of "
+            "gravity, antenna_y_m to the left of it. A metre that is forgotten is a degree in bends"
+        )
+    for needed in (SPEED, "yaw_rate"):
+        if needed not in signals:
+            raise ValueError(f"signals.course: it needs {needed} beside it")
+    speed = signals[SPEED]
+    if (course.time, course.delay_s) != (speed.time, speed.delay_s):
+        raise ValueError("signals.course: time and delay_s are one receiver's: give both alike")
+
+
+def count_range(name: str, column: SignalColumn) -> tuple[Signal, int, int]:
+    """Return the signal as which a column is checked, a course in any turn, and its counts."""
+    if column.component:
+        speed = catalogue()[SPEED]
+        return speed, -speed.max_count, speed.max_count
+    signal = catalogue()[name]
+    if name == COURSE:
+        return signal, -4 * HALF_TURN, 4 * HALF_TURN
+    return signal, signal.min_count, signal.max_count
+
+
+# Where the times of a log are from.
+
+
+class DateColumn(Config):
+    """The column of dates beside one of times of the day, and its strftime codes."""
+
+    column: Name
+    format: Name = "%Y-%m-%d"
+
+
+class TimeBase(Config):
+    """Where time is from, and which gaps are bridged or end a drive.
+
+    Either `column` with a `unit` (numbers) or a `format` (timestamps as text, strftime codes; naive
+    ones are UTC, or of a `zone`; a Parquet timestamp column needs no format; a `date` may stand in
+    a column of its own), or `rate_hz` for equally spaced rows, or `own_clock` for a format that
+    says itself when a sample was taken.
+    """
+
+    column: Name | None = None
+    unit: str | None = None
+    format: Name | None = None
+    date: DateColumn | None = added(None)
+    rate_hz: Annotated[float, Field(ge=1, le=100_000)] | None = None
+    epoch: bool = added(False)
+    """Numbers are counted from 1970, in UTC, so that they tell the date."""
+    zone: str | None = added(None)
+    """Where the clock of timestamps without a zone stands, such as `Europe/Berlin`."""
+    assumed: bool = added(False)
+    """Nobody knows the rate: each ingest says so."""
+    own_clock: bool = added(False)
+    longest_gap_s: Annotated[PositiveFloat, Field(le=10)] = 0.1
+    """Samples of a signal that lie further apart are not interpolated between."""
+    split_gap_s: Annotated[PositiveFloat, Field(le=60)] = 1.0
+    """A step in time larger than this, forward or back, begins a new drive."""
+
+    @field_validator("format")
+    @classmethod
+    def _format_is_known(cls, text: str | None) -> str | None:
+        if text is not None and not (_reads_back(text) or reads_clock(text)):
+            raise ValueError(f"{text!r} is not a strftime format with date and time, or with time")
+        return text
+
+    @field_validator("zone")
+    @classmethod
+    def _zone_is_known(cls, zone: str | None) -> str | None:
+        if zone is not None and zone not in available_timezones():
+            raise ValueError(f"{zone!r} is no time zone. Write it as 'Europe/Berlin'")
+        return zone
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "TimeBase":
+        if [self.column is None, self.rate_hz is None, not self.own_clock].count(False) != 1:
+            raise ValueError(
+                "needs either 'column' or 'rate_hz', or 'own_clock' for files with clocks, as MDF"
+            )
+        if self.column is None and (self.unit is not None or self.format is not None):
+            raise ValueError("'unit' and 'format' describe a column, and there is none")
+        if self.unit is not None and self.format is not None:
+            raise ValueError("'unit' is for numbers and 'format' for timestamps: give one of them")
+        if self.epoch and self.unit is None:
+            raise ValueError("'epoch' is for numbers: give their 'unit'")
+        if self.assumed and self.rate_hz is None:
+            raise ValueError("'assumed' is for a rate_hz that nobody knows")
+        if self.date is not None:
+            if self.format is None or not reads_clock(self.format):
+                raise ValueError("'date' stands beside a column whose format has the time alone")
+            if not _reads_back(str(self.moment_format)):
+                raise ValueError(f"{self.date.format!r} is not a strftime format of a date")
+        zoned = self.format is not None and "%z" in self.format
+        if self.zone is not None and (zoned or self.unit is not None or self.column is None):
+            raise ValueError("'zone' is for timestamps that do not say theirs")
+        if self.longest_gap_s > self.split_gap_s:
+            raise ValueError("longest_gap_s cannot be larger than split_gap_s")
+        if self.unit is not None:
+            try:
+                require_unit(self.unit, "s")
+            except ValueError as error:
+                raise ValueError(f"{self.column} {error}") from None
+        return self
+
+    @property
+    def is_dated(self) -> bool:
+        """Whether times can tell the day."""
+        if self.unit is not None or self.rate_hz is not None:
+            return self.epoch
+        if self.date is not None:
+            return True
+        return self.format is None or not reads_clock(self.format)
+
+    @property
+    def moment_format(self) -> str | None:
+        """The format of a text, the date before it if that stands in a column of its own."""
+        return self.format if self.date is None else f"{self.date.format} {self.format}"
+
+    @property
+    def key(self) -> str | None:
+        """The column that has the times of a batch, None if the rows are equally spaced."""
+        return OWN_TIME if self.own_clock else self.column
+
+
+def as_moments(text: pl.Expr, timestamp_format: str) -> pl.Expr:
+    """Return texts as timestamps, null where they are none.
+
+    Polars warns of `%f` with the place in our code; what comes of a wrong one, ingest tells.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pl.exceptions.ChronoFormatWarning)
+        return text.str.to_datetime(timestamp_format, time_unit="us", strict=False)
+
+
+def _reads_back(timestamp_format: str) -> bool:
+    """Whether a moment that is written in this format can be read, to the minute."""
+    moment = datetime(2024, 5, 31, 12, 34, tzinfo=UTC)
+    try:
+        written = pl.Series([moment]).dt.to_string(timestamp_format)
+        read = written.to_frame().select(as_moments(pl.col(written.name), timestamp_format))[0, 0]
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
+        return False
+    return isinstance(read, datetime) and read.replace(tzinfo=UTC) == moment
+
+
+@cache
+def reads_clock(timestamp_format: str) -> bool:
+    """Whether a format has the time of day and no date."""
+    if _reads_back(timestamp_format):
+        return False
+    try:
+        written = pl.Series(["12:34:00"]).str.to_time("%H:%M:%S").dt.to_string(timestamp_format)
+        return bool(written.str.to_time(timestamp_format, strict=False).is_not_null().all())
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException):
+        return False
+
+
+# Which rows of a file count: conditions on its columns. Those of other rows are only counted.
+#
+# People write them as `vehicle_speed > 5 m/s and fix in (4, 5)`.
+
+Bound = Annotated[float, Field(allow_inf_nan=False)]
+_BOUNDS: dict[str, Callable[[pl.Expr, float], Any]] = {
+    "at_least": operator.ge,
+    "at_most": operator.le,
+    "above": operator.gt,
+    "below": operator.lt,
+    "other_than": operator.ne,
+}
+
+_KEYS = {">=": "at_least", "<=": "at_most", ">": "above", "<": "below", "!=": "other_than"}
+_NAME = r'"(?P<quoted>[^"]{1,200})"|(?P<name>[^\W\d][\w.:@/\[\]-]*(?:\(:,\d+\))?)'
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_UNIT = r"(?!and\b)[^\W\d]\S*|°\S*|%"
+_ITEM = rf"'[^']*'|{_NUMBER}"
+_COMPARISON = re.compile(
+    rf"\s*(?:{_NAME})\s*(?:"
+    rf"(?P<sign>>=|<=|!=|==|=|>|<)\s*(?:(?P<number>{_NUMBER})(?:\s*(?P<unit>{_UNIT}))?"
+    rf"|'(?P<text>[^']*)')"
+    rf"|in\s*\((?P<items>\s*(?:{_ITEM})(?:\s*,\s*(?:{_ITEM}))*\s*)\))\s*(?P<end>and\b|$)"
+)
+_LONGEST = 2000
+
+
+class RowCondition(Config):
+    """A condition on one column, in the column's own unit; a missing value does not meet it.
+
+    Or on a signal that the mapping makes of a column, in the catalogue's unit. `text_conditions`
+    reads what people write: `speed > 5 m/s`.
+    """
+
+    column: Name | None = None
+    signal: Identifier | None = added(None)
+    at_least: Bound | None = None
+    at_most: Bound | None = None
+    above: Bound | None = added(None)
+    below: Bound | None = added(None)
+    other_than: Bound | None = added(None)
+    one_of: tuple[Name, ...] = ()
+    """Texts, such as the states of a fix; of a column of numbers, numbers as text."""
+
+    @model_validator(mode="after")
+    def _says_something(self) -> "RowCondition":
+        if (self.column is None) == (self.signal is None):
+            raise ValueError("needs either 'column' or 'signal'")
+        if self.one_of and self.bounds:
+            raise ValueError("give 'one_of', or 'at_least' and 'at_most', and not both")
+        if not self.one_of and not self.bounds:
+            raise ValueError("needs 'at_least', 'at_most' or 'one_of'")
+        if self.one_of and self.signal is not None:
+            raise ValueError("'one_of' is for a column: a signal is a number")
+        return self
+
+    @property
+    def bounds(self) -> dict[str, float]:
+        """The limits that are given, by their key."""
+        given = {key: getattr(self, key) for key in _BOUNDS}
+        return {key: bound for key, bound in given.items() if bound is not None}
+
+    def is_met(self, number: pl.Expr, text: pl.Expr) -> pl.Expr:
+        """Return whether a row meets it, given the column as a number and as a text."""
+        if self.one_of:
+            return text.is_in(self.one_of).fill_null(value=False)
+        met = (_BOUNDS[key](number, bound) for key, bound in self.bounds.items())
+        return reduce(operator.and_, met, number.is_finite()).fill_null(value=False)
+
+
+def describe(conditions: Sequence[RowCondition]) -> str:
+    """Return conditions as a message shows them."""
+    return " and ".join(map(_text, conditions))
+
+
+def _text(condition: RowCondition) -> str:
+    said: dict[str, Any] = condition.model_dump(exclude_defaults=True, exclude={"column", "signal"})
+    parts = [f"{key.replace('_', ' ')} {value}" for key, value in said.items()]
+    return f"{condition.column or condition.signal!r} is {' and '.join(parts)}"
+
+
+def text_conditions(text: str, signals: Collection[str]) -> list[dict[str, Any]]:
+    """Return the keys of a `RowCondition` for each comparison of a text, joined by `and`.
+
+    A name is that of one of the mapping's signals, and the number has a unit; else, or in double
+    quotes, it is a column of the file, whose own unit the number is in. Raises `ValueError`.
+    """
+    if len(text) > _LONGEST:
+        raise ValueError(f"is longer than {_LONGEST:,} characters")
+    conditions, at, more = [], 0, True
+    while more:
+        found = _COMPARISON.match(text, at)
+        if found is None:
+            raise ValueError(
+                f"{text[at:].strip()[:60]!r} is no condition. Write NAME > NUMBER UNIT, "
+                "NAME = 'text' or NAME in (4, 5); several are joined by: and"
+            )
+        conditions.append(_condition(found, signals))
+        at, more = found.end(), found["end"] == "and"
+    return conditions
+
+
+def _condition(found: re.Match[str], signals: Collection[str]) -> dict[str, Any]:
+    name = found["quoted"] or found["name"]
+    if found["quoted"] is None and name in signals:
+        return {"signal": name, **_of_signal(name, found)}
+    if found["items"] is not None:
+        texts = re.findall(_ITEM, found["items"])
+        return {"column": name, "one_of": [text.strip("'") for text in texts]}
+    if found["unit"] is not None:
+        raise ValueError(
+            f"{name!r} is no signal of this mapping but a column: its unit is not known. Give the "
+            f"number in the column's own unit, without {found['unit']!r}"
+        )
+    if found["text"] is not None:
+        if found["sign"] not in {"=", "=="}:
+            raise ValueError(f"{name} {found['sign']} '{found['text']}': a text can only be =")
+        return {"column": name, "one_of": [found["text"]]}
+    return {"column": name, **_bounds(found["sign"], float(found["number"]))}
+
+
+def _of_signal(name: str, found: re.Match[str]) -> dict[str, Any]:
+    if found["number"] is None:
+        raise ValueError(f"{name} is a signal, which is compared with a number")
+    unit = catalogue()[name].unit
+    if found["unit"] is None and unit != "1":
+        raise ValueError(f"{name} {found['sign']} {found['number']}: of which unit? Say it: {unit}")
+    try:
+        factor = conversion_factor(found["unit"] or "1", unit, name)
+    except ValueError as error:
+        raise ValueError(f"{name} {found['sign']} {found['number']} {error}") from None
+    return _bounds(found["sign"], float(found["number"]) * factor)
+
+
+def _bounds(sign: str, value: float) -> dict[str, float]:
+    if sign in {"=", "=="}:
+        return {"at_least": value, "at_most": value}
+    return {_KEYS[sign]: value}

@@ -1,0 +1,410 @@
+"""Drafts a mapping for a file: guesses by name, unit and values, corrected by how the car moves.
+
+The draft is read as any mapping is, and what looks wrong in the drives that come out is put right
+where there is one way to do so: a sign, or left for right. The rest is left to a person.
+"""
+
+import json
+import re
+import shlex
+import textwrap
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.base import FloatArray, shown
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import FleetSlipError, InputError
+from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
+from fleet_slip.ingest.formats.csv import CsvFormat
+from fleet_slip.ingest.guess import (
+    Guess,
+    TimeGuess,
+    choose_units,
+    guess_cars,
+    guess_signals,
+    guess_time,
+    guess_unnamed_wheels,
+    headings,
+    steering_ratio,
+    unit_choices,
+)
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.preview import preview_log
+from fleet_slip.ingest.profile import FileProfile
+from fleet_slip.ingest.suspicion import WHEELS, Suspicion, find_suspicions
+from fleet_slip.ingest.vocabulary import parts_of
+
+_STAND_IN: dict[str, Any] = {"vehicle_id": "car", "vehicle_model": "car", "day": date(2000, 1, 1)}
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A draft of a mapping."""
+
+    file: Path
+    profile: FileProfile
+    time: TimeGuess
+    guesses: dict[str, Guess]
+    """Those that nothing speaks against."""
+    questions: dict[str, Guess]
+    """Those with doubts, or with rivals."""
+    drive: dict[str, dict[str, str]]
+    """The columns that tell cars and trips apart, by key of `[drive]`."""
+    open_questions: tuple[str, ...]
+    """What looks wrong in what it makes of the file, or why it makes nothing."""
+
+
+def draft_mapping(file: Path, profile: FileProfile) -> Draft:
+    """Guess a mapping. Raises `InputError` if nothing in the file looks like a signal."""
+    guesses = guess_signals(profile.profiles)
+    taken = {guess.profile.channel.name for guess in guesses.values()}
+    unnamed = not set(WHEELS) & set(guesses)
+    if unnamed:
+        wheels = guess_unnamed_wheels(profile.profiles, taken)
+        guesses |= {guess.signal: guess for guess in wheels}
+    if not guesses:
+        names = ", ".join(repr(p.channel.name) for p in profile.profiles[:30])
+        raise InputError(
+            f"{shown(file)}: none of its channels looks like a signal: {names}. Write the mapping "
+            "by hand: docs/mapping.md."
+        )
+    drive_keys, group = guess_cars(profile.profiles)
+    bases = [guess.profile.channel.base for guess in guesses.values()]
+    taken = {guess.profile.channel.name for guess in guesses.values()}
+    time = guess_time(profile, taken, bases, group)
+    tried = _Tried(file, profile, time, drive_keys)
+    failures: tuple[str, ...] = ()
+    suspicions: list[Suspicion] = []
+    try:
+        if unnamed and set(WHEELS) <= set(guesses):
+            guesses |= _place_wheels(guesses, tried.drive(guesses))
+        guesses = choose_units(guesses, tried.drive(guesses))
+        drive = tried.drive(guesses)
+        guesses = _road_wheels(guesses, drive)
+        corrected = _correct(guesses, find_suspicions(drive))
+        guesses = corrected
+        suspicions = find_suspicions(tried.drive(guesses))
+    except FleetSlipError as error:
+        failures = (str(error),)
+    guesses = _doubted(guesses, suspicions)
+    asked_for = {name for name, guess in guesses.items() if guess.doubts or guess.rivals}
+    if COURSE in guesses and asked_for & {COURSE, SPEED, "yaw_rate"}:
+        asked_for |= {COURSE, SPEED}  # which stand together
+    sure = {name: guess for name, guess in guesses.items() if name not in asked_for}
+    left = {name: guess for name, guess in guesses.items() if name in asked_for}
+    asked = () if COURSE in guesses else _ask_of_headings(profile, guesses)
+    notes = (*failures, *map(str, suspicions), *asked, *_notes(profile, guesses))
+    return Draft(file, profile, time, sure, left, drive_keys, notes)
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """What a draft makes of its file."""
+
+    file: Path
+    profile: FileProfile
+    time: TimeGuess
+    drive_keys: dict[str, dict[str, str]]
+
+    def drive(self, guesses: dict[str, Guess]) -> dict[str, FloatArray]:
+        """Return the signals of the longest drive, of all guesses that the catalogue can hold."""
+        usable = {name: guess for name, guess in guesses.items() if not guess.doubts}
+        if COURSE in usable and not {SPEED, "yaw_rate"} <= set(usable):
+            usable.pop(COURSE)
+        if not usable:
+            return {}
+        mapping = as_mapping(self.profile, self.time, usable, self.drive_keys)
+        return preview_log(self.file, mapping).longest
+
+
+def _road_wheels(guesses: dict[str, Guess], drive: dict[str, FloatArray]) -> dict[str, Guess]:
+    """Return an angle called that of steering as the road wheels', where the car turns so."""
+    guess = guesses.get("steering_wheel")
+    ratio = steering_ratio(drive, "steering_wheel")
+    if guess is None or ratio is None or not 0.3 < ratio < 4:
+        return guesses
+    figure = f"it is {ratio:.1f} times the angle of the road wheels in bends, not 12 to 20 times"
+    named = {"wheel", "whl", "rad", "lenkrad"} & set(parts_of(guess.profile.channel.name))
+    if "steer" in guesses or named:
+        return {**guesses, "steering_wheel": guess.doubted(figure)}
+    others = {name: one for name, one in guesses.items() if name != "steering_wheel"}
+    return {**others, "steer": replace(guess.because(figure), signal="steer")}
+
+
+def _doubted(guesses: dict[str, Guess], suspicions: list[Suspicion]) -> dict[str, Guess]:
+    """Return the guesses with what the car's motion has against them.
+
+    Of several signals that contradict one another, those are doubted of which the file does not
+    say the unit, if there are some. A weak name without a unit needs something that agrees.
+    """
+    found = dict(guesses)
+    for one in suspicions:
+        if one.kind in {"late", "absent"}:
+            continue
+        concerned = [name for name in one.signals if name in found]
+        if one.kind == "stuck":  # a gear, a pedal and a brake may well be
+            concerned = [n for n in concerned if catalogue()[n].unit not in {"1", "Pa"}]
+        weak = [n for n in concerned if found[n].is_without_unit or found[n].is_weak]
+        for name in weak or concerned:
+            found[name] = found[name].doubted(one.figure)
+    agreeing = {"yaw_rate", "ay", "steering_wheel"} & set(guesses)
+    for name, guess in guesses.items():
+        if guess.is_weak and guess.is_without_unit and len(agreeing - {name}) < 1:
+            found[name] = found[name].doubted("its name may mean something else, and so its unit")
+    return found
+
+
+def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
+    """Yield what a person is to know of values that mean none, and of a label that is not there."""
+    for name, number in profile.absent.doubtful:
+        yield (
+            f"{shown(name)}: {number:g} looks like no value, but is one in another column: leave "
+            f"such rows out with where = '\"{name}\" != {number:g}'."
+        )
+    if {"vx", "vy"} <= set(guesses) and "sideslip" not in guesses:
+        yield (
+            "there is no side-slip angle, and vx and vy tell it if they are a sensor's: [label] "
+            "from_velocities = true, sensor_x_m = ... before the centre of gravity."
+        )
+    elif "sideslip" in guesses:
+        yield (
+            "sideslip: where is its sensor? If not at the centre of gravity: [label] sensor_x_m = "
+            "... before it, sensor_y_m = ... to its left."
+        )
+
+
+def _ask_of_headings(profile: FileProfile, guesses: dict[str, Guess]) -> tuple[str, ...]:
+    """Return what only a person knows: whether a direction is the car's, or that of its way."""
+    taken = {guess.profile.channel.name for guess in guesses.values()}
+    return tuple(
+        f"{shown(name)}: is it where the car points, or where it goes? If a satellite receiver "
+        f"tells it from motion: course = {{ column = {json.dumps(name, ensure_ascii=False)}, "
+        'unit = "deg", clockwise_from_north = true, antenna_x_m = ..., antenna_y_m = ... }, with '
+        "satellite_speed beside it. A heading says nothing of side-slip."
+        for name in headings(profile.profiles, taken)
+    )
+
+
+def as_mapping(
+    profile: FileProfile,
+    time: TimeGuess,
+    guesses: dict[str, Guess],
+    drive_keys: dict[str, dict[str, str]],
+) -> Mapping:
+    """Return a mapping of the guesses, with stand-ins for what nobody said of the drive."""
+    signals = {name: signal_keys(guess) for name, guess in guesses.items()}
+    if COURSE in signals:
+        signals[COURSE] |= {"antenna_x_m": 0.0, "antenna_y_m": 0.0}
+    formats = profile.formats
+    given: dict[str, Any] = {"csv": formats.csv, "can": formats.can, "duckdb": formats.duckdb}
+    drive = {**_STAND_IN, **{key: told.get("drive", told) for key, told in drive_keys.items()}}
+    given |= {"missing": profile.absent.texts, "drive": drive}
+    return Mapping.model_validate({"name": "draft", "time": time.keys, "signals": signals, **given})
+
+
+def signal_keys(guess: Guess) -> dict[str, Any]:
+    """Return the keys of a signal in a mapping, those that are not usual."""
+    keys: dict[str, Any] = {"column": guess.profile.channel.name, "unit": guess.unit}
+    if guess.radius_m is not None:
+        keys["radius_m"] = guess.radius_m
+    if guess.negate:
+        keys["negate"] = True
+    if guess.sign is not None:
+        column, negative = guess.sign
+        keys["sign"] = {"column": column, "negative": negative}
+    if guess.component is not None:
+        keys["component"] = guess.component
+    if guess.clockwise_from_north is not None:
+        keys["clockwise_from_north"] = guess.clockwise_from_north
+    rate_hz = guess.profile.rate_hz
+    if rate_hz is not None and rate_hz < 20 and guess.signal not in {COURSE, SPEED}:
+        keys["longest_gap_s"] = round(2 / rate_hz, 2)
+    return keys
+
+
+def _correct(guesses: dict[str, Guess], suspicions: list[Suspicion]) -> dict[str, Guess]:
+    """Return the guesses with signs turned and pairs swapped, each with its figure."""
+    corrected = dict(guesses)
+    for one in suspicions:
+        if one.kind == "reversed":
+            (name,) = one.signals
+            if name not in corrected:
+                continue
+            if name == COURSE:
+                corrected |= _turned_round(corrected, one.figure)
+                continue
+            turned = not corrected[name].negate
+            corrected[name] = corrected[name].because(one.figure, negate=turned)
+        elif one.kind == "swapped" and len(one.signals) == 2 and {*one.signals} <= {*corrected}:
+            left, right = one.signals
+            corrected[left], corrected[right] = (
+                replace(corrected[right].because(one.figure), signal=left),
+                replace(corrected[left].because(one.figure), signal=right),
+            )
+    return corrected
+
+
+def _turned_round(guesses: dict[str, Guess], figure: str) -> dict[str, Guess]:
+    """Return the course counterclockwise, or with north and east swapped."""
+    course, speed = guesses[COURSE], guesses[SPEED]
+    if not course.component:
+        return {COURSE: course.because(figure, clockwise_from_north=False)}
+    return {
+        COURSE: replace(speed.because(figure), signal=COURSE, component="north"),
+        SPEED: replace(course.because(figure), signal=SPEED, component="east"),
+    }
+
+
+def _place_wheels(guesses: dict[str, Guess], drive: dict[str, FloatArray]) -> dict[str, Guess]:
+    """Return where four wheels are: in bends the outer and the front ones are faster."""
+    if "yaw_rate" not in drive:
+        return {}
+    speeds = np.array([drive[name] for name in WHEELS])
+    rows = np.isfinite(speeds).all(axis=0) & np.isfinite(drive["yaw_rate"]) & (speeds[0] > 5)
+    if rows.sum() < 200:
+        return {}
+    relative = speeds[:, rows] / speeds[:, rows].mean(axis=0) - 1
+    yaw_rate = drive["yaw_rate"][rows]
+    outer = relative @ (yaw_rate - yaw_rate.mean())
+    left, right = np.argsort(outer)[:2], np.argsort(outer)[2:]
+    squared = yaw_rate**2 - np.mean(yaw_rate**2)
+    placed = {}
+    for side, pair in (("l", left), ("r", right)):
+        rear, front = sorted(pair, key=lambda wheel: float(relative[wheel] @ squared))
+        for axle, wheel in (("f", front), ("r", rear)):
+            name = f"wheel_{axle}{side}"
+            reason = "in bends it is the " + ("faster" if axle == "f" else "slower")
+            reason += f" of the two on the {'left' if side == 'l' else 'right'}, as yaw rate tells"
+            placed[name] = replace(guesses[WHEELS[wheel]].because(reason), signal=name)
+    return placed
+
+
+# Writes a draft of a mapping as TOML, each guess with its reasons as a comment.
+
+WIDTH = 100
+"""Of a comment."""
+_COPIED = re.compile(r"# ([a-z_0-9]+ = |fleet-slip )")
+_HEAD = """\
+# A draft for {file}. Every line is a guess: check it, with
+# fleet-slip ingest {file} --mapping THIS_FILE --dry-run
+# docs/mapping.md explains the keys, docs/conventions.md the axes and signs.
+"""
+
+
+def name_of(stem: str) -> str:
+    """Return the name of a mapping for a file, whatever that is called, such as 2024-05-30."""
+    plain = re.sub("[^a-z0-9]", "_", stem.lower())
+    return (plain if plain[:1].isalpha() else f"log_{plain}")[:41]
+
+
+def write_draft(draft: Draft, name: str, place: Path | str | None = None) -> str:
+    """Return a mapping in TOML. It lacks what the file does not tell: the day, the car.
+
+    `place` is what a person calls the file, if that is not where it was read.
+    """
+    called = shlex.quote(shown(str(place or draft.file)))
+    parts = [_HEAD.format(file=called), f"name = {_value(name)}\n"]
+    formats = draft.profile.formats
+    if draft.profile.absent.texts:
+        parts.append(f"missing = {_value(draft.profile.absent.texts)}\n")
+    if keys := _csv_keys(formats.csv):
+        parts.append(_table("csv", keys))
+    if formats.can is not None:
+        parts.append(_table("can", {"database": formats.can.database}))
+    if formats.duckdb is not None:
+        parts.append(_table("duckdb", formats.duckdb.model_dump(exclude_none=True)))
+    parts.append(f"# {draft.time.reason}\n" + _table("time", draft.time.keys))
+    parts.append(_drive(draft))
+    parts.append(_signals(draft))
+    if draft.open_questions:
+        parts.append("".join(f"# Look at this: {text}\n" for text in draft.open_questions))
+    return "\n".join(_wrapped(line) for line in "\n".join(parts).split("\n"))
+
+
+def _wrapped(line: str) -> str:
+    """Return a line; a long comment as several lines, unless it has a key or a command."""
+    if len(line) <= WIDTH or not line.startswith("# ") or _COPIED.match(line):
+        return line
+    return textwrap.fill(
+        line, WIDTH, subsequent_indent="#   ", break_long_words=False, break_on_hyphens=False
+    )
+
+
+def _csv_keys(csv: CsvFormat) -> dict[str, Any]:
+    """Return what is not usual of a text file."""
+    keys = csv.model_dump(exclude_defaults=True)
+    return keys | ({"decimal_comma": csv.decimal_comma} if "separator" in keys else {})
+
+
+def _drive(draft: Draft) -> str:
+    lines = ["[drive]"]
+    if not draft.profile.has_clock and not _is_dated(draft):
+        lines.append("# day = 2024-05-31  # to be filled in")
+    trip = draft.drive.get("column", {}).get("drive")
+    if trip is not None:
+        lines.append(f"column = {_value(trip)}  # each value is a drive of its own")
+    car = draft.drive.get("vehicle_id")
+    if car is not None:
+        lines.append(f"vehicle_id = {_value(car)}")
+    else:
+        lines.append('# vehicle_id = ""     # to be filled in')
+    lines.append('# vehicle_model = ""  # to be filled in')
+    return "\n".join(lines) + "\n"
+
+
+def _is_dated(draft: Draft) -> bool:
+    return TimeBase.model_validate(draft.time.keys).is_dated
+
+
+def _signals(draft: Draft) -> str:
+    lines = ["[signals]"]
+    for name, guess in draft.guesses.items():
+        lines.append(f"# {name}: {'; '.join(guess.reasons)}")
+        if guess.component != "east":  # stands beside north
+            end = "  # antenna_x_m and antenna_y_m: to be filled in" if name == COURSE else ""
+            lines.append(_line(name, guess, draft.guesses) + end)
+    for name, guess in draft.questions.items():
+        doubts = "; ".join(guess.doubts) or "its name and unit fit several columns"
+        lines.append(f"# Which one, if any? {name}: {doubts}")
+        if guess.component != "east":
+            alternatives = (guess, *guess.rivals, *_in_other_units(guess))
+            lines += ["# " + _line(name, one, draft.questions) for one in alternatives]
+    known = {*draft.guesses, *draft.questions}
+    absent = [name for name in catalogue().signals if name not in known]
+    if absent:
+        lines.append(f"# No channel looks like {', '.join(absent)}.")
+    return "\n".join(lines) + "\n"
+
+
+def _line(name: str, guess: Guess, guesses: dict[str, Guess]) -> str:
+    keys = signal_keys(guess)
+    if guess.component:
+        east = guesses[SPEED].profile.channel.name
+        keys = {"north": keys["column"], "east": east, "unit": keys["unit"]}
+    told = ", ".join(f"{key} = {_value(value)}" for key, value in keys.items())
+    return f"{name} = {{ {told} }}"
+
+
+def _in_other_units(guess: Guess) -> Iterator[Guess]:
+    """Yield a guess in the other units that its values may be in."""
+    if guess.is_without_unit and not guess.rivals:
+        for unit, radius_m in unit_choices(guess):
+            if unit != guess.unit:
+                yield replace(guess, unit=unit, radius_m=radius_m)
+
+
+def _table(name: str, keys: dict[str, Any]) -> str:
+    return f"[{name}]\n" + "".join(f"{key} = {_value(value)}\n" for key, value in keys.items())
+
+
+def _value(value: object) -> str:
+    """Return a TOML value; its strings are those of JSON."""
+    if isinstance(value, dict):
+        told = ", ".join(f"{key} = {_value(one)}" for key, one in value.items())
+        return f"{{ {told} }}"
+    return json.dumps(value, ensure_ascii=False)

@@ -1,0 +1,807 @@
+"""Checks the order of time and cuts rows, block by block, into drives: uninterrupted stretches."""
+
+import itertools
+import json
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, date, datetime, timedelta
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from fleet_slip.base import BoolArray, FloatArray, IntArray
+from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
+from fleet_slip.catalogue.signals import catalogue, digest_drive, round_chunks
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
+from fleet_slip.ingest.formats.reading import file_errors, open_source
+from fleet_slip.ingest.log_files import parts_of
+from fleet_slip.ingest.log_rows import (
+    describe_refused,
+    join_refused,
+    no_rows,
+    physical,
+    place_label,
+)
+from fleet_slip.ingest.mapping import FromColumn, Mapping
+from fleet_slip.ingest.resampling import (
+    SNAP_TOLERANCE_S,
+    STEP_S,
+    TIME_EPSILON_S,
+    Antenna,
+    Method,
+    Resampler,
+    build_resampler,
+    choose_method,
+    course_and_speed,
+    fixes_on_ticks,
+)
+from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, Suspicion
+from fleet_slip.ingest.vocabulary import is_called, vocabulary
+
+LONGEST_DRIVE_S = 2**19 * STEP_S
+"""A longer stretch is cut after this time, some 87 minutes, so that a drive fits into memory."""
+
+
+_GROUP = np.dtype(
+    [
+        ("last", "f8"),  # time of the last row
+        ("kept", "f8"),  # of the last one that is not isolated
+        ("latest", "f8"),  # the latest time of the stretch
+        ("start", "f8"),  # its first time
+        ("part", "i8"),  # number of the open part
+        ("piece", "i8"),  # which part of the stretch that is
+    ]
+)
+_UNSEEN = np.array((np.nan, np.nan, np.nan, np.nan, -1, -1), dtype=_GROUP)
+
+MOST_STRETCHES = 16
+"""Irregular steps up to which a block is taken apart at them; with more it is cut as a whole."""
+
+
+class _Stretch(NamedTuple):
+    """Rows, and whether they are of one group at times that ascend without a gap."""
+
+    rows: pl.DataFrame
+    is_steady: bool
+
+
+class DriveCutter:
+    """Gives every row the number of its part, a stretch of one `group`, and refuses others.
+
+    Within the rows of one group, in the file's order:
+
+    * a step in time larger than `split_gap_s`, forward or back, begins a new part;
+    * `isolated`: a row whose neighbours are both that far; it goes before parts are made, so one
+      wild time stamp costs one row and does not cut a drive;
+    * `time_duplicate`, `time_backwards`: not later than all earlier rows of its stretch;
+    * a stretch is cut into parts of `longest_s` at most.
+
+    What becomes of a row does not depend on the blocks in which rows come: what the next row
+    decides waits for it.
+    """
+
+    def __init__(self, base: TimeBase, longest_s: float = LONGEST_DRIVE_S) -> None:
+        """Take the gap that ends a drive, and how long a part lasts at most."""
+        self._gap_s = base.split_gap_s + TIME_EPSILON_S
+        self._longest_s = longest_s
+        self._waiting: pl.DataFrame | None = None
+        self._parts = 0
+        self._state = np.empty(0, dtype=_GROUP)
+        """What was seen of each group so far."""
+        self.ended: list[int] = []
+        """Parts that the last block ended, in an order that does not depend on blocks."""
+
+    def cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
+        """Return the rows of a block with their `part`, together; and the misplaced ones."""
+        self.ended = []
+        stretches = _stretches(rows, self._gap_s)
+        found = [
+            self._go_on(stretch, last=last and i + 1 == len(stretches))
+            for i, stretch in enumerate(stretches)
+        ]
+        if len(found) == 1:
+            return found[0]
+        good, bad = zip(*found, strict=True)
+        return pl.concat(good), join_refused(bad)
+
+    def _go_on(self, stretch: "_Stretch", *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
+        """Cut a stretch; at once if nothing happens in it but that a part begins or goes on."""
+        rows = stretch.rows
+        if not stretch.is_steady or self._waiting is not None:
+            return self._cut(rows, last=last)
+        group, time = int(rows["group"][0]), rows["time"].to_numpy()
+        if group >= self._state.size or np.isnan(self._state[group]["last"]):
+            if time.size < 2 or time[-1] - time[0] >= self._longest_s:
+                return self._cut(rows, last=last)
+            self._grow(rows)
+            self._state[group] = (np.nan, np.nan, np.nan, time[0], self._parts, 0)
+            self._parts += 1
+            return self._with_part(rows, group, time[-1])
+        seen = self._state[group]
+        if seen["part"] < 0:
+            return self._cut(rows, last=last)
+        near = all(abs(time[0] - seen[at]) <= self._gap_s for at in ("last", "kept"))
+        piece = (time[-1] - seen["start"]) // self._longest_s
+        if not near or time[0] <= seen["latest"] or piece != seen["piece"]:
+            return self._cut(rows, last=last)
+        return self._with_part(rows, group, time[-1])
+
+    def _with_part(
+        self, rows: pl.DataFrame, group: int, last_s: float
+    ) -> tuple[pl.DataFrame, pl.DataFrame]:
+        """Return rows that are all of their group's open part."""
+        for at in ("last", "kept", "latest"):
+            self._state[at][group] = last_s
+        part = pl.lit(int(self._state["part"][group]), pl.Int64)
+        return rows.with_columns(part.alias("part")), no_rows()
+
+    def _cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
+        """Cut rows of any kind."""
+        several = "base" in rows.columns
+        if self._waiting is not None:
+            rows = pl.concat([self._waiting, rows])
+        if rows.is_empty():
+            return rows.with_columns(pl.lit(0, pl.Int64).alias("part")), no_rows()
+        if several:
+            rows = rows.sort("group", "time", maintain_order=True)
+        elif not rows["group"].is_sorted():
+            rows = rows.sort("group", maintain_order=True)
+        self._grow(rows)
+        alone, waiting, known_at = self._isolated(rows, last=last)
+        self._waiting = rows.filter(pl.Series(waiting)) if waiting.any() else None
+        isolated = _refuse(rows, alone, "isolated")
+        unsettled = alone | waiting
+        if unsettled.any():
+            settled = pl.Series(~unsettled)
+            rows, known_at = rows.filter(settled), known_at[~unsettled]
+        rows, before = self._number_parts(rows, known_at)
+        if several:
+            return rows, isolated
+        time = rows["time"].to_numpy()
+        twice, backwards = time == before, time < before
+        disordered = twice | backwards
+        if disordered.any():
+            refused = [
+                _refuse(rows, twice, "time_duplicate"),
+                _refuse(rows, backwards, "time_backwards"),
+            ]
+            return rows.filter(pl.Series(~disordered)), pl.concat([isolated, *refused])
+        return rows, isolated
+
+    def _grow(self, rows: pl.DataFrame) -> None:
+        """Make room for groups that were not there before."""
+        more = int(rows["group"][-1]) + 1 - self._state.size
+        if more > 0:
+            self._state = np.concatenate([self._state, np.full(more, _UNSEEN, dtype=_GROUP)])
+
+    def _isolated(
+        self, rows: pl.DataFrame, *, last: bool
+    ) -> tuple[BoolArray, BoolArray, FloatArray]:
+        """Return which rows are isolated, which wait for the next, and which row tells that."""
+        group, time = rows["group"].to_numpy(), rows["time"].to_numpy()
+        first, end = _ends(group)
+        before = np.concatenate([[np.nan], time[:-1]])
+        before[first] = self._state["last"][group[first]]
+        far = ~(np.abs(time - before) <= self._gap_s)
+        far_next = np.concatenate([far[1:], [True]])
+        far_next[end] = True
+        alone = far & far_next
+        waiting = np.zeros(alone.size, dtype=np.bool_)
+        if not last:
+            waiting[end] = alone[end]
+            alone[end] = False
+        self._state["last"][group[end]] = np.where(waiting[end], before[end], time[end])
+        # Of several time bases only times tell what comes first.
+        number = time if "base" in rows.columns else rows["row"].to_numpy().astype(np.float64)
+        known_at = np.concatenate([number[1:], [np.inf]])
+        known_at[end] = np.inf
+        return alone, waiting, np.where(far, known_at, number)
+
+    def _number_parts(
+        self, rows: pl.DataFrame, known_at: FloatArray
+    ) -> tuple[pl.DataFrame, FloatArray]:
+        """Return the rows with their parts, and the latest time of its stretch before each.
+
+        Ended parts are told in the order in which it becomes known that they have ended.
+        """
+        group, time, seen = rows["group"].to_numpy(), rows["time"].to_numpy(), self._state
+        first, end = _ends(group)
+        is_first = np.zeros(time.size, dtype=np.bool_)
+        is_first[first] = True
+        before = np.concatenate([[np.nan], time[:-1]])
+        before[first] = seen["kept"][group[first]]
+        begins = ~(np.abs(time - before) <= self._gap_s)
+        before[first] = seen["latest"][group[first]]
+        before[begins] = np.nan
+        latest = time
+        if not (begins | (time > before)).all():
+            latest, before = _latest(time, before, begins | is_first)
+        heads = np.flatnonzero(begins | is_first)
+        start_of = np.where(begins[heads], time[heads], seen["start"][group[heads]])
+        start = np.repeat(start_of, np.diff(np.append(heads, time.size)))
+        piece = ((latest - start) // self._longest_s).astype(np.int64)
+        piece_before = np.concatenate([[-1], piece[:-1]])
+        piece_before[first] = seen["piece"][group[first]]
+        begins |= piece != piece_before
+        heads = np.flatnonzero(begins | is_first)
+        fresh, open_part = begins[heads], seen["part"][group[heads]]
+        part_of = np.where(fresh, self._parts + np.cumsum(fresh) - 1, open_part)
+        self._parts += int(fresh.sum())
+        before_head = np.where(is_first[heads], open_part, np.concatenate([[-1], part_of[:-1]]))
+        over = fresh & (before_head >= 0)
+        order = np.lexsort((group[heads[over]], known_at[heads[over]]))
+        self.ended += before_head[over][order].tolist()
+        parts = np.repeat(part_of, np.diff(np.append(heads, time.size)))
+        now = {"kept": time, "latest": latest, "start": start, "part": parts, "piece": piece}
+        for name, values in now.items():
+            seen[name][group[end]] = values[end]
+        return rows.with_columns(pl.Series("part", parts)), before
+
+    def open_parts(self) -> list[int]:
+        """Return the parts that no block has ended, by group."""
+        return [int(part) for part in self._state["part"] if part >= 0]
+
+
+def sample_interval_s(rows: pl.DataFrame) -> float | None:
+    """Return the usual time between two rows of a drive, the median; None without two rows."""
+    rows = rows if rows["part"].is_sorted() else rows.sort("part", maintain_order=True)
+    step, part = np.diff(rows["time"].to_numpy()), rows["part"].to_numpy()
+    median = pl.Series(step[part[1:] == part[:-1]]).median()
+    return float(median) if isinstance(median, float) else None
+
+
+def sample_intervals_s(rows: pl.DataFrame) -> dict[int, float]:
+    """Return the usual time between two rows of each time base; the only one is number 0."""
+    if "base" not in rows.columns:
+        return {0: sample_interval_s(rows) or STEP_S}
+    bases = rows.partition_by("base", as_dict=True)
+    return {number: sample_interval_s(base) or STEP_S for (number,), base in bases.items()}
+
+
+def _stretches(rows: pl.DataFrame, gap_s: float) -> list[_Stretch]:
+    """Take a block apart so that few rows are beside an irregular step, and most are steady.
+
+    Two rows stand alone at each such step: the one that is far from the last, and the one that
+    tells what it is.
+    """
+    if "base" in rows.columns or rows.height < 2:
+        return [_Stretch(rows, is_steady=False)]
+    step = np.diff(rows["time"].to_numpy())
+    irregular = ~((step > 0) & (step <= gap_s)) | (np.diff(rows["group"].to_numpy()) != 0)
+    heads = np.flatnonzero(irregular) + 1
+    if heads.size > MOST_STRETCHES:
+        return [_Stretch(rows, is_steady=False)]
+    ends = np.unique(np.clip([0, *heads, *(heads + 2), rows.height], 0, rows.height)).tolist()
+    return [
+        _Stretch(rows.slice(start, end - start), is_steady=start not in heads)
+        for start, end in itertools.pairwise(ends)
+    ]
+
+
+def _ends(group: IntArray) -> tuple[IntArray, IntArray]:
+    """Return where each group's rows begin, and the last of them."""
+    if not group.size:
+        nothing = np.empty(0, dtype=np.int64)
+        return nothing, nothing
+    changes = np.flatnonzero(np.diff(group)) + 1
+    return np.concatenate([[0], changes]), np.concatenate([changes - 1, [group.size - 1]])
+
+
+def _latest(
+    time: FloatArray, before: FloatArray, heads: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the latest time up to each row of its stretch, and before it (NaN for the first)."""
+    seeded = np.where(heads & ~np.isnan(before), np.maximum(time, before), time)
+    frame = pl.DataFrame({"time": seeded, "stretch": np.cumsum(heads)})
+    latest = frame.select(pl.col("time").cum_max().over("stretch"))["time"].to_numpy()
+    shifted = np.concatenate([[np.nan], latest[:-1]])
+    return latest, np.where(heads, before, shifted)
+
+
+def _refuse(rows: pl.DataFrame, which: BoolArray, reason: str) -> pl.DataFrame:
+    return describe_refused(rows, which, reason) if which.any() else no_rows()
+
+
+# Keeps the rows of drives that have not ended yet.
+
+MAX_OPEN_ROWS = 20_000_000
+"""Rows of drives that have not ended: 55 hours at 100 Hz of drives that alternate row by row."""
+MOST_RUNS = 8
+"""Runs of rows of one part, in a block, up to which they are sliced one by one."""
+
+
+@dataclass(frozen=True)
+class DriveRows:
+    """The rows of one drive, in the pieces that they came in: they are not joined without need.
+
+    Of several time bases, each piece is of one, and has the signals of that base only.
+    """
+
+    pieces: Sequence[pl.DataFrame]
+
+    @cached_property
+    def height(self) -> int:
+        """Number of rows."""
+        return sum(piece.height for piece in self.pieces)
+
+    @cached_property
+    def group(self) -> int:
+        """Number of what the rows say of the drive."""
+        return int(self.pieces[0]["group"][0])
+
+    @cached_property
+    def start_s(self) -> float:
+        """The first time."""
+        return min(float(piece["time"][0]) for piece in self.pieces)
+
+    @cached_property
+    def end_s(self) -> float:
+        """The last time."""
+        return max(float(piece["time"][-1]) for piece in self.pieces)
+
+    @cached_property
+    def bases(self) -> tuple[int, ...]:
+        """Numbers of the time bases; none if the file has but one."""
+        return tuple(sorted({_base(piece) for piece in self.pieces if "base" in piece.columns}))
+
+    @cached_property
+    def time_s(self) -> FloatArray:
+        """Times of all rows, which are of one base."""
+        return self.column("time")
+
+    def times_of(self, base: int) -> FloatArray:
+        """Return the times of one of several bases."""
+        return np.concatenate([p["time"].to_numpy() for p in self.pieces if _base(p) == base])
+
+    def chunks(self, name: str) -> list[FloatArray]:
+        """Return a column piece by piece, NaN where it has no value."""
+        found: list[FloatArray] = []
+        for piece in self.pieces:
+            some = name in piece.columns
+            chunks = (
+                piece[name].get_chunks() if some else [pl.repeat(np.nan, piece.height, eager=True)]
+            )
+            found += [chunk.to_numpy() for chunk in chunks]
+        return found
+
+    def column(self, name: str) -> FloatArray:
+        """Return a column, NaN where it has no value."""
+        chunks = self.chunks(name)
+        return chunks[0] if len(chunks) == 1 else np.concatenate(chunks)
+
+    def samples(self, name: str) -> pl.DataFrame:
+        """Return `time`, `base` and a signal where it has a value, by time, of several bases."""
+        columns = ["time", "base", name]
+        some = [piece.select(columns) for piece in self.pieces if name in piece.columns]
+        if not some:
+            return pl.DataFrame(schema=dict.fromkeys(columns, pl.Float64))
+        found = pl.concat(some).filter(pl.col(name).is_not_null())
+        return found if found["time"].is_sorted() else found.sort("time", maintain_order=True)
+
+    def number_of(self, name: str) -> int:
+        """Return how many rows have a value in a column."""
+        columns = [piece[name] for piece in self.pieces if name in piece.columns]
+        return sum(len(column) - column.null_count() for column in columns)
+
+    def frame(self) -> pl.DataFrame:
+        """Return all rows in one frame."""
+        return pl.concat(self.pieces, how="diagonal")
+
+
+def _base(piece: pl.DataFrame) -> int:
+    return int(piece["base"][0])
+
+
+class OpenDrives:
+    """Rows by part, as long as the part has not ended."""
+
+    def __init__(self) -> None:
+        """Begin without rows."""
+        self._rows: dict[int, list[pl.DataFrame]] = {}
+        self.number_of_rows = 0
+
+    def add(self, rows: pl.DataFrame) -> None:
+        """Keep rows that are sorted by group, and so the rows of each part stand together."""
+        if rows.is_empty():
+            return
+        self.number_of_rows += rows.height
+        part = rows["part"].to_numpy()
+        heads = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), rows.height]
+        if len(heads) > MOST_RUNS + 1:
+            runs = rows.partition_by("part", maintain_order=True)
+        else:
+            runs = [_run(rows, *ends) for ends in itertools.pairwise(heads)]
+        for run in runs:
+            pieces = _by_base(run) if "base" in run.columns else [run]
+            self._rows.setdefault(int(run["part"][0]), []).extend(pieces)
+
+    def take(self, parts: Iterable[int]) -> Iterator[DriveRows]:
+        """Yield the rows of parts that have any, and let go of them."""
+        for part in parts:
+            found = self._rows.pop(part, None)
+            if found is not None:
+                rows = DriveRows(found)
+                self.number_of_rows -= rows.height
+                yield rows
+
+
+def _run(rows: pl.DataFrame, start: int, end: int) -> pl.DataFrame:
+    """Return some rows; a copy if they are few, or they would keep all others in memory."""
+    run = rows.slice(start, end - start)
+    if 2 * run.height >= rows.height:
+        return run
+    return run.select(pl.all().gather(pl.int_range(pl.len())))
+
+
+def _by_base(run: pl.DataFrame) -> list[pl.DataFrame]:
+    """Return the rows of each time base, with those columns that have a value there."""
+    bases = run.drop("part").partition_by("base", maintain_order=True)
+    return [
+        rows.select(column for column in rows if column.null_count() < rows.height)
+        for rows in bases
+    ]
+
+
+# Makes drives of checked rows: their names and trips, their ticks and counts; and counts them.
+
+SOURCE = "measured"
+_SECONDS_PER_DAY = 86_400
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_EARLIEST_S = 10**8
+"""Times before 1973 are counted from the start of a recording, not from 1970."""
+_FROM_FILE = ("drive_name", "source_file", "trip_id")
+_FROM_MAPPING = (
+    *("vehicle_id", "vehicle_model", "track", "mass_kg"),
+    *("tyres", "receiver", "adhesion", "day"),
+)
+
+
+@dataclass(frozen=True)
+class MeasuredDrive:
+    """One uninterrupted stretch of a file on ticks.
+
+    Attributes:
+        metadata: what is known of it, by column of `logs`.
+        counts: an int16 array for each signal.
+    """
+
+    drive_id: str
+    metadata: dict[str, Any]
+    method: Method
+    ticks: NDArray[np.int32]
+    counts: dict[str, pa.Array]
+
+    @property
+    def num_rows(self) -> int:
+        """Number of its rows, as a table has it."""
+        return self.ticks.size
+
+    @cached_property
+    def counts_digest(self) -> str:
+        """What tells it by its counts."""
+        car, day = str(self.metadata["vehicle_id"]), str(self.metadata["day"])
+        return digest_drive(car, day, self.ticks, self.counts)
+
+
+def drive_id(prefix: str, group: int, stretch: int = 1) -> str:
+    """Return the name of the n-th stretch (from 1) of the drive with this number (from 0)."""
+    return f"{prefix}-{group + 1}" + (f"-{stretch}" if stretch > 1 else "")
+
+
+def to_ticks(
+    rows: DriveRows,
+    mapping: Mapping,
+    intervals_s: dict[int, float],
+    name: str,
+    known: dict[str, Any],
+) -> MeasuredDrive:
+    """Bring one drive's signals, SI units at times in s, to counts at 100 Hz.
+
+    Ticks at which no signal has a value are left out. `intervals_s` are the usual times between
+    the samples of each time base; `known` is what is known of the drive, by column of `logs`.
+    Raises `InputError` for what nobody says.
+    """
+    start_s = rows.start_s
+    resampler = _build_resampler(rows, intervals_s, whole=COURSE in mapping.signals)
+    method, ticks = resampler.method, resampler.ticks.astype(np.int32)
+    counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
+    for signal, source in mapping.signals.items():
+        if signal in {COURSE, SPEED} and COURSE in mapping.signals:
+            continue
+        if method == "snap" and source.interpolate and not source.delay_s:
+            values = rows.chunks(signal)
+        elif len(intervals_s) == 1:
+            values = [_resample(rows.column(signal), resampler, signal, mapping)]
+        else:
+            samples = rows.samples(signal)
+            own = _on_own_times(samples, start_s, resampler, intervals_s)
+            values = [_resample(samples[signal].to_numpy(), own, signal, mapping)]
+        # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
+        counts[signal] = round_chunks(values, catalogue()[signal])
+    if COURSE in mapping.signals:
+        counts |= _fixes(rows, resampler, intervals_s, mapping, counts)
+    counts |= place_label(mapping, counts)
+    for signal in counts:
+        if not counts[signal].null_count:
+            somewhere[:] = True
+        elif not somewhere.all():
+            somewhere |= pl.Series(counts[signal]).is_not_null().to_numpy()
+    if not somewhere.all():
+        kept = pl.Series(somewhere).to_arrow()
+        counts = {key: array.filter(kept) for key, array in counts.items()}
+        ticks = ticks[somewhere]
+    metadata = _metadata(name, known, start_s, mapping)
+    if len(ticks):
+        metadata |= {"rows": len(ticks), "duration_s": (int(ticks[-1]) - int(ticks[0])) * STEP_S}
+    return MeasuredDrive(name, metadata, method, ticks, counts)
+
+
+def _fixes(
+    rows: DriveRows,
+    resampler: Resampler,
+    intervals_s: dict[int, float],
+    mapping: Mapping,
+    counts: dict[str, pa.Array],
+) -> dict[str, pa.Array]:
+    """Return the counts of course and speed over ground, null between fixes."""
+    source = mapping.signals[COURSE]
+    if len(intervals_s) == 1:
+        first, second = rows.column(COURSE), rows.column(SPEED)
+    else:
+        samples = rows.samples(COURSE).join(rows.samples(SPEED), on="time", how="inner")
+        resampler = _on_own_times(samples, rows.start_s, resampler, intervals_s)
+        first, second = samples[COURSE].to_numpy(), samples[SPEED].to_numpy()
+    fixes = fixes_on_ticks(
+        *course_and_speed(source, first, second),
+        resampler,
+        source.delay_s,
+        Antenna(source.antenna_x_m or 0.0, source.antenna_y_m or 0.0),
+        physical(counts, "yaw_rate"),
+        physical(counts, "ay") if "ay" in counts else None,
+    )
+    both = zip((COURSE, SPEED), fixes, strict=True)
+    return {name: round_chunks([values], catalogue()[name]) for name, values in both}
+
+
+def _resample(
+    values: FloatArray, resampler: Resampler, signal: str, mapping: Mapping
+) -> FloatArray:
+    """Return a signal on the ticks of its drive."""
+    source = mapping.signals[signal]
+    if not source.interpolate:
+        return resampler.place(values, source.delay_s)
+    longest_gap_s = source.longest_gap_s or mapping.time.longest_gap_s
+    between = resampler.hold if catalogue()[signal].stepwise else resampler.resample
+    resample = partial(between, delay_s=source.delay_s, longest_gap_s=longest_gap_s)
+    return _on_the_circle(resample, values) if signal == catalogue().label else resample(values)
+
+
+def _build_resampler(rows: DriveRows, intervals_s: dict[int, float], *, whole: bool) -> Resampler:
+    """Return what says the ticks of a drive, and brings its signals there if they share times.
+
+    A `whole` drive is one without missing ticks where gaps are short: a lost sample, of which some
+    loggers have one in a hundred, would leave no seconds in which the yaw rate adds up.
+    """
+    if len(intervals_s) == 1:
+        (interval_s,) = intervals_s.values()
+        time_s = rows.time_s - rows.start_s
+        resampler = build_resampler(time_s, choose_method(time_s, interval_s))
+        if whole and resampler.method == "snap" and (np.diff(resampler.ticks) > 1).any():
+            return build_resampler(time_s, "interpolate")
+        return resampler
+    return build_resampler(np.array([0.0, rows.end_s - rows.start_s]), "interpolate")
+
+
+def _on_own_times(
+    samples: pl.DataFrame, start_s: float, ticks: Resampler, intervals_s: dict[int, float]
+) -> Resampler:
+    """Return what brings the samples of one time base of several onto a drive's ticks."""
+    interval_s = intervals_s[samples["base"][0]] if len(samples) else STEP_S
+    fast = interval_s < STEP_S - SNAP_TOLERANCE_S
+    time_s = samples["time"].to_numpy() - start_s
+    return replace(ticks, time_s=time_s, method="average" if fast else "interpolate")
+
+
+def _on_the_circle(resample: Callable[[FloatArray], FloatArray], angle: FloatArray) -> FloatArray:
+    """Resample an angle without passing through 0 where it wraps from π to -π: the car spins."""
+    present = ~np.isnan(angle)
+    unwrapped = angle.copy()
+    unwrapped[present] = np.unwrap(angle[present])
+    resampled = resample(unwrapped)
+    return np.asarray(resampled - 2 * np.pi * np.rint(resampled / (2 * np.pi)), dtype=np.float64)
+
+
+def _metadata(name: str, told: dict[str, Any], start_s: float, mapping: Mapping) -> dict[str, Any]:
+    """Return what is known of a drive, by column of `logs`. Raises `InputError`."""
+    given = {key: getattr(mapping.drive, key) for key in _FROM_MAPPING}
+    known = {key: value for key, value in given.items() if not isinstance(value, FromColumn)}
+    if given["day"] is None:  # then time is in timestamps, or those of the file's own clock
+        if mapping.time.own_clock and start_s < _EARLIEST_S:
+            raise InputError("its clock does not tell the date. Give it in the mapping: drive.day.")
+        known["day"] = date.fromordinal(_EPOCH.toordinal() + int(start_s // _SECONDS_PER_DAY))
+    known |= {key: value for key, value in told.items() if key in given or key in _FROM_FILE}
+    dated = mapping.time.is_dated and start_s >= _EARLIEST_S
+    return {
+        **known,
+        "started_at": _EPOCH + timedelta(seconds=start_s) if dated else None,  # to the microsecond
+        **_facts_of(mapping, known),
+        "drive_id": name,
+        "source": SOURCE,
+        "campaign": mapping.name,
+        "saturated": 0,  # what is outside its range is quarantined, not clipped
+    }
+
+
+def _facts_of(mapping: Mapping, known: dict[str, Any]) -> dict[str, Any]:
+    """Return what the mapping's table adds to what is known of a car. Raises `InputError`."""
+    vehicles = mapping.vehicle_facts()
+    if not vehicles:
+        return {}
+    vehicle = known["vehicle_id"]
+    facts = next((facts for facts in vehicles if facts.vehicle_id == vehicle), None)
+    if facts is None:
+        raise InputError(
+            f"the car {vehicle!r} is not in the table of vehicles of the mapping "
+            f"{mapping.name!r}. Add a row for it."
+        )
+    told = {name: fact for name, fact in facts.model_dump().items() if known.get(name) is None}
+    if told.get("vehicle_model", "") is None:
+        raise InputError(f"nobody says the vehicle_model of the car {vehicle!r}. Add it.")
+    return told
+
+
+class Trips:
+    """Names each drive's trip: the first of the drives of one file that follow each other."""
+
+    def __init__(self) -> None:
+        """Begin without drives."""
+        self._last: dict[int, tuple[str, float]] = {}
+
+    def name(self, drive_id: str, group: int, start_s: float, end_s: float) -> str:
+        """Return the trip of a group's next drive; a clock that goes back begins another."""
+        trip_id, ended_s = self._last.get(group, (drive_id, start_s))
+        if not 0 <= start_s - ended_s <= LONGEST_PAUSE_S:
+            trip_id = drive_id
+        self._last[group] = trip_id, end_s
+        return trip_id
+
+
+# Finds rows of several cars or trips that a mapping takes for those of one.
+#
+# A log of several cars in turns becomes drives that no car drove: neighbouring rows differ by more
+# than a car can change between them. Where times are dated, one car cannot be under way twice. And
+# a column that is named as cars or trips are, and that no mapping uses, tells them apart.
+
+_LIMITS = {
+    **dict.fromkeys(WHEELS, (3 / RADIUS_M, 150 / RADIUS_M)),  # a wheel may lock within 0.15 s
+    "vx": (3.0, 30.0),
+    "vehicle_speed": (3.0, 30.0),
+    "steering_wheel": (0.5, 30.0),
+    "yaw_rate": (0.3, 30.0),
+}
+"""More than its own noise, and so much a second, no car's signal changes from row to row."""
+_STANDING = {**dict.fromkeys(WHEELS, 2 / RADIUS_M), "vx": 2.0, "vehicle_speed": 2.0}
+"""A speed below, as any 0, is that of a car that stands, or of a sensor lost for a while."""
+FEWEST_JUMPS, FEWEST_A_MINUTE = 10, 3.0
+MOST_TOLD = 0.15
+"""Where more neighbours than this part jump, these are no single values that went wrong."""
+OVERLAP_S = 1.0
+MOST_NAMES, LEAST_ROWS_A_NAME = 1000, 20
+
+
+class SeveralCars:
+    """What tells, of the drives of one file, that they are of several cars."""
+
+    def __init__(self) -> None:
+        """Begin without drives."""
+        self._jumps: Counter[str] = Counter()
+        self._under_way: dict[str, list[tuple[float, float]]] = defaultdict(list)
+
+    def add(self, rows: DriveRows, drive: MeasuredDrive) -> None:
+        """Look at the rows of a drive."""
+        for name in _LIMITS:
+            if any(name in piece.columns for piece in rows.pieces):
+                self._jumps[name] += _count_jumps(name, *_samples(rows, name))
+        if drive.metadata["started_at"] is not None:
+            car = str(drive.metadata["vehicle_id"])
+            self._under_way[car].append((rows.start_s, rows.end_s))
+
+    def suspicions(self) -> Iterator[Suspicion]:
+        """Yield what is seen of several cars, once all drives were looked at."""
+        remedy = "Map the column that tells cars or trips apart."
+        for name, jumps in self._jumps.most_common(1):
+            if jumps:
+                figure = f"from row to row it jumps {jumps:,} times as that of no car does"
+                yield Suspicion("cars", (name,), figure, remedy)
+        twice = sum(_overlaps(under_way) for under_way in self._under_way.values())
+        if twice:
+            figure = f"one car is under way twice at a time, {twice:,} times"
+            yield Suspicion("repeated", ("time",), figure, remedy)
+
+
+def unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Suspicion]:
+    """Yield columns named as cars or trips are that tell rows apart, and that a mapping passes by.
+
+    `drives` is what the file fell into. Logs that have clocks of their own are those of one car.
+    """
+    wanted = {
+        key: words
+        for key, words in vocabulary()["cars"].items()
+        if not (mapping.drive.column or isinstance(getattr(mapping.drive, key), FromColumn))
+    }
+    if mapping.time.own_clock or not wanted:
+        return
+    used = {name for names in mapping.time_bases().values() for name in names}
+    part = parts_of(file)[0]
+    with file_errors(part), open_source(part, mapping.formats) as source:
+        names = [channel.name for channel in source.channels()]
+        for key, words in wanted.items():
+            for name in names:
+                if name in used or names.count(name) > 1 or not is_called(words, name):
+                    continue
+                column = pl.concat([batch[name] for batch in source.batches([name])])
+                values, runs = _values_and_runs(column)
+                if values > 1 and (key == "vehicle_id" or runs > values or values > drives):
+                    figure = f"it has {values:,} values, and the mapping does not use it"
+                    told = json.dumps(name, ensure_ascii=False)
+                    where = f"column = {told}"
+                    where = f"{key} = {{ {where} }}" if key != "column" else where
+                    yield Suspicion("cars", (name,), figure, f"Write {where} under [drive].")
+
+
+def _values_and_runs(column: pl.Series) -> tuple[int, int]:
+    """Return how many names a column has, and how often one begins; none if it is a quantity."""
+    texts = column.cast(pl.String).str.strip_chars()
+    present = texts.filter(texts.is_not_null() & (texts != ""))
+    values = present.n_unique()
+    if values > min(MOST_NAMES, len(present) // LEAST_ROWS_A_NAME):
+        return 0, 0
+    return values, 1 + int((present != present.shift()).sum())
+
+
+def _samples(rows: DriveRows, name: str) -> tuple[FloatArray, FloatArray]:
+    """Return the times and values of a signal of a drive, where it has some."""
+    if rows.bases:
+        samples = rows.samples(name)
+        return samples["time"].to_numpy(), samples[name].to_numpy()
+    values = rows.column(name)
+    present = np.isfinite(values)
+    return (rows.time_s, values) if present.all() else (rows.time_s[present], values[present])
+
+
+def _count_jumps(name: str, time_s: FloatArray, values: FloatArray) -> int:
+    """Return how often a signal jumps from row to row, 0 if so seldom that a sensor may do it."""
+    if time_s.size < FEWEST_JUMPS or not time_s[-1] > time_s[0]:
+        return 0
+    if np.count_nonzero(np.abs(np.diff(values)) > _LIMITS[name][0]) < FEWEST_JUMPS:
+        return 0  # of most drives this tells it, at a third of the cost of all below
+    jumps = _jumps(name, time_s, values)
+    if jumps.sum() < max(FEWEST_JUMPS, MOST_TOLD * jumps.size):  # values that are wrong alone
+        alone = np.zeros(values.size, dtype=np.bool_)
+        alone[1:-1] = jumps[:-1] & jumps[1:]
+        jumps = _jumps(name, time_s[~alone], values[~alone])
+    minutes = (time_s[-1] - time_s[0]) / 60
+    return int(jumps.sum()) if jumps.sum() >= max(FEWEST_JUMPS, FEWEST_A_MINUTE * minutes) else 0
+
+
+def _jumps(name: str, time_s: FloatArray, values: FloatArray) -> BoolArray:
+    noise, rate = _LIMITS[name]
+    slower = np.minimum(np.abs(values[1:]), np.abs(values[:-1]))
+    jumps = np.abs(np.diff(values)) > noise + rate * np.diff(time_s)
+    return np.asarray(jumps & (slower > _STANDING.get(name, 0.0)))
+
+
+def _overlaps(under_way: list[tuple[float, float]]) -> int:
+    """Return how many of some drives begin while an earlier one is under way."""
+    ordered = sorted(under_way)
+    latest = itertools.accumulate((end for _, end in ordered), max)
+    return sum(
+        start < end - OVERLAP_S for (start, _), end in zip(ordered[1:], latest, strict=False)
+    )

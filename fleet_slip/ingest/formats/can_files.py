@@ -1,0 +1,457 @@
+"""Reads CAN traces: BLF, ASC, candump and what else python-can does, with a database of messages.
+
+Each message is a time base, a column is `Message.Signal`. Frames of errors and remote requests are
+passed over. A value that the database gives a name, such as `SNA`, is no number: it is null, or in
+a signal that has no other values the name itself.
+"""
+
+import os
+import re
+import struct
+import zlib
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from functools import partial
+from itertools import product
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+import polars as pl
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from fleet_slip.base import BoolArray, IntArray, shown
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.can import (
+    MOST_BYTES,
+    Bytes,
+    CanBus,
+    CanFrames,
+    FrameBlock,
+    is_possible,
+    is_sent,
+    needed_bytes,
+    parse_database,
+    physical,
+    raw_numbers,
+)
+from fleet_slip.ingest.formats.source import (
+    OWN_TIME,
+    Base,
+    Budget,
+    Channel,
+    ClockSource,
+    describe_missing,
+    reading_with,
+)
+from fleet_slip.ingest.log_files import Spool
+
+# The CAN frames of a BLF file, as arrays: some containers of objects at a time.
+#
+# Nobody published the format; it is as python-can reads it (after Toby Lorenz's Vector BLF), frame
+# by frame and a hundred times slower, which the tests compare with. A file may say what it likes:
+# sizes are looked at before anything is unfolded or read.
+
+MAGIC = b"LOGG"
+_MARK, _OBJECT = b"LOBJ", struct.Struct("<4s4xII")
+"""What an object begins with: the mark, its size and its kind."""
+_MARKS = re.compile(_MARK)
+_CONTAINER, _CONTAINER_HEADER = 10, struct.Struct("<16xH14x")
+_PLAIN, _COMPRESSED = 0, 2
+_LARGEST_OBJECT, _PADDING = 2**20, 4
+_REACH = len(_MARK) + _PADDING
+_AT_ONCE = 2**22
+"""Bytes of containers that are read together."""
+
+_HEADERS = {1: 32, 2: 40}
+"""Bytes of an object's header, by its version."""
+_HEADER = {"version": ("<u2", 6), "size": ("<u4", 8), "kind": ("<u4", 12)}
+_TIMED = {"flags": ("<u4", 16), "time": ("<u8", 24)}
+"""What begins every object, and what more a header has: the types of fields, and where."""
+
+
+class _Kind(NamedTuple):
+    """What follows the header in a kind of frame."""
+
+    fields: dict[str, tuple[str, int]]
+    """Types and places of fields; `further` is where other data follow, if not at the end."""
+    size: int
+    remote: int
+    """The bit in `how` of a frame that asks for data and has none."""
+
+
+_CLASSIC = _Kind(
+    {"bus": ("<u2", 0), "how": ("u1", 2), "length": ("u1", 3), "number": ("<u4", 4)}
+    | {"data": ("8u1", 8)},
+    size=16,
+    remote=0x80,
+)
+_FD = _Kind(
+    {"bus": ("<u2", 0), "how": ("u1", 2), "number": ("<u4", 4), "length": ("u1", 14)}
+    | {"data": ("64u1", 20)},
+    size=84,
+    remote=0x80,
+)
+_FD_64 = _Kind(
+    {"bus": ("u1", 0), "length": ("u1", 2), "number": ("<u4", 4), "how": ("<u4", 12)}
+    | {"further": ("u1", 35)},
+    size=40,
+    remote=0x10,
+)
+_KINDS = {1: _CLASSIC, 86: _CLASSIC, 100: _FD, 101: _FD_64}
+_EXTENDED, _IDENTIFIER, _TENS_OF_US = 1 << 31, (1 << 29) - 1, 1
+_NONE = np.empty(0, dtype=np.int64)
+_NOTHING = FrameBlock(_NONE, _NONE > 0, _NONE / 1.0, _NONE, _NONE, np.empty((0, 0), dtype=np.uint8))
+
+
+def read_blf_frames(budget: Budget, start_s: float) -> Iterator[FrameBlock]:
+    """Yield the data frames of a file that begins at `start_s`; all other objects are passed over.
+
+    Raises `InputError` for a file that is damaged or more than it seems, and `OSError`.
+    """
+    rest = b""
+    with budget.file.open("rb") as stream:
+        for some in _together(_containers(stream, budget)):
+            content = rest + some
+            begins, end = _objects(content, budget)
+            rest = content[end:]
+            if len(begins):
+                yield _frames(content, begins, start_s, budget)
+    if _MARK in rest:
+        raise budget.damaged("a last object that ends too early")
+
+
+def _together(containers: Iterator[bytes]) -> Iterator[bytes]:
+    """Yield contents that are long enough for what it costs to look at one."""
+    some: list[bytes] = []
+    for container in containers:
+        some.append(container)
+        if sum(map(len, some)) >= _AT_ONCE:
+            yield b"".join(some)
+            some = []
+    yield b"".join(some)
+
+
+def _containers(stream: BinaryIO, budget: Budget) -> Iterator[bytes]:
+    """Yield the content of each container."""
+    stream.seek(len(MAGIC))
+    (at,) = struct.unpack("<I", stream.read(4).ljust(4, b"\0"))
+    while header := os.pread(stream.fileno(), _CONTAINER_HEADER.size, at):
+        mark, size, kind = _OBJECT.unpack_from(header.ljust(_CONTAINER_HEADER.size))
+        if mark != _MARK or len(header) < _CONTAINER_HEADER.size:
+            raise budget.damaged(f"no object at byte {at:,}")
+        if size < len(header):
+            raise budget.damaged(f"an object of {size:,} bytes")
+        if kind == _CONTAINER:
+            content = os.pread(stream.fileno(), size - len(header), at + len(header))
+            if len(content) < size - len(header):
+                raise budget.damaged("a container that ends too early")
+            yield _unfolded(content, _CONTAINER_HEADER.unpack(header)[0], budget)
+        at += size + size % _PADDING
+        budget.meter.pass_over(at, budget.size)
+
+
+def _unfolded(content: bytes, method: int, budget: Budget) -> bytes:
+    if method == _COMPRESSED:
+        try:
+            return zlib.decompress(content)
+        except zlib.error as error:
+            raise budget.damaged(f"a container that zlib cannot unfold ({error})") from None
+    if method != _PLAIN:
+        raise budget.damaged(f"a container compressed by an unknown method, {method}")
+    return content
+
+
+def _objects(content: bytes, budget: Budget) -> tuple[IntArray, int]:
+    """Return where whole objects begin, and where the last of them ends.
+
+    Marks are all objects, if each stands where the object before it ends; where one is among data,
+    objects are sought one after the other.
+    """
+    begins = np.array([found.start() for found in _MARKS.finditer(content)], dtype=np.int64)
+    begins = begins[begins <= len(content) - _OBJECT.size]
+    sizes = _read(np.frombuffer(content, np.uint8), begins, _HEADER, _OBJECT.size)["size"]
+    ends = begins + sizes
+    gaps = begins - np.concatenate([[0], ends[:-1]])
+    possible = (sizes >= _OBJECT.size) & (sizes <= _LARGEST_OBJECT)
+    if (possible & (gaps >= 0) & (gaps <= _PADDING)).all():
+        begins = begins[ends <= len(content)]
+        end = int(ends[len(begins) - 1]) if len(begins) else 0
+    else:
+        begins, end = _seek_objects(content, budget)
+    left = content[end : end + _REACH]
+    if len(left) == _REACH and _MARK not in left:
+        raise budget.damaged("no object where the next should begin")
+    return begins, end
+
+
+def _seek_objects(content: bytes, budget: Budget) -> tuple[IntArray, int]:
+    """Do what `_objects` does, from object to object."""
+    begins: list[int] = []
+    at = 0
+    while (begin := content.find(_MARK, at, at + _REACH)) >= 0:
+        if len(content) < begin + _OBJECT.size:
+            break
+        _, size, _ = _OBJECT.unpack_from(content, begin)
+        if not _OBJECT.size <= size <= _LARGEST_OBJECT:
+            raise budget.damaged(f"an object of {size:,} bytes")
+        if begin + size > len(content):
+            break
+        begins.append(begin)
+        at = begin + size
+    return np.array(begins, dtype=np.int64), at
+
+
+def _frames(content: bytes, begins: IntArray, start_s: float, budget: Budget) -> FrameBlock:
+    """Return the data frames among some objects, in their order."""
+    data = np.frombuffer(content, dtype=np.uint8)
+    heads = _read(data, begins, _HEADER, _OBJECT.size)
+    blocks, places = [_NOTHING], [_NONE]
+    for (number, kind), (version, header) in product(_KINDS.items(), _HEADERS.items()):
+        at = np.flatnonzero((heads["kind"] == number) & (heads["version"] == version))
+        if not len(at):
+            continue
+        least, size = heads["size"][at].min(), header + kind.size
+        if least < size:
+            raise budget.damaged(f"a frame of {least} bytes")
+        fields = {name: (form, header + place) for name, (form, place) in kind.fields.items()}
+        found = _read(data, begins[at], _TIMED | fields, size)
+        if "data" in fields:
+            payloads = found["data"]
+        else:
+            ends = np.where(found["further"] > 0, found["further"], heads["size"][at])
+            payloads = _data_behind(data, begins[at] + size, ends.astype(np.int64) - size)
+        numbers = found["number"].astype(np.int64)
+        block = FrameBlock(
+            numbers & _IDENTIFIER,
+            numbers & _EXTENDED != 0,
+            found["time"] / np.where(found["flags"] == _TENS_OF_US, 1e5, 1e9) + start_s,
+            found["bus"].astype(np.int64) - 1,
+            np.minimum(found["length"].astype(np.int64), payloads.shape[1]),
+            payloads,
+        )
+        sent = found["how"] & kind.remote == 0
+        blocks.append(block.where(sent))
+        places.append(at[sent])
+    return _joined(blocks).where(np.argsort(np.concatenate(places), kind="stable"))
+
+
+def _joined(blocks: list[FrameBlock]) -> FrameBlock:
+    """Return several blocks as one."""
+    widest = max(block.data.shape[1] for block in blocks)
+    columns = list(zip(*(vars(block).values() for block in blocks), strict=True))
+    columns[-1] = tuple(np.pad(data, ((0, 0), (0, widest - data.shape[1]))) for data in columns[-1])
+    return FrameBlock(*map(np.concatenate, columns))
+
+
+def _data_behind(data: Bytes, starts: IntArray, there: IntArray) -> Bytes:
+    """Return the data at some places; where too little is there, zeros, as CANoe reads it."""
+    found: Bytes = sliding_window_view(np.pad(data, (0, MOST_BYTES)), MOST_BYTES)[starts]
+    found[np.arange(MOST_BYTES) >= there[:, np.newaxis]] = 0
+    return found
+
+
+def _read(
+    data: Bytes, begins: IntArray, fields: dict[str, tuple[str, int]], size: int
+) -> NDArray[Any]:
+    """Return fields of so many bytes at some places."""
+    formats, offsets = zip(*fields.values(), strict=True)
+    kind = np.dtype(
+        {"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": size}
+    )
+    if not len(begins):  # perhaps there is not even room for one
+        return np.empty(0, dtype=kind)
+    records: NDArray[Any] = sliding_window_view(data, size)[begins].view(kind)[:, 0]
+    return records
+
+
+SUFFIXES = {".blf", ".asc", ".log", ".trc"}
+TOLD_EVERY = 2**12
+"""Frames that are read one by one until it is told how far the file is read."""
+
+
+_Key = tuple[int, bool]
+"""Number of a message, and whether it is of 29 bits."""
+
+
+class CanSource(ClockSource):
+    """The messages of a CAN trace."""
+
+    def __init__(self, bus: CanBus, database: Any, spool: Spool, budget: Budget) -> None:
+        """Take what the mapping says of the trace, the parsed database, and the file."""
+        self._file, self._bus, self._database = budget.file, bus, database
+        self._spool, self._budget = spool, budget
+        self._messages = {message.name: message for message in database.messages}
+        self._wanted: set[_Key] = set()
+        self._numbers: set[_Key] = set()
+        """Of the messages in the trace, once it was read."""
+
+    def channels(self) -> list[Channel]:
+        """Return the signals of all messages of the trace that the database knows."""
+        self._want({_key(message) for message in self._database.messages})
+        return [
+            Channel(f"{message.name}.{signal.name}", signal.unit or "", message.name)
+            for message in self._database.messages
+            if _key(message) in self._numbers
+            for signal in message.signals
+        ]
+
+    def bases(self, columns: Sequence[str]) -> list[Base]:
+        """Return the messages that have one of the columns. Raises `InputError`."""
+        wanted: dict[str, dict[str, Any]] = defaultdict(dict)
+        for column in columns:
+            name, _, signal = column.partition(".")
+            of = self._messages[name].signals if name in self._messages else ()
+            found = {s.name: s for s in of if is_possible(s)}
+            if signal not in found:
+                known = [f"{m}.{s.name}" for m, of in self._messages.items() for s in of.signals]
+                raise InputError(f"{shown(self._bus.database)}: {describe_missing(column, known)}")
+            wanted[name][column] = found[signal]
+        self._want({_key(self._messages[name]) for name in wanted})
+        return [
+            Base(name, partial(self._count, name, signals), partial(self._read, name, signals))
+            for name, signals in wanted.items()
+        ]
+
+    def _want(self, asked: set[_Key]) -> None:
+        """Read the trace, once more if it was read without these messages."""
+        if not self._numbers or not asked <= self._wanted:
+            self._wanted |= asked
+            self._spool.clear()
+            self._frames = {key: CanFrames(self._spool) for key in self._wanted}
+            self._numbers = set()
+            self._read_trace()
+            if not self._numbers:
+                raise InputError(
+                    f"{shown(self._file)}: there is no CAN frame in it. Record it again."
+                )
+
+    def _count(self, name: str, signals: dict[str, Any]) -> int:
+        """Return how many frames of a message have one of the signals."""
+        if any(signal.multiplexer_ids is None for signal in signals.values()):
+            return self._frames[_key(self._messages[name])].sizes_on(self._bus.channel).total()
+        return sum(table.height for table in self._read(name, signals))
+
+    def _read(self, name: str, signals: dict[str, Any]) -> Iterator[pl.DataFrame]:
+        """Yield the signals of one message; rows are frames that have one of them."""
+        message, needed = self._messages[name], max(map(needed_bytes, signals.values()))
+        frames = self._require_usable(message, next(iter(signals)), needed)
+        named = {
+            column
+            for column, signal in signals.items()
+            if signal.choices and self._has_names_only(message, signal)
+        }
+        for times_s, payloads in frames.take(self._bus.channel, needed):
+            frame = {OWN_TIME: pl.Series(times_s)}
+            some = np.zeros(len(times_s), dtype=np.bool_)
+            for column, signal in signals.items():
+                sent = is_sent(message, signal, payloads)
+                some |= sent
+                raw = raw_numbers(signal, payloads)
+                frame[column] = _values(signal, raw, sent, as_names=column in named).alias(column)
+            yield pl.DataFrame(frame).filter(some)
+
+    def _has_names_only(self, message: Any, signal: Any) -> bool:
+        """Whether the database gives all values of a signal a name, and there is one."""
+        found = False
+        needed = needed_bytes(signal)
+        for _, payloads in self._frames[_key(message)].take(self._bus.channel, needed):
+            sent = is_sent(message, signal, payloads)
+            named = np.isin(raw_numbers(signal, payloads), list(signal.choices))
+            if not (named | ~sent).all():
+                return False
+            found |= bool(sent.any())
+        return found
+
+    def _require_usable(self, message: Any, column: str, needed: int) -> CanFrames:
+        """Return the frames of a message. Raises `InputError` if they are not what it says."""
+        frames = self._frames[_key(message)]
+        if _key(message) not in self._numbers:
+            known = sum(_key(m) in self._numbers for m in self._database.messages)
+            raise InputError(
+                f"{shown(self._file)}: the message {message.name} ({message.frame_id:#x}) is not "
+                f"in it. Of the {len(self._numbers)} numbers in the trace {known} are in "
+                f"{self._bus.database}. Is it the database of this car and bus?"
+            )
+        buses = frames.buses
+        if self._bus.channel is None and len(buses) > 1:
+            raise InputError(
+                f"{shown(self._file)}: the message {message.name} is on the buses "
+                f"{', '.join(buses)}. Say in the mapping which counts: [can] channel = "
+                f'"{buses[0]}".'
+            )
+        sizes = frames.sizes_on(self._bus.channel)
+        short = sum(number for size, number in sizes.items() if size < needed)
+        if short or not sizes:
+            raise InputError(
+                f"{shown(self._file)}: {short:,} of {sizes.total():,} frames of "
+                f"{message.name} ({message.frame_id:#x}) are too short: {column} ends "
+                f"in byte {needed}, the longest has {max(sizes, default=0)}; buses: "
+                f"{', '.join(buses)}. Is {self._bus.database} the database of this car and bus?"
+            )
+        return frames
+
+    def _keep(self, block: FrameBlock) -> None:
+        """Keep the frames of the wanted messages, and note the numbers of all."""
+        keys = block.numbers << 1 | block.extended
+        order = np.argsort(keys, kind="stable")
+        found, firsts = np.unique(keys[order], return_index=True)
+        for key, chosen in zip(found.tolist(), np.split(order, firsts[1:]), strict=True):
+            of = key >> 1, bool(key & 1)
+            self._numbers.add(of)
+            if of in self._frames:
+                self._frames[of].extend(block.where(chosen))
+
+    def _read_trace(self) -> None:
+        """Keep the frames of the wanted messages, and note the numbers of all."""
+        if self._file.suffix.lower() not in SUFFIXES:
+            raise InputError(
+                f"{shown(self._file)}: the suffix tells the format of a CAN trace: "
+                f"{', '.join(sorted(SUFFIXES))}. Name it as what it is."
+            )
+        with reading_with(self._file, "can") as can, can.LogReader(self._file) as trace:
+            self._require_whole(trace)
+            if isinstance(trace, can.BLFReader):
+                for block in read_blf_frames(self._budget, trace.start_timestamp):
+                    self._keep(block)
+                return
+            for number, frame in enumerate(trace):
+                if not number % TOLD_EVERY:
+                    self._budget.meter.pass_over(trace.file.buffer.tell(), self._budget.size)
+                if frame.is_error_frame or frame.is_remote_frame:
+                    continue
+                key = frame.arbitration_id, frame.is_extended_id
+                self._numbers.add(key)
+                if key in self._frames:
+                    self._frames[key].append(frame.timestamp, str(frame.channel), frame.data)
+
+    def _require_whole(self, trace: Any) -> None:
+        # A BLF file says how long it is; python-can reads what is there of one that was cut.
+        stated, there = getattr(trace, "file_size", 0), self._file.stat().st_size
+        if stated > there:
+            raise InputError(
+                f"{shown(self._file)}: {there:,} of {stated:,} bytes: it is truncated. Copy it "
+                "again."
+            )
+
+
+def _values(signal: Any, raw: NDArray[Any], sent: BoolArray, *, as_names: bool) -> pl.Series:
+    """Return a signal, null where it was not sent; values that have a name are null, or all it."""
+    named = np.isin(raw, list(signal.choices)) if signal.choices else np.zeros_like(sent)
+    if as_names:
+        texts = {value: str(text) for value, text in signal.choices.items()}
+        names = [texts[v] if s else None for v, s in zip(raw, sent, strict=True)]
+        return pl.Series(names, dtype=pl.String)
+    return pl.Series(physical(signal, raw)).set(pl.Series(~sent | named), None)
+
+
+def _key(message: Any) -> _Key:
+    return message.frame_id, message.is_extended_frame
+
+
+@contextmanager
+def open_can_trace(bus: CanBus, budget: Budget) -> Iterator[CanSource]:
+    """Open a CAN trace. Raises `InputError`, for a database that cannot be parsed too."""
+    with closing(Spool()) as spool:
+        yield CanSource(bus, parse_database(bus), spool, budget)

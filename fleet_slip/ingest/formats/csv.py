@@ -1,0 +1,328 @@
+"""Reads CSV in blocks of whole lines: fields as text, columns of plain numbers as numbers."""
+
+import codecs
+import csv
+from collections.abc import Iterator, Sequence, Set
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BufferedReader, BytesIO, RawIOBase
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+from pydantic import Field, field_validator, model_validator
+
+from fleet_slip.base import is_finite, shown
+from fleet_slip.compute.tasks import map_ahead
+from fleet_slip.config import Config, added
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.source import Budget, Channel, require_columns
+
+if TYPE_CHECKING:
+    from _typeshed import WriteableBuffer
+
+
+# What the text of a CSV file is made of: encoding, separator, and which of its lines are data.
+
+BUFFER_BYTES = 2**22
+MAX_LINE_BYTES = 2**20
+COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd"}
+"""What compressed files begin with."""
+
+
+Encoding = Literal["utf-8", "utf-16", "cp1252"]
+Line = Annotated[int, Field(ge=1, le=1000)]
+
+
+class CsvFormat(Config):
+    """How a CSV file is written. Lines are counted from 1, as editors do.
+
+    What came after the first release is left out of the mapping's identity where it is usual.
+    """
+
+    separator: str = ","
+    decimal_comma: bool = False
+    encoding: Encoding = added("utf-8")
+    """UTF-8 is with or without a byte order mark."""
+    header_line: Line = added(1)
+    """The line with the names of the columns; those above it are passed over."""
+    data_line: Line | None = added(None)
+    """The first line of data, if it is not the next: a line of units may be between."""
+
+    @field_validator("separator")
+    @classmethod
+    def _one_character(cls, separator: str) -> str:
+        if len(separator) != 1 or not separator.isascii() or separator in '"\r\n\0':
+            raise ValueError("must be one ASCII character such as ',', ';' or a tab")
+        return separator
+
+    @model_validator(mode="after")
+    def _unambiguous(self) -> "CsvFormat":
+        if self.decimal_comma and self.separator == ",":
+            raise ValueError("with decimal_comma the separator cannot be ',': set it, often ';'")
+        if self.data_line is not None and self.data_line <= self.header_line:
+            raise ValueError("data_line must come after header_line")
+        return self
+
+    @property
+    def lines_between(self) -> int:
+        """Lines between the header and the data."""
+        return (self.data_line or self.header_line + 1) - self.header_line - 1
+
+
+def decompressed(stream: BinaryIO) -> BinaryIO:
+    """Return the text of a stream, whatever it is compressed with."""
+    start = stream.read(max(map(len, COMPRESSED)))
+    stream.seek(0)
+    for magic, codec in COMPRESSED.items():
+        if start.startswith(magic):
+            # Text is read in blocks: what a small file may become is never in memory at once.
+            plain = pa.CompressedInputStream(stream, codec)
+            return BufferedReader(plain, BUFFER_BYTES)
+    return stream
+
+
+class _Recoded(RawIOBase):
+    """A stream of text in another encoding, as UTF-8."""
+
+    def __init__(self, stream: BinaryIO, encoding: Encoding) -> None:
+        self._stream, self._rest = stream, b""
+        self._decoder = codecs.getincrementaldecoder(encoding)()
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: "WriteableBuffer") -> int:
+        room, ended = memoryview(buffer).cast("B"), False
+        while not self._rest and not ended:
+            more = self._stream.read(max(len(room) // 4, 1024))
+            ended = not more
+            self._rest = self._decoder.decode(more, final=ended).encode()
+        taken, self._rest = self._rest[: len(room)], self._rest[len(room) :]
+        room[: len(taken)] = taken
+        return len(taken)
+
+
+def recoded(stream: BinaryIO, encoding: Encoding) -> BinaryIO:
+    """Return text in another encoding as UTF-8."""
+    return stream if encoding == "utf-8" else BufferedReader(_Recoded(stream, encoding), 2**20)
+
+
+def text_of(stream: BinaryIO, csv_format: CsvFormat) -> BinaryIO:
+    """Return the UTF-8 text of a stream, whatever it is compressed with."""
+    return recoded(decompressed(stream), csv_format.encoding)
+
+
+def first_lines(file: Path, csv_format: CsvFormat, most: int) -> list[str]:
+    """Return the first lines of a text file, whatever it is compressed with."""
+    with file.open("rb") as stream:
+        text = text_of(stream, csv_format)
+        lines = iter(lambda: text.readline(MAX_LINE_BYTES), b"")
+        return [line.decode("utf-8", "replace").rstrip("\r\n") for line in islice(lines, most)]
+
+
+BLOCK_BYTES = 2**22
+"""CSV is parsed in blocks of about this size."""
+
+_SAMPLE_BYTES = 2**18
+
+LINE_BLOCKS = 4
+"""Blocks that one line may fill. Where it fills more, usually a quote was not closed."""
+
+EXTRA_FIELDS = "\0extra fields"
+"""Column of a CSV batch: what a line has after the header's last column, null if nothing."""
+
+
+@dataclass(frozen=True)
+class PlainNumbers:
+    """Columns that are used only as numbers, and numbers that mean "no value".
+
+    They are parsed as numbers at once, three times as fast as by way of text. A column in which a
+    text is empty, is not a number or means "no value" is read as text.
+    """
+
+    columns: frozenset[str] = frozenset()
+    missing: tuple[float, ...] = ()
+
+    def are_in(self, column: pl.Series) -> bool:
+        """Whether a column that was parsed as numbers has one in every row."""
+        if column.null_count() or not is_finite(column.to_numpy()):
+            return False
+        return not (self.missing and column.is_in(self.missing).any())
+
+
+@dataclass(frozen=True)
+class CsvSource:
+    """A CSV file, or one that is compressed."""
+
+    budget: Budget
+    csv_format: CsvFormat
+    numbers: PlainNumbers
+    has_clock = False
+
+    @property
+    def file(self) -> Path:
+        """The file."""
+        return self.budget.file
+
+    def channels(self) -> list[Channel]:
+        """Return the columns of the header."""
+        with self.file.open("rb") as stream:
+            names = _csv_header(text_of(stream, self.csv_format), self.file, self.csv_format)
+        return [Channel(name) for name in names if names.count(name) == 1]
+
+    def expected_rows(self, _columns: Sequence[str]) -> int:
+        """Return how many lines the file has, if those of its begin are like all others."""
+        with self.file.open("rb") as stream:
+            sample = stream.read(_SAMPLE_BYTES)
+        lines = sample.count(b"\n") - 1  # without the header
+        is_text = lines > 0 and b"\0" not in sample
+        return round(self.budget.size * lines / len(sample)) if is_text else 0
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield the named columns as text or plain numbers, and `EXTRA_FIELDS`."""
+        with self.file.open("rb") as stream:
+            unfolded = decompressed(stream)
+            plain = recoded(unfolded, self.csv_format.encoding)
+            names = _csv_header(plain, self.file, self.csv_format)
+            positions = require_columns(self.file, names, columns)
+            numbers = set(self.numbers.columns & set(columns))
+
+            def parse(block: bytes) -> pl.DataFrame:
+                # Reading on over bad numbers is reading on over bad quotes.
+                fit = frozenset() if b'"' in block else frozenset(numbers)
+                parsed = self._parse(block, len(names), positions, fit)
+                texts = {name for name in fit if not self.numbers.are_in(parsed[name])}
+                if texts:
+                    numbers.difference_update(texts)  # so that others need not be parsed twice
+                    again = self._parse(block, len(names), {n: positions[n] for n in texts}, set())
+                    parsed = parsed.with_columns(again.select(sorted(texts)))
+                return parsed
+
+            # A line of separators before each block fixes the number of fields and keeps a block
+            # from looking like a compressed file.
+            padding = self.csv_format.separator.encode() * len(names) + b"\n"
+            blocks = _whole_lines(plain, self.file, padding)
+            if unfolded is not stream:
+                blocks = _within(self.budget, blocks)
+            yield from map_ahead(parse, blocks)
+
+    def _parse(
+        self, block: bytes, width: int, positions: dict[str, int], numbers: Set[str]
+    ) -> pl.DataFrame:
+        """Parse all lines but the first. Columns are read by position: Polars renames doubles."""
+        fields = [f"column {i}" for i in range(width)] + [EXTRA_FIELDS]
+        schema: dict[str, type[pl.DataType]] = dict.fromkeys(fields, pl.String)
+        schema |= {fields[positions[name]]: pl.Float64 for name in numbers}
+        frame = pl.scan_csv(
+            BytesIO(block),
+            has_header=False,
+            separator=self.csv_format.separator,
+            schema=schema,
+            truncate_ragged_lines=True,
+            ignore_errors=bool(numbers),
+            decimal_comma=self.csv_format.decimal_comma,
+        )
+        selection = [pl.col(fields[i]).alias(name) for name, i in positions.items()]
+        return frame.select(*selection, EXTRA_FIELDS).collect().slice(1)
+
+
+@contextmanager
+def open_csv(
+    budget: Budget, csv_format: CsvFormat, numbers: PlainNumbers | None = None
+) -> Iterator[CsvSource]:
+    """Open a CSV file."""
+    yield CsvSource(budget, csv_format, numbers or PlainNumbers())
+
+
+def _within(budget: Budget, blocks: Iterator[bytes]) -> Iterator[bytes]:
+    """Yield the blocks of a compressed file as long as they, and the lines in them, are few."""
+    unfolded = lines = 0
+    for block in blocks:
+        unfolded += len(block)
+        lines += block.count(b"\n") - 1  # the first is ours
+        budget.require_unfolded(unfolded)
+        budget.require_rows(lines)
+        yield block
+
+
+def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str]:
+    """Return the names of the columns, and leave the stream where the data begin."""
+    for _ in range(csv_format.header_line - 1):
+        stream.readline(MAX_LINE_BYTES)
+    line = stream.readline(MAX_LINE_BYTES + 1)
+    if not line.strip():
+        number = "first line" if csv_format.header_line == 1 else f"line {csv_format.header_line}"
+        raise InputError(
+            f"{shown(file)}: {f'its {number} is' if line else 'it is'} empty. Export it again."
+        )
+    if len(line) > MAX_LINE_BYTES:
+        raise InputError(
+            f"{shown(file)}: the header is longer than {MAX_LINE_BYTES:,} bytes. Is it a CSV file?"
+        )
+    text = _decode(line.removeprefix(b"\xef\xbb\xbf"), file).rstrip("\r\n")
+    try:
+        names = next(csv.reader([text], delimiter=csv_format.separator, strict=True))
+    except csv.Error as error:
+        raise InputError(f"{shown(file)}: its header is not CSV: {error}.") from None
+    for _ in range(csv_format.lines_between):
+        stream.readline(MAX_LINE_BYTES)
+    return [name.strip() for name in names]
+
+
+def _whole_lines(stream: BinaryIO, file: Path, padding: bytes) -> Iterator[bytes]:
+    """Yield blocks of UTF-8 that end with a line; a line break in quotes does not end one.
+
+    Each begins with the padding, a line of its own: put here, the block is not copied for it.
+    """
+    rest = padding
+    while more := stream.read(BLOCK_BYTES):
+        block = rest + more
+        end = _end_of_lines(block)
+        if end > len(padding):
+            whole, rest = block[:end], padding + block[end:]
+            _require_text(whole, file)
+            yield whole
+            continue
+        if len(block) > LINE_BLOCKS * BLOCK_BYTES:
+            raise InputError(
+                f"{shown(file)}: a line is longer than {LINE_BLOCKS * BLOCK_BYTES:,} bytes. "
+                "Is a quote not closed?"
+            )
+        rest = block
+    if len(rest) > len(padding):
+        _require_text(rest, file)
+        yield rest
+
+
+def _end_of_lines(block: bytes) -> int:
+    """Return where the last whole line ends: behind a line break with no open quote before it."""
+    end = block.rfind(b"\n") + 1
+    if b'"' not in block or block.count(b'"', 0, end) % 2 == 0:
+        return end
+    characters = np.frombuffer(block[:end], dtype=np.uint8)
+    open_quote = np.logical_xor.accumulate(characters == ord('"'))
+    ends = np.flatnonzero((characters == ord("\n")) & ~open_quote)
+    return int(ends[-1]) + 1 if ends.size else 0
+
+
+def _require_text(block: bytes, file: Path) -> None:
+    if b"\0" in block or not block.isascii():
+        _decode(block, file)
+
+
+def _decode(block: bytes, file: Path) -> str:
+    advice = (
+        "Write encoding under [csv] in the mapping: 'cp1252' of Western Windows, or 'utf-16'; or "
+        "give a Parquet file."
+    )
+    if b"\0" in block:
+        raise InputError(f"{shown(file)}: binary or UTF-16, not a UTF-8 CSV file. {advice}")
+    try:
+        return block.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = block[error.start - min(error.start, 20) : error.start + 20]
+        raise InputError(f"{shown(file)}: not UTF-8, near {line!r}. {advice}") from None

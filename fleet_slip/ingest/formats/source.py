@@ -1,0 +1,351 @@
+"""What every format is read as: a table of named columns for each time base of a file.
+
+A format whose files say when each sample was taken (MDF, CAN traces) has clocks of its own: its
+times stand in the column `OWN_TIME`, in s, since 1970 where the file tells the date. In all others
+time is a column like any other.
+"""
+
+import difflib
+import errno
+import logging
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import polars as pl
+
+from fleet_slip.base import Progress, needed, no_progress, shown
+from fleet_slip.errors import FleetSlipError, InputError
+
+OWN_TIME = "\0time"
+"""Column of times in s, where the file has clocks of its own."""
+BASE = "\0base"
+"""Column with the number of the time base that a row is of, where there are several."""
+
+MAX_COLUMNS = 10_000
+
+_SHOWN_COLUMNS = 30
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A column that a file has.
+
+    Attributes:
+        name: as a mapping names it.
+        unit: as the file names it, empty if it does not.
+        base: which time base it is of; what has the same stands in one table.
+    """
+
+    name: str
+    unit: str = ""
+    base: str = ""
+
+
+@dataclass(frozen=True)
+class Base:
+    """The rows of a log that share their times.
+
+    Attributes:
+        name: what goes on in another file of the log has the same.
+        count_rows: returns how many rows there are.
+        read: yields them in the file's order, in bounded batches of the same columns, at least one.
+    """
+
+    name: str
+    count_rows: Callable[[], int]
+    read: Callable[[], Iterator[pl.DataFrame]]
+
+
+class Source(Protocol):
+    """A file that is open for reading."""
+
+    has_clock: bool
+    """Whether its times are in `OWN_TIME`. Such a file is a `ClockSource`."""
+
+    def channels(self) -> list[Channel]:
+        """Return all that can be read, in the file's order."""
+        ...
+
+    def expected_rows(self, columns: Sequence[str]) -> int:
+        """Return about how many rows `batches` yields; 0 where only reading them would tell."""
+        ...
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield rows that have the named columns: text, 64-bit floats, dates or timestamps.
+
+        With a clock, the rows of one time base come after those of another; each batch has
+        `OWN_TIME` and those of the columns that are of its base. Raises `InputError`, for a column
+        that is missing or ambiguous too.
+        """
+        ...
+
+
+class ClockSource(ABC):
+    """A file that says when each sample was taken."""
+
+    has_clock = True
+
+    @abstractmethod
+    def channels(self) -> list[Channel]:
+        """Return all that can be read, in the file's order."""
+
+    @abstractmethod
+    def bases(self, columns: Sequence[str]) -> list[Base]:
+        """Return the time bases that have one of the columns. Raises `InputError`."""
+
+    def expected_rows(self, columns: Sequence[str]) -> int:
+        """Return how many rows the time bases have together."""
+        return sum(base.count_rows() for base in self.bases(columns))
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield the rows of each time base that has one of the columns, base by base."""
+        for base in self.bases(columns):
+            yield from base.read()
+
+
+@contextmanager
+def reading_with(file: Path, package: str) -> Iterator[Any]:
+    """Give a package of the extra `logs`; whatever it raises at a file is an `InputError`."""
+    with needed("logs", f"{shown(file)}: its format"):
+        module = import_module(package)
+    logging.getLogger(package.partition(".")[0]).setLevel(logging.CRITICAL)
+    try:
+        yield module
+    except (FleetSlipError, MemoryError):
+        raise
+    except Exception as error:
+        if getattr(error, "errno", 0) == errno.EFBIG:  # who set the limit tells it
+            raise
+        reason = shown(str(error).strip().split("\n")[0][:200]) or type(error).__name__
+        raise InputError(
+            f"{shown(file)}: {package} cannot read it: {reason}. Is it complete? Copy it again, or "
+            "export it in another format."
+        ) from None
+
+
+def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
+    """Return an array as text, timestamps or 64-bit floats. Raises `InputError` for others."""
+    if values.ndim != 1:
+        raise InputError(
+            f"{shown(file)}: channel {name!r} has {' x '.join(map(str, values.shape))} values, "
+            "not one a row. Map one of its columns."
+        )
+    if values.dtype.kind == "S":
+        return pl.Series(name, [text.decode("utf-8", "replace").strip("\0") for text in values])
+    if values.dtype.kind in "UO":
+        return pl.Series(name, [str(text) for text in values], pl.String)
+    if values.dtype.kind == "M":
+        return pl.Series(name, values.astype("M8[us]"))
+    if values.dtype.kind not in "iufb":
+        raise InputError(
+            f"{shown(file)}: channel {name!r} is of the type {values.dtype}, neither a number nor "
+            "text. Map another one."
+        )
+    return pl.Series(name, np.ascontiguousarray(values, dtype=np.float64))
+
+
+def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> dict[str, int]:
+    """Return where each wanted column stands. Raises `InputError` for none or two of a name."""
+    if len(names) > MAX_COLUMNS:
+        raise InputError(
+            f"{shown(file)}: {len(names):,} columns, at most {MAX_COLUMNS:,} are read."
+        )
+    positions: dict[str, int] = {}
+    for column in wanted:
+        found = [i for i, name in enumerate(names) if name == column]
+        if len(found) > 1:
+            where = ", ".join(str(i + 1) for i in found[:5])
+            raise InputError(
+                f"{shown(file)}: {len(found)} columns are called {column!r} (number {where}). "
+                "Rename all but one."
+            )
+        if not found:
+            raise InputError(f"{shown(file)}: {describe_missing(column, names)}")
+        positions[column] = found[0]
+    return positions
+
+
+def describe_unknown(signal: str, known: Iterable[str]) -> str:
+    """Return what to say of a signal that the catalogue does not have."""
+    names = list(known)
+    near = difflib.get_close_matches(signal, names, n=2, cutoff=0.7)
+    near += [name for name in names if signal in name.split("_") and name not in near]
+    hint = f" Do you mean {' or '.join(near[:3])}?" if near else ""
+    return f"unknown signal {signal!r}.{hint} Known signals: {', '.join(names)}"
+
+
+def describe_missing(column: str, names: Sequence[str]) -> str:
+    """Return what to say of a column that is not among a file's."""
+    folded = {name.casefold(): name for name in names}
+    matches = difflib.get_close_matches(column.casefold(), folded, n=3, cutoff=0.6)
+    near = [folded[match] for match in matches]
+    hint = f" Did the mapping mean {' or '.join(repr(name[:80]) for name in near)}?" if near else ""
+    there = ", ".join(repr(name[:80]) for name in names[:_SHOWN_COLUMNS])
+    more = f" and {len(names) - _SHOWN_COLUMNS:,} more" if len(names) > _SHOWN_COLUMNS else ""
+    return f"no column {column!r}.{hint} Its columns are {there}{more}."
+
+
+# Tells how far a log is read, for whoever shows it.
+
+
+class Meter:
+    """A share of a log's bytes: that of its rows which were read.
+
+    Where all of a file must be passed over before its first row, as with messages in the order of
+    time, each pass counts for half of what is left.
+    """
+
+    def __init__(self, size: int = 0, progress: Progress = no_progress) -> None:
+        """Take the bytes of the log, and who is told how many more of them are done."""
+        self._size, self._progress, self.is_watched = size, progress, progress is not no_progress
+        self._told = self._at = self._rows = 0
+        self._share = self._begun = 0.0
+
+    def pass_over(self, at: int, size: int) -> None:
+        """Tell how much of a file was passed over; at an earlier place another pass has begun."""
+        if at < self._at:
+            self._begun = self._share
+        self._at = at
+        self._tell(self._begun + (1 - self._begun) / 2 * at / max(size, 1))
+
+    def expect(self, rows: int, of: int = 0) -> None:
+        """Take about how many rows come, or come of so many bytes; 0 where that is not known."""
+        self._rows = rows * self._size // of if of else rows
+        self._begun = self._share
+
+    def count(self, rows: int) -> None:
+        """Tell how many rows were read so far."""
+        if self._rows:
+            self._tell(self._begun + (1 - self._begun) * rows / self._rows)
+
+    def end(self) -> None:
+        """Tell that all was read."""
+        self._tell(1.0)
+
+    def _tell(self, share: float) -> None:
+        self._share = max(self._share, min(share, 1.0))
+        done = int(self._size * self._share)
+        if done > self._told:
+            self._progress(done - self._told, self._size)
+            self._told = done
+
+
+# What a measured file may become while it is decoded: so many bytes and rows, in so many seconds.
+#
+# A small file can stand for anything: a thousand times its size in zeros, a billion equal rows, a
+# view without end. How much is allowed follows from the file's size alone, so that it is known
+# before anything is decoded, and is the same for every format. A log that was measured is far
+# below: a row of it takes several bytes however well it is packed, since sensors are noisy.
+
+FREE_ROWS, ROWS_PER_BYTE = 10**6, 4
+"""Rows that any file may have, and rows for each of its bytes if those are more."""
+FREE_BYTES, BYTES_PER_BYTE = 2**30, 200
+"""The same for the bytes that it unfolds to."""
+FREE_MEMORY, MEMORY_PER_BYTE = 2**30, 8
+"""Memory that any reader of other people's may take, and more for each byte of its file."""
+FREE_S, BYTES_PER_S = 60.0, 10**5
+"""Seconds in which any file must be decoded, and a speed that no format falls below."""
+
+_WAY_OUT = "Is it damaged? If it was measured so, export it as CSV that is not compressed."
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What one file may become."""
+
+    file: Path
+    size: int
+    """Bytes of the file."""
+    meter: Meter = field(default_factory=Meter, compare=False)
+    """Who is told how much of it was passed over."""
+
+    @classmethod
+    def of(cls, file: Path, meter: Meter | None = None) -> "Budget":
+        """Return the budget of a file. Raises `OSError`."""
+        return cls(file, file.stat().st_size, meter or Meter())
+
+    @property
+    def rows(self) -> int:
+        """Rows that are decoded at most."""
+        return max(FREE_ROWS, ROWS_PER_BYTE * self.size)
+
+    @property
+    def unfolded(self) -> int:
+        """Bytes that it unfolds to at most."""
+        return max(FREE_BYTES, BYTES_PER_BYTE * self.size)
+
+    @property
+    def memory(self) -> int:
+        """Bytes of memory that its reader takes at most, where that is a process of its own."""
+        return FREE_MEMORY + MEMORY_PER_BYTE * self.size
+
+    @property
+    def seconds(self) -> float:
+        """How long decoding takes at most."""
+        return max(FREE_S, self.size / BYTES_PER_S)
+
+    def require_rows(self, rows: int) -> None:
+        """Raise `InputError` for more rows than a file of its size can have."""
+        if rows > self.rows:
+            raise InputError(
+                f"{shown(self.file)}: {rows:,} rows or more in {self.size:,} bytes; of a file of "
+                f"this size at most {self.rows:,} are read. {_WAY_OUT}"
+            )
+
+    def require_unfolded(self, size: int) -> None:
+        """Raise `InputError` for more bytes than a file of its size can unfold to."""
+        if size > self.unfolded:
+            raise InputError(
+                f"{shown(self.file)}: its {self.size:,} bytes unfold to {size:,} or more; of a "
+                f"file of this size at most {self.unfolded:,} are read. {_WAY_OUT}"
+            )
+
+    def over_memory(self) -> InputError:
+        """Return what to say of a file whose reader asked for more memory, or longer files."""
+        return InputError(
+            f"{shown(self.file)}: its {self.size:,} bytes unfold to more than {self.memory:,} in "
+            f"memory or {self.unfolded:,} in a temporary file. {_WAY_OUT}"
+        )
+
+    def crashed(self) -> InputError:
+        """Return what to say of a file whose reader ended without a word, or talks nonsense."""
+        return InputError(
+            f"{shown(self.file)}: its reader crashed, or was ended because it took more than "
+            f"{self.memory:,} bytes of memory. {_WAY_OUT}"
+        )
+
+    def over_time(self) -> InputError:
+        """Return what to say of a file that took too long."""
+        return InputError(
+            f"{shown(self.file)}: {self.seconds:,.0f} s did not suffice to decode its "
+            f"{self.size:,} bytes. {_WAY_OUT}"
+        )
+
+    def damaged(self, what: str) -> InputError:
+        """Return what to say of a file with something that no recorder writes."""
+        return InputError(
+            f"{shown(self.file)}: {what}, which no trace has: it is damaged. Record or copy it "
+            "again."
+        )
+
+    def metered(self, batches: Iterator[pl.DataFrame]) -> Iterator[pl.DataFrame]:
+        """Yield batches while rows and seconds last; the caller's own time does not count."""
+        rows, seconds = 0, 0.0
+        while True:
+            began = time.monotonic()
+            batch = next(batches, None)
+            seconds += time.monotonic() - began
+            if seconds > self.seconds:
+                raise self.over_time()
+            if batch is None:
+                return
+            rows += batch.height
+            self.require_rows(rows)
+            yield batch

@@ -1,0 +1,371 @@
+"""Reads Parquet in batches: text, numbers as float64, dates and timestamps."""
+
+import json
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import date
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from urllib.parse import unquote
+
+import duckdb
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from pydantic import model_validator
+
+from fleet_slip.base import shown
+from fleet_slip.config import Config, Name
+from fleet_slip.errors import InputError, QuestionError
+from fleet_slip.ingest.formats.source import Budget, Channel, require_columns
+from fleet_slip.limits import memory_bytes
+from fleet_slip.warehouse.database import one_query, sql_text
+
+BATCH_ROWS = 2**15
+"""Parquet is read in batches of this many rows."""
+
+BUFFER_BYTES = 2**16
+"""Bytes of a column that are read at once."""
+MAX_FOOTER_BYTES = 2**24
+MAX_TEXT = 1_000
+"""Characters of one text in Parquet: a dictionary can repeat a long one for the price of a bit."""
+
+PARQUET_MAGIC = b"PAR1"
+_PER_DAY = {unit: 86_400 * 10**power for unit, power in {"s": 0, "ms": 3, "us": 6, "ns": 9}.items()}
+_FIRST_DAY = date.min.toordinal() - date(1970, 1, 1).toordinal()
+_END_DAY = date.max.toordinal() + 1 - date(1970, 1, 1).toordinal()
+
+
+class ParquetSource:
+    """An open Parquet file. Keys in the names of its folders, `car=A7`, are columns of text."""
+
+    has_clock = False
+
+    def __init__(self, stream: pa.NativeFile, budget: Budget) -> None:
+        """Take the bytes of a file, and what it may become."""
+        _require_sane_footer(stream, budget.file)
+        self._file, self._stream = budget.file, stream
+        parquet = pq.ParquetFile(stream)
+        _require_within(budget, parquet.metadata)
+        self._schema, self._rows = parquet.schema_arrow, parquet.metadata.num_rows
+        self._keys = {
+            name: text
+            for name, text in partition_keys(budget.file).items()
+            if name not in self._schema.names
+        }
+
+    def channels(self) -> list[Channel]:
+        """Return the columns."""
+        readable = [f.name for f in self._schema if is_readable(f.type)]
+        return [Channel(name) for name in (*readable, *self._keys)]
+
+    def expected_rows(self, _columns: Sequence[str]) -> int:
+        """Return how many rows there are."""
+        return int(self._rows)
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield rows. Raises `InputError`."""
+        require_columns(self._file, [*self._schema.names, *self._keys], columns)
+        inside = [name for name in columns if name not in self._keys]
+        for name in inside:  # before anything is decoded: one list can be all of a file
+            _require_readable(self._schema.field(name).type, name, self._file)
+        keys = [pl.lit(self._keys[name]).alias(name) for name in columns if name in self._keys]
+        for batch in _parquet_batches(self._stream, self._file, inside):
+            yield batch.with_columns(keys)
+
+
+@contextmanager
+def open_parquet(budget: Budget) -> Iterator[ParquetSource]:
+    """Open a Parquet file. Raises `InputError`."""
+    # Not Python's own file: each read of Arrow's threads would wait for the interpreter.
+    with pa.OSFile(os.fsencode(budget.file), "rb") as stream:
+        yield ParquetSource(stream, budget)
+
+
+def partition_keys(file: Path) -> dict[str, str]:
+    """Return what the folders above a file say of it, as Hive writes it: `key=value`."""
+    named = (part.partition("=") for part in file.parts[:-1])
+    return {key: unquote(text) for key, equals, text in named if key and equals}
+
+
+def _parquet_batches(
+    stream: pa.NativeFile, file: Path, columns: Sequence[str]
+) -> Iterator[pl.DataFrame]:
+    schema = pq.ParquetFile(stream).schema_arrow
+    texts = [name for name in columns if _is_text(schema.field(name).type)]
+    # Buffered before, the bytes of the whole file would stay in memory until its end; and without
+    # a buffer those of each column of a row group, of which a file may have a single one.
+    parquet = pq.ParquetFile(
+        stream,
+        read_dictionary=texts,
+        page_checksum_verification=True,
+        pre_buffer=False,
+        buffer_size=BUFFER_BYTES,
+    )
+    for batch in parquet.iter_batches(BATCH_ROWS, columns=list(columns)):
+        plain = {name: plain_column(batch.column(name), name, file) for name in columns}
+        yield pl.DataFrame(pa.table(plain))
+
+
+def _require_sane_footer(stream: pa.NativeFile, file: Path) -> None:
+    size = stream.seek(0, 2)
+    stream.seek(max(0, size - 8))
+    tail = stream.read(8)
+    stream.seek(0)
+    if tail[4:] != PARQUET_MAGIC or size < 12:
+        raise InputError(
+            f"{shown(file)}: begins as a Parquet file but has no footer: it is truncated. "
+            "Copy it again."
+        )
+    if int.from_bytes(tail[:4], "little") > MAX_FOOTER_BYTES:
+        raise InputError(
+            f"{shown(file)}: its footer is too large. Write fewer columns or row groups."
+        )
+
+
+def _require_within(budget: Budget, metadata: pq.FileMetaData) -> None:
+    """Raise `InputError` for more rows or bytes than a file can have, or those of another file."""
+    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    values = [
+        max((group.column(i).num_values for i in range(group.num_columns)), default=0)
+        for group in groups
+    ]
+    rows = (metadata.num_rows, sum(group.num_rows for group in groups), sum(values))
+    budget.require_rows(max(rows))
+    budget.require_unfolded(sum(group.total_byte_size for group in groups))
+    if any(group.num_columns and group.column(0).file_path for group in groups):
+        raise InputError(
+            f"{shown(budget.file)}: its values are in other files: it is the index of a dataset. "
+            "Give the files themselves."
+        )
+
+
+def is_readable(kind: pa.DataType) -> bool:
+    """Whether a column of this type is text, a number or a time."""
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+    tests = (_is_text, pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
+    times = (pa.types.is_date, pa.types.is_timestamp, pa.types.is_null)
+    return any(is_it(kind) for is_it in (*tests, *times))
+
+
+def _is_text(arrow_type: pa.DataType) -> bool:
+    if pa.types.is_dictionary(arrow_type):
+        arrow_type = arrow_type.value_type
+    return bool(pa.types.is_string(arrow_type) or pa.types.is_large_string(arrow_type))
+
+
+def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
+    """Return a column as text, float64, date or timestamp. Raises `InputError` for others."""
+    array.validate(full=True)  # what Parquet calls text need not be UTF-8, and Polars trusts it
+    if pa.types.is_dictionary(array.type):
+        longest = pc.max(pc.utf8_length(array.dictionary)).as_py() if _is_text(array.type) else 0
+        if longest is not None and longest > MAX_TEXT:
+            raise InputError(
+                f"{shown(file)}: column {name!r} has texts of {longest:,} characters, "
+                f"at most {MAX_TEXT:,} are read."
+            )
+        array = array.dictionary_decode()
+    kind = array.type
+    if _is_text(kind):
+        return array
+    if pa.types.is_date(kind) or pa.types.is_timestamp(kind):
+        return _in_calendar(array)
+    if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind):
+        return pc.cast(array, pa.float64(), safe=False)
+    if pa.types.is_null(kind):
+        return pc.cast(array, pa.float64())
+    _require_readable(kind, name, file)
+    return array
+
+
+def _require_readable(kind: pa.DataType, name: str, file: Path) -> None:
+    if not is_readable(kind):
+        raise InputError(
+            f"{shown(file)}: column {name!r} has the type {shown(kind)[:80]}, which is neither a "
+            "number, text nor a time. Convert it or map another one."
+        )
+
+
+def _in_calendar(array: pa.Array) -> pa.Array:
+    """Return dates or timestamps, null outside the years 1 to 9999: Polars would panic."""
+    kind = array.type
+    if pa.types.is_date32(kind):
+        counts, per_day = pc.cast(pc.cast(array, pa.int32()), pa.int64()), 1
+    else:
+        unit = "ms" if pa.types.is_date64(kind) else kind.unit
+        counts, per_day = pc.cast(array, pa.int64()), _PER_DAY[unit]
+    first, end = (max(-(2**63), min(2**63 - 1, days * per_day)) for days in (_FIRST_DAY, _END_DAY))
+    inside = pc.and_(pc.greater_equal(counts, first), pc.less(counts, end))
+    return pc.if_else(inside, array, pa.scalar(None, kind))
+
+
+# Reads a table or a query of a DuckDB file.
+
+MAGIC = b"DUCK"
+MAGIC_AT = 8
+_NAME = "measured"
+"""What the file is called as a database."""
+_COMPUTED = """
+    SELECT view_name FROM duckdb_views() WHERE NOT internal
+    UNION ALL SELECT function_name FROM duckdb_functions() WHERE NOT internal
+    UNION ALL SELECT table_name FROM duckdb_columns() WHERE is_generated AND NOT internal
+"""
+_TABLES = "SELECT table_name, estimated_size FROM duckdb_tables() WHERE NOT internal"
+_LOOK_S = 0.1
+
+
+class DuckdbRows(Config):
+    """What of a DuckDB file is the log: a table, or the answer of a query."""
+
+    table: Name | None = None
+    query: str | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> "DuckdbRows":
+        if (self.table is None) == (self.query is None):
+            raise ValueError("needs either 'table' or 'query'")
+        return self
+
+
+class DuckdbSource:
+    """Rows of an open DuckDB file, in the table's order or the query's."""
+
+    has_clock = False
+
+    def __init__(
+        self, connection: duckdb.DuckDBPyConnection, rows: DuckdbRows, budget: Budget
+    ) -> None:
+        """Take a connection to a file, which rows of it, and what it may become."""
+        self._file, self._connection, self._budget = budget.file, connection, budget
+        name = (rows.table or "").replace('"', '""')
+        self._query = rows.query or f'SELECT * FROM "{name}"'
+
+    def channels(self) -> list[Channel]:
+        """Return the columns."""
+        with _duckdb_errors(self._file), _in_time(self._connection, self._budget):
+            return [Channel(name) for name in self._connection.sql(self._query).columns]
+
+    def expected_rows(self, _columns: Sequence[str]) -> int:
+        """Return 0: of a query only its answer tells."""
+        return 0
+
+    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+        """Yield rows. Raises `InputError`."""
+        with _duckdb_errors(self._file):
+            with _in_time(self._connection, self._budget):
+                rows = self._connection.sql(self._query)
+                require_columns(self._file, rows.columns, columns)
+                batches = rows.to_arrow_reader(BATCH_ROWS)
+            while True:
+                with _in_time(self._connection, self._budget):
+                    batch = next(batches, None)
+                if batch is None:
+                    return
+                plain = {n: plain_column(batch.column(n), n, self._file) for n in columns}
+                yield pl.DataFrame(pa.table(plain))
+
+
+@contextmanager
+def open_duckdb(rows: DuckdbRows, budget: Budget) -> Iterator[DuckdbSource]:
+    """Open a DuckDB file for reading. Raises `InputError`.
+
+    What is read must stand in the file: no view, macro or generated column of it has a say, since
+    these can compute anything, and go by the name of any function.
+    """
+    file = budget.file
+    if os.path.lexists(f"{file}.wal"):
+        raise InputError(
+            f"{shown(file)}: beside it is a .wal file with rows that are not in it yet. Open and "
+            "close it with DuckDB."
+        )
+    with TemporaryDirectory(prefix="fleet-slip-") as folder, _duckdb_errors(file):
+        # One thread: the order of rows, and so the ticks, may depend on nothing but the file.
+        settings: dict[str, Any] = {
+            "threads": 1,
+            "memory_limit": f"{memory_bytes() // 2 // 2**20}MiB",
+            "temp_directory": folder,
+            "max_temp_directory_size": f"{budget.unfolded}B",
+            "autoinstall_known_extensions": False,
+            "autoload_known_extensions": False,
+        }
+        with duckdb.connect(config=settings) as connection:
+            connection.execute(f"ATTACH {sql_text(str(file))} AS {_NAME} (TYPE duckdb, READ_ONLY)")
+            connection.execute("SET enable_external_access = false")
+            connection.execute("SET lock_configuration = true")
+            _require_stored(connection, rows, budget)
+            connection.execute(f"USE {_NAME}")
+            yield DuckdbSource(connection, rows, budget)
+
+
+def _require_stored(
+    connection: duckdb.DuckDBPyConnection, rows: DuckdbRows, budget: Budget
+) -> None:
+    """Raise `InputError` for rows that do not stand in tables of the file, or too many of them."""
+    named = {rows.table or ""}
+    if rows.query is not None:
+        try:
+            named = _names_in(connection, one_query(connection, rows.query))
+        except QuestionError as error:
+            raise InputError(f"{shown(budget.file)}: [duckdb] in the mapping: {error}") from None
+    named = {name.casefold() for name in named}
+    for (name,) in connection.execute(_COMPUTED).fetchall():
+        if name.casefold() in named:
+            raise InputError(
+                f"{shown(budget.file)}: {name!r} is a view, a macro or a table with generated "
+                "columns, and what a file computes is not read. Store it: CREATE TABLE … AS FROM …"
+            )
+    for name, size in connection.execute(_TABLES).fetchall():
+        if name.casefold() in named:
+            budget.require_rows(size)
+
+
+def _names_in(connection: duckdb.DuckDBPyConnection, query: str) -> set[str]:
+    """Return the names of all tables, views and functions in a query."""
+    statement = "SELECT json_serialize_sql($text::VARCHAR)"
+    [(tree,)] = connection.execute(statement, {"text": query}).fetchall()
+    found: set[str] = set()
+
+    def note(node: dict[str, Any]) -> dict[str, Any]:
+        found.update(str(node[key]) for key in ("table_name", "function_name") if key in node)
+        return node
+
+    json.loads(tree, object_hook=note)
+    return found
+
+
+@contextmanager
+def _in_time(connection: duckdb.DuckDBPyConnection, budget: Budget) -> Iterator[None]:
+    """Interrupt what a connection does when the time is over. Raises `InputError`."""
+    done, over = threading.Event(), threading.Event()
+
+    def watch() -> None:
+        if not done.wait(budget.seconds):
+            over.set()
+            while not done.wait(_LOOK_S):  # it forgets an interruption between two tasks
+                connection.interrupt()
+
+    threading.Thread(target=watch, daemon=True).start()
+    try:
+        yield
+    except Exception:
+        if over.is_set():
+            raise budget.over_time() from None
+        raise
+    finally:
+        done.set()
+
+
+@contextmanager
+def _duckdb_errors(file: Path) -> Iterator[None]:
+    try:
+        yield
+    except duckdb.Error as error:
+        reason = " ".join(str(error).split())[:300]
+        raise InputError(
+            f"{shown(file)}: DuckDB says: {reason} See [duckdb] in the mapping."
+        ) from None

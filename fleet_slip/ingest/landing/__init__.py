@@ -1,1 +1,0 @@
-"""How drives land in the warehouse, once."""

@@ -1,0 +1,528 @@
+"""Finds measured logs: files, those of a folder, and folders whose files are parts of one log.
+
+They are on this machine, or on an object store. Every format is read where it can be sought in and
+mapped, so that a log on a store is copied as a whole to the temporary folder (`TMPDIR`).
+"""
+
+import errno
+import hashlib
+import os
+import re
+import tempfile
+from collections import defaultdict
+from collections.abc import Hashable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from glob import glob
+from os import environ
+from pathlib import Path, PosixPath
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Self, TypeAlias
+
+import obstore
+from fsspec.utils import glob_translate
+from obstore.exceptions import InvalidPathError
+
+from fleet_slip.base import needed, shown
+from fleet_slip.errors import FleetSlipError, InputError, StorageError, UsageError
+from fleet_slip.storage.folder import (
+    NoSuchObjectError,
+    StoredFile,
+    meaning_of,
+    object_errors,
+    storage_errors,
+)
+from fleet_slip.storage.objects import (
+    CONNECT_TIMEOUT_S,
+    TIMEOUT_S,
+    ObjectFolder,
+    client,
+    fetch_parts,
+    profile_of,
+)
+
+SUFFIXES = (
+    ".csv", ".csv.gz", ".csv.zst", ".parquet", ".pq", ".mf4", ".mdf", ".mat", ".h5", ".hdf5",
+    ".blf", ".asc", ".log", ".trc", ".duckdb", ".ddb", ".mcap", ".tdms",
+)  # fmt: skip
+
+_HIDDEN = re.compile(r"/\.(?!\.?(/|$))")
+"""A part of a path that begins with a point, and is not `.` or `..`: those are told as faults."""
+
+_NO_LOG = f"no file in this folder has the suffix of a log: {', '.join(SUFFIXES)}."
+
+AT_ONCE = 16
+
+LONGEST_NAME_BYTES = 255
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+
+
+@dataclass(frozen=True)
+class StoredParts:
+    """A folder of an object store whose files are parts of one log; as text it is its URL."""
+
+    url: str
+
+    def __str__(self) -> str:
+        """Return the URL."""
+        return self.url
+
+
+class StrayLink(PosixPath):
+    """A file found behind a link out of a folder: who fills it may not choose what is read."""
+
+
+Log: TypeAlias = Path | StoredFile | StoredParts
+"""A measured log: a file, or a folder whose files are its parts, here or on an object store."""
+
+Place: TypeAlias = Path | str
+"""What a person gives: a path, a pattern, or the URL of an object store."""
+
+
+def find_logs(given: Iterable[Place]) -> list[Log]:
+    """Return files as they are given, and those in folders that have the suffix of a log, sorted.
+
+    What is not a path may be a pattern such as `2024-*/*.mf4`, given in quotes. Hidden files and
+    folders are passed over. Raises `InputError` for a folder or a pattern without any.
+    """
+    found: list[Log] = []
+    for place in given:
+        if is_url(place):
+            found += _stored(str(place))
+        else:
+            found += find_files(Path(place))
+    return found
+
+
+def find_whole_logs(given: Iterable[Place]) -> list[Log]:
+    """Return folders, each as one log in several files. Raises `UsageError` for anything else."""
+    found: list[Log] = []
+    for place in given:
+        if not is_url(place) and not Path(place).is_dir():
+            raise UsageError(f"{place}: only a folder has the files of one log. Give it.")
+        found.append(StoredParts(str(place).rstrip("/")) if is_url(place) else Path(place))
+    return found
+
+
+def find_files(path: Path) -> list[Path]:
+    """Return a file of this machine, or those that a folder or a pattern stands for."""
+    if is_pattern(path):
+        return _matching(path)
+    if not path.is_dir():
+        return [path]
+    real = path.resolve()
+    tables = [path / "logs", *(one for one in (real, *real.parents) if one.name == "logs")]
+    _require_no_root(path, any((table / "_delta_log").is_dir() for table in tables))
+    inside = sorted(_logs_below(path))
+    if not inside:
+        raise InputError(f"{shown(path)}: {_NO_LOG}")
+    return _without_strays(inside, path)
+
+
+def _require_no_root(place: Place, is_root: bool) -> None:
+    """Raise `InputError` for a data root: what is in it is in it."""
+    if is_root:
+        raise InputError(
+            f"{shown(place)}: it is, has or is in a data root, whose logs were ingested before. "
+            "Name the folder where logs land."
+        )
+
+
+def names_several(place: Place) -> bool:
+    """Whether it is a folder or a pattern, of which what is new is taken."""
+    if is_url(place):
+        return not str(place).lower().endswith(SUFFIXES) or is_pattern(str(place))
+    return Path(place).is_dir() or is_pattern(Path(place))
+
+
+def is_url(place: Place) -> bool:
+    """Whether a place is on an object store."""
+    return isinstance(place, str) and "://" in place
+
+
+def is_pattern(place: Place) -> bool:
+    """Whether a path stands for those that match it."""
+    return any(c in str(place) for c in "*?[") and (is_url(place) or not Path(place).exists())
+
+
+def parts_of(log: Path) -> list[Path]:
+    """Return the files that one log is in: itself, or those of its folder. Raises `InputError`."""
+    files = find_files(log)
+    for file in files:
+        require_inside(file)
+    return files
+
+
+def size_of(log: Log) -> int:
+    """Return the bytes of a log, for its progress; 0 of what only reading it would tell."""
+    if not isinstance(log, Path):
+        return getattr(log, "size_bytes", 0)
+    try:
+        return sum(part.stat().st_size for part in parts_of(log))
+    except (InputError, OSError):  # who reads it raises
+        return 0
+
+
+def require_inside(file: Path) -> None:
+    """Raise `InputError` for a link that leads out of the folder in which it was found."""
+    if isinstance(file, StrayLink):
+        raise InputError(
+            f"{shown(file)}: it is behind a link that leads out of its folder, and not followed. "
+            "Give the file by its own path."
+        )
+
+
+def stored_parts(log: StoredFile | StoredParts) -> list[StoredFile]:
+    """Return the objects that one log is in. Raises `InputError` and `StorageError`."""
+    return [log] if isinstance(log, StoredFile) else _stored(log.url)
+
+
+def _stored(url: str) -> list[StoredFile]:
+    with needed("objects", "a log on an object store"):
+        pass
+    if (one := find_object(url)) is not None:
+        return [one]
+    below = find_below(url)
+    _require_no_root(url, any("/logs/_delta_log/" in f"/{file.path}" for file in below))
+    seen = [file for file in below if not _HIDDEN.search(str(file)) or "/." in url]
+    if is_pattern(url):
+        found, none = seen, "no object matches this pattern. Look at its folder."
+    else:
+        found = [file for file in seen if file.name.lower().endswith(SUFFIXES)]
+        none = _NO_LOG if below else "no such object, and no folder."
+    if not found:
+        raise InputError(f"{shown(url)}: {none}")
+    return found
+
+
+def _matching(pattern: Path) -> list[Path]:
+    names = sorted(glob(str(pattern), recursive=True))  # noqa: PTH207 - takes absolute ones
+    files = [path for path in map(Path, names) if path.is_file()]
+    if not files:
+        raise InputError(f"{shown(pattern)}: no file matches this pattern. Look at its folder.")
+    plain = [part for part in pattern.parents if not any(c in str(part) for c in "*?[")]
+    return _without_strays(files, plain[0])
+
+
+def _without_strays(files: list[Path], folder: Path) -> list[Path]:
+    """Return files that were found below a folder, marked where they are in truth elsewhere."""
+    top = os.path.realpath(folder)
+    real = cache(os.path.realpath)
+
+    def is_inside(file: Path) -> bool:
+        place = os.path.realpath(file) if file.is_symlink() else f"{real(file.parent)}/"
+        return os.path.commonpath([top, place]) == top
+
+    return [file if is_inside(file) else StrayLink(file) for file in files]
+
+
+def _logs_below(folder: Path) -> Iterator[Path]:
+    for parent, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in names:
+            if name.lower().endswith(SUFFIXES) and not name.startswith("."):
+                yield Path(parent, name)
+
+
+class LocalCopies:
+    """Copies of those logs that are on a store, fetched at once, as long as this is entered."""
+
+    def __init__(self, logs: Iterable[Log]) -> None:
+        """Take the logs."""
+        self._stored = [log for log in dict.fromkeys(logs) if not isinstance(log, Path)]
+        self._copies: dict[Log, Future[Path]] = {}
+
+    def __enter__(self) -> Self:
+        """Begin to fetch."""
+        if self._stored:
+            with storage_errors("the temporary folder"):
+                self._folder = TemporaryDirectory(prefix="fleet-slip-copies-")
+            self._threads = ThreadPoolExecutor(AT_ONCE)
+            for number, log in enumerate(self._stored):
+                folder = Path(self._folder.name, str(number))
+                self._copies[log] = self._threads.submit(_copy, log, folder)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Remove the copies."""
+        if self._stored:
+            self._threads.shutdown(cancel_futures=True)
+            self._folder.cleanup()
+
+    @contextmanager
+    def of(self, log: Log) -> Iterator[Path]:
+        """Give the file to read a log from, whose errors name the log. Raises `InputError`."""
+        if isinstance(log, Path):
+            require_inside(log)
+            yield log
+            return
+        copy = self._copies[log].result()
+        folder = str(Path(self._folder.name, str(self._stored.index(log))))
+        try:
+            yield copy
+        except FleetSlipError as error:
+            bucket = "/".join(str(log).split("/")[:3])
+            raise type(error)(str(error).replace(folder, bucket)) from None
+
+
+def _copy(log: StoredFile | StoredParts, folder: Path) -> Path:
+    """Copy a log below a folder, under its path in the bucket: keys may be in its names."""
+
+    for part in stored_parts(log):
+        names = part.path.split("/")
+        if not {"", ".", ".."}.isdisjoint(names) or not all(map(_can_be_copied, names)):
+            raise InputError(f"{shown(part)}: no file may have this name. Give it another.")
+        copy_object(part, folder / part.path)
+    return folder / (log.path if isinstance(log, StoredFile) else parse_url(log.url)[1])
+
+
+def _can_be_copied(name: str) -> bool:
+    """Whether a part of a key is the name of a file, without characters that stores refuse."""
+    return len(os.fsencode(name)) <= LONGEST_NAME_BYTES and not _CONTROL.search(name)
+
+
+@contextmanager
+def local_copy(log: Log) -> Iterator[Path]:
+    """Give the file to read one log from. Raises what `LocalCopies.of` raises."""
+    with LocalCopies([log]) as copies, copies.of(log) as file:
+        yield file
+
+
+# Keeps what comes in one order and is read in another, in a temporary file if it is large.
+#
+# The file has no name: it is gone with the process, however that ends.
+
+IN_MEMORY_BYTES = 2**24
+"""Up to this size all is in memory, and there is no file."""
+
+
+@contextmanager
+def needing_room(written: int) -> Iterator[None]:
+    """Raise `InputError` where a temporary file, so long already, cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno == errno.EFBIG:  # a limit of our own, on a file that unfolds
+            raise
+        raise InputError(
+            f"{tempfile.gettempdir()}: no room for a temporary copy of more than {written:,} bytes "
+            f"({error.strerror}). Free some, or name another folder in the environment variable "
+            "TMPDIR."
+        ) from None
+
+
+class Spool:
+    """Pieces of bytes by key, those of a key in the order in which they came."""
+
+    def __init__(self) -> None:
+        """Begin without any."""
+        self._file = tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES)  # noqa: SIM115 - see close
+        self._pieces: dict[Hashable, list[tuple[int, int]]] = defaultdict(list)
+        self._end = 0
+
+    def add(self, key: Hashable, piece: bytes) -> None:
+        """Keep a piece. Raises `InputError` if the disk is full."""
+        with needing_room(self._end):
+            self._file.seek(self._end)
+            self._file.write(piece)
+            self._file.flush()
+        self._pieces[key].append((self._end, len(piece)))
+        self._end += len(piece)
+
+    def read(self, key: Hashable) -> Iterator[bytes]:
+        """Yield the pieces of a key."""
+        for start, size in self._pieces[key]:
+            self._file.seek(start)
+            yield self._file.read(size)
+
+    def clear(self) -> None:
+        """Forget all pieces."""
+        self._pieces.clear()
+        self._file.seek(0)
+        self._file.truncate()
+        self._end = 0
+
+    def close(self) -> None:
+        """Let go of all."""
+        self._file.close()
+
+
+# Files that commands read from an object store: found by URL, and copied to be read.
+
+ATTEMPTS = 3
+"""So often an object is fetched that does not arrive as the store says that it is."""
+
+_COMPARABLE = re.compile(r"[0-9a-f]{32}(-[1-9][0-9]{0,4})?")
+"""A tag that may be an MD5, or the MD5 of the MD5s of so many parts."""
+
+_PART_SIZES = (5, 8, 10, 15, 16, 25, 32, 50, 64, 100, 128, 256, 512)
+"""Sizes of a part that uploaders choose."""
+
+_URL = re.compile(r"(?P<bucket>(?:s3|gs|az)://[a-z0-9][a-z0-9._-]{1,62})(?:/+(?P<path>.*))?")
+
+
+def list_any_names(bucket: ObjectFolder, path: str) -> Iterator[StoredFile]:
+    """Yield the objects below a folder of a bucket of S3. Raises `StorageError`."""
+    with needed("objects", "a listing of an object store"):
+        from botocore.config import Config  # noqa: PLC0415 - a fifth of a second
+        from botocore.exceptions import BotoCoreError, ClientError  # noqa: PLC0415
+        from botocore.session import Session  # noqa: PLC0415
+    profile = profile_of(bucket.bucket)
+    endpoint = environ.get("AWS_ENDPOINT_URL_S3") or environ.get("AWS_ENDPOINT_URL")
+    style = "path" if endpoint else "auto"
+    limits = {"connect_timeout": CONNECT_TIMEOUT_S, "read_timeout": TIMEOUT_S}
+    store = Session().create_client(
+        "s3",
+        region_name=(profile and profile.region) or environ.get("AWS_REGION"),
+        endpoint_url=(profile and profile.endpoint) or endpoint,
+        config=Config(s3={"addressing_style": style}, **limits),
+    )
+    name = bucket.bucket.removeprefix("s3://")
+    try:
+        pages = store.get_paginator("list_objects_v2").paginate(
+            Bucket=name, Prefix=f"{path}/" if path else ""
+        )
+        for page in pages:
+            for one in page.get("Contents", ()):
+                yield bucket.found(
+                    {
+                        "path": one["Key"],
+                        "size": one["Size"],
+                        "last_modified": one["LastModified"],
+                        "e_tag": one["ETag"],
+                    }
+                )
+    except (BotoCoreError, ClientError) as error:
+        raise StorageError(f"{bucket}/{path}: {meaning_of(error)}") from None
+
+
+def parse_url(url: str) -> tuple[ObjectFolder, str]:
+    """Return bucket and path of a URL. Raises `InputError`, which may not show a password."""
+    found = _URL.fullmatch(url)
+    if found is None:
+        raise InputError(
+            "a file on an object store is written as s3://BUCKET/PATH, gs://BUCKET/PATH or "
+            "az://CONTAINER/PATH. Credentials are not part of it: they come from the environment."
+        )
+    path = (found["path"] or "").rstrip("/")
+    if not {".", ".."}.isdisjoint(path.split("/")):
+        raise InputError(
+            f"{found['bucket']}: a path in a bucket has no folder '.' or '..'. Write it "
+            "as the store lists it."
+        )
+    return ObjectFolder(found["bucket"], ""), path
+
+
+def find_object(url: str) -> StoredFile | None:
+    """Return the object of the very name, None if there is none. Raises `StorageError`."""
+    bucket, path = parse_url(url)
+    if not path:
+        return None
+    with object_errors(url):
+        try:
+            return bucket.found(obstore.head(client(bucket.bucket), path))
+        except FileNotFoundError:
+            return None
+
+
+def find_below(url: str) -> list[StoredFile]:
+    """Return objects below a folder, or that match a pattern with `*`, `?`, `**`, sorted."""
+    bucket, path = parse_url(url)
+    whole = path.split("/")
+    plain = [part for part in whole if not has_wildcards(part)]
+    if len(plain) == len(whole):
+        return _listed(bucket, path)
+    first = next(at for at, part in enumerate(whole) if has_wildcards(part))
+    matches = re.compile(glob_translate(path)).match
+    return [file for file in _listed(bucket, "/".join(whole[:first])) if matches(file.path)]
+
+
+def has_wildcards(text: str) -> bool:
+    """Whether a text has characters that stand for others."""
+    return any(c in text for c in "*?[")
+
+
+def copy_object(file: StoredFile, copy: Path) -> None:
+    """Copy an object as a listing found it to a file, whose folder is made.
+
+    Raises `InputError` if it is gone, replaced, or not as its tag's checksum; and `StorageError`.
+    """
+    arrived = set[str]()
+    with storage_errors(copy):
+        copy.parent.mkdir(parents=True, exist_ok=True)
+    for _ in range(ATTEMPTS):
+        digest = _copy_once(file, copy)
+        # A tag that looks like a checksum may be none: then two transfers that agree must do.
+        if not _COMPARABLE.fullmatch(file.identity) or digest in arrived:
+            return
+        if digest == file.identity or _is_of_parts(copy, file.identity):
+            return
+        arrived.add(digest)
+    raise InputError(
+        f"{file}: it arrived {ATTEMPTS} times with other bytes than the store has. Run the same "
+        "command again, and have the network examined."
+    )
+
+
+def _copy_once(file: StoredFile, copy: Path) -> str:
+    folder = file.folder
+    assert isinstance(folder, ObjectFolder)  # noqa: S101 - where else?
+    md5, copied = hashlib.md5(usedforsecurity=False), 0
+    try:
+        with storage_errors(copy), copy.open("wb") as stream:
+            for meta, part in fetch_parts(client(folder.bucket), file.path, str(file)):
+                if folder.found(meta).identity != file.identity:
+                    break
+                copied += stream.write(part)
+                md5.update(part)
+    except NoSuchObjectError as error:
+        raise InputError(str(error)) from None
+    if copied != file.size_bytes:
+        raise InputError(f"{file}: it changed while it was read. Wait until it is complete.")
+    return md5.hexdigest()
+
+
+def _is_of_parts(copy: Path, tag: str) -> bool:
+    """Whether a tag is the MD5 of the MD5s of N parts, of any size that uploaders choose."""
+    stated, _, number = tag.partition("-")
+    size, parts = copy.stat().st_size, int(number or 0)
+    if not parts:
+        return False
+    for unit in (2**20, 10**6):
+        for length in {_rounded_up(size, parts * unit) * unit, *(n * unit for n in _PART_SIZES)}:
+            if _rounded_up(size, length) == parts and _md5_of_parts(copy, length) == stated:
+                return True
+    return False
+
+
+def _rounded_up(size: int, length: int) -> int:
+    return -(-size // length)
+
+
+def _md5_of_parts(copy: Path, length: int) -> str:
+    whole = hashlib.md5(usedforsecurity=False)
+    with copy.open("rb") as stream:
+        while part := stream.read(length):
+            whole.update(hashlib.md5(part, usedforsecurity=False).digest())
+    return whole.hexdigest()
+
+
+def _listed(bucket: ObjectFolder, path: str) -> list[StoredFile]:
+    where = f"{bucket}/{path}"
+    with object_errors(where):
+        try:
+            pages = list(obstore.list(client(bucket.bucket), path or None))
+        except InvalidPathError:
+            if not bucket.bucket.startswith("s3://"):
+                raise
+            return sorted(list_any_names(bucket, path), key=str)
+    return sorted((bucket.found(meta) for page in pages for meta in page), key=str)

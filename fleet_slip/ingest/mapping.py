@@ -1,0 +1,447 @@
+"""The mapping of a measured log: which column is which signal, in which unit, with which sign."""
+
+import csv
+import io
+import os
+import re
+from collections.abc import Container, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import date
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from fleet_slip.base import canonical_ascii, number_of, shown
+from fleet_slip.catalogue.signals import Identifier, catalogue
+from fleet_slip.config import (
+    Config,
+    Name,
+    PositiveFloat,
+    added,
+    faults_of,
+    find_config,
+    load_config,
+    load_toml,
+    read_named_file,
+)
+from fleet_slip.errors import ConfigError, UnclaimedError
+from fleet_slip.ingest.columns import (
+    WHEELS,
+    OffsetM,
+    RowCondition,
+    SignalColumn,
+    TimeBase,
+    require_satellites,
+    split_components,
+    text_conditions,
+)
+from fleet_slip.ingest.formats.can import CanBus, read_can_database
+from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers
+from fleet_slip.ingest.formats.reading import FileFormats
+from fleet_slip.ingest.formats.source import describe_unknown
+from fleet_slip.ingest.formats.tables import DuckdbRows
+from fleet_slip.ingest.log_files import Log, Place, is_pattern, is_url, names_several
+
+# Where the sensor of the label is, against the centre of gravity.
+
+SPEEDS = ("vx", "vehicle_speed")
+
+
+class LabelSensor(Config):
+    """The sensor that tells side-slip: its place, and whether it tells velocities or the angle.
+
+    A car that turns drives sideways before and behind its centre of gravity, so that an optical
+    sensor on the rear bumper tells another angle.
+    """
+
+    from_velocities: bool = False
+    """Side-slip is arctan(vy / vx), of the signals `vx` and `vy`, which are the sensor's."""
+    sensor_x_m: OffsetM = 0.0
+    """How far the sensor is before the centre of gravity."""
+    sensor_y_m: OffsetM = 0.0
+    """How far it is to the left of the centre of gravity."""
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether it is not at the centre of gravity."""
+        return bool(self.sensor_x_m or self.sensor_y_m)
+
+    def require_signals(self, signals: Container[str]) -> None:
+        """Raise `ValueError` for a mapping that lacks what the label is computed from."""
+        label = catalogue().label
+        if self.from_velocities and label in signals:
+            raise ValueError(f"label: from_velocities, and {label} has a column: leave out one")
+        needed = ["vx", "vy"] if self.from_velocities else [label]
+        needed += ["yaw_rate"] if self.is_elsewhere else []
+        for name in needed:
+            if name not in signals:
+                raise ValueError(f"label: it needs the signal {name}")
+        wheels = all(f"{WHEELS}{corner}" in signals for corner in ("fl", "fr", "rl", "rr"))
+        if self.is_elsewhere and not wheels and not any(name in signals for name in SPEEDS):
+            raise ValueError("label: to move it needs a speed: vx, vehicle_speed or four wheels")
+
+
+# What is known of each car, from a table beside the mapping.
+
+Told = TypeVar("Told")
+
+
+def require_drive_column(told: Told, info: ValidationInfo) -> Told:
+    """Return what is told of a drive. Raises `ValueError` if the catalogue has no such column."""
+    if info.field_name not in catalogue().drive:
+        raise ValueError(
+            "the catalogue has no such drive column. Copy it from the shipped one: "
+            "configs/signals.toml"
+        )
+    return told
+
+
+OptionalColumn = Annotated[
+    Annotated[Name, AfterValidator(require_drive_column)] | None, added(None)
+]
+
+
+class VehicleFacts(Config):
+    """One car: what its drives say unless the mapping's `[drive]` says it."""
+
+    vehicle_id: Name
+    vehicle_model: Name | None = None
+    mass_kg: PositiveFloat | None = None
+    tyres: OptionalColumn = None
+    receiver: OptionalColumn = None
+
+
+def read_vehicle_facts(file: Path) -> tuple[VehicleFacts, ...]:
+    """Read a CSV file: vehicle_id, and any other facts. Raises `ConfigError`, with the line."""
+    content = read_named_file(file)
+    try:
+        lines = csv.DictReader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
+        columns, rows = lines.fieldnames or (), list(lines)
+    except (ValueError, csv.Error):
+        columns, rows = (), []
+    if "vehicle_id" not in columns:
+        raise ConfigError(
+            f"{file}: vehicle_id is missing. A table of cars is CSV in UTF-8, whose first line "
+            f"names its columns: {', '.join(VehicleFacts.model_fields)}."
+        )
+    found = tuple(_facts(file, line, row) for line, row in enumerate(rows, 2))
+    names = [facts.vehicle_id for facts in found]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise ConfigError(f"{file}: the car {twice!r} stands in it twice.")
+    if not found:
+        raise ConfigError(f"{file}: it has no row. It needs a header and one row for each car.")
+    return found
+
+
+def _facts(file: Path, line: int, row: dict[str, str]) -> VehicleFacts:
+    try:
+        return VehicleFacts.model_validate({key: text or None for key, text in row.items()})
+    except ValidationError as error:
+        raise ConfigError(f"{file}: line {line}: {faults_of(error)}") from None
+
+
+class FromColumn(Config):
+    """A drive's metadata that stand in a column of the file; a new value begins a new drive."""
+
+    column: Name
+
+
+OptionalFact = Annotated[
+    Annotated[Name | FromColumn, AfterValidator(require_drive_column)] | None,
+    added(None),
+]
+
+
+class DriveMetadata(Config):
+    """What is known of each drive, given here or taken from a column; absent stays null."""
+
+    column: Name | None = None
+    """Every value of this column is a drive of its own."""
+    day: date | FromColumn | None = None
+    """Date of the drive; with timestamps it may be left out and is that of the first row (UTC)."""
+    vehicle_id: Name | FromColumn
+    vehicle_model: Name | FromColumn | None = None
+    track: Name | FromColumn | None = None
+    mass_kg: PositiveFloat | FromColumn | None = None
+    tyres: OptionalFact = None
+    receiver: OptionalFact = None
+    adhesion: PositiveFloat | FromColumn | None = None
+
+
+class Mapping(Config):
+    """How one kind of measured file becomes drives. Identifies itself by `name`."""
+
+    name: Identifier
+    missing: tuple[str, ...] = ()
+    """Texts that mean "no value", besides the empty one; `nan` also clears NaN in binary files."""
+    csv: CsvFormat = CsvFormat()
+    can: CanBus | None = added(None)
+    duckdb: DuckdbRows | None = added(None)
+    time: TimeBase
+    drive: DriveMetadata
+    signals: Annotated[
+        dict[str, SignalColumn], BeforeValidator(split_components), Field(min_length=1)
+    ]
+    label: LabelSensor | None = added(None)
+    """Where the label's sensor is, and whether it tells two velocities instead of an angle."""
+    where: tuple[RowCondition, ...] = added(())
+    """Conditions that a row meets, all of them, or is left out and only counted; also as text."""
+    vehicles: tuple[VehicleFacts, ...] | Name = added(())
+    """What is known of each car; a text is the path of a CSV file, seen from the mapping's own."""
+
+    @field_validator("where", mode="before")
+    @classmethod
+    def _texts_are_read(cls, where: Any, info: ValidationInfo) -> Any:
+        texts = [where] if isinstance(where, str) else where
+        if not isinstance(texts, list | tuple):
+            return where
+        signals = info.data.get("signals", {})
+        read = [text_conditions(t, signals) if isinstance(t, str) else [t] for t in texts]
+        return [condition for conditions in read for condition in conditions]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Mapping":
+        for condition in self.where:
+            if condition.signal is not None and condition.signal not in self.signals:
+                raise ValueError(f"where: {condition.signal!r} is no signal of this mapping")
+            if condition.signal is not None and self.signals[condition.signal].component:
+                raise ValueError(f"where: name the column of the file, not {condition.signal!r}")
+        known = catalogue().signals
+        for name, column in self.signals.items():
+            if name not in known:
+                raise ValueError(describe_unknown(name, known))
+            try:
+                column.require_unit_of(name, known[name].unit)
+            except ValueError as error:
+                raise ValueError(f"signals.{name}: {column.column} {error}") from None
+        require_satellites(self.signals)
+        if self.label is not None:
+            self.label.require_signals(self.signals)
+        if self.drive.day is None and not self.time.is_dated:
+            raise ValueError("drive.day is needed: the time has no date. Give a date or a column")
+        if self.drive.vehicle_model is None and not self.vehicles:
+            raise ValueError("drive.vehicle_model is needed, or 'vehicles', a table of the cars")
+        for name, signal in self.signals.items():
+            if signal.time is not None and self.time.unit is None:
+                raise ValueError(f"signals.{name}: 'time' needs [time] with 'column' and 'unit'")
+        return self
+
+    def __hash__(self) -> int:
+        """Return the hash of what identifies it."""
+        return hash(self.canonical_json())
+
+    def time_bases(self) -> dict[str | None, list[str]]:
+        """Return the columns that the mapping uses, each once, by the column of their times."""
+        own = {s.column for s in self.signals.values() if s.time not in {None, self.time.column}}
+        common = [name for name in self.common_columns() if name not in own]
+        bases = {self.time.column: [self.time.column, *common]}
+        for signal in self.signals.values():
+            time = self.time.column if signal.time is None else signal.time
+            bases.setdefault(time, [time]).append(signal.column)
+        return {
+            time: list(dict.fromkeys(name for name in names if name is not None))
+            for time, names in bases.items()
+        }
+
+    def common_columns(self) -> list[str]:
+        """Return the columns that say something of all signals: of the drive, and conditions."""
+        metadata = (getattr(self.drive, name) for name in DriveMetadata.model_fields)
+        names = [self.drive.column]
+        names += [source.column for source in metadata if isinstance(source, FromColumn)]
+        names += [self.time.date.column] if self.time.date else []
+        for condition in self.where:
+            of = condition.signal
+            names.append(condition.column if of is None else self.signals[of].column)
+        names += [signal.sign.column for signal in self.signals.values() if signal.sign]
+        return list(dict.fromkeys(name for name in names if name is not None))
+
+    @property
+    def signal_names(self) -> tuple[str, ...]:
+        """All signals that drives have, those computed from others too."""
+        derived = self.label is not None and self.label.from_velocities
+        return (*self.signals, *([catalogue().label] if derived else []))
+
+    @property
+    def formats(self) -> FileFormats:
+        """What must be known of a file to open it."""
+        return FileFormats(self.csv, self.can, self.duckdb, self.name, self._plain_numbers)
+
+    @property
+    def _plain_numbers(self) -> PlainNumbers:
+        """Columns of which only the number counts, not how it is written."""
+        if len(self.time_bases()) > 1:
+            return PlainNumbers()
+        numbers = {signal.column for signal in self.signals.values()}
+        if self.time.column is not None and self.time.unit is not None:
+            numbers.add(self.time.column)
+        columns = frozenset(numbers - set(self.common_columns()))
+        return PlainNumbers(columns, tuple(float(text) for text in self.missing if is_number(text)))
+
+    def vehicle_facts(self) -> tuple[VehicleFacts, ...]:
+        """Return what is known of each car. Raises `ConfigError` if its file was not read."""
+        if isinstance(self.vehicles, str):
+            raise ConfigError(f"{self.vehicles}: not read. Load the mapping by its name or path.")
+        return self.vehicles
+
+    def canonical_json(self) -> str:
+        """The mapping as JSON that does not depend on the order or layout of its TOML file."""
+        return canonical_ascii(self.model_dump(mode="json"))
+
+
+def is_number(text: str) -> bool:
+    """Whether a text that means "no value" is also a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def load_mapping(name_or_path: str) -> Mapping:
+    """Load a mapping by name from `configs/mappings`, or by path. Raises `ConfigError`."""
+    file = find_config("mappings", name_or_path)
+    mapping = load_config(file, Mapping)
+    folder = Path(str(file)).parent
+    if isinstance(mapping.vehicles, str):
+        facts = read_vehicle_facts(folder / mapping.vehicles)
+        mapping = mapping.model_copy(update={"vehicles": facts})
+    if mapping.can is not None:
+        mapping = mapping.model_copy(update={"can": read_can_database(mapping.can, folder)})
+    return mapping
+
+
+# Which mapping the logs of a folder go through: one all of them, or several each its own.
+
+NAMES_SHOWN = 3
+
+
+class ListedMapping(Config):
+    """Which files of a folder go through a mapping; without one they are left alone."""
+
+    files: Name
+    """A folder in it, a pattern of names at any depth, or, with `/`, of paths below it."""
+    mapping: Name | None = None
+    """A name, or the path of a TOML file, seen from the list's own."""
+
+
+class ListFile(Config):
+    """A TOML file that lists mappings."""
+
+    mappings: tuple[ListedMapping, ...] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Files, and the mapping that they go through, None if they are left alone."""
+
+    files: str
+    mapping: Mapping | None
+
+    def takes(self, name: str) -> bool:
+        """Whether a path below the folder is among the files."""
+        seen = name if "/" in self.files else name.rpartition("/")[2]
+        return fnmatchcase(seen, self.files) or name.startswith(f"{self.files.rstrip('/')}/")
+
+
+@dataclass(frozen=True)
+class MappingList:
+    """Mappings, each of which takes files of its own."""
+
+    name: str
+    entries: tuple[Entry, ...]
+
+    def share_out(
+        self, logs: Sequence[Log], places: Iterable[Place]
+    ) -> tuple[list[tuple[Mapping, list[Log]]], UnclaimedError | None]:
+        """Return the logs of each mapping, and what tells of those of none or of several.
+
+        Patterns are seen from the `places` in which the logs were found.
+        """
+        folders = sorted(map(_folder_of, places), key=len)
+        shares: list[list[Log]] = [[] for _ in self.entries]
+        none, several = list[str](), list[str]()
+        for log in logs:
+            name = _name_below(folders, log)
+            takers = [n for n, one in enumerate(self.entries) if one.takes(name)]
+            if len(takers) == 1:
+                shares[takers[0]].append(log)
+            else:
+                (several if takers else none).append(name)
+        taken = [
+            (one.mapping, share)
+            for one, share in zip(self.entries, shares, strict=True)
+            if one.mapping is not None and share
+        ]
+        left_out = [
+            f"{_told(n)} of {of}"
+            for n, of in ((none, "no mapping"), (several, "several mappings"))
+            if n
+        ]
+        if not left_out:
+            return taken, None
+        return taken, UnclaimedError(
+            f"{self.name}: {' and '.join(left_out)} left out. Give each file one mapping in it, or "
+            "none, and it is left alone."
+        )
+
+
+def _told(names: list[str]) -> str:
+    """Return how many logs they are, and the first of them."""
+    more = ", …" if len(names) > NAMES_SHOWN else ""
+    listed = ", ".join(map(shown, names[:NAMES_SHOWN]))
+    return f"{number_of(len(names), 'log')} ({listed}{more})"
+
+
+def as_list(mapping: str | Mapping | MappingList) -> MappingList:
+    """Return what a name, a path, a mapping or a list stands for. Raises `ConfigError`.
+
+    A file with `[[mappings]]` is a list; any other is the mapping of all logs.
+    """
+    if isinstance(mapping, MappingList):
+        return mapping
+    if isinstance(mapping, Mapping):
+        return MappingList(mapping.name, (Entry("*", mapping),))
+    file = find_config("mappings", mapping)
+    if "mappings" not in load_toml(file):
+        return as_list(load_mapping(mapping))
+    folder = Path(str(file)).parent
+    return MappingList(
+        mapping,
+        tuple(
+            Entry(one.files, _listed(one.mapping, folder))
+            for one in load_config(file, ListFile).mappings
+        ),
+    )
+
+
+def _listed(mapping: str | None, folder: Path) -> Mapping | None:
+    if mapping is None:
+        return None
+    return load_mapping(str(folder / mapping) if mapping.endswith(".toml") else mapping)
+
+
+def _folder_of(place: Place) -> str:
+    """Return the folder that is searched, with `/` at its end."""
+    text = str(place) if is_url(place) else os.path.abspath(place)  # noqa: PTH100 - as in a URL
+    if is_pattern(place if is_url(place) else Path(place)):
+        text = re.split(r"[*?[]", text, maxsplit=1)[0]
+    elif names_several(place):
+        return f"{text.rstrip('/')}/"
+    return f"{text.rpartition('/')[0]}/"
+
+
+def _name_below(folders: Sequence[str], log: Log) -> str:
+    """Return the path of a log below the outermost of the folders that have it."""
+    text = os.path.abspath(log) if isinstance(log, Path) else str(log)  # noqa: PTH100
+    inside = (text[len(folder) :] for folder in folders if text.startswith(folder))
+    return next(inside, text.rpartition("/")[2])

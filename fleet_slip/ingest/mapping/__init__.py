@@ -1,1 +1,0 @@
-"""What a mapping says of a log: columns, units, axes, vehicles."""

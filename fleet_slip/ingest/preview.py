@@ -1,0 +1,151 @@
+"""What ingesting a file would do, and a picture of it: nothing is stored."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.base import FloatArray, needed
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.errors import ConfigError
+from fleet_slip.ingest.drives import MeasuredDrive
+from fleet_slip.ingest.log_files import Log, local_copy
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.stream import IngestCounts, open_measured
+from fleet_slip.ingest.suspicion import Suspicion, find_suspicions
+from fleet_slip.storage.folder import storage_errors
+
+MOST_TICKS = 200_000
+"""Ticks of the longest drive that are looked at: half an hour."""
+
+
+@dataclass(frozen=True)
+class SignalRange:
+    """The values of a signal in a file, in the catalogue's unit."""
+
+    signal: str
+    unit: str
+    low: float
+    high: float
+    missing: float
+    """Part of the ticks without a value."""
+
+
+@dataclass(frozen=True)
+class Preview:
+    """What would become of a file."""
+
+    file: str
+    counts: IngestCounts
+    ranges: tuple[SignalRange, ...]
+    suspicions: tuple[Suspicion, ...]
+    longest: dict[str, FloatArray]
+    """The signals of the longest drive, on consecutive ticks from its first."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `ingest --dry-run --json` prints."""
+        return {
+            "file": self.file,
+            **vars(self.counts),
+            "ranges": [vars(one) for one in self.ranges],
+            "suspicions": [vars(one) for one in self.suspicions],
+        }
+
+
+def preview_log(log: Log, mapping: Mapping) -> Preview:
+    """Read a log through a mapping, and look at what came out. Raises `InputError`."""
+    longest: MeasuredDrive | None = None
+    found = {name: _Found() for name in mapping.signal_names}
+    with local_copy(log) as file, open_measured(file, mapping) as stream:
+        for piece in stream.pieces():
+            for drive in piece.drives:
+                if longest is None or drive.ticks.size > longest.ticks.size:
+                    longest = drive
+                for name, counts in drive.counts.items():
+                    found[name].add(counts)
+        of_rows = stream.suspicions()  # which may look into the file again
+    signals = signals_of(longest) if longest is not None else {}
+    ranges = tuple(_range(name, found[name]) for name in mapping.signal_names)
+    suspicions = (*of_rows, *find_suspicions(signals))
+    return Preview(str(log), stream.counts(), ranges, suspicions, signals)
+
+
+def signals_of(drive: MeasuredDrive) -> dict[str, FloatArray]:
+    """Return the signals of the beginning of a drive in SI units, NaN where there is no value."""
+    ticks = drive.ticks - drive.ticks[0]
+    kept = ticks < MOST_TICKS
+    signals = {}
+    for name, counts in drive.counts.items():
+        values = np.full(int(ticks[kept][-1]) + 1, np.nan)
+        numbers = pl.Series(counts).cast(pl.Float64).to_numpy()  # Arrow's own would load pandas
+        values[ticks[kept]] = numbers[kept] * float(catalogue()[name].scale)
+        signals[name] = values
+    return signals
+
+
+@dataclass
+class _Found:
+    """Counts of a signal so far."""
+
+    low: int | None = None
+    high: int | None = None
+    values: int = 0
+    ticks: int = 0
+
+    def add(self, counts: pa.Array) -> None:
+        self.ticks += len(counts)
+        self.values += len(counts) - counts.null_count
+        ends = pc.min_max(counts).as_py()
+        if ends["min"] is not None:
+            self.low = ends["min"] if self.low is None else min(self.low, ends["min"])
+            self.high = ends["max"] if self.high is None else max(self.high, ends["max"])
+
+
+def _range(name: str, found: _Found) -> SignalRange:
+    signal = catalogue()[name]
+    low, high = (
+        np.nan if end is None else end * float(signal.scale) for end in (found.low, found.high)
+    )
+    return SignalRange(name, signal.unit, low, high, 1 - found.values / max(found.ticks, 1))
+
+
+_SHOWN = {
+    "rad": ("deg", 180 / math.pi),
+    "rad/s": ("deg/s", 180 / math.pi),
+    "m/s": ("km/h", 3.6),
+}
+"""What people read a unit in, and how many of it one is; others are drawn as they are."""
+
+
+def draw_preview(preview: Preview, file: Path) -> None:
+    """Draw the signals to a file of any format. Raises `ConfigError`, `StorageError`."""
+    with needed("report", "a picture of a measured log"):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - takes a while
+        from matplotlib.figure import Figure  # noqa: PLC0415
+
+    names = list(preview.longest)
+    figure = Figure(figsize=(10, 1.3 * len(names) + 0.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = np.atleast_1d(figure.subplots(len(names), sharex=True))
+    for name, axes in zip(names, panels, strict=True):
+        values, signal = preview.longest[name], catalogue()[name]
+        wrong = [s.kind for s in preview.suspicions if name in s.signals]
+        time_s = np.arange(values.size) * float(SAMPLE_TIME_S)
+        unit, factor = _SHOWN.get(signal.unit, (signal.unit, 1.0))
+        axes.plot(time_s, values * factor, color="tab:red" if wrong else "tab:blue", linewidth=0.8)
+        axes.axhline(0, color="0.8", linewidth=0.5, zorder=0)
+        axes.set_title(f"{name}, {unit}", loc="left", fontsize="small")
+        axes.set_title("; ".join(f"{kind}?" for kind in wrong), loc="right", fontsize="small")
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[-1].set_xlabel("time, s")
+    figure.suptitle(f"{Path(preview.file).name}: its longest drive", x=0.01, ha="left")
+    with storage_errors(file):
+        try:
+            figure.savefig(file, metadata={"Date": None} if file.suffix == ".svg" else None)
+        except ValueError as error:
+            raise ConfigError(f"{file}: {error}") from None

@@ -1,0 +1,339 @@
+"""What is in a file from a stranger: each channel's rate, range, and share of missing values."""
+
+import csv
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from fleet_slip.base import FloatArray
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.csv import CsvFormat, Encoding, decompressed, first_lines
+from fleet_slip.ingest.formats.reading import (
+    FileFormats,
+    file_errors,
+    open_source,
+    require_unchanged_file,
+)
+from fleet_slip.ingest.formats.source import OWN_TIME, Channel, Source
+from fleet_slip.ingest.vocabulary import unit_called, vocabulary
+
+# Guesses how a text file is written: encoding, separator, and where header, units and data are.
+
+_SEPARATORS = (";", "\t", "|", ",", " ")
+_LINES = 120
+_NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*")
+_DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
+_BOMS = (b"\xff\xfe", b"\xfe\xff")
+
+
+def guess_layout(file: Path) -> tuple[CsvFormat, dict[str, str]]:
+    """Return how a text file is written, and the units of its columns if a line has them."""
+    encoding = _guess_encoding(file)
+    if encoding is None:
+        return CsvFormat(), {}
+    lines = first_lines(file, CsvFormat(encoding=encoding), _LINES)
+    if not lines:
+        return CsvFormat(encoding=encoding), {}
+    separator = max(_SEPARATORS, key=lambda one: _regularity(lines, one))
+    rows = [_split(line, separator) for line in lines]
+    header, data = _header_and_data(rows)
+    fields = [field for row in rows[data:] for field in row]
+    given = CsvFormat(
+        separator=separator,
+        decimal_comma=separator != "," and any(_DECIMAL_COMMA.fullmatch(f) for f in fields),
+        encoding=encoding,
+        header_line=header + 1,
+        data_line=data + 1 if data > header + 1 else None,
+    )
+    return given, _units(rows[header], rows[header + 1 : data])
+
+
+def _guess_encoding(file: Path) -> Encoding | None:
+    """Return the encoding of a text, None for what is no text."""
+    with file.open("rb") as stream:
+        start = decompressed(stream).read(2**16)
+    if start.startswith(_BOMS):
+        return "utf-16"
+    if b"\0" in start:
+        return None
+    try:
+        start[: start.rfind(b"\n") + 1].decode("utf-8")
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8"
+
+
+def _split(line: str, separator: str) -> list[str]:
+    try:
+        return next(csv.reader([line], delimiter=separator), [])
+    except csv.Error:
+        return [line]
+
+
+def _regularity(lines: list[str], separator: str) -> tuple[float, bool, float, int]:
+    """Return how well a separator splits lines.
+
+    Which part of the last lines has numbers in equally many fields, whether a line above them has
+    as many, which part has whatever is in them, and how many they are.
+    """
+    rows = [_split(line, separator) for line in lines if line.strip()]
+    last = rows[len(rows) // 2 :]
+    width, often = Counter(map(len, last)).most_common(1)[0] if last else (1, 0)
+    if width == 1:
+        return 0.0, False, 0.0, 0
+    numbers = sum(len(row) == width and _is_data(row) for row in last)
+    has_header = any(len(row) == width and not _is_data(row) for row in rows)
+    return round(numbers / len(last), 1), has_header, round(often / len(last), 1), width
+
+
+def _header_and_data(rows: list[list[str]]) -> tuple[int, int]:
+    """Return the places of the header and of the first line of data; 0 and 1 if nothing tells.
+
+    Above the data are lines of as many fields, the first of which is the header; a blank line or a
+    title in brackets may be between.
+    """
+    width = Counter(map(len, rows[len(rows) // 2 :])).most_common(1)[0][0]
+    data = next((i for i, row in enumerate(rows) if len(row) == width and _is_data(row)), None)
+    if not data:
+        return 0, 1
+    header, found = data, 0
+    for place in range(data - 1, -1, -1):
+        row = rows[place]
+        if len(row) == width and sum(bool(field.strip()) for field in row) > width / 2:
+            header, found = place, found + 1
+        elif "".join(row).strip() and not re.fullmatch(r"\s*\[.*\]\s*", "".join(row)):
+            break
+        if found == 3:
+            break
+    return (header, data) if found else (0, 1)
+
+
+def _is_data(row: list[str]) -> bool:
+    some = [field for field in row if field.strip()]
+    numbers = sum(_NUMBER.fullmatch(field) is not None for field in some)
+    return bool(some) and numbers >= max(len(some) / 2, 1)
+
+
+def _units(header: list[str], between: list[list[str]]) -> dict[str, str]:
+    """Return the units of columns, from a line of as many fields in which one is a unit."""
+    for row in between:
+        if len(row) == len(header) and any(unit_called(field) for field in row):
+            told = zip(header, row, strict=True)
+            return {name.strip(): unit.strip(" []()") for name, unit in told}
+    return {}
+
+
+# Finds what loggers write where there is no value: -9999, 65535, n.v.
+
+_FAR = 2.0
+"""How many times the range of the others a number lies outside of it, to be none."""
+_FEWEST = 20
+
+
+@dataclass(frozen=True)
+class Absent:
+    """What means that there is no value.
+
+    Attributes:
+        texts: as a mapping has them under `missing`, numbers too.
+        numbers: those of them that are numbers.
+        doubtful: a channel and a number that means none in it, though another has it as a value.
+    """
+
+    texts: tuple[str, ...] = ()
+    numbers: tuple[float, ...] = ()
+    doubtful: tuple[tuple[str, float], ...] = ()
+
+
+def find_absent(channels: Sequence[tuple[str, FloatArray, tuple[str, ...]]]) -> Absent:
+    """Return what means no value in channels: their names, numbers, and texts among numbers."""
+    known = vocabulary()["missing"]
+    texts = [t for _, _, odd in channels for t in odd if t.lower() in known["texts"]]
+    sentinels: dict[float, list[str]] = {}
+    real: set[float] = set()
+    for name, values, _ in channels:
+        present = values[np.isfinite(values)]
+        others = present[~np.isin(present, known["numbers"])]
+        for number in np.unique(present[np.isin(present, known["numbers"])]):
+            if others.size >= _FEWEST and _is_far(float(number), others):
+                sentinels.setdefault(float(number), []).append(name)
+            else:
+                real.add(float(number))
+    sure = tuple(number for number in sentinels if number not in real)
+    doubtful = tuple((n, one) for one, names in sentinels.items() if one in real for n in names)
+    written = [f"{number:.0f}" for number in sure]
+    return Absent(tuple(dict.fromkeys([*written, *texts])), sure, doubtful)
+
+
+def _is_far(number: float, others: FloatArray) -> bool:
+    low, high = float(others.min()), float(others.max())
+    margin = _FAR * max(high - low, 1e-6)
+    return number > high + margin or number < low - margin
+
+
+def without_absent(values: FloatArray, absent: Absent) -> FloatArray:
+    """Return values with NaN for the numbers that mean none."""
+    if not absent.numbers or not values.size:
+        return values
+    return np.where(np.isin(values, absent.numbers), np.nan, values)
+
+
+MOST_ROWS = 200_000
+"""Rows of each time base that are looked at."""
+_LOOKED_AT = 200
+"""Texts that tell whether a column has times, and of which format."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """One channel of a file.
+
+    Attributes:
+        rate_hz: of its time base, where the file has a clock.
+        values: those looked at as numbers, NaN where there is none; of times, seconds since 1970
+            or midnight; empty for other texts.
+        texts: some of its texts, all that are no numbers among numbers.
+        keys: where it has texts or whole numbers, a number for each; else empty.
+        time_format: of texts that are times; empty for a type that is a time.
+    """
+
+    channel: Channel
+    rate_hz: float | None
+    values: FloatArray
+    texts: tuple[str, ...] = field(default=())
+    keys: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    time_format: str | None = None
+
+    @property
+    def is_number(self) -> bool:
+        """Whether there are numbers in it."""
+        return self.time_format is None and bool(np.isfinite(self.values).any())
+
+    @property
+    def missing(self) -> float:
+        """Part of the rows without a number."""
+        return float(1 - np.isfinite(self.values).mean()) if self.values.size else 1.0
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The least and the largest number. There must be one."""
+        return float(np.nanmin(self.values)), float(np.nanmax(self.values))
+
+
+@dataclass(frozen=True)
+class FileProfile:
+    """All channels of a file, in its order, and whether it has clocks of its own."""
+
+    has_clock: bool
+    formats: FileFormats
+    profiles: tuple[Profile, ...]
+    absent: Absent = field(default_factory=Absent)
+    """What means that there is no value."""
+
+
+def profile_file(file: Path, formats: FileFormats) -> FileProfile:
+    """Look at the first `MOST_ROWS` rows of every channel. Raises `InputError`."""
+    with require_unchanged_file(file), file_errors(file), ExitStack() as opened:
+        if formats.can is None and formats.duckdb is None:
+            layout, units = guess_layout(file)
+            formats = FileFormats(csv=layout)
+        else:
+            units = {}
+        source = opened.enter_context(open_source(file, formats))
+        bases: dict[str, list[Channel]] = defaultdict(list)
+        for channel in source.channels():
+            told = replace(channel, unit=channel.unit or units.get(channel.name, ""))
+            bases[channel.base].append(told)
+        found = tuple(p for of in bases.values() for p in _profile_base(source, of, formats.csv))
+        absent = find_absent([(p.channel.name, p.values, p.texts) for p in found if p.is_number])
+        cleaned = (replace(p, values=without_absent(p.values, absent)) for p in found)
+        return FileProfile(source.has_clock, formats, tuple(cleaned), absent)
+
+
+def _profile_base(source: Source, channels: list[Channel], csv: CsvFormat) -> Iterator[Profile]:
+    """Yield what can be read of one time base; a channel that cannot is passed over."""
+    try:
+        table = _first_rows(source, channels)
+    except InputError:
+        if len(channels) > 1:
+            for channel in channels:
+                yield from _profile_base(source, [channel], csv)
+        return
+    rate_hz = sample_rate_hz(table[OWN_TIME].to_numpy()) if OWN_TIME in table.columns else None
+    for channel in channels:
+        if channel.name in table.columns:
+            yield _profile(channel, rate_hz, table[channel.name], csv)
+
+
+def _first_rows(source: Source, channels: list[Channel]) -> pl.DataFrame:
+    frames, rows = [], 0
+    for frame in source.batches([channel.name for channel in channels]):
+        frames.append(frame)
+        rows += frame.height
+        if rows >= MOST_ROWS:
+            break
+    return pl.concat(frames).head(MOST_ROWS) if frames else pl.DataFrame()
+
+
+def _profile(channel: Channel, rate_hz: float | None, column: pl.Series, csv: CsvFormat) -> Profile:
+    if column.dtype.is_temporal():
+        first = tuple(map(str, column.drop_nulls()[:3]))
+        is_time = isinstance(column.dtype, pl.Datetime)
+        seconds = _seconds(column) if is_time else np.zeros(0)
+        return Profile(channel, rate_hz, seconds, first, time_format="" if is_time else None)
+    if not column.dtype.is_numeric():
+        texts = column.cast(pl.String).str.strip_chars()
+        plain = texts.str.replace(",", ".", literal=True) if csv.decimal_comma else texts
+        numbers = plain.cast(pl.Float64, strict=False)
+        if numbers.is_not_null().any():
+            odd = texts.filter(numbers.is_null() & (texts != "")).unique()[:20].to_list()
+            return Profile(
+                channel, rate_hz, numbers.fill_null(np.nan).to_numpy(), tuple(odd), _keys(texts)
+            )
+        some = tuple(texts.drop_nulls().unique(maintain_order=True)[:3])
+        for written in _time_formats(texts):
+            return Profile(channel, rate_hz, _read_times(texts, written), some, time_format=written)
+        return Profile(channel, rate_hz, np.zeros(0), some, _keys(texts))
+    values = column.cast(pl.Float64).fill_null(np.nan)
+    return Profile(channel, rate_hz, values.to_numpy(), keys=_keys(values))
+
+
+def _keys(column: pl.Series) -> NDArray[np.int64]:
+    """Return a number for each text or whole number, the first ones first; empty for others."""
+    if column.dtype.is_float() and not (column == column.round()).all():
+        return np.zeros(0, dtype=np.int64)
+    return column.rank("dense").fill_null(0).cast(pl.Int64).to_numpy()
+
+
+def _time_formats(texts: pl.Series) -> Iterator[str]:
+    """Yield the first format that all texts at the beginning have."""
+    some = texts.drop_nulls().head(_LOOKED_AT)
+    for written in vocabulary()["time"]["formats"]:
+        if some.len() and bool(np.isfinite(_read_times(some, written)).all()):
+            yield written
+            return
+
+
+def _read_times(texts: pl.Series, written: str) -> FloatArray:
+    """Return seconds since 1970, or midnight, NaN for what is no such time."""
+    if "%d" not in written:
+        clock = texts.str.to_time(written, strict=False).cast(pl.Int64)
+        return np.asarray((clock.cast(pl.Float64) / 1e9).fill_null(np.nan).to_numpy())
+    return _seconds(texts.str.to_datetime(written, time_unit="us", strict=False))
+
+
+def _seconds(moments: pl.Series) -> FloatArray:
+    return np.asarray((moments.dt.epoch("us") / 1e6).fill_null(np.nan).to_numpy())
+
+
+def sample_rate_hz(time_s: FloatArray) -> float | None:
+    """Return one over the usual step of time, None if time does not go on."""
+    step = np.median(np.diff(time_s)) if time_s.size > 1 else 0.0
+    return float(1 / step) if step > 0 else None

@@ -1,0 +1,369 @@
+"""Puts the samples of one drive onto ticks of 100 Hz: snap, interpolate or average.
+
+All functions are pure; `time_s` is strictly increasing, seconds since any origin; a missing value
+is NaN, and each signal is resampled from its own samples, so that a slow sensor in a fast file is
+as well off as one with a file of its own. Nothing is extrapolated. A satellite receiver's fixes
+become the velocity of the centre of gravity.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.base import BoolArray, FloatArray, IntArray
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.ingest.columns import SignalColumn
+
+# Which fixes of a satellite receiver tell where the car goes, and where they stand.
+#
+# Not all that have a course do, and changes over some seconds are of fixes that are exactly so far
+# apart.
+
+STEP_S = float(SAMPLE_TIME_S)
+SAME_RAD = 1e-6
+"""A course is finer; of two velocities one that stands still differs by rounding."""
+HELD_RAD = 0.005
+"""What a car may turn while its course stays the same: half a degree is a coarse receiver's."""
+BACKWARDS_MPS = 8.0
+"""Nobody drives backwards faster."""
+LEAST_TURNING_RAD_S = 0.1
+"""An accelerometer that is off by 0.15 m/s² seems to drive backwards at 1.5 m/s then, no faster."""
+
+SECOND = round(1 / STEP_S)
+GRIDS = tuple(ticks for ticks in range(1, SECOND + 1) if SECOND % ticks == 0)
+"""Spacings of fixes, in ticks, of which a whole number is a second."""
+REGULAR = 0.8
+LONGEST_BETWEEN = 25
+"""Ticks between two fixes, in which the side-slip angle is nearly a straight line."""
+LONGEST_BESIDE = 5
+"""Ticks from the only fix near: it changes by some tenths of a degree at most."""
+
+
+def is_held(course: FloatArray, yaw_rate: FloatArray, place: IntArray) -> BoolArray:
+    """Return which fixes repeat a course from before the car turned on.
+
+    Receivers hold the course when they are slow, or tell it less often than the speed. `place` says
+    at which tick each fix is; `course` is of the fixes, and `yaw_rate` of the ticks.
+    """
+    if not course.size:
+        return np.zeros(0, dtype=np.bool_)
+    heading = np.cumsum(np.nan_to_num(yaw_rate))[place] * STEP_S
+    new = np.append(True, np.abs(np.diff(course)) > SAME_RAD)
+    first = np.maximum.accumulate(np.where(new, np.arange(course.size), 0))
+    held: BoolArray = ~new & (np.abs(heading - heading[first]) > HELD_RAD)
+    return held
+
+
+def is_backwards(
+    yaw_rate: FloatArray, ay: FloatArray, speed: FloatArray, place: IntArray
+) -> BoolArray:
+    """Return at which fixes the car drives backwards: it is pushed to the outside of its bend.
+
+    The lateral acceleration is the yaw rate times the forward speed, here by least squares over the
+    second around a fix. Straight on it does not tell, and the course is right all the same.
+    """
+    second = np.ones(2 * round(0.5 / STEP_S) + 1)
+    if not place.size:
+        return np.zeros(0, dtype=np.bool_)
+    squares, products = (
+        np.convolve(np.nan_to_num(one), second)[second.size // 2 :][place]
+        for one in (yaw_rate**2, yaw_rate * ay)
+    )
+    turning = squares > second.size * LEAST_TURNING_RAD_S**2
+    backwards: BoolArray = turning & (speed < BACKWARDS_MPS) & (products < -0.5 * speed * squares)
+    return backwards
+
+
+def on_grid(
+    ticks: IntArray, course: FloatArray, speed: FloatArray, yaw_rate: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return course and speed at regular ticks, if the fixes are at irregular ones.
+
+    They are regular if most that have a fix about a second later have one exactly then. What is
+    interpolated is the course less the yaw rate's integral, that is the slip, between two fixes
+    that are near, or taken from one that is nearer. All arrays are of the ticks.
+    """
+    fixes = np.flatnonzero(~np.isnan(course))
+    if fixes.size < 2 or _is_regular(ticks[fixes]):
+        return course, speed
+    heading = np.cumsum(np.nan_to_num(yaw_rate)) * STEP_S
+    heading[np.isnan(yaw_rate)] = np.nan
+    slip = np.full(course.size, np.nan)
+    slip[fixes] = np.unwrap(course[fixes] - heading[fixes])
+    usual = float(np.median(np.diff(ticks[fixes])))
+    spacing = min(GRIDS, key=lambda grid: abs(np.log(grid / usual)))
+    chosen = ticks % spacing == 0
+    found = []
+    for values in (slip, speed):
+        placed = np.full(values.size, np.nan)
+        placed[chosen] = _between(ticks, values, ticks[chosen])
+        found.append(placed)
+    return found[0] + heading, found[1]
+
+
+def find_ticks(
+    ticks: IntArray, wanted: IntArray | FloatArray
+) -> tuple[NDArray[np.intp], BoolArray]:
+    """Return where ticks are among others, which are in order, and whether they are at all."""
+    place = np.searchsorted(ticks, wanted)
+    found: BoolArray = place < ticks.size
+    found[found] = ticks[place[found]] == wanted[found]
+    return place, found
+
+
+def _is_regular(fixes: IntArray) -> bool:
+    """Return whether most fixes that have one about a second later have one exactly then."""
+    later = find_ticks(fixes, fixes + SECOND)[1]
+    next_one = np.searchsorted(fixes, fixes + SECOND - SECOND // 10)
+    there = next_one < fixes.size
+    there[there] = fixes[next_one[there]] <= fixes[there] + SECOND + SECOND // 10
+    return not there.any() or bool(later[there].mean() >= REGULAR)
+
+
+def _between(ticks: IntArray, values: FloatArray, at: IntArray) -> FloatArray:
+    """Return values at ticks, by straight lines between near samples, else beside a nearer one."""
+    known = np.flatnonzero(~np.isnan(values))
+    times, told = ticks[known], values[known]
+    right = np.clip(np.searchsorted(times, at), 0, times.size - 1)
+    left = np.maximum(right - 1, 0)
+    bridged = (times[right] >= at) & (times[right] - times[left] <= LONGEST_BETWEEN)
+    bridged &= times[left] <= at
+    nearer = np.where(at - times[left] < times[right] - at, left, right)
+    beside = np.abs(times[nearer] - at) <= LONGEST_BESIDE
+    line = np.where(bridged, np.interp(at, times, told), np.nan)
+    return np.where(bridged | ~beside, line, told[nearer])
+
+
+Method = Literal["snap", "interpolate", "average"]
+
+SNAP_TOLERANCE_S = 0.1 * STEP_S
+"""A sample this close to its tick is taken as measured there."""
+TIME_EPSILON_S = 1e-6
+"""Times that differ by less are equal: a float64 of seconds since 1970 resolves 0.24 µs."""
+
+LEAST_SPEED_MPS = 2.0
+"""Below, receivers freeze the course or tell noise."""
+
+
+def choose_method(time_s: FloatArray, interval_s: float) -> Method:
+    """Snap samples of 100 Hz that are near ticks, average a faster log, interpolate others."""
+    if interval_s < STEP_S - SNAP_TOLERANCE_S:
+        return "average"
+    if interval_s <= STEP_S + SNAP_TOLERANCE_S:
+        since = time_s - time_s[0]
+        ticks = np.rint(since / STEP_S)
+        offset = np.abs(since - ticks * STEP_S).max()
+        distinct = bool(np.all(ticks[1:] > ticks[:-1]))
+        if distinct and offset <= SNAP_TOLERANCE_S + TIME_EPSILON_S:
+            return "snap"
+    return "interpolate"
+
+
+@dataclass(frozen=True)
+class Resampler:
+    """Brings the signals of one drive onto its ticks.
+
+    Attributes:
+        ticks: the drive's ticks, shape (n_ticks,).
+        start_s: time of tick 0.
+    """
+
+    time_s: FloatArray
+    method: Method
+    ticks: IntArray
+    start_s: float
+
+    @cached_property
+    def at_s(self) -> FloatArray:
+        """Times of the ticks."""
+        return np.asarray(self.start_s + self.ticks * STEP_S, dtype=np.float64)
+
+    def resample(
+        self, values: FloatArray, delay_s: float = 0.0, longest_gap_s: float = 0.1
+    ) -> FloatArray:
+        """Return a signal on the ticks; what was measured at t stands in the file at t + delay."""
+        if self.method == "snap" and not delay_s:
+            return values
+        resample = average if self.method == "average" else interpolate
+        return resample(self.time_s - delay_s, values, self.at_s, longest_gap_s)
+
+    def hold(
+        self, values: FloatArray, delay_s: float = 0.0, longest_gap_s: float = 0.1
+    ) -> FloatArray:
+        """Return a signal that changes in steps: at each tick the last sample, unless too old."""
+        if self.method == "snap" and not delay_s:
+            return values
+        time_s, values = _present(self.time_s - delay_s, values)
+        last = np.searchsorted(time_s, self.at_s + TIME_EPSILON_S, side="right") - 1
+        held = np.full(self.at_s.size, np.nan)
+        known = last >= 0
+        known[known] = (self.at_s[known] - time_s[last[known]]) <= longest_gap_s + TIME_EPSILON_S
+        held[known] = values[last[known]]
+        return held
+
+    def place(self, values: FloatArray, delay_s: float = 0.0) -> FloatArray:
+        """Return a signal with each sample at its nearest tick, the last of several, else NaN."""
+        present = np.flatnonzero(~np.isnan(values))
+        nearest = np.rint((self.time_s[present] - delay_s - self.at_s[0]) / STEP_S)
+        place, found = find_ticks(self.ticks, nearest)
+        placed = np.full(self.ticks.size, np.nan)
+        placed[place[found]] = values[present[found]]
+        return placed
+
+
+def build_resampler(time_s: FloatArray, method: Method) -> Resampler:
+    """Return what brings signals at these times onto the ticks of their drive."""
+    if method == "snap":
+        return Resampler(time_s, method, snap(time_s), time_s[0])
+    start_s, number = tick_range(time_s, method)
+    return Resampler(time_s, method, np.arange(number), start_s)
+
+
+def snap(time_s: FloatArray) -> IntArray:
+    """Return the tick nearest to each sample, the first sample being tick 0."""
+    ticks: IntArray = np.rint((time_s - time_s[0]) / STEP_S).astype(np.int64)
+    return ticks
+
+
+def tick_range(time_s: FloatArray, method: Method) -> tuple[float, int]:
+    """Return the time of tick 0, half a tick late for averages, and the number of ticks."""
+    margin = STEP_S / 2 if method == "average" else 0.0
+    span = time_s[-1] - time_s[0] - 2 * margin
+    return float(time_s[0] + margin), int(np.floor((span + TIME_EPSILON_S) / STEP_S)) + 1
+
+
+def interpolate(
+    time_s: FloatArray, values: FloatArray, at_s: FloatArray, longest_gap_s: float
+) -> FloatArray:
+    """Interpolate at `at_s`; NaN outside, and in gaps that are too wide unless at a sample."""
+    time_s, values = _present(time_s, values)
+    if not time_s.size:
+        return np.full(at_s.shape, np.nan)
+    right = np.clip(np.searchsorted(time_s, at_s), 0, time_s.size - 1)
+    left = np.maximum(right - 1, 0)
+    to_left, to_right = np.abs(at_s - time_s[left]), np.abs(at_s - time_s[right])
+    measured = np.minimum(to_left, to_right) <= TIME_EPSILON_S
+    inside = (at_s >= time_s[0]) & (at_s <= time_s[-1])
+    bridged = time_s[right] - time_s[left] <= longest_gap_s + TIME_EPSILON_S
+    return np.where(measured | (inside & bridged), np.interp(at_s, time_s, values), np.nan)
+
+
+def average(
+    time_s: FloatArray, values: FloatArray, at_s: FloatArray, longest_gap_s: float
+) -> FloatArray:
+    """Average the piecewise linear signal over the sample time around each of `at_s`.
+
+    The integral of the trapezoids is exact, so a linear signal comes out exact. As a filter it is
+    a moving average of 10 ms: gain sinc(f / 100 Hz), -3.9 dB at 50 Hz, zero at 100 Hz and its
+    multiples, no phase shift. NaN where the window leaves the samples or meets a gap.
+    """
+    time_s, values = _present(time_s, values)
+    if time_s.size < 2:
+        return np.full(at_s.shape, np.nan)
+    step = np.diff(time_s)
+    slope = np.diff(values) / step
+    area = np.concatenate([[0.0], np.cumsum(step * (values[1:] + values[:-1]) / 2)])
+    gaps = np.concatenate([[0], np.cumsum(step > longest_gap_s + TIME_EPSILON_S)])
+    start = np.clip(at_s - STEP_S / 2, time_s[0], time_s[-1])
+    end = np.clip(at_s + STEP_S / 2, time_s[0], time_s[-1])
+    first = np.clip(np.searchsorted(time_s, start, side="right") - 1, 0, step.size - 1)
+    last = np.clip(np.searchsorted(time_s, end) - 1, 0, step.size - 1)
+
+    def integral(i: IntArray, t: FloatArray) -> FloatArray:
+        into = t - time_s[i]
+        return np.asarray(area[i] + into * (values[i] + slope[i] * into / 2), dtype=np.float64)
+
+    width = end - start
+    whole = (width >= STEP_S - 2 * TIME_EPSILON_S) & (gaps[last + 1] == gaps[first])
+    mean = (integral(last, end) - integral(first, start)) / np.where(whole, width, 1.0)
+    return np.where(whole, mean, np.nan)
+
+
+def _present(time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    present = ~np.isnan(values)
+    return time_s[present], values[present]
+
+
+@dataclass(frozen=True)
+class Antenna:
+    """Where the antenna is: before the centre of gravity, and to the left of it, in m."""
+
+    x_m: float
+    y_m: float
+
+
+def course_and_speed(
+    column: SignalColumn, first: FloatArray, second: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return course from east and speed of two columns: north and east, or course and speed."""
+    if column.component:
+        return np.arctan2(first, second), np.hypot(first, second)
+    course = np.pi / 2 - first if column.clockwise_from_north else first
+    return course, second
+
+
+def fixes_on_ticks(
+    course: FloatArray,
+    speed: FloatArray,
+    resampler: Resampler,
+    delay_s: float,
+    antenna: Antenna,
+    yaw_rate: FloatArray,
+    ay: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return course in rad and speed in m/s at the ticks nearest to the fixes, NaN elsewhere.
+
+    `course` and `speed` are the antenna's, of the resampler's samples; `yaw_rate` in rad/s and
+    `ay` in m/s² are of the ticks. A sample that repeats the one before is no fix: the file holds
+    values in between. One of a course that `is_held`, or of a car that `is_backwards`, has none.
+    Fixes at irregular times are brought `on_grid`.
+
+    In the car's axes the antenna moves by (-r y, r x) against the centre of gravity, with the yaw
+    rate r. Where the car does not slip, that tells how the axes lie to the antenna's course; what
+    slip β there is makes an error of r y β over speed. A fix that is measured a part of a tick
+    before its tick turns by r times that part. Without a yaw rate there is no course; nor is there
+    one below `LEAST_SPEED_MPS`.
+    """
+    present = np.flatnonzero(_is_new(course, speed))
+    nearest, late_s = _nearest(resampler, present, delay_s)
+    place, found = find_ticks(resampler.ticks, nearest)
+    place, late_s, fixes = place[found], late_s[found], present[found]
+    r = yaw_rate[place]
+    across = r * antenna.x_m
+    along = np.sqrt(np.maximum(speed[fixes] ** 2 - across**2, 0.0))
+    turned = course[fixes] - np.arctan2(across, along) + r * late_s
+    courses, speeds = (np.full(resampler.ticks.size, np.nan) for _ in range(2))
+    speeds[place] = along + r * antenna.y_m
+    sound = (speed[fixes] >= LEAST_SPEED_MPS) & ~is_held(course[fixes], yaw_rate, place)
+    if ay is not None:
+        sound &= ~is_backwards(yaw_rate, ay, speed[fixes], place)
+    courses[place] = np.where(sound, turned, np.nan)
+    courses, speeds = on_grid(resampler.ticks, courses, speeds, yaw_rate)
+    return _in_one_turn(courses), speeds
+
+
+def _is_new(course: FloatArray, speed: FloatArray) -> BoolArray:
+    """Return where a sample is there and is not the one before again."""
+    there = np.flatnonzero(~np.isnan(course) & ~np.isnan(speed))
+    same = np.zeros(there.size, dtype=np.bool_)
+    same[1:] = (np.diff(course[there]) == 0) & (np.diff(speed[there]) == 0)
+    new = np.zeros(course.size, dtype=np.bool_)
+    new[there[~same]] = True
+    return new
+
+
+def _nearest(
+    resampler: Resampler, samples: IntArray, delay_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the tick nearest to each sample, and how much later it is, in s."""
+    since = resampler.time_s[samples] - delay_s - resampler.start_s
+    nearest = np.rint(since / STEP_S)
+    return nearest, nearest * STEP_S - since
+
+
+def _in_one_turn(angle: FloatArray) -> FloatArray:
+    """Return the angle from -pi on, below pi."""
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi, dtype=np.float64)

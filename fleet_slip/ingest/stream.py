@@ -1,0 +1,381 @@
+"""From a measured file to drives in counts, piece by piece: few drives are in memory at once."""
+
+import os
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+
+from fleet_slip.base import Progress, canonical_ascii, no_progress, number_of, shown
+from fleet_slip.compute.tasks import read_ahead
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.drives import (
+    LONGEST_DRIVE_S,
+    MAX_OPEN_ROWS,
+    DriveCutter,
+    DriveRows,
+    MeasuredDrive,
+    OpenDrives,
+    SeveralCars,
+    Trips,
+    drive_id,
+    sample_intervals_s,
+    to_ticks,
+    unmapped_cars,
+)
+from fleet_slip.ingest.formats.reading import log_digest, require_unchanged_log
+from fleet_slip.ingest.formats.source import Meter
+from fleet_slip.ingest.formats.tables import partition_keys
+from fleet_slip.ingest.log_files import parts_of, size_of
+from fleet_slip.ingest.log_rows import (
+    CheckedBlock,
+    RowChecker,
+    describe_refused,
+    find_look_alikes,
+    join_refused,
+    no_rows,
+)
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
+from fleet_slip.ingest.suspicion import Suspicion, assumed_rate, find_refusals
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
+
+# What became of a file's rows, and when that says that the file or its mapping is not usable.
+
+MAX_DRIVES = 10_000
+"""Short drives in one file. With more, time or the drive's column is not what the mapping says."""
+SHORT_ROWS = 1000
+MAX_TICKS = 40_000_000
+"""Ticks of all drives of one file together, where it has few rows for so many."""
+MOST_TICKS_A_ROW = 1000
+
+
+@dataclass(frozen=True)
+class IngestCounts:
+    """What became of a file's rows: read are left out, kept or quarantined."""
+
+    rows_read: int
+    rows_left_out: int
+    """Rows that do not meet the mapping's conditions."""
+    rows_kept: int
+    quarantined: dict[str, int]
+    """Rejected rows by reason."""
+    drives: int
+    drives_resampled: int
+    ticks: int
+    """Rows of the result; equal to `rows_kept` where nothing was resampled."""
+
+    def without(self, drives: int, ticks: int) -> "IngestCounts":
+        """Return the counts where some drives were left out, and so many ticks are left."""
+        return replace(self, drives=self.drives - drives, ticks=ticks)
+
+
+@dataclass
+class Totals:
+    """What became of a file's rows so far."""
+
+    rows_kept: int = 0
+    quarantined: Counter[str] = field(default_factory=Counter)
+    refused: Counter[tuple[str, str]] = field(default_factory=Counter)
+    """Rejected rows by what is wrong, where that is a signal, and by the reason."""
+    drives: int = 0
+    drives_resampled: int = 0
+    ticks: int = 0
+    samples: Counter[str] = field(default_factory=Counter)
+    """Values of each signal in the file's rows; `values` are those on ticks."""
+    values: Counter[str] = field(default_factory=Counter)
+    first_refused: dict[str, Any] | None = None
+
+    def add(self, rows: DriveRows, drive: MeasuredDrive) -> None:
+        """Count a drive that was made of rows."""
+        self.rows_kept += rows.height
+        self.drives += 1
+        self.drives_resampled += drive.method != "snap"
+        self.ticks += drive.ticks.size
+        for name, counts in drive.counts.items():
+            self.samples[name] += rows.number_of(name)
+            self.values[name] += len(counts) - counts.null_count
+
+    def add_refused(self, refused: pl.DataFrame, signals: Collection[str]) -> None:
+        """Count refused rows, by reason and, where that is one of the signals, by what is wrong."""
+        if refused.height:
+            self.quarantined.update(refused["reason"])
+            of_signals = refused.filter(pl.col("signal").is_in(list(signals)))
+            self.refused.update(zip(of_signals["signal"], of_signals["reason"], strict=True))
+            first = refused.row(refused["row"].arg_min() or 0, named=True)
+            self.first_refused = min(self.first_refused or first, first, key=lambda r: r["row"])
+
+    def counts(self, rows_read: int, rows_left_out: int) -> IngestCounts:
+        """Return what became of the rows, of which so many were read and left out."""
+        return IngestCounts(
+            rows_read=rows_read,
+            rows_left_out=rows_left_out,
+            rows_kept=self.rows_kept,
+            quarantined=dict(sorted(self.quarantined.items())),
+            drives=self.drives,
+            drives_resampled=self.drives_resampled,
+            ticks=self.ticks,
+        )
+
+    def require_sane_drives(self, file: Path, mapping: Mapping) -> None:
+        """Raise `InputError` where drives are too many or too long for so few rows."""
+        if self.drives > MAX_DRIVES and self.rows_kept < SHORT_ROWS * self.drives:
+            raise InputError(
+                f"{shown(file)}: it falls into more than {MAX_DRIVES:,} drives, of "
+                f"{self.rows_kept / self.drives:.0f} rows on average. Check time, split_gap_s "
+                f"and the drive's column in the mapping {mapping.name!r}."
+            )
+        if self.ticks > MAX_TICKS and self.ticks > MOST_TICKS_A_ROW * self.rows_kept:
+            raise InputError(
+                f"{shown(file)}: {self.rows_kept:,} rows last {self.ticks:,} ticks of "
+                "100 Hz. Check the unit of time and split_gap_s in the mapping "
+                f"{mapping.name!r}."
+            )
+
+    def require_usable(self, file: Path, mapping: Mapping) -> None:
+        """Raise `InputError` where no row, no tick, or no value of a signal came of all rows."""
+        if not self.rows_kept and self.first_refused is not None:
+            reasons = ", ".join(f"{n:,} {reason}" for reason, n in self.quarantined.most_common())
+            first = self.first_refused
+            example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
+            raise InputError(
+                f"{shown(file)}: none of its "
+                f"{number_of(self.quarantined.total(), 'row')} is usable ({reasons}; first: "
+                f"{example}). Check columns, units and time in the mapping {mapping.name!r}."
+            )
+        if not self.ticks:
+            raise InputError(
+                f"{shown(file)}: no row is on a tick of 100 Hz, and longest_gap_s = "
+                f"{mapping.time.longest_gap_s:g} forbids to interpolate. Raise it in the "
+                f"mapping {mapping.name!r} if the signals change slowly enough."
+            )
+        for signal, source in mapping.signals.items():
+            if self.samples[signal] and not self.values[signal]:
+                raise InputError(
+                    f"{shown(file)}: {signal} has "
+                    f"{number_of(self.samples[signal], 'value')} in {source.column!r}, and none "
+                    "is on a tick of 100 Hz: they are further apart than longest_gap_s. Give the "
+                    f"signal in the mapping {mapping.name!r} a longest_gap_s of its own, or "
+                    "interpolate = false."
+                )
+
+
+RATE_ROWS, MOST_RATE_ROWS = 2**17, 2**21
+"""The fewest and the most first rows of a file whose median step is the usual time between rows."""
+FEWEST_STEPS = 1000
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Drives of a file that have ended, and rows that were refused meanwhile.
+
+    Attributes:
+        drives: in an order that depends on the file and the mapping only.
+        refused: `row`, `group`, `reason`, `signal` and `value`.
+    """
+
+    drives: list[MeasuredDrive]
+    refused: pl.DataFrame
+
+
+class MeasuredStream:
+    """A measured file, open for reading through a mapping.
+
+    The result depends on the file's bytes and the mapping only, not on its path (but for keys in
+    the names of folders, `car=A7`, that the mapping uses), nor on how it is read. Drives are called
+    `<mapping>-<digest>-<number>`, and `-2`, `-3` … follow where a gap in time cut one.
+    """
+
+    def __init__(
+        self, file: Path, mapping: Mapping, digest: str, content: str, meter: Meter
+    ) -> None:
+        """Take the file, the mapping, the digest of both, that of the file alone, and a meter."""
+        self.file, self.mapping, self.digest, self.content = file, mapping, digest, content
+        self.prefix = f"{mapping.name}-{digest[:12]}"
+        self.checker, self._meter = RowChecker(file, mapping, meter), meter
+        self.totals = Totals()
+        self._open = OpenDrives()
+        self._stretches: Counter[int] = Counter()
+        self._trips = Trips()
+        self._cars = SeveralCars()
+        self.name = os.fsencode(file.name).decode("utf-8", "replace")
+        self._stem = self.name.split(".", 1)[0] or self.name
+
+    def pieces(self) -> Iterator[Piece]:
+        """Yield what the file becomes, in order, once. Raises `InputError`, at its end too."""
+        with closing(read_ahead(self.checker.blocks())) as blocks:
+            early, intervals_s = self._usual_intervals(blocks)
+            longest_s = LONGEST_DRIVE_S * min([1.0, *(s / STEP_S for s in intervals_s.values())])
+            cutter = DriveCutter(self.mapping.time, longest_s)
+            for block in chain(early, blocks):
+                self._meter.count(block.read)
+                yield self._piece(cutter, block, intervals_s)
+            no_more = CheckedBlock(block.rows.clear(), no_rows(), block.read)
+            yield self._piece(cutter, no_more, intervals_s, last=True)
+        self._meter.end()
+        self.totals.require_usable(self.file, self.mapping)
+
+    def _usual_intervals(
+        self, blocks: Iterator[CheckedBlock]
+    ) -> tuple[list[CheckedBlock], dict[int, float]]:
+        """Return the first blocks, and the usual time between samples of each time base in them.
+
+        It is that of rows up to a number that is the same however a file is cut into blocks. Of a
+        time base that is not among them, its first drive tells it.
+        """
+        early: list[CheckedBlock] = []
+        enough = RATE_ROWS
+        for block in blocks:
+            early.append(block)
+            while _reach(early) >= enough:
+                first = _trial(self.mapping, early, enough)
+                has_steps = first["part"].is_duplicated().sum() > FEWEST_STEPS
+                if has_steps or enough >= MOST_RATE_ROWS:
+                    return early, sample_intervals_s(first)
+                enough += RATE_ROWS
+        return early, sample_intervals_s(_trial(self.mapping, early, _reach(early)))
+
+    def _piece(
+        self,
+        cutter: DriveCutter,
+        block: CheckedBlock,
+        intervals_s: dict[int, float],
+        *,
+        last: bool = False,
+    ) -> Piece:
+        rows, misplaced = cutter.cut(block.rows, last=last)
+        refused = [block.refused, misplaced]
+        self._open.add(rows)
+        drives = []
+        for ended in self._open.take([*cutter.ended, *(cutter.open_parts() if last else ())]):
+            if ended.end_s - ended.start_s < STEP_S - TIME_EPSILON_S:
+                refused.append(describe_refused(ended.frame(), None, "too_short"))
+            else:
+                drives.append(self._drive(ended, intervals_s))
+        if self._open.number_of_rows > MAX_OPEN_ROWS:
+            raise InputError(
+                f"{shown(self.file)}: more than {MAX_OPEN_ROWS:,} rows of drives that alternate, "
+                "and none of them ends. Sort the file by drive and time."
+            )
+        bad = join_refused(refused)
+        self.totals.add_refused(bad, self.mapping.signals)
+        return Piece(drives, bad)
+
+    def _drive(self, rows: DriveRows, intervals_s: dict[int, float]) -> MeasuredDrive:
+        group = rows.group
+        self._stretches[group] += 1
+        name = drive_id(self.prefix, group, self._stretches[group])
+        told = self.checker.keys.metadata[group]
+        known = {
+            **told,
+            "drive_name": told.get("drive", self._stem),
+            "source_file": self.name,
+            "trip_id": self._trips.name(name, group, rows.start_s, rows.end_s),
+        }
+        for base in set(rows.bases) - intervals_s.keys():
+            steps_s = np.diff(rows.times_of(base)[:RATE_ROWS])
+            intervals_s[base] = float(np.median(steps_s)) if steps_s.size else STEP_S
+        try:
+            drive = to_ticks(rows, self.mapping, intervals_s, name, known)
+        except InputError as error:
+            raise InputError(f"{shown(self.file)}: {error}") from None
+        self.totals.add(rows, drive)
+        self._cars.add(rows, drive)
+        self.totals.require_sane_drives(self.file, self.mapping)
+        return drive
+
+    def quarantine_table(self, refused: Sequence[pl.DataFrame]) -> pa.Table:
+        """Return refused rows as those of the table `quarantine`, in the file's order."""
+        bad = join_refused(refused).sort("row", maintain_order=True)
+        groups = bad["group"].unique().drop_nulls()
+        ids = {group: drive_id(self.prefix, group) for group in groups}
+        stated = self.mapping.drive.vehicle_id
+        vehicle = stated if isinstance(stated, str) else None
+        metadata = self.checker.keys.metadata
+        vehicles = {str(group): metadata[group].get("vehicle_id", vehicle) for group in groups}
+        frame = bad.select(
+            pl.lit(self.name).alias("file"),
+            "row",
+            pl.col("group").replace_strict(ids, return_dtype=pl.String).alias("drive_id"),
+            pl.col("group")
+            .cast(pl.String)
+            .replace_strict(vehicles, return_dtype=pl.String)
+            .fill_null(pl.lit(vehicle, pl.String))
+            .alias("vehicle_id"),
+            "reason",
+            "signal",
+            "value",
+        )
+        return frame.to_arrow().cast(QUARANTINE_SCHEMA)
+
+    def counts(self) -> IngestCounts:
+        """Return what became of the rows, once all pieces were taken."""
+        return self.totals.counts(self.checker.rows, self.checker.left_out)
+
+    def suspicions(self) -> tuple[Suspicion, ...]:
+        """Return the signals of which many values were refused, once all pieces were taken."""
+        of_signals = Counter[str]()
+        for (_, reason), count in self.totals.refused.items():
+            of_signals[reason] += count
+        others = self.totals.quarantined - of_signals
+        found = tuple(find_refusals(self.totals.refused, self.checker.rows, others))
+        time, drives = self.mapping.time, self.totals.drives
+        of_cars = (*self._cars.suspicions(), *unmapped_cars(self.file, self.mapping, drives))
+        return (*found, *of_cars, *assumed_rate(time.rate_hz if time.assumed else None))
+
+    def look_alikes(self) -> tuple[tuple[str, ...], ...]:
+        """Return names of drives or cars in the file that differ only in their Unicode form."""
+        told = {value for key in self.checker.keys.metadata for value in key.values()}
+        return find_look_alikes({value for value in told if isinstance(value, str)})
+
+
+@contextmanager
+def open_measured(
+    file: Path, mapping: Mapping, progress: Progress = no_progress
+) -> Iterator[MeasuredStream]:
+    """Open a measured file; progress is in its bytes.
+
+    Raises `InputError`, if it changes until the end too.
+    """
+    with require_unchanged_log(file):
+        meter = Meter(size_of(file), progress)
+        yield MeasuredStream(file, mapping, *_identity(file, mapping), meter)
+
+
+def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
+    """Return the digest of a file and a mapping, and that of the file and its folders' keys."""
+    digest = log_digest(file)
+    content = digest.copy()
+    used = {name for names in mapping.time_bases().values() for name in names}
+    for part in parts_of(file):
+        told = partition_keys(part)
+        if keys := {key: text for key, text in told.items() if key in used}:
+            digest.update(canonical_ascii(keys).encode())
+        content.update(canonical_ascii(told).encode())
+    digest.update(mapping.canonical_json().encode())
+    return digest.hexdigest(), content.hexdigest()
+
+
+def _reach(blocks: list[CheckedBlock]) -> int:
+    """Return how many rows tell the usual time; of several bases good ones are counted."""
+    if "base" in blocks[-1].rows.columns:
+        return sum(block.rows.height for block in blocks)
+    return blocks[-1].read
+
+
+def _trial(mapping: Mapping, blocks: list[CheckedBlock], until: int) -> pl.DataFrame:
+    """Return the rows of the first blocks up to a number, cut into parts."""
+    rows = blocks[0].rows if len(blocks) == 1 else pl.concat([block.rows for block in blocks])
+    several = "base" in rows.columns
+    if several:
+        rows = rows.head(until)
+    elif until < blocks[-1].read:
+        rows = rows.filter(pl.col("row") <= until)
+    return DriveCutter(mapping.time).cut(rows, last=several)[0]

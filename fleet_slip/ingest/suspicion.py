@@ -1,0 +1,628 @@
+"""What looks wrong in a drive whose values are all well formed: a sign, a unit, swapped wheels, a
+label that comes late.
+
+Nothing here is certain: a suspicion is a relation of vehicle dynamics that a drive contradicts,
+with the figure that shows it, and what to try. Axes and signs are ISO 8855.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from fleet_slip.base import BoolArray, FloatArray
+from fleet_slip.catalogue.course import (
+    COURSE,
+    LARGEST_RAD,
+    WITNESSES,
+    CourseFault,
+    CourseRelation,
+    relate,
+)
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+
+# How signals of a drive go with one another: slopes, fits, a label's delay.
+
+FEWEST_TICKS = 200
+MOVING_MPS = 2.0
+
+MOST_TICKS = 20_000
+FEWEST_DELAY_TICKS = 1000
+MOST_LAG, FAR_LAG = 50, 150
+"""A label is looked for this many ticks before and after its inputs; from the first on roughly."""
+HALF_CHANGE = 25
+"""The lateral velocity changes over twice so many ticks: the label's noise matters less."""
+EACH = 5
+"""Of what is that smooth, each fifth tick tells as much."""
+
+LEAST_EXPLAINED = 0.6
+"""Where accelerations explain less of the change of lateral velocity, they are no witness."""
+LEAST_KINEMATIC_LAG, LEAST_KINEMATIC_GAIN = 5, 0.1
+"""Simulated drives without a delay reach 11 ticks and .04, one of these at a time."""
+LEAST_LAG, LEAST_GAIN = 3, 0.3
+"""A delay explains away this part of a label's variance: a car's own lag of 0.1 s does 0.23."""
+
+
+def moving(speed: FloatArray | None) -> BoolArray:
+    """Return where the car drives; everywhere if its speed is not known."""
+    if speed is None:
+        return np.ones(1, dtype=np.bool_)
+    return np.asarray(np.nan_to_num(speed) > MOVING_MPS)
+
+
+def slope_of(values: FloatArray, expected: FloatArray, rows: BoolArray) -> tuple[float, float]:
+    """Return values over expected, by least squares about their means, and their correlation."""
+    rows = rows & np.isfinite(values) & np.isfinite(expected)
+    if rows.sum() < FEWEST_TICKS:
+        return 1.0, 0.0
+    y, x = values[rows] - values[rows].mean(), expected[rows] - expected[rows].mean()
+    xx, yy, xy = x @ x, y @ y, x @ y
+    if not xx > 0 or not yy > 0:
+        return 1.0, 0.0
+    return float(xy / xx), float(xy / np.sqrt(xx * yy))
+
+
+def fit(y: FloatArray, inputs: FloatArray, rows: BoolArray) -> tuple[FloatArray, float, float]:
+    """Return coefficients of inputs, the constant, and what part of the variance they explain."""
+    rows = rows & np.isfinite(y) & np.isfinite(inputs).all(axis=0)
+    nothing = np.zeros(len(inputs)), 0.0, 0.0
+    if rows.sum() < FEWEST_TICKS:
+        return nothing
+    middle, mean = inputs[:, rows].mean(axis=1), y[rows].mean()
+    x, centred = inputs[:, rows] - middle[:, None], y[rows] - mean
+    total = float(centred @ centred)
+    if not total > 0:
+        return nothing
+    coefficients = np.linalg.lstsq(x @ x.T, x @ centred, rcond=1e-12)[0]
+    left = centred - coefficients @ x
+    constant = float(mean - coefficients @ middle)
+    return coefficients, constant, 1 - float(left @ left) / total
+
+
+def find_delay(
+    angle_rad: FloatArray,
+    ay_mps2: FloatArray,
+    yaw_rate_rad_s: FloatArray,
+    speed_mps: FloatArray,
+    inputs: Sequence[FloatArray],
+) -> tuple[float, float] | None:
+    """Return the delay of a side-slip angle in s, and what part of its variance it explains away.
+
+    All are of one shape, (n_ticks,). The lateral velocity changes with ay - yaw_rate * speed, at
+    the same moment whatever car it is (Rajamani, Vehicle Dynamics and Control, eq. 2.9): where that
+    can be seen, it settles the matter. Else the delay is that at which the inputs explain the angle
+    best; a car that lags behind its inputs has one, too, so that it must be large. None if there is
+    none to be seen.
+    """
+    rows = moving(speed_mps)
+    if rows.sum() < FEWEST_DELAY_TICKS:
+        return None
+    n = min(angle_rad.size, MOST_TICKS)
+    angle, speed, rows = angle_rad[:n], speed_mps[:n], np.broadcast_to(rows, angle_rad.shape)[:n]
+    turning = yaw_rate_rad_s[:n] * speed
+    moves = np.array([_mean(ay_mps2[:n]), _mean(turning), _mean(speed)])
+    smooth = rows & (np.arange(n) % EACH == 0)
+    left = _unexplained(_change(speed * np.tan(angle)), moves, smooth)
+    if 1 - min(left.values()) > LEAST_EXPLAINED:
+        return _judged(left, LEAST_KINEMATIC_LAG, LEAST_KINEMATIC_GAIN)
+    left = _unexplained(angle, np.array([*(one[:n] for one in inputs), speed]), rows)
+    return None if min(left.values()) > 1 / 2 else _judged(left, LEAST_LAG, LEAST_GAIN)
+
+
+def is_in_time(angle_rad: FloatArray, course_rad: FloatArray, yaw_rate_rad_s: FloatArray) -> bool:
+    """Return whether a side-slip angle changes when the course does beyond the heading."""
+    n, apart = min(angle_rad.size, MOST_TICKS), 4 * HALF_CHANGE
+    turned = np.cumsum(np.nan_to_num(yaw_rate_rad_s)) * float(SAMPLE_TIME_S)
+    series = np.array([angle_rad, course_rad - turned, turned])[:, :n]
+    changes = series[:, apart:] - series[:, :-apart]
+    angle, slip = (changes[:2] + np.pi) % (2 * np.pi) - np.pi
+    left = _unexplained(angle, np.array([slip, changes[2]]), np.ones(angle.size, dtype=np.bool_))
+    best = min(left, key=lambda lag: left[lag])
+    return 1 - left[best] > LEAST_EXPLAINED and abs(best) < LEAST_KINEMATIC_LAG
+
+
+def _unexplained(label: FloatArray, inputs: FloatArray, rows: BoolArray) -> dict[int, float]:
+    """Return what part of a label's variance its inputs leave, by how many ticks it is late."""
+    n, m = label.size, FAR_LAG
+    within = slice(m, n - m)
+    some = rows & (np.arange(n) % EACH == 0)
+    near = dict.fromkeys(range(-MOST_LAG, MOST_LAG + 1), rows)
+    return {
+        lag: 1 - fit(label[m + lag : n - m + lag], inputs[:, within], chosen[within])[2]
+        for lag, chosen in (dict.fromkeys(range(-m, m + 1, EACH), some) | near).items()
+    }
+
+
+def _judged(
+    left: dict[int, float], least_lag: int, least_gain: float
+) -> tuple[float, float] | None:
+    best = min(left, key=lambda lag: left[lag])
+    gain = 1 - left[best] / left[0] if left[0] > 0 else 0.0
+    if not least_lag <= abs(best) < FAR_LAG or gain < least_gain:
+        return None
+    return best * float(SAMPLE_TIME_S), gain
+
+
+def _change(velocity_mps: FloatArray) -> FloatArray:
+    """Return the mean rate of change around each tick, NaN at both ends."""
+    change = np.full(velocity_mps.size, np.nan)
+    width = 2 * HALF_CHANGE
+    change[HALF_CHANGE:-HALF_CHANGE] = velocity_mps[width:] - velocity_mps[:-width]
+    return change / (width * float(SAMPLE_TIME_S))
+
+
+def _mean(values: FloatArray) -> FloatArray:
+    """Return the mean over the same ticks."""
+    width = 2 * HALF_CHANGE
+    return np.convolve(values, np.ones(width) / width, "same")
+
+
+# What looks wrong in a course: it turns as the yaw rate does, and slips as a car does.
+
+SECOND = round(1 / float(SAMPLE_TIME_S))
+APART = 4 * SECOND
+COURSE_SUSPICION_LEAST_CORRELATION = 0.6
+SOUND = (0.8, 1.25)
+"""Of the course's change to the yaw rate's integral, and of the receiver's speed to the wheels'."""
+LEAST_OF_THEIR_OWN = 0.9
+MOST_SCALE_ERROR = 0.02
+LEAST_SPEED_MPS = 3.0
+SPEED = "satellite_speed"
+
+
+def course_fault(
+    signals: Mapping[str, FloatArray], speed: FloatArray | None = None
+) -> CourseFault | None:
+    """Return what fault the course of a drive seems to have; `speed` is that of the wheels."""
+    if not {"course", "yaw_rate"} <= set(signals):
+        return None
+    course, turned = signals["course"], np.cumsum(signals["yaw_rate"]) * float(SAMPLE_TIME_S)
+    change = _wrapped(course[SECOND:] - course[:-SECOND])
+    slope, correlation = slope_of(
+        change, turned[SECOND:] - turned[:-SECOND], np.ones(change.size, dtype=np.bool_)
+    )
+    if (slope, correlation) != (1.0, 0.0):  # else it is too little to tell
+        figure = f"over a second it changes by {slope:+.2f} times what the yaw rate adds up to"
+        if correlation < -COURSE_SUSPICION_LEAST_CORRELATION:
+            remedy = "Turn clockwise_from_north, or swap north and east."
+            return CourseFault("reversed", (COURSE,), figure, remedy)
+        if correlation < COURSE_SUSPICION_LEAST_CORRELATION:
+            figure = f"over a second its change hardly goes with the yaw rate ({correlation:+.2f})"
+            remedy = "Is it a course over ground, and of this car?"
+            return CourseFault("values", (COURSE,), figure, remedy)
+        if not SOUND[0] <= slope <= SOUND[1]:
+            remedy = "Check its unit, and that of the yaw rate."
+            return CourseFault("scaled", (COURSE,), figure, remedy)
+    return _of_fixes(signals, speed) or _of_relation(_relation(signals, turned))
+
+
+def _of_fixes(signals: Mapping[str, FloatArray], speed: FloatArray | None) -> CourseFault | None:
+    """Return what is wrong with the receiver's speed, or with how many fixes have a course."""
+    told = signals.get("satellite_speed")
+    if told is None:
+        return None
+    fast = told > LEAST_SPEED_MPS
+    own = float(np.isfinite(signals["course"][fast]).mean()) if fast.any() else 1.0
+    if own < LEAST_OF_THEIR_OWN:
+        figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of backwards"
+        remedy = "They are left out. Map it as the receiver tells it."
+        return CourseFault("values", (COURSE,), figure, remedy)
+    both = fast & (speed > LEAST_SPEED_MPS) if speed is not None else fast
+    if speed is not None and both.sum() >= SECOND:
+        ratio = float(np.median(told[both] / speed[both]))
+        if not SOUND[0] <= ratio <= SOUND[1]:
+            figure = f"it is {ratio:.2f} times the speed of the wheels"
+            remedy = "Check both units: the antenna's place is by it."
+            return CourseFault("scaled", (SPEED,), figure, remedy)
+    return None
+
+
+def _of_relation(relation: CourseRelation | None) -> CourseFault | None:
+    if relation is None:
+        return None
+    if fault := relation.fault or relation.misplaced:
+        return replace(fault, signals=(COURSE,))
+    if abs(relation.scale - 1) > MOST_SCALE_ERROR:
+        figure = f"it turns {relation.scale:.3f} times as the yaw rate adds up to"
+        remedy = "The gyroscope's is off, which learning allows for."
+        return CourseFault("scale", (COURSE,), figure, remedy)
+    return None
+
+
+def _relation(signals: Mapping[str, FloatArray], turned: FloatArray) -> CourseRelation | None:
+    """Return what changes over some seconds come to, by the receiver's own speed."""
+    if not {"ay", "satellite_speed"} <= set(signals):
+        return None
+    yaw_rate, speed = signals["yaw_rate"], signals["satellite_speed"]
+    fast = np.where(speed > LEAST_SPEED_MPS, speed, np.nan)
+    series = np.array([yaw_rate / fast, signals["ay"], yaw_rate, turned, signals["course"]])
+    changes = series[:, APART:] - series[:, :-APART]
+    changes[4] = _wrapped(changes[4] - changes[3])
+    sound = np.isfinite(changes).all(axis=0) & (np.abs(changes[4]) <= float(LARGEST_RAD))
+    rows = np.vstack([np.ones(int(sound.sum())), changes[:, sound]])
+    return relate(rows @ rows.T)
+
+
+def _wrapped(angle: FloatArray) -> FloatArray:
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+# Finds what turns to one side alone, though the car turns to both: a magnitude without its sign.
+#
+# Some buses send a rate or an angle as a magnitude, and its sign as a bit of its own.
+
+TURNING = ("ay", "yaw_rate", "steering_wheel", "steer", "steer_fl", "steer_fr", "sideslip")
+LEAST_S = 60.0
+"""Who drives for less may well turn to one side."""
+_SMALL = 0.02
+"""Part of the usual largest value that noise and zero points reach on the other side."""
+
+
+def find_one_sided(
+    signals: Mapping[str, FloatArray], moving: BoolArray | None
+) -> Iterator[tuple[str, str]]:
+    """Yield the signals that never change their sign, and the figure that shows it.
+
+    `moving` are the ticks to look at, None for all. Nothing is said of a car whose rear wheels tell
+    that it does turn to one side, as on an oval.
+    """
+    if {"wheel_rl", "wheel_rr"} <= set(signals) and _side(
+        signals["wheel_rr"] - signals["wheel_rl"], moving
+    ):
+        return
+    for name in TURNING:
+        if name in signals and (side := _side(signals[name], moving)):
+            never, minutes = ("negative" if side > 0 else "positive"), signals[name].size / 6000
+            yield name, f"it is never {never} in {minutes:.0f} min"
+
+
+def _side(values: FloatArray, moving: BoolArray | None) -> int:
+    """Return +1 or -1 for values on one side of zero alone, 0 for others, or too few."""
+    looked_at = np.isfinite(values) if moving is None else np.isfinite(values) & moving
+    present = values[looked_at]
+    if present.size * float(SAMPLE_TIME_S) < LEAST_S:
+        return 0
+    low, high = np.quantile(present, [0.001, 0.999])
+    if max(-low, high) <= 0:
+        return 0
+    if low >= -_SMALL * high:
+        return 1
+    return -1 if high <= -_SMALL * low else 0
+
+
+Signals: TypeAlias = Mapping[str, FloatArray]
+"""Values in SI units on consecutive ticks, NaN where there is none; all of one shape (n_ticks,)."""
+
+RADIUS_M, TRACK_M = 0.31, 1.55
+"""Of a passenger car: what is looked for is a factor of 3.6, 9.8 or 57."""
+LONGEST_M, LARGE_RAD = 8.0, 0.15
+"""No car's rear axle is so far behind, and a car that slips so often slides."""
+LEAST_LEVER_M, LONGEST_LEVER_M, LONGEST_PART = 0.6, 2.6, 0.75
+"""The rear axle is so far behind the centre of gravity, and by this part of the wheelbase."""
+WHEELBASE_M = (2.0, 4.5)
+"""Beyond, it is the road wheels that are in doubt."""
+LARGEST_ZERO_RAD = math.radians(0.7)
+"""Real cars have up to 0.4 deg, from a sensor that is not aligned and roads that lean."""
+SLOW_MPS, SURE_EXPLAINED = 20.0, 0.85
+WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
+ROAD_WHEELS = ("steer_fl", "steer")
+LEAST_CORRELATION, SURE_CORRELATION = 0.6, 0.9
+LEAST_AGAINST = -0.3
+"""A correlation above tells no sign, as in `quality`: of noise alone half are below zero."""
+_GOES_WITH, _GOES_NOT = 0.8, 0.5
+"""Correlations of an acceleration with the turns, across the car and along it."""
+_FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """What looks wrong.
+
+    Attributes:
+        kind: as `quality` calls it (stuck, magnitude, reversed, swapped, scaled, repeated, no slip,
+            noisy), or late, absent, values, time, cars, or scale, which does no harm.
+        signals: those concerned.
+        figure: what shows it.
+        remedy: what to try in the mapping.
+        value: how late, in seconds.
+    """
+
+    kind: str
+    signals: tuple[str, ...]
+    figure: str
+    remedy: str
+    value: float | None = None
+
+    def __str__(self) -> str:
+        """Return it as one line."""
+        return f"{self.kind} {', '.join(self.signals)}? {self.figure}. {self.remedy}"
+
+
+def find_suspicions(signals: Signals) -> list[Suspicion]:
+    """Return what looks wrong in the signals of one drive; little data raises few suspicions."""
+    still = list(_still(signals))
+    usual = {name: v for name, v in signals.items() if name not in {s.signals[0] for s in still}}
+    speed = speed_mps(usual)
+    remedy = 'Where another column has its sign: sign = { column = "..." }.'
+    magnitudes = {
+        name: Suspicion("magnitude", (name,), figure, remedy)
+        for name, figure in find_one_sided(usual, None if speed is None else moving(speed))
+    }
+    sideslip = magnitudes.pop(catalogue().label, None)
+    usual = {name: values for name, values in usual.items() if name not in magnitudes}
+    found = [*still, *magnitudes.values(), *_turning(usual, speed)]
+    for check in (_axes_swapped, _wheels_differ, _rates_differ, _accelerates, _axles_swapped):
+        found += check(usual, speed)
+    label: list[Suspicion] = []
+    if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
+        label = list(_label(usual, speed))  # which is judged by them
+    if sideslip and all(one.kind != "biased" for one in label):  # else it is off to one side
+        label = [sideslip]
+    found += label
+    if fault := course_fault(usual, speed):
+        found.append(Suspicion(**vars(fault)))
+    return found
+
+
+def speed_mps(signals: Signals) -> FloatArray | None:
+    """Return a rough speed: that of the wheels, else `vx` or the car's own; None without any."""
+    wheels = [signals[name] for name in WHEELS if name in signals]
+    if wheels:
+        return np.asarray(np.median(wheels, axis=0) * RADIUS_M, dtype=np.float64)
+    return signals.get("vx", signals.get("vehicle_speed"))
+
+
+def _still(signals: Signals) -> Iterator[Suspicion]:
+    for name, values in signals.items():
+        present = values[np.isfinite(values)]
+        if not present.size:
+            yield Suspicion("absent", (name,), "it has no value at all", "Map another column.")
+        elif present.size >= FEWEST_TICKS and present.min() == present.max():
+            figure = f"it is {present[0]:g} {catalogue()[name].unit} all the time"
+            yield Suspicion("stuck", (name,), figure, "Map another column.")
+
+
+def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    """Compare the signs of all that tells left from right.
+
+    The fewest faults that explain all count, as in `quality`: where up to two others are against
+    both axles, the axes are not ISO 8855; where more are, left and right wheels are swapped.
+    """
+    known = {
+        name: np.asarray(sum(k * signals[s] for s, k in parts.items()))
+        for name, parts in {**WITNESSES, "steer": {"steer": 1}}.items()
+        if set(parts) <= set(signals)
+    }
+    known = {name: values for name, values in known.items() if np.nanstd(values) > 0}
+    if len(known) < 2:
+        return
+    names, values = list(known), np.array(list(known.values()))
+    rows = moving(speed) & np.isfinite(values).all(axis=0)
+    if rows.sum() < FEWEST_TICKS:
+        return
+    correlations = np.nan_to_num(np.corrcoef(values[:, rows]))
+    loadings = np.linalg.eigh(correlations)[1][:, -1]
+    axles = [loadings[names.index(n)] for n in ("front wheels", "rear wheels") if n in names]
+    agree = len(axles) == 2 and min(map(abs, axles)) > 0.2 and axles[0] * axles[1] > 0
+    few = len(names) - len(axles) <= len(axles)
+    loadings *= np.sign(axles[0] if agree and few else loadings.sum()) or 1
+    for name, loading in zip(names, loadings, strict=True):
+        if loading > -0.2:
+            continue
+        concerned = tuple(WITNESSES.get(name, (name,)))
+        others = np.where(loadings > 0, correlations[names.index(name)], 0.0)
+        against = int(np.argmin(others))
+        if others[against] > LEAST_AGAINST:
+            continue
+        figure = f"its correlation with {names[against]} is {others[against]:+.2f}"
+        if len(concerned) == 2:
+            remedy = "Swap their columns."
+            if agree:
+                remedy += " If all others are positive to the right (SAE J670), negate these."
+            yield Suspicion("swapped", concerned, figure, remedy)
+        else:
+            yield Suspicion("reversed", concerned, figure, "Write negate = true.")
+
+
+def _axes_swapped(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    """Compare both accelerations with the turns."""
+    if speed is None or not {"ax", "ay", "yaw_rate"} <= set(signals):
+        return
+    expected, rows = signals["yaw_rate"] * speed, moving(speed)
+    ax, ay = (abs(slope_of(signals[name], expected, rows)[1]) for name in ("ax", "ay"))
+    if ax > _GOES_WITH and ay < _GOES_NOT:
+        figure = f"yaw rate times speed goes with ax by {ax:.2f}, with ay by {ay:.2f}"
+        yield Suspicion("swapped", ("ax", "ay"), figure, "Swap their columns.")
+
+
+def _wheels_differ(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    if speed is None:
+        return
+    for name in (*WHEELS, "vx", "vehicle_speed"):
+        if name in signals:
+            own = signals[name] * (RADIUS_M if name in WHEELS else 1.0)
+            yield from _of_scale(own, speed, (name,), "the speed of the wheels", (0.7, 1.4), speed)
+
+
+def _rates_differ(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    if speed is None or "yaw_rate" not in signals:
+        return
+    yaw_rate, wide = signals["yaw_rate"], (0.4, 2.5)
+    if {"wheel_rl", "wheel_rr"} <= set(signals):
+        turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M
+        of = "what the rear wheels tell"
+        yield from _of_scale(yaw_rate, turn, ("yaw_rate",), of, wide, speed)
+    if "ay" in signals:
+        both, of = ("ay", "yaw_rate"), "yaw rate times speed"
+        yield from _of_scale(signals["ay"], yaw_rate * speed, both, of, wide, speed)
+    angle = next((name for name in ROAD_WHEELS if name in signals), None)
+    if angle is not None and "steering_wheel" in signals:
+        both, of = ("steering_wheel", angle), "15 times the other"
+        wheel, road = signals["steering_wheel"], 15 * signals[angle]
+        yield from _of_scale(wheel, road, both, of, wide, speed)
+
+
+def _accelerates(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    """Compare `ax` with the change of speed over a second."""
+    if speed is None or "ax" not in signals or speed.size < 4 * FEWEST_TICKS:
+        return
+    second = round(1 / float(SAMPLE_TIME_S))
+    change = np.full(speed.size, np.nan)
+    change[second // 2 : -second // 2] = speed[second:] - speed[:-second]
+    smooth = np.convolve(np.nan_to_num(signals["ax"]), np.ones(second) / second, "same")
+    slope, correlation = slope_of(smooth, change, moving(speed))
+    if correlation < -LEAST_CORRELATION:
+        figure = f"its correlation with the change of speed is {correlation:+.2f}"
+        yield Suspicion("reversed", ("ax",), figure, "Write negate = true.")
+    elif correlation > LEAST_CORRELATION:
+        yield from _wrong_scale(slope, ("ax",), "the change of speed", (0.4, 2.5))
+
+
+def _axles_swapped(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    """Compare axles in tight bends: the front one drives the longer way."""
+    if speed is None or not {"yaw_rate", *WHEELS} <= set(signals):
+        return
+    front, rear = (signals[f"wheel_{a}l"] + signals[f"wheel_{a}r"] for a in "fr")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tightness, longer = (signals["yaw_rate"] / speed) ** 2, front / rear - 1
+    rows = moving(speed) & (speed < 12)
+    if np.nanmax(tightness, initial=0, where=rows & np.isfinite(tightness)) < 0.05**2:
+        return
+    slope, correlation = slope_of(longer, tightness, rows)
+    if correlation < -LEAST_CORRELATION and slope < -1:
+        figure = f"in tight bends the front wheels are slower (correlation {correlation:+.2f})"
+        yield Suspicion("swapped", WHEELS, figure, "Swap the front columns with the rear ones.")
+
+
+def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+    """Look for the label's delay behind its inputs, its sign, and its unit."""
+    label = catalogue().label
+    if label not in signals or speed is None or not {"yaw_rate", "ay"} <= set(signals):
+        return
+    rows = moving(speed)
+    angle = signals[label]
+    large = np.abs(angle[rows & (speed > 8) & np.isfinite(angle)])
+    if large.size >= FEWEST_TICKS and np.median(large) > 0.5:
+        figure = f"half of the time it is above {np.degrees(np.median(large)):.0f} deg"
+        yield Suspicion("scaled", (label,), figure, "Check its unit: degrees or radians?")
+        return
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inputs = [signals["ay"], signals["yaw_rate"] / speed, signals["yaw_rate"] * speed]
+    steering = [signals[n] for n in ("steering_wheel", *ROAD_WHEELS) if n in signals]
+    delay = find_delay(angle, signals["ay"], signals["yaw_rate"], speed, [*inputs, *steering])
+    told = "course" in signals and is_in_time(angle, signals["course"], signals["yaw_rate"])
+    if delay is not None and not told:
+        seconds, gain = delay
+        figure = f"its inputs explain it best {abs(seconds):.2f} s " + (
+            "earlier" if seconds > 0 else "later"
+        )
+        figure += f", with {gain:.0%} less of its variance left"
+        yield Suspicion("late", (label,), figure, f"Try delay_s = {seconds:.2f}.", seconds)
+    many = large.size >= FEWEST_TICKS and np.quantile(large, 0.9) > LARGE_RAD
+    yield from _lever(signals, np.array(inputs[:2]), rows & (speed < SLOW_MPS), many=bool(many))
+
+
+def _lever(
+    signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool
+) -> Iterator[Suspicion]:
+    """Compare the label with what any car does: it needs no peers, where all are wrong alike.
+
+    Turning slowly it is the distance to the rear axle times the yaw rate over the speed, less what
+    the rear tyres slip, and 0 on a straight (Milliken and Milliken, Race Car Vehicle Dynamics,
+    chapter 5). The same fit of the road wheels tells the wheelbase, which is longer.
+    """
+    label = catalogue().label
+    (_, lever), zero, explained = fit(signals[label], inputs, slow)
+    figure = f"turning slowly it goes with the yaw rate by {lever:+.2f} m, should be +1 to +2"
+    if explained <= LEAST_CORRELATION:
+        return
+    if lever < -LEAST_LEVER_M / 2:
+        yield Suspicion("reversed", (label,), figure, "Write negate = true.")
+        return
+    longest = LONGEST_LEVER_M
+    for name in ROAD_WHEELS:
+        if name in signals:
+            (_, base), _, sure = fit(signals[name], inputs, slow)
+            if sure > SURE_EXPLAINED and WHEELBASE_M[0] < base < WHEELBASE_M[1]:
+                longest = min(longest, LONGEST_PART * base)
+                break
+    unit = "Check its unit, degrees or radians, its factor, and where its sensor is: sensor_x_m."
+    if lever > LONGEST_M and many:
+        yield Suspicion("scaled", (label,), figure, unit)
+    elif explained <= SURE_EXPLAINED:
+        return
+    elif not LEAST_LEVER_M < lever < longest:
+        yield Suspicion("scaled", (label,), figure, unit)
+    elif abs(zero) > LARGEST_ZERO_RAD:
+        figure = f"on a straight it is {np.degrees(zero):+.2f} deg, should be 0"
+        yield Suspicion("biased", (label,), figure, f"Write offset = {-zero:.4f} (rad).")
+
+
+def _of_scale(
+    values: FloatArray,
+    expected: FloatArray,
+    concerned: tuple[str, ...],
+    of: str,
+    sound: tuple[float, float],
+    speed: FloatArray,
+) -> Iterator[Suspicion]:
+    slope, correlation = slope_of(values, expected, moving(speed))
+    if abs(correlation) > LEAST_CORRELATION:
+        yield from _wrong_scale(abs(slope), concerned, of, sound)
+
+
+def _wrong_scale(
+    slope: float, concerned: tuple[str, ...], of: str, sound: tuple[float, float]
+) -> Iterator[Suspicion]:
+    if sound[0] <= slope <= sound[1] or slope <= 0:
+        return
+    large = max(slope, 1 / slope)
+    factor = min(_FACTORS, key=lambda f: abs(np.log(f / large)))
+    near = f" ({factor:g} is between {_FACTORS[factor]})" if 0.6 < factor / large < 1.7 else ""
+    yield Suspicion("scaled", concerned, f"it is {slope:.3g} times {of}{near}", "Check the units.")
+
+
+# What looks wrong in a file as a whole: many rows refused, and times that are assumed.
+
+LARGEST_REFUSED, FEWEST_REFUSED = 0.1, 10
+_REFUSED = {
+    "out_of_range": ("scaled", "Check its unit."),
+    "not_a_number": ("texts", "Name those that mean no value under missing."),
+    "not_finite": ("values", 'Write missing = ["nan"] if they mean no value.'),
+}
+_OF_TIME = ("time", "isolated", "too_short", "not_a_time")
+
+
+def find_refusals(
+    refused: Mapping[tuple[str, str], int], rows: int, others: Mapping[str, int] | None = None
+) -> Iterator[Suspicion]:
+    """Yield the signals of which more than a tenth of a file's rows were refused, by reason.
+
+    `others` are the rows refused for anything but a signal, by reason: together they are another.
+    """
+    for (name, reason), count in refused.items():
+        if count > max(rows * LARGEST_REFUSED, FEWEST_REFUSED):
+            kind, remedy = _REFUSED.get(reason, ("values", "Look at the column."))
+            figure = f"{count:,} of {rows:,} rows are refused for it, {reason}"
+            yield Suspicion(kind, (name,), figure, remedy)
+    total = sum((others or {}).values())
+    if others and total > max(rows * LARGEST_REFUSED, FEWEST_REFUSED):
+        reason = max(others, key=lambda one: others[one])
+        figure = f"{total:,} of {rows:,} rows are refused, {others[reason]:,} as {reason}"
+        if reason.startswith(_OF_TIME):
+            remedy = "Check the column of times, its unit and its format"
+            if reason in {"time_duplicate", "time_backwards"}:
+                remedy += ", and map the column that tells cars or trips apart if there are several"
+            yield Suspicion("values", ("time",), figure, f"{remedy}.")
+        else:
+            yield Suspicion("values", ("rows",), figure, "Look at the view quarantine.")
+
+
+def assumed_rate(rate_hz: float | None) -> Iterator[Suspicion]:
+    """Yield that a log has no times, and that its mapping assumes a rate; None: it does not."""
+    if rate_hz is not None:
+        figure = f"the log has no times, and {rate_hz:g} Hz are assumed"
+        remedy = "Find out, correct rate_hz, and remove assumed = true."
+        yield Suspicion("time", ("rate_hz",), figure, remedy)

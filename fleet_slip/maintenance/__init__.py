@@ -1,1 +1,0 @@
-"""Keeping a warehouse whole: verify, repair, compact, vacuum, forget, retain, migrate."""

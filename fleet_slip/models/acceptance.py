@@ -1,0 +1,666 @@
+"""What a model must be before it becomes champion: above a floor, and no worse than the champion.
+
+Both are asked of rows that the challenger was not fitted on, and on which its columns were not
+chosen: a search is made again without them, for as many columns. The champion is what cars have:
+its own coefficients, not its signals fitted anew. It is compared on the same held-out drives, so
+that the error that counts is that of the difference, over what is independent in the data: cars
+where there are several, else drives. And so that many small steps do not lead downhill, the best of
+the champions so far is compared as well.
+
+Rows do not decide alone: a car that sends its rows may say that they are many. Where cars are held
+out, the median group of them must not be worse off either, each group having one vote.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import zip_longest
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from pydantic import Field
+
+from fleet_slip.base import BoolArray, FloatArray, number_of
+from fleet_slip.catalogue.course import CourseFault, relate
+from fleet_slip.catalogue.facts import ALL_DRIVES, DELAY
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.config import Config, config_file, load_config
+from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
+from fleet_slip.grams.calibration import course_moments
+from fleet_slip.grams.cohort import Cohort, TaughtCohort, load_cohort
+from fleet_slip.grams.folding import FOLD_KEYS, FoldKey, assign_folds
+from fleet_slip.grams.gram_rows import hash_numbers
+from fleet_slip.grams.reader import GramReader, open_grams
+from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
+from fleet_slip.grams.sums import SummedCohort
+from fleet_slip.ingest.drives import SOURCE
+from fleet_slip.ingest.suspicion import Suspicion, find_suspicions
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.predict import counts_model
+from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
+from fleet_slip.models.search import searching
+from fleet_slip.models.select import Selection
+from fleet_slip.models.trained_drives import TrainedDrives
+from fleet_slip.regression.choice import Shortfall, Worth, compare_paired, compare_typical
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.folds import (
+    CohortFolds,
+    CrossValidation,
+    FoldAssignment,
+    Folds,
+    Procedure,
+    assemble,
+    cross_validate,
+    held_out_errors,
+    least_squares,
+)
+from fleet_slip.regression.least_squares import LinearModel
+from fleet_slip.storage.runs import LOGGER
+from fleet_slip.warehouse.condition import asking, parse_cohort, parse_condition
+from fleet_slip.warehouse.tables import Warehouse, connect_tables
+
+
+class Floor(Config):
+    """What a person asks of every champion; `configs/publish.toml` says what each means."""
+
+    min_correlation: float = Field(gt=-1, lt=1)
+    max_rmse_deg: float = Field(gt=0)
+    min_drives: int = Field(ge=1)
+    min_vehicles: int = Field(ge=1)
+    min_part_of_champion: float = Field(ge=0, le=1)
+    worth_deg: float = Field(ge=0)
+    max_columns_per_drive: float = Field(default=3.0, gt=0)
+    min_rows_per_column: int = Field(default=100, ge=1)
+
+
+@cache
+def floor() -> Floor:
+    """Return what `publish.toml` asks for."""
+    return load_config(config_file("publish.toml"), Floor)
+
+
+LEAST_VEHICLES = 5
+"""With fewer cars their difference says little of other cars, and drives are held out instead."""
+
+SURE = 3.0
+"""So many standard errors worse is no chance: a champion does not give way to that."""
+
+GROUPS = 20
+"""Into so many groups, or fewer, cars or drives are dealt. Each is an exact fit."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A challenger and the own coefficients of published versions on the same held-out rows.
+
+    Attributes:
+        by: what was held out, vehicle or drive.
+        challenger: fitted to all groups but the one that it is tested on, its columns searched for
+            there if a search found them.
+        incumbents: the champion, and the best of the champions so far if that is another one.
+        shortfalls: of the challenger, from each of them, over all rows.
+        typical: the same in the median group, where cars are held out.
+    """
+
+    by: FoldKey
+    challenger: CrossValidation
+    incumbents: tuple[CrossValidation, ...]
+    shortfalls: tuple[Shortfall, ...]
+    typical: tuple[Shortfall, ...] = ()
+
+    @property
+    def better(self) -> tuple[CrossValidation, ...]:
+        """Those that the challenger is worse than, over all rows or in the median group."""
+        both = zip_longest(self.shortfalls, self.typical)
+        return tuple(
+            incumbent
+            for incumbent, shortfalls in zip(self.incumbents, both, strict=True)
+            if not all(one is None or one.negligible for one in shortfalls)
+        )
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the champion is better by much more than chance, though hardly worth it."""
+        first = self.shortfalls[0]
+        enough = len(self.challenger.folds) >= LEAST_VEHICLES
+        return enough and first.rmse > SURE * first.standard_error
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether a published version estimates the opposite of the label."""
+        return any(one.pooled.correlation < 0 for one in self.incumbents)
+
+    @property
+    def best(self) -> str | None:
+        """The incumbent that is better than all others and the challenger; None if none is."""
+        first = min(self.incumbents, key=lambda one: one.pooled.rmse)
+        return first.name if first.pooled.rmse < self.challenger.pooled.rmse else None
+
+    def __str__(self) -> str:
+        challenger = self.challenger.pooled
+        others = "; ".join(
+            f"the coefficients of {one.name} have {one.pooled.rmse_deg:.4f} deg and "
+            f"{one.pooled.correlation:.4f}, difference {shortfall}"
+            + (f", in the median group {typical}" if typical else "")
+            for one, shortfall, typical in zip_longest(
+                self.incumbents, self.shortfalls, self.typical
+            )
+        )
+        return (
+            f"on the same {number_of(challenger.rows, 'row')} of "
+            f"{number_of(self.challenger.drives, 'drive')}, held out "
+            f"in {len(self.challenger.folds)} groups by {self.by}, it has RMSE "
+            f"{challenger.rmse_deg:.4f} deg and correlation {challenger.correlation:.4f}; {others}"
+        )
+
+
+@dataclass(frozen=True)
+class Contest:
+    """How a selection's winner is made again without what is held out, and whom it meets.
+
+    Attributes:
+        signals: all that any of them needs.
+        by: what is held out, vehicle or drive.
+        procedure: makes the challenger, its columns searched for anew if a search found them.
+        models: those that it meets, as they are, in counts.
+    """
+
+    signals: tuple[str, ...]
+    by: FoldKey
+    procedure: Procedure
+    models: tuple[LinearModel, ...]
+
+
+def worth() -> Worth:
+    """Return what a challenger may lack that is no reason to refuse it."""
+    return Worth(math.radians(floor().worth_deg))
+
+
+def contest(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Contest:
+    """Return how a selection's winner meets published versions, over drives with all signals.
+
+    Raises `DataError` or `QuestionError` if the features of a version are not defined as they were.
+    """
+    for version in incumbents:
+        _require_same_features(version)
+    label, winner, found = catalogue().label, selection.winner.model, selection.searched
+    searched = found is not None and winner in found.models
+    inputs = found.inputs if found is not None and searched else winner.signals
+    feature_set = selection.cohort.feature_set
+    models = tuple(counts_model(version.manifest, feature_set) for version in incumbents)
+    every = (name for model in models for name in model.signals)
+    signals = tuple(dict.fromkeys((*inputs, *every)))
+    cars = selection.cohort.members.count_vehicles_with((*signals, label))
+    by: FoldKey = "vehicle" if cars >= LEAST_VEHICLES else "drive"
+    intercept = selection.intercept
+    if found is not None and searched:
+        procedure = searching(found, len(winner.signals), intercept=intercept)
+    else:
+        procedure = least_squares(inputs, label, intercept=intercept)
+    return Contest(signals, by, procedure, models)
+
+
+def compare(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Comparison:
+    """Compare a selection's winner with the own coefficients of published versions.
+
+    Raises `DataError` or `QuestionError` if no drive has the signals of all, and as `contest`.
+    """
+    asked = contest(selection, incumbents)
+    label, name = catalogue().label, selection.winner.model.name
+    folds = selection.cohort.folds(asked.by, GROUPS)
+    groups = folds.serving(asked.signals, label, sparse=True)
+    challenger = cross_validate(name, groups, asked.procedure, input_scales())
+    others = tuple(
+        as_it_is(version.reference, model, groups)
+        for version, model in zip(incumbents, asked.models, strict=True)
+    )
+    shortfalls = tuple(compare_paired(challenger, other, worth()) for other in others)
+    typical = tuple(compare_typical(challenger, other, worth()) for other in others)
+    by_car = asked.by == "vehicle"
+    return Comparison(asked.by, challenger, others, shortfalls, typical if by_car else ())
+
+
+def as_it_is(name: str, model: LinearModel, folds: Folds) -> CrossValidation:
+    """Return the figures of a published model over folds, none of which it is fitted to again."""
+    tests = [error_sums(model, test) for test in folds.grams]
+    return assemble(name, folds, tests, model, input_scales())
+
+
+def find_faults(manifest: Manifest, champion: Manifest | None) -> list[str]:
+    """Return in what a manifest is below the floor, and what it must be."""
+    least, figures, trained = floor(), manifest.cross_validation, manifest.trained_on
+    found = []
+    if figures.correlation < least.min_correlation:
+        found.append(f"its correlation is {figures.correlation:.4f}, below {least.min_correlation}")
+    if figures.rmse_deg > least.max_rmse_deg:
+        found.append(f"its RMSE is {figures.rmse_deg:.4f} deg, above {least.max_rmse_deg} deg")
+    if trained.drives < least.min_drives:
+        found.append(
+            f"it was trained on {number_of(trained.drives, 'drive')}, fewer than {least.min_drives}"
+        )
+    if trained.vehicles is not None and trained.vehicles < least.min_vehicles:
+        cars = number_of(trained.vehicles, "car")
+        found.append(f"it was trained on {cars}, fewer than {least.min_vehicles}")
+    if champion is not None:
+        found += _shrunk(manifest, champion, least.min_part_of_champion)
+    return found
+
+
+def find_lacks(manifest: Manifest) -> list[str]:
+    """Return of what a first champion of measured drives has too little for its columns."""
+    if manifest.learned_from is not None:
+        return []
+    found, least = [], floor()
+    columns, trained = len(manifest.terms), manifest.trained_on
+    if columns > least.max_columns_per_drive * trained.drives:
+        drives = number_of(trained.drives, "drive")
+        most = f"{least.max_columns_per_drive:g}"
+        found.append(f"it has {columns} columns on {drives}, more than {most} a drive")
+    if trained.rows < least.min_rows_per_column * columns:
+        rows = number_of(trained.rows, "row")
+        few = f"{least.min_rows_per_column} for each of its {columns} columns"
+        found.append(f"it was trained on {rows}, fewer than {few}")
+    return found
+
+
+def _shrunk(manifest: Manifest, champion: Manifest, part: float) -> list[str]:
+    """Return of what a model was trained on too little beside the champion."""
+    pairs = (
+        ("drives", manifest.trained_on.drives, champion.trained_on.drives),
+        ("cars", manifest.trained_on.vehicles, champion.trained_on.vehicles),
+    )
+    return [
+        f"it was trained on {own:,} {what}, less than {part:.0%} of the champion's {other:,}"
+        for what, own, other in pairs
+        if own is not None and other is not None and own < part * other
+    ]
+
+
+def _require_same_features(version: ModelVersion) -> None:
+    known, then = features(), version.manifest
+    for name, one in then.features.items():
+        if known.rows([name]).get(name) != one:
+            raise DataError(f"the feature {name} of {version.reference} is not defined as then.")
+    for name, definition in then.definitions.items():
+        if name not in known.inputs or known.definition(name) != definition:
+            raise DataError(f"the column {name} of {version.reference} is not defined as then.")
+
+
+# Examines drives before a model learns from them: a fault of all shows in no comparison.
+#
+# A first champion has only its data, and where these are wrong alike, such as a label with the
+# other sign, no drive is unlike its peers. A label that is late on a new day hardly changes what
+# Gram rows tell. So a few of the longest drives that are new to the champion, or of all if there
+# is none, are looked at as a file is at `ingest`: for what contradicts any car.
+
+DRIVES = 5
+"""That are looked at, of as many cars if there are so many."""
+
+FEWEST_NEW = 3
+"""New drives that are looked at if there is a champion: one alone may be odd."""
+
+MOST_TICKS = 100_000
+
+_LONGEST = """
+    SELECT drive_id, day FROM drives WHERE source = $source AND ({condition})
+    ORDER BY row_number() OVER (PARTITION BY vehicle_id ORDER BY rows DESC, drive_id),
+        rows DESC, drive_id
+"""
+
+
+def require_sound_drives(
+    warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None = None, settled: int = 0
+) -> None:
+    """Raise `RefusedError` if most of some measured drives of a cohort contradict any car.
+
+    `made` are the drives that made the champion, of `settled` columns: one of more columns needs as
+    much data for them as a first champion does. What is looked at is the label, and the signals
+    that a model has columns of. Simulated drives, and those of cars that sent no log, are passed
+    over.
+    """
+    found, looked_at, measured = _look(warehouse, manifest, made)
+    if measured and len(manifest.terms) > settled and (lacks := find_lacks(manifest)):
+        raise RefusedError(
+            f"{manifest.name} was not published: {'; '.join(lacks)}. Ingest more drives, choose "
+            "fewer columns, or publish it with force all the same."
+        )
+    if made is not None and looked_at < FEWEST_NEW:
+        return
+    used = {manifest.label.signal}
+    for term in manifest.terms:
+        used |= set(term.definition.signals) if term.definition else {term.signal}
+    for (_, signals), examples in found.items():
+        # Beside a champion, whose drives are in order, half of them are enough.
+        if used.isdisjoint(signals) or 2 * len(examples) + (made is not None) <= looked_at:
+            continue
+        raise RefusedError(
+            f"{manifest.name} was not published: {len(examples)} of {looked_at} drives that were "
+            f"looked at contradict what any car does: {examples[0]} Publish it with "
+            "force all the same, or correct the mapping and run: fleet-slip ingest LOGS --mapping "
+            "M --replace"
+        )
+
+
+def _look(
+    warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None
+) -> tuple[dict[tuple[str, tuple[str, ...]], list[Suspicion]], int, int]:
+    """Return what looks wrong in some long drives, how many these are, and of how many."""
+    found: dict[tuple[str, tuple[str, ...]], list[Suspicion]] = {}
+    condition = parse_condition(manifest.trained_on.cohort)
+    query = _LONGEST.format(condition=condition.sql)
+    with connect_tables(warehouse, query + "log_counts") as database, asking(database, condition):
+        drives = database.execute(query, {"source": SOURCE}).fetchall()
+        measured = len(drives)
+        if made is not None:
+            numbers = hash_numbers(pa.array([drive for drive, _ in drives], pa.string()))
+            seen = made.among(numbers).tolist()
+            drives = [drive for drive, known in zip(drives, seen, strict=True) if not known]
+        chosen = drives[:DRIVES]
+        for drive, day in chosen:
+            columns = database.execute(
+                "SELECT * FROM log_counts WHERE day = $day AND drive_id = $drive ORDER BY tick "
+                f"LIMIT {MOST_TICKS}",
+                {"day": day, "drive": drive},
+            ).fetchnumpy()
+            for suspicion in find_suspicions(_signals(columns)):
+                found.setdefault((suspicion.kind, suspicion.signals), []).append(suspicion)
+    return found, len(chosen), measured
+
+
+def _signals(columns: Mapping[str, Any]) -> dict[str, FloatArray]:
+    """Return the signals of a drive in SI units on consecutive ticks, NaN where there is none."""
+    ticks = np.asarray(columns["tick"], dtype=np.int64)
+    found = {}
+    for name, signal in catalogue().signals.items():
+        if name not in columns:
+            continue
+        values = np.ma.filled(np.ma.asarray(columns[name], dtype=np.float64), np.nan)
+        if np.isfinite(values).any():
+            dense = np.full(int(ticks[-1] - ticks[0]) + 1, np.nan)
+            dense[ticks - ticks[0]] = values * float(signal.scale)
+            found[name] = dense
+    return found
+
+
+# Whether a challenger is better on the drives that vouch for the champion, or on odd ones alone.
+#
+# A challenger that has learned from odd drives is better on them, held out or not, and where they
+# are many that outweighs what it loses elsewhere. So where the champion meets new drives on which
+# it is much more wrong than on those that made it, both are compared on these alone.
+
+ODD = 2.0
+"""Drives on which the champion's error is so many times that on the others are odd."""
+
+MOST_DRIVES = 20_000
+"""Of a larger cohort so many drives, chosen by their hash, are judged."""
+
+_HEX = 4
+
+
+def odd_gain(registry: Registry, selection: Selection[Any], champion: ModelVersion) -> str | None:
+    """Return why a person must look first: it is better on odd new drives alone; else None.
+
+    Nothing is said where changes of the course taught, or all drives are as known as the others.
+    Raises `StorageError` if which drives made the champion cannot be read.
+    """
+    made = registry.trained_drives(champion.manifest)
+    if made is None or isinstance(selection.cohort, TaughtCohort):
+        return None
+    try:
+        cohort = _some_drives(selection)
+        known = made.among(hash_numbers(cohort.drives["drive_id"]))
+        if known.any() and not known.all():
+            return _compare(selection, champion, cohort, known)
+    except DataError as error:
+        LOGGER.warning("whether it is better on odd drives alone was not judged: %s", error)
+    return None
+
+
+def _some_drives(selection: Selection[Any]) -> Cohort:
+    cohort: Cohort | SummedCohort = selection.cohort
+    if isinstance(cohort, Cohort):
+        return cohort
+    condition, drives = cohort.condition, cohort.drive_count
+    if drives > MOST_DRIVES:
+        below = 16**_HEX * MOST_DRIVES // drives
+        chosen = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
+        condition &= parse_condition(chosen)
+    return load_cohort(cohort.source, condition, cohort.feature_set)
+
+
+def _compare(
+    selection: Selection[Any], champion: ModelVersion, cohort: Cohort, known: BoolArray
+) -> str | None:
+    asked = contest(selection, [champion])
+    every = np.ones(len(known), dtype=np.bool_)
+    groups, old, new = (_folds(cohort, asked, mask) for mask in (every, known, ~known))
+    incumbent = as_it_is(champion.reference, asked.models[0], old)
+    on_new = as_it_is(champion.reference, asked.models[0], new).pooled.rmse_deg
+    if on_new <= ODD * incumbent.pooled.rmse_deg:
+        return None
+    challenger = _held_out(selection.winner.model.name, asked, groups, old)
+    shortfall = compare_paired(challenger, incumbent, worth())
+    if shortfall.negligible:
+        return None
+    return (
+        f"it is better on odd drives alone: on the drives that made {champion.reference} it has "
+        f"{challenger.pooled.rmse_deg:.4f} deg where the champion has "
+        f"{incumbent.pooled.rmse_deg:.4f} deg, difference {shortfall}, and on the new ones the "
+        f"champion has {on_new:.4f} deg. Look at these before they teach"
+    )
+
+
+def _held_out(name: str, asked: Contest, groups: Folds, old: Folds) -> CrossValidation:
+    """Cross-validate over all groups, tested on the drives of each that made the champion."""
+    training = dict(zip(groups.names, (train for train, _ in groups.splits()), strict=True))
+    tests = [
+        held_out_errors(asked.procedure(training[fold]), training[fold], test)
+        for fold, test in zip(old.names, old.grams, strict=True)
+    ]
+    return assemble(name, old, tests, asked.procedure(groups.total), input_scales())
+
+
+def _folds(cohort: Cohort, asked: Contest, wanted: BoolArray) -> Folds:
+    """Return some drives in the groups that the whole cohort has. Raises `DataError`."""
+    values = cohort.drives[FOLD_KEYS[asked.by]].to_pylist()
+    whole = assign_folds(values, asked.by, GROUPS)
+    used, fold = np.unique(whole.fold[wanted], return_inverse=True)
+    names = tuple(whole.names[number] for number in used.tolist())
+    part = cohort.part(wanted)
+    folds = CohortFolds.of(part.tables, FoldAssignment(fold, names), part.drive_numbers)
+    return folds.serving(asked.signals, catalogue().label, sparse=True)
+
+
+# What the rules for champions, and the drives that made this one, say of a challenger.
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the rules say of a challenger.
+
+    Attributes:
+        problems: why it is not to become champion.
+        compared: with what it was compared.
+        best: the number of a champion of before that is better than it; None if none is.
+        drifts: whether the champion is better for sure, if not by what is worth a refusal.
+    """
+
+    problems: tuple[str, ...]
+    compared: str
+    best: int | None = None
+    drifts: bool = False
+
+    @property
+    def reason(self) -> str:
+        """The problems, else what was compared, as a sentence."""
+        text = "; ".join(self.problems) or self.compared
+        return f"{text[:1].upper()}{text[1:]}."
+
+    def require_passed(self, name: str) -> None:
+        """Raise `RefusedError` if there are problems."""
+        if self.problems:
+            raise RefusedError(
+                f"{name} was not published: {'; '.join(self.problems)}. Look at the data, or "
+                "publish it with force all the same."
+            )
+
+
+def judge(
+    registry: Registry,
+    champion: ModelVersion | None,
+    manifest: Manifest,
+    selection: Selection[Any],
+) -> Judgement:
+    """Compare a challenger with the champion, and with the best of the champions so far."""
+    problems = find_faults(manifest, champion.manifest if champion else None)
+    if champion is None:
+        return Judgement(tuple(problems), "It is the first version")
+    try:
+        incumbents = _incumbents(registry, champion)
+        comparison = compare(selection, incumbents)
+    except (DataError, QuestionError) as error:
+        problems.append(f"the champion {champion.reference} cannot be compared ({error})")
+        return Judgement(tuple(problems), "")
+    if comparison.contradicted:
+        problems.append(
+            f"the label runs against what {champion.reference} estimates: is it reversed? "
+            f"{comparison}"
+        )
+    better = [one.name for one in comparison.better]
+    if champion.reference in better:
+        problems.append(f"it is worse than the champion: {comparison}")
+    elif better:
+        problems.append(
+            f"it is worse than {better[0]}, the best of the champions so far, from which small "
+            f"steps have led away: {comparison}. To begin anew at the champion: fleet-slip promote "
+            f"{champion.reference}"
+        )
+    then = champion.manifest
+    if then.learned_from is None and manifest.learned_from is None:
+        was, now = then.cross_validation.rmse_deg, comparison.incumbents[0].pooled.rmse_deg
+        if now > ODD * was and not problems:
+            problems.append(
+                f"{champion.reference} had an RMSE of {was:.4f} deg on drives that did not train "
+                f"it, and has {now:.4f} deg on these: most of it comes from drives unlike those "
+                f"that vouch for it. Look at them before they teach: {comparison}"
+            )
+    try:
+        if not problems and (odd := odd_gain(registry, selection, champion)):
+            problems.append(odd)
+    except StorageError as error:
+        problems.append(f"it cannot be judged on the drives that made the champion: {error}")
+    best = next((one.version for one in incumbents if one.reference == comparison.best), None)
+    return Judgement(tuple(problems), str(comparison), best, comparison.drifts)
+
+
+def _incumbents(registry: Registry, champion: ModelVersion) -> list[ModelVersion]:
+    """Return the champion, and the best of the champions so far if that is another version."""
+    name = champion.manifest.name
+    best = registry.history(name).best_of(CHAMPION)
+    others = [] if best in (None, champion.version) else [registry.load(name, best)]
+    return [champion, *others]
+
+
+# Whether the course that a model learned from moves as cars do, and came in time.
+#
+# A late one looks like a side-slip angle, in all figures, and so does a heading.
+
+MOST_S, SURE_S = 0.01, 0.005
+"""Delay that may be left, and its standard error: 20 ms cost 0.4 deg on a real car."""
+NAMED, SHOWN = 5, 3
+
+
+def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float]:
+    """Return how late courses still are, in s, in the Gram rows of the cars that taught a model.
+
+    Raises `RefusedError` unless all are known and corrected for, `DataError` without Gram rows.
+    """
+    condition = parse_cohort(manifest.trained_on.cohort)
+    with open_grams(warehouse, DELAY, condition) as opened:
+        told = opened.batches(parse_condition(ALL_DRIVES))
+        delays = receiver_delays(told).cars
+    feature_set = features().name_of(manifest.trained_on.feature_set)
+    with open_grams(warehouse, feature_set, condition) as opened:
+        cars = dict(opened.course_delays(condition))
+    problems = [*_unsure(delays, cars), *_not_corrected(delays, cars)]
+    if problems:
+        raise RefusedError(
+            f"{manifest.name} was not published: a course that is late looks like a side-slip "
+            f"angle, and {'; '.join(problems)}. The view calibration has the number receiver_delay "
+            "of each car. Choose other cars, more drives of them, or tell the type of their "
+            "receivers: receiver in a mapping or its table of cars. To publish all the same: "
+            f"fleet-slip publish {manifest.name} --label course --force"
+        )
+    return {car: max(_left(delays[car], corrected), key=abs) for car, corrected in cars.items()}
+
+
+def _unsure(delays: Mapping[str, ReceiverDelay], cars: Iterable[str]) -> Iterator[str]:
+    unsure = {car: delays[car] for car in cars if car in delays and not _sure(delays[car])}
+    if unsure:
+        yield f"delays are not known to {1000 * SURE_S:g} ms ({_named(unsure)})"
+    if untold := sum(car not in delays for car in cars):
+        yield f"that of {number_of(untold, 'car')} is not known at all: their drives do not tell it"
+
+
+def _not_corrected(
+    delays: Mapping[str, ReceiverDelay], cars: Mapping[str, tuple[int, int]]
+) -> Iterator[str]:
+    late = {
+        car: delays[car]
+        for car, corrected in cars.items()
+        if car in delays and max(map(abs, _left(delays[car], corrected))) > MOST_S
+    }
+    if late:
+        yield (
+            f"the Gram rows of some cars are corrected by another delay than they have "
+            f"({_named(late)}): run fleet-slip gram --features course, and tell cars that count "
+            "on board their delay"
+        )
+
+
+def _left(one: ReceiverDelay, corrected: tuple[int, int]) -> list[float]:
+    return [one.value - GRAIN_S * parts for parts in corrected]
+
+
+def _named(delays: Mapping[str, ReceiverDelay]) -> str:
+    shown = ", ".join(f"{car}: {_said(one)}" for car, one in list(delays.items())[:NAMED])
+    return f"{shown}, and {len(delays) - NAMED} more" if len(delays) > NAMED else shown
+
+
+def _sure(one: ReceiverDelay) -> bool:
+    return one.uncertainty is not None and one.uncertainty <= SURE_S
+
+
+def _said(one: ReceiverDelay) -> str:
+    if one.uncertainty is None:
+        return f"{1000 * one.value:.0f} ms, of too few drives to be sure"
+    return f"{1000 * one.value:.0f} +- {1000 * one.uncertainty:.0f} ms"
+
+
+def require_sound_course(
+    warehouse: Warehouse, manifest: Manifest, delays_s: Mapping[str, float]
+) -> None:
+    """Raise `RefusedError` unless all courses, `delays_s` late in Gram rows, are those of a car."""
+    condition = parse_cohort(manifest.trained_on.cohort)
+    with GramReader(warehouse) as reader:
+        cars = course_moments(reader, condition)
+    faults: dict[str, CourseFault] = {}
+    for car, drives in sorted(cars.items()):
+        relation = relate(np.sum(list(drives.values()), axis=0), delays_s.get(car, 0.0))
+        if relation and (fault := relation.fault or relation.misplaced):
+            faults[car] = fault
+    if not faults:
+        return
+    first = next(iter(faults.values()))
+    named = "; ".join(f"{car}: {fault.figure}" for car, fault in list(faults.items())[:SHOWN])
+    more = f", and {len(faults) - SHOWN} more" if len(faults) > SHOWN else ""
+    raise RefusedError(
+        f"{manifest.name} was not published: the course of {len(faults)} of "
+        f"{number_of(len(cars), 'car')} is not that of a car "
+        f"({named}{more}). {first.remedy} Then ingest "
+        "again, or choose other cars; fleet-slip quality names the drives. To publish all the "
+        f"same: fleet-slip publish {manifest.name} --label course --force"
+    )

@@ -1,0 +1,300 @@
+"""What there is to know about a model's fit to a cohort: errors, collinearity, stability."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from fleet_slip.base import number_of
+from fleet_slip.catalogue.features import LAG, features, input_scales, lag_signals
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.cohort import Cohort, Served, clustered_moments
+from fleet_slip.models.select import influential_cars
+from fleet_slip.regression.choice import nested_fits
+from fleet_slip.regression.drives import (
+    LEAST_CARS,
+    AutoregressiveFit,
+    ClusterUnit,
+    DriveMoments,
+    Influential,
+    LagGram,
+    SerialCorrelation,
+    fit_autoregressive,
+    serial_correlation,
+    serving_drives,
+)
+from fleet_slip.regression.figures import Figures, error_sums
+from fleet_slip.regression.inference import (
+    Evidence,
+    FTest,
+    Inference,
+    chow_test,
+    infer_by_clusters,
+    infer_classically,
+    variance_inflation,
+    wald_test,
+)
+from fleet_slip.regression.least_squares import Fit, LinearModel, condition_number, fit
+from fleet_slip.regression.shrinkage import disturb, fit_errors_in_variables, fit_noise_matched
+
+
+@dataclass(frozen=True)
+class SerialDiagnosis:
+    """How much a row's residual says of the next one's; slopes of feasible least squares."""
+
+    correlation: SerialCorrelation
+    autoregressive: AutoregressiveFit
+    inference: Inference
+
+
+@dataclass(frozen=True)
+class CohortComparison:
+    """Whether another cohort has the same coefficients: Chow's test of rows, Wald's of drives."""
+
+    condition: str
+    other: Inference
+    rows: FTest
+    drives: FTest | None
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """One model on one cohort; coefficients are in SI units, and None is what was not asked for.
+
+    Attributes:
+        fitted: exact fit, in counts.
+        cluster: what is independent in `robust` and `evidence`; rows of a single drive.
+        inflation: variance inflation of each input.
+        condition_number: of the inputs' correlation matrix.
+        evidence: effective rows and design effect.
+        noise_free: the model for signals without the noise they were logged with.
+        influential: the cars that `robust` would leave out of a selection, by name.
+    """
+
+    fitted: Fit = field(repr=False)  # holds a Gram matrix and long fractions
+    drives: int
+    cluster: ClusterUnit | Literal["row"]
+    naive: Inference
+    robust: Inference
+    inflation: Mapping[str, float]
+    condition_number: float
+    evidence: Evidence
+    serial: SerialDiagnosis | None = None
+    comparison: CohortComparison | None = None
+    noise_free: LinearModel | None = None
+    influential: Mapping[str, Influential] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `diagnose --json` prints."""
+        document: dict[str, Any] = {
+            "signals": list(self.fitted.model.signals),
+            "drives": self.drives,
+            "cluster": self.cluster,
+            "clusters": self.robust.degrees_of_freedom + 1 if self.cluster != "row" else 1,
+            "rows": self.fitted.gram.n,
+            "effective_rows": self.evidence.rows,
+            "design_effect": self.evidence.design_effect,
+            "r_squared": self.fitted.r_squared,
+            "residual_std": self.naive.residual_std,
+            "condition_number": self.condition_number,
+            "variance_inflation": dict(self.inflation),
+            "by_rows": [asdict(estimate) for estimate in self.naive.estimates],
+            "by_clusters": [asdict(estimate) for estimate in self.robust.estimates],
+        }
+        if self.influential:
+            document["influential"] = {
+                car: {"times": one.times, "rows": one.rows} for car, one in self.influential.items()
+            }
+        if self.serial is not None:
+            document["serial"] = {
+                **asdict(self.serial.correlation),
+                "autoregressive_rho": self.serial.autoregressive.rho,
+                "autoregressive": [asdict(e) for e in self.serial.inference.estimates[1:]],
+            }
+        if self.comparison is not None:
+            document["against"] = {
+                "cohort": self.comparison.condition,
+                "by_clusters": [asdict(estimate) for estimate in self.comparison.other.estimates],
+                "chow_rows_independent": asdict(self.comparison.rows),
+                "wald_clusters_independent": asdict(self.comparison.drives)
+                if self.comparison.drives
+                else None,
+            }
+        if self.noise_free is not None:
+            document["noise_free"] = {
+                "intercept": self.noise_free.offset,
+                **self.noise_free.weights,
+            }
+        return document
+
+
+def diagnose(
+    cohort: Cohort,
+    inputs: Sequence[str],
+    *,
+    lagged: Cohort | None = None,
+    against: Cohort | None = None,
+    sensor_noise: Mapping[str, float] | None = None,
+    cluster: ClusterUnit | None = None,
+    intercept: bool = True,
+) -> Diagnosis:
+    """Fit the inputs to the drives of a cohort that have them all, and examine the fit.
+
+    `lagged` has lagged Gram rows; `sensor_noise` is in SI units. Raises `DataError` for dependent
+    or absent signals.
+    """
+    label, scales = catalogue().label, input_scales()
+    served = cohort.serving(inputs)
+    there = against.serving(inputs) if against else None
+    if cluster is None and any(len({*_cars(one)}) == 1 for one in (served, there) if one):
+        cluster = "drive"  # several cars in all, but one only in a cohort
+    moments = clustered_moments(served, cluster, _cars(served, there), intercept=intercept)
+    alone = _is_alone(moments)
+    total = served.table.total()
+    fits = nested_fits(total, inputs, label, intercept=intercept)
+    fitted = fits[-1]
+    free = None
+    if sensor_noise:
+        seen = total if intercept else total.about_origin()
+        free = fit_errors_in_variables(seen, inputs, label, sensor_noise, scales).physical(scales)
+    return Diagnosis(
+        fitted=fitted,
+        drives=len(served.table),
+        cluster="row" if alone else moments.unit,
+        naive=infer_classically(fitted, scales),
+        robust=_infer(fitted, moments),
+        inflation=variance_inflation(total, inputs),
+        condition_number=condition_number(total, inputs),
+        evidence=Evidence.naive(fits) if alone else Evidence.clustered(fits, moments),
+        serial=_serial(fitted, lagged) if lagged else None,
+        comparison=_compare(served, fitted, moments, against.condition.text, there)
+        if against and there
+        else None,
+        noise_free=free,
+        influential=influential_cars(served, moments)
+        if len(set(_cars(served))) >= LEAST_CARS
+        else {},
+    )
+
+
+def _is_alone(moments: DriveMoments) -> bool:
+    """Return whether there is a single drive, which tells nothing of how drives differ."""
+    return moments.unit == "drive" and len(moments) == 1
+
+
+def _infer(fitted: Fit, moments: DriveMoments) -> Inference:
+    """Return errors by drives or cars; of a single drive by rows, for want of anything better."""
+    if _is_alone(moments):
+        return infer_classically(fitted, input_scales())
+    return infer_by_clusters(fitted, moments, input_scales())
+
+
+def _serial(fitted: Fit, lagged: Cohort) -> SerialDiagnosis:
+    inputs, label = fitted.model.signals, fitted.model.label
+    table, _ = serving_drives(lagged.tables, lag_signals([*inputs, label]))
+    gram = LagGram(table.total(), LAG)
+    autoregressive = fit_autoregressive(gram, inputs, label)
+    return SerialDiagnosis(
+        serial_correlation(fitted.model, fitted.gram, gram),
+        autoregressive,
+        infer_classically(autoregressive.differenced, input_scales()),
+    )
+
+
+def _cars(*cohorts: Served | None) -> list[str]:
+    return [car for one in cohorts if one for car in one.drives["vehicle_id"].to_pylist()]
+
+
+def _compare(
+    here: Served, fitted: Fit, moments: DriveMoments, condition: str, there: Served
+) -> CohortComparison:
+    inputs, label = fitted.model.signals, fitted.model.label
+    shared = {*here.drives["drive_id"].to_pylist()} & {*there.drives["drive_id"].to_pylist()}
+    if shared:
+        raise QuestionError(
+            f"the two cohorts share {number_of(len(shared), 'drive')}, such as {min(shared)}: "
+            f"a comparison needs different drives. Add to the cohort: AND NOT ({condition})"
+        )
+    intercept = fitted.has_intercept
+    other_moments = clustered_moments(there, moments.unit, _cars(here, there), intercept=intercept)
+    other = fit(there.table.total(), inputs, label, intercept=intercept)
+    by_rows = chow_test([fitted.gram, other.gram], inputs, label, intercept=intercept)
+    try:
+        by_clusters = wald_test(fitted, moments, other, other_moments)
+    except DataError:  # too few of them
+        by_clusters = None
+    return CohortComparison(
+        condition,
+        _infer(other, other_moments),
+        by_rows,
+        by_clusters,
+    )
+
+
+# What worse sensors would do to a model's error, in closed form: no drive is simulated again.
+
+
+@dataclass(frozen=True)
+class WhatIf:
+    """Figures of a model before and after bias and noise come, and of the best model after it."""
+
+    drives: int
+    before: Figures
+    after: Figures
+    refitted: LinearModel
+    refitted_after: Figures
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `what-if --json` prints."""
+        return {
+            "drives": self.drives,
+            "before": self.before.as_dict(),
+            "after": self.after.as_dict(),
+            "refitted_after": self.refitted_after.as_dict(),
+            "refitted": {"intercept": self.refitted.offset, **self.refitted.weights},
+        }
+
+
+def what_if(
+    cohort: Cohort,
+    model: LinearModel,
+    *,
+    bias: Mapping[str, float],
+    noise: Mapping[str, float],
+    intercept: bool = True,
+) -> WhatIf:
+    """Return the figures to expect once bias and white noise come on top of what is logged.
+
+    `model` is of counts; `bias` and `noise` (standard deviations) are in SI units. Raises
+    `QuestionError` for a signal that the model lacks, or has in a feature: that is not linear.
+    """
+    for name in {*bias, *noise}:
+        _require_linear(name, model)
+    scales = input_scales()
+    served = cohort.serving(model.signals)
+    total = served.table.total()
+    unit = scales[model.label]
+
+    def after(one: LinearModel) -> Figures:
+        return disturb(error_sums(one, total), one, scales, bias=bias, noise=noise).figures(unit)
+
+    seen = total if intercept else total.about_origin()
+    refitted = fit_noise_matched(seen, model.signals, model.label, noise, scales)
+    return WhatIf(
+        len(served.table),
+        error_sums(model, total).figures(unit),
+        after(model),
+        refitted.physical(scales),
+        after(refitted),
+    )
+
+
+def _require_linear(name: str, model: LinearModel) -> None:
+    known = features().features
+    inside = [f for f in model.signals if f in known and name in known[f].inputs]
+    if inside:
+        raise QuestionError(
+            f"{name} also enters the model through {', '.join(inside)}, where its error has no "
+            "closed form. Use a model without that feature, or simulate the campaign with other "
+            "sensors."
+        )

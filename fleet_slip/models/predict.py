@@ -1,0 +1,347 @@
+"""A published model on a data frame: side-slip angles from columns in SI units.
+
+Terms are added from left to right, to the bits of `score` in SQL. Features are arithmetic of
+rounded counts, as the manifest has it; what is out of its valid range is missing. Models with
+columns over time look back within a drive.
+"""
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from fractions import Fraction
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.base import FloatArray, IntArray
+from fleet_slip.catalogue.definitions import plain_column
+from fleet_slip.catalogue.facts import round_number
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue, round_to_counts, valid_values
+from fleet_slip.columns.drive_columns import DriveCounts, Workspace, row_counts
+from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
+from fleet_slip.compiling import kernel
+from fleet_slip.errors import DataError, InputError
+from fleet_slip.grams.compute import counts_of
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.regression.least_squares import LinearModel
+
+# Estimates of a published model, sample by sample in the order of time, from logged counts.
+
+KEPT_ROWS = 2**16
+"""Of longer drives no memory is kept: it is some 400 bytes a row."""
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """A published model on counts: the columns that it needs, and what a count of each adds.
+
+    `coefficients` are in rad per physical value, which is `scales` times the count.
+    """
+
+    plan: ColumnPlan
+    intercept: float
+    coefficients: tuple[float, ...]
+    scales: tuple[float, ...]
+    _idle: list[Workspace] = field(default_factory=list, repr=False, compare=False)
+
+    @classmethod
+    def of(cls, manifest: Manifest) -> "Predictor":
+        """Return what a manifest publishes, by features of its own.
+
+        Raises `DataError` if these contradict each other, `RefusedError` if counts mean otherwise
+        now.
+        """
+        manifest.require_same_counts()
+        coefficients = tuple(term.coefficient for term in manifest.terms)
+        scales = tuple(
+            float(catalogue()[term.signal].scale if term.logged else term.scale)
+            for term in manifest.terms
+        )
+        plan = ColumnPlan.of(manifest.signals, manifest.features, manifest.definitions)
+        return cls(plan, manifest.intercept, coefficients, scales)
+
+    @contextmanager
+    def lend_workspace(self) -> Iterator[Workspace]:
+        """Lend memory for one drive after the other; one that is not large is kept for the next."""
+        try:
+            workspace = self._idle.pop()  # no other thread has it then
+        except IndexError:
+            workspace = Workspace(self.plan)
+        try:
+            yield workspace
+        finally:
+            if workspace.rows_at_most <= KEPT_ROWS:
+                self._idle.append(workspace)
+
+    def __call__(self, drive: DriveCounts, workspace: Workspace | None = None) -> FloatArray:
+        """Return the estimate at each row in rad, shape (rows,); NaN where a column is missing.
+
+        Added up left to right and block by block, to the bits of `score --sql`. Raises `DataError`
+        for a drive that cannot be looked back on.
+        """
+        workspace = workspace or Workspace(self.plan)
+        workspace.load(drive)
+        coefficients, scales = np.array(self.coefficients), np.array(self.scales)
+        estimate: FloatArray = np.full(len(drive.ticks), self.intercept)
+        for first in range(0, len(estimate), BLOCK_ROWS):
+            workspace.compute_block(first)
+            columns = workspace.block(first)[0]
+            add_terms(columns, coefficients, scales, estimate[first : first + BLOCK_ROWS])
+        return estimate
+
+
+@kernel
+def add_terms(columns: Any, coefficients: Any, scales: Any, estimate: Any) -> None:
+    """Add a dot product's terms to the estimates, left to right; counts are (columns, rows)."""
+    for number in range(len(columns)):
+        column, coefficient, scale = columns[number], coefficients[number], scales[number]
+        for row in range(len(estimate)):
+            estimate[row] += coefficient * (column[row] * scale)
+
+
+# Data frames of any kind: columns of numbers out of them, and an array of the same kind back.
+
+NAMES_SHOWN = 20
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A data frame of some library: columns as Arrow arrays by name, and how to wrap an answer."""
+
+    names: Sequence[str]
+    column: Callable[[str], Any]
+    wrap: Callable[[pa.Array, str], Any]
+
+    def numbers(self, names: Sequence[str], wanted_by: str) -> dict[str, FloatArray]:
+        """Return columns as arrays of shape (rows,), NaN where null.
+
+        Raises `InputError` for columns that are missing, repeated, infinite or not of numbers.
+        """
+        missing = [name for name in names if name not in self.names]
+        if missing:
+            more = len(self.names) - NAMES_SHOWN
+            there = ", ".join(map(str, self.names[:NAMES_SHOWN])) or "no column"
+            raise InputError(
+                f"{wanted_by} needs {', '.join(names)}; the frame lacks {', '.join(missing)}. It "
+                f"has {there}{f' and {more} more' if more > 0 else ''}."
+            )
+        found = {name: self._numbers(name) for name in names}
+        rows = {name: len(values) for name, values in found.items()}
+        if len(set(rows.values())) > 1:
+            told = ", ".join(f"{name} {n:,}" for name, n in rows.items())
+            raise InputError(f"the columns differ in length: {told}.")
+        return found
+
+    def _numbers(self, name: str) -> FloatArray:
+        if list(self.names).count(name) > 1:
+            raise InputError(f"the frame has several columns {name}.")
+        try:
+            column = self.column(name)
+            if not _is_number(column.type):
+                raise InputError(f"the column {name} is of {column.type}, not of numbers.")
+            if column.type != pa.float64():
+                column = column.cast(pa.float64())
+            values = column.to_numpy(zero_copy_only=False)
+        except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"the column {name} is no column of numbers: {error}") from None
+        if infinite := int(np.isinf(values).sum()):
+            raise InputError(f"the column {name} has {infinite:,} infinite values.")
+        return np.asarray(values, dtype=np.float64)
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    tests = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_null)
+    return any(test(kind) for test in tests)
+
+
+def open_frame(frame: Any) -> Frame:
+    """Return a frame of Polars, pandas, Arrow (any stream) or a mapping. Raises `InputError`."""
+    if _is_of("polars", "DataFrame", frame):
+        return Frame(frame.columns, lambda name: frame[name].to_arrow(), _polars)
+    if _is_of("pandas", "DataFrame", frame):
+        return Frame(
+            list(frame.columns),
+            lambda name: pa.array(frame[name], from_pandas=True),
+            lambda values, name: _pandas(values, name, frame.index),
+        )
+    if isinstance(frame, pa.RecordBatch):
+        return Frame(frame.schema.names, frame.column, lambda values, _: values)
+    if isinstance(frame, Mapping):
+        return Frame(
+            list(frame),
+            lambda name: pa.array(frame[name], from_pandas=True),
+            lambda values, _: values.to_numpy(zero_copy_only=False),
+        )
+    if hasattr(frame, "__arrow_c_stream__"):
+        with contextlib.suppress(pa.ArrowException):  # of a series, not of a frame
+            table = pa.table(frame)
+            return Frame(
+                table.column_names, table.column, lambda values, _: pa.chunked_array([values])
+            )
+    raise InputError(
+        f"{type(frame).__name__} is no data frame. Give one of Polars (collected), pandas or "
+        "Arrow, or a mapping of names to arrays."
+    )
+
+
+def _is_of(library: str, kind: str, frame: Any) -> bool:
+    """Whether a value is of a class of a library, which need not be installed for that."""
+    module = sys.modules.get(library)
+    return module is not None and isinstance(frame, getattr(module, kind))
+
+
+def _polars(values: pa.Array, name: str) -> Any:
+    return sys.modules["polars"].Series(name, values)
+
+
+def _pandas(values: pa.Array, name: str, index: Any) -> Any:
+    numbers = values.to_numpy(zero_copy_only=False)
+    return sys.modules["pandas"].Series(numbers, index=index, name=name, dtype="float64")
+
+
+def predict(manifest: Manifest, frame: Any, predictor: Predictor | None = None) -> Any:
+    """Return the angle of each row in rad; see `ModelVersion.predict`."""
+    opened = open_frame(frame)
+    columns = opened.numbers(manifest.columns, f"the model {manifest.name}")
+    for signal in catalogue().signals.values():
+        if signal.column in columns:
+            columns[signal.column] = valid_values(columns[signal.column], signal)
+    if manifest.definitions:
+        angle = _over_time(manifest, opened, columns, predictor or Predictor.of(manifest))
+        return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
+    physical = columns | _features(manifest, columns)
+    angle = np.asarray(manifest.intercept)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is beyond float64 is infinite, or NaN
+        for term in manifest.terms:
+            angle = angle + term.coefficient * physical[term.column]
+    return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
+
+
+def _over_time(
+    manifest: Manifest, frame: Frame, columns: dict[str, FloatArray], predictor: Predictor
+) -> FloatArray:
+    """Return the angles of a model that looks back, drive by drive in the order of time."""
+    signals = catalogue()
+    counts = {
+        name: round_to_counts(columns[signals[name].column], signals[name])
+        for name in predictor.plan.signals
+    }
+    if missing := [name for name in predictor.plan.facts if name not in frame.names]:
+        raise InputError(f"{manifest.name} needs what the car knows: {', '.join(missing)}.")
+    facts = {name: _column(frame, name) for name in predictor.plan.facts}
+    numbers = _numbers(manifest, frame)
+    ticks = _ticks(frame, len(next(iter(counts.values()))))
+    if not len(ticks):
+        return np.empty(0)
+    rows = counts_of(pa.table({"tick": ticks, **counts}), predictor.plan, {})
+    angle = np.empty(len(ticks))
+    with predictor.lend_workspace() as workspace:
+        for at in _rows_of_each_drive(frame, len(ticks)):
+            first = at.start if isinstance(at, slice) else at[0]
+            own = {
+                name: count
+                for name, (values, grain) in numbers.items()
+                if np.isfinite(values[first])
+                and (count := round_number(Fraction(float(values[first])), grain)) is not None
+            }
+            known = {name: values[first].as_py() for name, values in facts.items()}
+            angle[at] = predictor(rows.part(at, known, own), workspace)
+    return angle
+
+
+def _rows_of_each_drive(frame: Frame, rows: int) -> list[slice] | list[IntArray]:
+    """Return the rows of each drive: a slice of each, if the rows of every drive lie together."""
+    if "drive_id" not in frame.names:
+        return [slice(0, rows)]
+    runs = pc.run_end_encode(_column(frame, "drive_id").cast(pa.large_string()))
+    ends = [0, *runs.run_ends.to_pylist()]
+    drives = runs.values.dictionary_encode().indices.fill_null(-1).to_numpy(zero_copy_only=False)
+    found = np.unique(drives)
+    if len(found) == len(drives):
+        return [slice(*one) for one in pairwise(ends)]
+    of_row = np.repeat(drives, np.diff(ends))
+    return [np.flatnonzero(of_row == drive) for drive in found]
+
+
+def _numbers(manifest: Manifest, frame: Frame) -> dict[str, tuple[FloatArray, Fraction]]:
+    """Return what a car's drives tell of it, in SI units by row with NaN, and grains."""
+    used = {one.number.name: one.number for one in manifest.definitions.values() if one.number}
+    if missing := [name for name in used if name not in frame.names]:
+        raise InputError(
+            f"{manifest.name} needs what a car's own drives tell of it: {', '.join(missing)}. Run: "
+            "fleet-slip calibrate --car NAME. A car that has driven too little has nulls there."
+        )
+    return {
+        name: (frame.numbers([name], manifest.name)[name], Fraction(number.grain))
+        for name, number in used.items()
+    }
+
+
+def _column(frame: Frame, name: str) -> pa.Array:
+    column = frame.column(name)
+    return column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+
+
+def _ticks(frame: Frame, rows: int) -> IntArray:
+    """Return the tick of each row: by `tick` or `time_s`, else one row is one tick."""
+    for name, per_tick in (("tick", 1), ("time_s", int(1 / SAMPLE_TIME_S))):
+        if name in frame.names:
+            values = frame.numbers([name], "a model that looks back")[name]
+            if np.isnan(values).any():
+                raise InputError(f"the column {name} has missing values.")
+            return np.rint(values * per_tick).astype(np.int64)
+    return np.arange(rows)
+
+
+def _features(manifest: Manifest, columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
+    """Return the features in SI units by column, NaN where one has no value."""
+    terms = [term for term in manifest.terms if term.sql]
+    made = [(term, plain_column(term.signal, term.sql)) for term in terms]
+    if not all(one.signals for _, one in made):
+        raise DataError(f"the features of {manifest.name} are of no signal. Publish it again.")
+    signals = catalogue()
+    counts, present = {}, {}
+    for name in {name for _, one in made for name in one.signals}:
+        rounded = round_to_counts(columns[signals[name].column], signals[name])
+        present[name] = rounded.is_valid().to_numpy(zero_copy_only=False)
+        counts[name] = rounded.fill_null(0).to_numpy().astype(np.int64)
+    found = {}
+    for term, one in made:
+        given = np.logical_and.reduce([present[name] for name in one.signals])
+        values, there = row_counts(one, counts, given)
+        found[term.column] = np.where(there, values * float(term.scale), np.nan)
+    return found
+
+
+# A published model as one of counts, so that Gram rows can tell its error.
+
+
+def counts_model(manifest: Manifest, feature_set: str | None = None) -> LinearModel:
+    """Return a published model as one of counts, exactly.
+
+    For the Gram rows of a feature set of changes it has no intercept, and no column that is a
+    number of the car alone: a change has none.
+    """
+    changes = feature_set is not None and features().feature_set(feature_set).change_ticks
+    # Of the counts as they are now: a signal's scale may have changed since it was published.
+    manifest.require_same_counts()
+    scales = input_scales()
+    unit = scales[manifest.label.signal]
+    terms = [term for term in manifest.terms if not (changes and term.alone)]
+    return LinearModel(
+        tuple(term.signal for term in terms),
+        manifest.label.signal,
+        tuple(
+            term.coefficient_exact
+            * (scales[term.signal] if term.logged else term.scale_exact)
+            / unit
+            for term in terms
+        ),
+        Fraction(0) if changes else manifest.intercept_exact / unit,
+    )

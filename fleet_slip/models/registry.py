@@ -1,0 +1,478 @@
+"""Model versions: immutable, numbered, each explaining itself; and aliases with their history.
+
+models/<name>/versions/1.json, 2.json, ...     what was published
+models/<name>/history/1.json, 2.json, ...      every move of an alias, with its time
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar, overload
+
+import pyarrow as pa
+from pydantic import Field
+
+from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier
+from fleet_slip.config import Config, parse_document
+from fleet_slip.errors import QuestionError, RefusedError, StorageError
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.trained_drives import TrainedDrives, keep_drives, read_listed
+from fleet_slip.pages.page import notebook_table
+from fleet_slip.storage.documents import MAX_DIGITS, DocumentFolder
+from fleet_slip.storage.folder import Folder
+
+if TYPE_CHECKING:
+    import polars as pl
+    from numpy import float64
+    from numpy.typing import ArrayLike, NDArray
+
+    from fleet_slip.models.predict import Predictor
+    from fleet_slip.storage.table import Table
+    from fleet_slip.warehouse.tables import Warehouse
+
+
+# Where the aliases of a model point, and every move that brought them there.
+#
+# A move follows the moves before it directly: of two processes that decide at once, one decides
+# again.
+
+CHAMPION = "champion"
+"""The alias of the version in use."""
+
+CANDIDATE = "candidate"
+"""The alias of the version that waits for somebody to look at it."""
+
+Command = Literal["publish", "promote", "rollback", "pin", "unpin"]
+
+HOLDING: frozenset[Command] = frozenset({"rollback", "pin"})
+"""After these no publication moves the alias, until a person lets it go."""
+
+RELEASING: frozenset[Command] = frozenset({"promote", "unpin"})
+
+T = TypeVar("T")
+
+
+class AliasMove(Config):
+    """One entry of the history: an alias points at a version from this moment on."""
+
+    alias: Identifier
+    version: Annotated[int, Field(ge=1, lt=10**MAX_DIGITS)]
+    command: Command
+    at: datetime
+    best: Annotated[int, Field(ge=1, lt=10**MAX_DIGITS)] | None = None
+    """Of a publication: the best of the champions so far, if that is another version."""
+
+
+@dataclass(frozen=True)
+class AliasHistory:
+    """All moves of one model's aliases."""
+
+    documents: DocumentFolder
+
+    def moves(self) -> list[AliasMove]:
+        """Return all moves, oldest first."""
+        return list(self.latest_moves())[::-1]
+
+    def latest_moves(self) -> Iterator[AliasMove]:
+        """Yield the moves, newest first, each read when it is asked for."""
+        for number in reversed(self.documents.numbers()):
+            document = self.documents.read(number)
+            file = self.documents.file(number)
+            yield parse_document(document.content, AliasMove, file, "this move of an alias")
+
+    def pointed_at(self, alias: str) -> int | None:
+        """Return the version that an alias points at, or None."""
+        return next((move.version for move in self.latest_moves() if move.alias == alias), None)
+
+    def before(self, alias: str) -> int | None:
+        """Return the version that an alias pointed at before the one of now, or None.
+
+        What was rolled back does not count: going back twice goes back two versions.
+        """
+        trail: list[int] = []
+        for move in self.moves():
+            if move.alias == alias:
+                trail = _after(trail, move)
+        return trail[-2] if len(trail) > 1 else None
+
+    def best_of(self, alias: str) -> int | None:
+        """Return the best of the versions that an alias was led through since a person moved it.
+
+        That is what publications said; None if the alias points at no version.
+        """
+        last = next((move for move in self.latest_moves() if move.alias == alias), None)
+        return None if last is None else last.best or last.version
+
+    def published_at(self, version: int) -> datetime | None:
+        """Return when a version was published last; None if no move tells."""
+        moves = self.latest_moves()
+        published = (m.at for m in moves if m.version == version and m.command == "publish")
+        return next(published, None)
+
+    def held_by(self, alias: str) -> AliasMove | None:
+        """Return the move since which no publication may move an alias; None if one may."""
+        moves = (move for move in self.latest_moves() if move.alias == alias)
+        last = next((move for move in moves if move.command in HOLDING | RELEASING), None)
+        return last if last is not None and last.command in HOLDING else None
+
+    def aliases(self) -> dict[str, int]:
+        """Return each alias and the version that it points at."""
+        return {move.alias: move.version for move in self.moves()}
+
+    def decide(self, decision: Callable[[int], T | None]) -> T:
+        """Return what a decision comes to, which is taken again while it comes to None.
+
+        The decision gets the number of the newest move, which it passes to `move`; it must read
+        nothing of the history before it is called. Raises `ConflictError` after many attempts.
+        """
+        return self.documents.after_newest(decision)
+
+    def move(
+        self, alias: str, version: int, command: Command, *, after: int, best: int | None = None
+    ) -> bool:
+        """Point an alias at a version; return False if there were moves after the one given."""
+        if not re.fullmatch(IDENTIFIER_PATTERN, alias):
+            raise QuestionError(
+                f"{alias!r} cannot be an alias: use small letters, digits and _, beginning with a "
+                "letter, at most 41."
+            )
+        move = AliasMove(
+            alias=alias,
+            version=version,
+            command=command,
+            at=datetime.now(UTC),
+            best=None if best == version else best,
+        )
+        content = move.model_dump(mode="json", exclude_none=True)
+        return self.documents.create(after + 1, content) is not None
+
+
+def _after(trail: list[int], move: AliasMove) -> list[int]:
+    """Return the versions that an alias was led through, after one more move."""
+    match move.command:
+        case "rollback":
+            return trail[:-1]
+        case "pin" | "unpin":
+            return trail
+        case _ if trail and trail[-1] == move.version:
+            return trail
+        case _:
+            return [*trail, move.version]
+
+
+# One published version of a model, which estimates angles from data frames.
+
+
+class ArrowStream(Protocol):
+    """A table of Arrow, or of a library that hands its tables over as Arrow."""
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """Return the table's batches."""
+
+
+class PandasFrame(Protocol):
+    """A data frame of pandas, which need not be installed."""
+
+    @property
+    def iloc(self) -> Any:
+        """Rows by position."""
+
+
+@dataclass(frozen=True)
+class ModelVersion:
+    """A manifest with its number and verified checksum."""
+
+    version: int
+    manifest: Manifest
+    sha256: str
+
+    def __repr__(self) -> str:
+        figures = self.manifest.cross_validation
+        return (
+            f"<{type(self).__name__} {self.reference}: {len(self.manifest.terms)} signals, RMSE "
+            f"{figures.rmse_deg:.4f} deg, correlation {figures.correlation:.4f}>"
+        )
+
+    def _repr_html_(self) -> str:
+        terms = self.manifest.terms
+        rows = [[term.column, term.unit, f"{term.coefficient:.6g}"] for term in terms]
+        rows.append(["intercept", self.manifest.label.unit, f"{self.manifest.intercept:.6g}"])
+        sizes = [*(term.coefficient * float(term.scale) for term in terms), 0.0]
+        return notebook_table(repr(self)[1:-1], ["signal", "unit", "coefficient"], rows, sizes)
+
+    @property
+    def reference(self) -> str:
+        """The version as it is named on the command line: `NAME@VERSION`."""
+        return f"{self.manifest.name}@{self.version}"
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns in SI units that `predict` needs, named as in the view `log`."""
+        return self.manifest.columns
+
+    @overload
+    def predict(self, frame: "pl.DataFrame") -> "pl.Series": ...
+    @overload
+    def predict(
+        self, frame: "Mapping[str, ArrayLike | Sequence[float | None]]"
+    ) -> "NDArray[float64]": ...
+    @overload
+    def predict(self, frame: ArrowStream | PandasFrame) -> Any: ...
+    def predict(self, frame: Any) -> Any:
+        """Estimate the side-slip angle in rad for each row of a frame.
+
+        The frame has the columns of `columns` in SI units, as the view `log` has them; others are
+        left alone. A model with features rounds the signals that they are made of to counts, half
+        to even, and clips them to their valid range, as the sensors do. On the rows of the logs the
+        angles have the bits that `score` computes.
+
+        | frame | returned, one float64 for each row | no angle |
+        | --- | --- | --- |
+        | `polars.DataFrame` | `polars.Series` | null |
+        | `pandas.DataFrame` | `pandas.Series` with its index | NaN |
+        | `pyarrow.RecordBatch` | `pyarrow.Array` | null |
+        | `pyarrow.Table`, a DuckDB relation, any Arrow stream | `pyarrow.ChunkedArray` | null |
+        | mapping of names to arrays of shape (rows,) | `numpy.ndarray` of shape (rows,) | NaN |
+
+        A model that looks back does so within a drive: by the columns `drive_id` and `tick` or
+        `time_s`, if the frame has them; else its rows are the ticks of one drive, in their order.
+
+        There is no angle where an input is null or NaN, or a feature has no value, such as a
+        curvature at standstill.
+
+        Raises `InputError` for a column that is missing (it says what is there), is there twice, is
+        not of numbers, has infinite ones, or differs from the others in length.
+        """
+        from fleet_slip.models.predict import predict  # noqa: PLC0415 - DuckDB, not for show
+
+        return predict(self.manifest, frame, self._predictor if self.manifest.definitions else None)
+
+    @cached_property
+    def _predictor(self) -> "Predictor":
+        from fleet_slip.models.predict import Predictor  # noqa: PLC0415 - numba, not for show
+
+        return Predictor.of(self.manifest)
+
+
+_IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
+_NONE = "none yet; publish one with: fleet-slip publish NAME"
+
+
+@dataclass(frozen=True)
+class Registry:
+    """All models below a folder, which are made of some Gram rows."""
+
+    folder: Folder
+    grams: "Table | None" = None
+
+    @classmethod
+    def of(cls, warehouse: "Warehouse") -> "Registry":
+        """Return the models of a data root."""
+        return cls(warehouse.root / "models", warehouse.grams)
+
+    def names(self) -> list[str]:
+        """Return the names of all models, sorted."""
+        return [
+            name
+            for name in self.folder.names()
+            if _IDENTIFIER.fullmatch(name) and (self.folder / name / "versions").exists()
+        ]
+
+    def require(self, name: str) -> None:
+        """Raise `QuestionError` if no model is called so."""
+        if name not in self.names():
+            known = ", ".join(self.names()) or _NONE
+            raise QuestionError(f"no model is called {name!r}. Models: {known}.")
+
+    def versions(self, name: str) -> list[int]:
+        """Return the version numbers of a model, ascending."""
+        return self._versions(name).numbers()
+
+    def load(self, name: str, version: int) -> ModelVersion:
+        """Return a version. Raises `StorageError` if it was changed."""
+        if not _IDENTIFIER.fullmatch(name):
+            self.require(name)
+        try:
+            document = self._versions(name).read(version)
+        except StorageError:
+            # Looked up only now: a model may have very many versions.
+            self.require(name)
+            numbers = self.versions(name)
+            if version in numbers:
+                raise
+            raise _unknown(name, str(version), numbers) from None
+        manifest = parse_document(document.content, Manifest, f"{name}@{version}", "its manifest")
+        if manifest.name != name:
+            raise StorageError(
+                f"{name}@{version}: its manifest is of the model {manifest.name}. Restore the file "
+                "from a backup, or publish again."
+            )
+        return ModelVersion(version, manifest, document.sha256)
+
+    def only(self, or_else: str = "") -> str:
+        """Return the name of the only model. Raises `QuestionError` if there is not one."""
+        names = self.names()
+        if len(names) != 1:
+            known = ", ".join(names) or _NONE
+            raise QuestionError(f"name a published model{or_else}. Models: {known}.")
+        return names[0]
+
+    def resolve(self, reference: str | None) -> ModelVersion:
+        """Return the version of a reference, or the only model. Raises `QuestionError`."""
+        name, _, which = (reference or self.only()).partition("@")
+        self.require(name)
+        which = which or CHAMPION
+        if which.isascii() and which.isdigit() and len(which) <= MAX_DIGITS:
+            return self.load(name, int(which))
+        history = self.history(name)
+        version = history.pointed_at(which)
+        if version is None:
+            raise _unknown(name, which, [*self.versions(name), *sorted(history.aliases())])
+        return self.load(name, version)
+
+    def folder_of(self, name: str) -> Folder:
+        """Return the folder of a model's versions."""
+        return self._versions(name).folder
+
+    def champion(self, name: str) -> ModelVersion | None:
+        """Return the version in use, or None before the first."""
+        version = self.history(name).pointed_at(CHAMPION)
+        return None if version is None else self.load(name, version)
+
+    def history(self, name: str) -> AliasHistory:
+        """Return the moves of a model's aliases."""
+        return AliasHistory(DocumentFolder(self.folder / name / "history"))
+
+    def trained_drives(self, manifest: Manifest) -> TrainedDrives | None:
+        """Return what drives made a version; None if it does not tell. Raises `StorageError`."""
+        listed = read_listed(self.folder_of(manifest.name), manifest)
+        return None if listed is None else TrainedDrives(manifest.name, listed)
+
+    def require_drives(self, manifest: Manifest) -> None:
+        """Raise `StorageError` if what tells a version's drives is damaged or gone."""
+        self.trained_drives(manifest)
+
+    def add(self, manifest: Manifest, drives: bytes | None = None) -> ModelVersion:
+        """Make a manifest the next version of its model, after what tells its `drives`.
+
+        If the latest is the same estimator from the same rows, it is used: another process added
+        it.
+        """
+        name, versions = manifest.name, self._versions(manifest.name)
+        if drives is not None:
+            keep_drives(self.folder_of(name), drives)
+
+        def next_version(latest: int) -> int | None:
+            if latest and self.load(name, latest).manifest.same_estimator(manifest):
+                return latest
+            document = versions.create(latest + 1, manifest.model_dump(mode="json"))
+            return document.number if document else None
+
+        version = versions.after_newest(next_version)
+        return self.load(name, version)
+
+    def make_champion(self, version: ModelVersion, *, after: int, best: int | None = None) -> bool:
+        """Point the champion at a version, and at the `best`; False if an alias moved since."""
+        history = self.history(version.manifest.name)
+        there = history.pointed_at(CHAMPION) == version.version
+        return there or history.move(CHAMPION, version.version, "publish", after=after, best=best)
+
+    def promote(self, name: str, version: int, alias: str) -> None:
+        """Point an alias at a version. Raises `QuestionError` for an unknown version.
+
+        Where it points there already nothing is added, unless a hold or a better champion of before
+        ends: one `rollback` undoes a repeated command.
+        """
+        self.load(name, version)
+        history = self.history(name)
+
+        def move(newest: int) -> int | None:
+            chosen = history.pointed_at(alias) == history.best_of(alias) == version
+            there = chosen and not history.held_by(alias)
+            moved = there or history.move(alias, version, "promote", after=newest)
+            return version if moved else None
+
+        history.decide(move)
+
+    def hold(self, name: str, alias: str, command: Literal["pin", "unpin"]) -> int:
+        """Pin or unpin an alias; return its version. Raises `QuestionError` if there is none."""
+        version = self.resolve(f"{name}@{alias}").version
+        history = self.history(name)
+
+        def move(newest: int) -> int | None:
+            there = bool(history.held_by(alias)) == (command == "pin")
+            return version if there or history.move(alias, version, command, after=newest) else None
+
+        return history.decide(move)
+
+    def rollback(self, name: str, alias: str) -> int:
+        """Point an alias back; return its version. Raises `RefusedError`, and as `load`."""
+        history = self.history(name)
+
+        def move(newest: int) -> int | None:
+            version = history.before(alias)
+            if version is None:
+                raise RefusedError(
+                    f"{name}@{alias} never pointed at another version, so there is nothing to go "
+                    f"back to. See: fleet-slip models {name}"
+                )
+            self.load(name, version)
+            return version if history.move(alias, version, "rollback", after=newest) else None
+
+        return history.decide(move)
+
+    def as_table(self, name: str | None = None) -> pa.Table:
+        """Return all versions of all models, or of one, as rows."""
+        names = self.names() if name is None else [name]
+        rows = [row for one in names for row in self._rows(one)]
+        return pa.Table.from_pylist(rows, schema=_TABLE_SCHEMA)
+
+    def _rows(self, name: str) -> list[Mapping[str, Any]]:
+        moves = self.history(name).moves()
+        aliases: dict[int, list[str]] = {}
+        for alias, number in sorted({move.alias: move.version for move in moves}.items()):
+            aliases.setdefault(number, []).append(alias)
+        published = {move.version: move.at for move in reversed(moves)}
+        rows: list[Mapping[str, Any]] = []
+        for number in self.versions(name):
+            version = self.load(name, number)
+            manifest = version.manifest
+            figures, trained = manifest.cross_validation, manifest.trained_on
+            own = {
+                "version": number,
+                "aliases": ",".join(aliases.get(number, [])),
+                "signals": ",".join(manifest.signals),
+                "published_at": published.get(number),
+                "sha256": version.sha256,
+            }
+            rows.append({**vars(trained), **vars(figures), "name": name, **own})
+        return rows
+
+    def _versions(self, name: str) -> DocumentFolder:
+        return DocumentFolder(self.folder / name / "versions")
+
+
+_TABLE_SCHEMA = pa.schema(
+    [
+        ("name", pa.string()),
+        ("version", pa.int64()),
+        ("aliases", pa.string()),
+        ("signals", pa.string()),
+        ("correlation", pa.float64()),
+        ("rmse_deg", pa.float64()),
+        ("error_mean_deg", pa.float64()),
+        ("error_std_deg", pa.float64()),
+        ("cohort", pa.string()),
+        ("drives", pa.int64()),
+        ("rows", pa.int64()),
+        ("published_at", pa.timestamp("us", tz="UTC")),
+        ("sha256", pa.string()),
+    ]
+)
+
+
+def _unknown(name: str, which: str, known: Sequence[int | str]) -> QuestionError:
+    there = ", ".join(map(str, known))
+    return QuestionError(f"{name} has no version or alias {which!r}. It has: {there}.")

@@ -1,0 +1,355 @@
+"""How to select: the one definition of what `FleetCohort.select` and `fleet-slip select` take."""
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+from typing_extensions import Doc
+
+from fleet_slip.base import canonical_json, sha256_of
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.config import Config, find_config, load_config
+from fleet_slip.errors import QuestionError, UsageError
+from fleet_slip.grams.cohort import Cohort
+from fleet_slip.grams.folding import Folding, FoldKey
+from fleet_slip.grams.sums import SummedCohort
+from fleet_slip.regression.choice import DEFAULT_WORTH, Worth
+from fleet_slip.regression.drives import ClusterUnit
+from fleet_slip.regression.orders import METHODS, RANKINGS
+from fleet_slip.regression.subsets import CRITERIA
+
+DEFAULT_MODELS = "estimator"
+"""The model list that is compared unless another is named, by `run` and every night too."""
+
+LOGGED_MODELS = "table1"
+"""That of logged signals, for other feature sets or where the usual columns are not computed."""
+
+Label = Literal["course", "course+sideslip"]
+"""What may stand for the label of a reference sensor, or beside it where few cars have one."""
+
+COURSE = "course"
+"""Also the name of the feature set, and of the model list, that are taken for it."""
+BOTH: Label = "course+sideslip"
+"""The course of most cars, and the label of those that have it."""
+
+DEFAULT_MOST = 24
+
+WORTH = Doc(
+    "The smallest gain that is worth a signal: as an angle such as 0.025deg, the root of the "
+    "difference of the mean squared errors, in which the label's noise cancels; or a share of the "
+    "RMSE, such as 2%. Of the models that fall less short of the best, or by no more than one "
+    "standard error of the difference, that with the fewest signals wins. Default: 0.025deg, or "
+    "the rule of the list."
+)
+
+NAIVE = Doc(
+    "Take rows for independent evidence, not drives or cars. At 100 Hz they are not: then every "
+    "criterion keeps nearly everything."
+)
+CLUSTER = Doc(
+    "What is independent evidence: vehicle, since a car's drives share its biases and tyres, or "
+    "drive. Default: vehicle where there are several, else drive."
+)
+
+_WORTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectionRequest:
+    """How models are compared and one is chosen; without options, by the usual list."""
+
+    models: Annotated[
+        str | None,
+        Doc(
+            f"A model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, or "
+            f"{LOGGED_MODELS} with `features` or without its Gram rows, unless `nested` or an "
+            "option that searches is given."
+        ),
+    ] = None
+    model: Annotated[
+        str | None,
+        Doc(
+            "The inputs of the one model to take, separated by commas, such as "
+            '"ax, ay, yaw_rate", instead of a list.'
+        ),
+    ] = None
+    nested: Annotated[
+        str | None,
+        Doc(
+            "Add the nested models of an order of signals, separated by commas; 'catalogue' is all "
+            "inputs in the order of configs/signals.toml, a family of windows or gates its "
+            "columns."
+        ),
+    ] = None
+    features: Annotated[
+        str | None,
+        Doc(
+            "Feature set of configs/features.toml, computed before with: fleet-slip gram "
+            "--features NAME. Default: what the list says, else the logged signals."
+        ),
+    ] = None
+    label: Annotated[
+        Label | None,
+        Doc(
+            "course: learn without a reference sensor, from changes of the course over ground; "
+            "course+sideslip: from these, and the label of the cars that have it. Feature set and "
+            "model list are then those called course, unless others are named."
+        ),
+    ] = None
+    by: Annotated[
+        FoldKey | None,
+        Doc("What a fold is made of. Default: what the list says. By row is WEKA's way and leaks."),
+    ] = None
+    folds: Annotated[
+        int | str | None,
+        Doc(
+            "Number of folds, or each: every drive, or whatever folds are made of, is a fold of "
+            "its own. Default: what the list says."
+        ),
+    ] = None
+    rank: Annotated[
+        str | None,
+        Doc(f"Rank the inputs of `nested` first: {', '.join(RANKINGS)}. Default: declared."),
+    ] = None
+    criterion: Annotated[
+        str | None,
+        Doc(
+            "What decides how many of the ranked inputs are kept: cv (the smallest model that "
+            f"falls negligibly short of the best; see `worth`), {', '.join(CRITERIA)}. Default: cv."
+        ),
+    ] = None
+    worth: Annotated[str | None, WORTH] = None
+    all_subsets: Annotated[
+        bool, Doc("Search all subsets of the inputs of `nested` instead of an order.")
+    ] = False
+    robust: Annotated[
+        bool,
+        Doc(
+            "Leave out the cars whose influence on the model no honest car of their rows has, and "
+            "say which; diagnose says it before."
+        ),
+    ] = False
+    naive: Annotated[bool, NAIVE] = False
+    cluster: Annotated[ClusterUnit | None, CLUSTER] = None
+    intercept: Annotated[
+        bool,
+        Doc(
+            "Whether models have an intercept. Without it they go through the origin: a car that "
+            "drives straight on then has no side-slip, and no sensor an offset."
+        ),
+    ] = True
+    search: Annotated[
+        str | None,
+        Doc(
+            f"Search among the inputs of `nested`, or all: {', '.join(METHODS)}; the search is "
+            "made again in every fold. Adds its models of 1, 2, ... columns."
+        ),
+    ] = None
+    most: Annotated[int | None, Doc(f"Most columns of `search`. Default: {DEFAULT_MOST}.")] = None
+    repeat: Annotated[
+        int | None, Doc("Cross-validate the winner again with so many other deals of folds.")
+    ] = None
+    bootstrap: Annotated[
+        int | None,
+        Doc("Confidence interval of the winner's correlation by drawing the drives so many times."),
+    ] = None
+
+    @property
+    def ordered(self) -> bool:
+        """Whether inputs are ranked or searched, rather than given models compared."""
+        return bool(self.rank or self.criterion or self.all_subsets or self.naive)
+
+    @property
+    def chosen_by_inputs(self) -> bool:
+        """Whether models are made of an order or a search of inputs, and not of a list alone."""
+        return bool(self.nested or self.ordered or self.search)
+
+    @property
+    def resampled(self) -> bool:
+        """Whether the winner's figures are resampled."""
+        return bool(self.bootstrap or self.repeat)
+
+    def check(self) -> None:
+        """Raise `UsageError` for options that do not go together."""
+        parse_worth(self.worth)
+        if self.ordered and self.models:
+            raise UsageError(
+                "a list of models is compared by cross-validation as it stands: leave out "
+                "models, or rank, criterion, all_subsets and naive, which search among the inputs "
+                "of nested."
+            )
+        if self.model and (self.models or self.nested or self.ordered or self.search):
+            raise UsageError(
+                "model says which inputs to take: leave it out, or models, nested, rank, "
+                "criterion, all_subsets, naive and search, which choose."
+            )
+        if self.rank and self.all_subsets:
+            raise UsageError("a search of all subsets needs no order: leave out rank.")
+        if self.most and not self.search:
+            raise UsageError("most is for a search: say how to search.")
+        evidence = self.ordered or self.bootstrap or self.nested
+        if self.cluster and (self.naive or not evidence):
+            raise UsageError(
+                "cluster says what is independent evidence for nested, rank, criterion, "
+                "all_subsets and bootstrap: leave it out, or naive."
+            )
+        if self.label == BOTH and (self.ordered or self.nested or self.resampled or self.robust):
+            raise UsageError(
+                "course+sideslip compares a list of models, one model or a search: leave out "
+                "nested, rank, criterion, all_subsets, naive, robust, bootstrap and repeat."
+            )
+        if self.search and self.ordered:
+            raise UsageError(
+                "a search is made again in every fold, and looks at folds alone: leave out rank, "
+                "criterion, all_subsets and naive."
+            )
+
+
+def parse_worth(text: str | None) -> Worth:
+    """Return a gain from text such as `0.025deg` or `2%`, or the usual one. Raises `UsageError`."""
+    if text is None:
+        return DEFAULT_WORTH
+    found = _WORTH.fullmatch(text.strip())
+    if found is None:
+        raise UsageError(
+            f"worth = {text}: write an angle such as 0.025deg, or a share of the best RMSE such as "
+            "2%."
+        )
+    amount = float(found[1])
+    return Worth(amount / 100, relative=True) if found[2] == "%" else Worth(math.radians(amount))
+
+
+# Model lists: the candidates that a selection compares, read from `configs/models/*.toml`.
+
+INPUTS_TOLD = 30
+"""Inputs, or families of them, in a message."""
+
+
+class CandidateModel(Config):
+    """A named set of signals or features; a family of windows or gates stands for its members."""
+
+    name: str = Field(min_length=1, max_length=60)
+    signals: tuple[Identifier, ...] = Field(min_length=1)
+
+    @field_validator("signals")
+    @classmethod
+    def _families_are_their_members(cls, signals: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(member for name in signals for member in features().members(name))
+
+    @model_validator(mode="after")
+    def _signals_are_inputs(self) -> "CandidateModel":
+        inputs = features().inputs
+        for name in self.signals:
+            if name not in inputs:
+                raise ValueError(
+                    f"model {self.name!r}: {name!r} is not an input. Inputs: {_told(inputs)}"
+                )
+        if len(set(self.signals)) < len(self.signals):
+            raise ValueError(f"model {self.name!r} names a signal twice")
+        return self
+
+
+class Search(Config):
+    """How to choose among many inputs: at most so many columns, by `rule`.
+
+    `best` takes the best cross-validated correlation; `worth` the fewest columns whose error is
+    negligibly larger (`fleet_slip.regression.choice`).
+    """
+
+    method: Literal["forward", "backward", "exchange"] = "forward"
+    most: int = Field(default=DEFAULT_MOST, ge=1, le=200)
+    rule: Literal["best", "worth"] = "worth"
+
+
+class ModelList(Config):
+    """Candidates in their declared order, the feature set and the folds to compare them on.
+
+    `label` may stand for a reference sensor. What a `search` finds joins, and its rule decides.
+    """
+
+    description: str = Field(min_length=1)
+    label: Label | None = None
+    features: Identifier = PLAIN
+    folds: Folding = Folding()
+    model: tuple[CandidateModel, ...] = Field(min_length=1)
+    search: Search | None = None
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> "ModelList":
+        names = [candidate.name for candidate in self.model]
+        if len(set(names)) < len(names):
+            raise ValueError("two models have the same name")
+        return self
+
+    @model_validator(mode="after")
+    def _feature_set_has_the_inputs(self) -> "ModelList":
+        known = features()
+        if self.features not in {PLAIN, *known.sets}:
+            raise ValueError(f"features: no feature set is called {self.features!r}")
+        inputs = known.feature_set(self.features).inputs
+        for candidate in self.model:
+            absent = [name for name in candidate.signals if name not in inputs]
+            if absent:
+                raise ValueError(
+                    f"model {candidate.name!r}: {', '.join(absent)} is not in the feature set "
+                    f"{self.features!r}. Its inputs: {', '.join(inputs)}"
+                )
+        return self
+
+    @property
+    def sha256(self) -> str:
+        """Checksum of what the list says, whatever its layout."""
+        content = self.model_dump(mode="json", exclude_defaults=True)
+        return sha256_of(canonical_json(content))
+
+
+def load_model_list(name_or_path: str) -> ModelList:
+    """Return a shipped model list by name, or one from a TOML file. Raises `ConfigError`."""
+    return load_config(find_config("models", name_or_path), ModelList)
+
+
+def nested_candidates(order: Sequence[str]) -> tuple[CandidateModel, ...]:
+    """Return the models of an order's first 1..k inputs (paper, section II.B)."""
+    return tuple(
+        CandidateModel(name=f"first {size}", signals=tuple(order[:size]))
+        for size in range(1, len(order) + 1)
+    )
+
+
+WHOLE_SET = "catalogue"
+"""As an order of signals: all inputs of the feature set, in its order."""
+
+
+def inputs_of(cohort: Cohort | SummedCohort, order: str) -> tuple[str, ...]:
+    """Return the order of inputs in a text, `catalogue` being all; raises as `require_inputs`."""
+    if order == WHOLE_SET:
+        return cohort.inputs
+    return require_inputs(order.split(","), cohort.feature_set)
+
+
+def require_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
+    """Return the inputs, of a family of windows or gates its members.
+
+    Raises `QuestionError` for an unknown one, `UsageError` for a repeated one.
+    """
+    known = features().feature_set(feature_set).inputs
+    order = tuple(one for name in names for one in features().members(name.strip()))
+    if unknown := [name for name in order if name not in known]:
+        raise QuestionError(
+            f"{','.join(order)}: {', '.join(unknown)} is not an input. Inputs of the feature set "
+            f"{feature_set}: {_told(known)}."
+        )
+    if len(set(order)) < len(order):
+        raise UsageError(f"{','.join(order)}: an input stands twice.")
+    return order
+
+
+def _told(inputs: Iterable[str]) -> str:
+    """Return names of inputs in a line, families by their own, and how many more there are."""
+    names = list(features().families(inputs))
+    more = f" and {len(names) - INPUTS_TOLD} more (fleet-slip features)"
+    return ", ".join(names[:INPUTS_TOLD]) + (more if len(names) > INPUTS_TOLD else "")

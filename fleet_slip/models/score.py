@@ -1,0 +1,233 @@
+"""Evaluates a published model on the rows of a cohort, in SQL."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.base import FloatArray
+from fleet_slip.catalogue.definitions import limit_of
+from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, catalogue
+from fleet_slip.columns.sql import with_columns
+from fleet_slip.config import read_sql
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.calibration import calibrate
+from fleet_slip.grams.compute import counts_of, drives_of_stream
+from fleet_slip.grams.expansion import CarCounts
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.predict import Predictor
+from fleet_slip.storage.runs import log_event
+from fleet_slip.warehouse.condition import Condition, asking, parse_cohort, row_columns
+from fleet_slip.warehouse.tables import Warehouse, connect_tables
+
+BATCH_ROWS = 2**17
+
+
+@dataclass(frozen=True)
+class Score:
+    """Figures of the error, estimate minus truth, over the rows of a cohort with the signals."""
+
+    rows: int
+    correlation: float | None
+    rmse_deg: float
+    error_mean_deg: float
+    error_std_deg: float
+    error_mean_absolute_deg: float
+    error_median_deg: float
+    error_p95_deg: float
+    error_p99_deg: float
+    error_max_deg: float
+    drives: int | None = None
+    """Of the cohort, where they were counted; `drives_trained` of them made the model."""
+    drives_trained: int | None = None
+    drives_left_out: int = 0
+    """How many of these are not scored, since no cohort was asked for."""
+    rows_without: int = 0
+    """Of the cohort, that tell nothing of the model: the label or a signal is missing."""
+    examined: str = ""
+    """Which drives were left out since they are not in order, as a sentence."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `score --json` prints."""
+        return asdict(self)
+
+
+def score_statement(manifest: Manifest, condition: str | Condition) -> str:
+    """Return `jobs/score.sql` for a model: its dot product over the logs in SI units.
+
+    Raises `QuestionError` for a condition that is not one expression on the view `log`, and for a
+    model with numbers that a car's drives tell.
+    """
+    if numbers := numbers_of(manifest):
+        raise QuestionError(
+            f"{manifest.name} uses numbers of each car ({', '.join(numbers)}), which one statement "
+            "on rows does not have. They are in the view calibration. Score it by fleet-slip score."
+        )
+    terms = [f"{term.coefficient!r} * {term.column}" for term in manifest.terms]
+    return read_sql("jobs", "score.sql").format(
+        estimate="\n        + ".join([repr(manifest.intercept), *terms]),
+        label=manifest.label.column,
+        step_rad=repr(_step_rad(manifest)),
+        **_scored_rows(manifest, parse_cohort(condition, row_columns())),
+    )
+
+
+def _scored_rows(manifest: Manifest, condition: Condition) -> dict[str, str]:
+    columns = [term.column for term in manifest.terms] + [manifest.label.column]
+    return {
+        "rows": _rows(manifest),
+        "complete": " AND ".join(f"{column} IS NOT NULL" for column in columns),
+        "condition": condition.sql,
+    }
+
+
+def _step_rad(manifest: Manifest) -> float:
+    """Return a power of two of which no angle has 2^45, so that 2^34 squares fit into HUGEINT."""
+    largest = abs(manifest.intercept) + float(manifest.label.scale) * COUNT_MAX
+    for term in manifest.terms:
+        limit = limit_of(term.definition.bits) if term.definition else COUNT_MAX + 1
+        largest += abs(term.coefficient) * float(term.scale) * limit
+    return 2.0 ** (math.frexp(largest)[1] - 45)
+
+
+def _rows(manifest: Manifest) -> str:
+    """Return the view `log`, or for a model with features a subquery with their columns too."""
+    if not manifest.features and not manifest.definitions:
+        return "log"
+    computed = [
+        f"{t.signal} * {t.scale}::DOUBLE AS {t.column}" for t in manifest.terms if not t.logged
+    ]
+    rows = with_columns("log_counts", manifest.features, manifest.definitions)
+    return _si_rows(rows, computed)
+
+
+def _si_rows(rows: str, computed: Sequence[str] = ()) -> str:
+    """Return a subquery: rows of counts with the columns of the view `log`, and further ones."""
+    columns = [
+        f"tick / {int(1 / SAMPLE_TIME_S)}::DOUBLE AS time_s",
+        *(f"{name} * {s.scale}::DOUBLE AS {s.column}" for name, s in catalogue().signals.items()),
+        *computed,
+    ]
+    separator = ",\n            "
+    return f"""(
+        SELECT
+            *,
+            {separator.join(columns)}
+        FROM {rows}
+    )"""
+
+
+def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) -> Score:
+    """Score a model on the rows of `log` that satisfy a condition.
+
+    Raises like `score_statement`, and `DataError` if no row has the model's signals.
+    """
+    condition = cohort_of_rows(condition)
+    manifest.require_same_counts()
+    found = (
+        _score_over_time(warehouse, manifest, condition)
+        if manifest.definitions
+        else _score_by_sql(warehouse, manifest, condition)
+    )
+    if found is None:
+        raise DataError(
+            f"no row of the cohort {condition.text!r} has {', '.join(manifest.signals)} and "
+            f"{manifest.label.signal}. Choose another cohort, or a model with fewer signals."
+        )
+    return replace(found, rows_without=_count_rows(warehouse, condition) - found.rows)
+
+
+def _count_rows(warehouse: Warehouse, condition: Condition) -> int:
+    statement = f"SELECT count(*) FROM log WHERE {condition.sql}"
+    with connect_tables(warehouse, statement) as database, asking(database, condition):
+        [(rows,)] = database.execute(statement).fetchall()
+    return int(rows)
+
+
+def cohort_of_rows(condition: str | Condition) -> Condition:
+    """Return the condition of a cohort of rows, on the view `log`. Raises `QuestionError`."""
+    return condition if isinstance(condition, Condition) else parse_cohort(condition, row_columns())
+
+
+def _score_by_sql(warehouse: Warehouse, manifest: Manifest, condition: Condition) -> Score | None:
+    statement = score_statement(manifest, condition)
+    with connect_tables(warehouse, statement) as database, asking(database, condition):
+        result = database.execute(statement)
+        names = [column[0] for column in result.description or ()]
+        row = result.fetchone()
+    if row is None or not row[0]:
+        return None
+    figures = dict(zip(names, row, strict=True))
+    percentiles = figures.pop("error_percentiles_deg")
+    median, p95, p99 = percentiles
+    return Score(**figures, error_median_deg=median, error_p95_deg=p95, error_p99_deg=p99)
+
+
+def _score_over_time(
+    warehouse: Warehouse, manifest: Manifest, condition: Condition
+) -> Score | None:
+    """Estimate the drives that have rows of the cohort, whole; score the rows of the cohort."""
+    predictor = Predictor.of(manifest)
+    label = manifest.label.signal
+    needed = [*predictor.plan.signals, label, *predictor.plan.facts, "vehicle_id"]
+    cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
+    counts = ", ".join(dict.fromkeys(needed))
+    text = read_sql("jobs", "drives_in_time.sql").format(
+        columns=counts, rows=_si_rows("log_counts"), condition=condition.sql
+    )
+    estimates: list[FloatArray] = []
+    truths: list[FloatArray] = []
+    unit = float(input_scales()[label])
+    with (
+        connect_tables(warehouse, text) as database,
+        asking(database, condition),
+        predictor.lend_workspace() as workspace,
+    ):
+        stream = database.sql(text).to_arrow_reader(BATCH_ROWS)
+        for rows in drives_of_stream(stream):
+            numbers = cars.get(rows["vehicle_id"][0].as_py())
+            estimate = predictor(counts_of(rows, predictor.plan, None, numbers), workspace)
+            truth = rows[label].to_numpy(zero_copy_only=False).astype(np.float64) * unit
+            chosen = rows["chosen"].to_numpy(zero_copy_only=False).astype(np.bool_)
+            given = chosen & np.isfinite(estimate) & np.isfinite(truth)
+            estimates.append(estimate[given])
+            truths.append(truth[given])
+    if not sum(map(len, truths)):
+        return None
+    return _figures(np.concatenate(estimates), np.concatenate(truths))
+
+
+def numbers_of(manifest: Manifest) -> tuple[str, ...]:
+    """Return the numbers of a car that a model uses."""
+    found = (one.number.name for one in manifest.definitions.values() if one.number)
+    return tuple(dict.fromkeys(found))
+
+
+def calibrated_cars(warehouse: Warehouse) -> CarCounts:
+    """Return the counts of every car's numbers, by its drives so far. Raises `DataError`."""
+    found = calibrate(warehouse)
+    log_event("calibration", cars=len(found.cars), grams_version=found.grams_version)
+    return found.counts()
+
+
+def _figures(estimate_rad: FloatArray, truth_rad: FloatArray) -> Score:
+    error = np.degrees(estimate_rad - truth_rad)
+    size = np.abs(error)
+    several = len(error) > 1
+    constant = not np.ptp(estimate_rad) or not np.ptp(truth_rad)
+    median, p95, p99 = np.quantile(size, [0.5, 0.95, 0.99]).tolist()
+    return Score(
+        rows=len(error),
+        correlation=None if constant else float(np.corrcoef(estimate_rad, truth_rad)[0, 1]),
+        rmse_deg=float(np.sqrt(np.mean(error**2))),
+        error_mean_deg=float(error.mean()),
+        error_std_deg=float(error.std(ddof=1)) if several else math.nan,
+        error_mean_absolute_deg=float(size.mean()),
+        error_median_deg=median,
+        error_p95_deg=p95,
+        error_p99_deg=p99,
+        error_max_deg=float(size.max()),
+    )

@@ -1,0 +1,258 @@
+"""Which signals of a set: the nested models of a ranking, or the best subset of every size."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.cohort import Cohort, drive_folds, row_training
+from fleet_slip.grams.folding import ROW_FOLDS, Folding
+from fleet_slip.grams.sums import SummedCohort
+from fleet_slip.models.request import Search, SelectionRequest
+from fleet_slip.regression.choice import (
+    CROSS_VALIDATION,
+    DEFAULT_WORTH,
+    FEWEST_FOLDS,
+    NestedDistances,
+    Rule,
+    Winner,
+    Worth,
+    choose,
+    cross_validate_nested,
+    cross_validate_selection,
+    measure_distances,
+    nested_fits,
+    select_nested,
+)
+from fleet_slip.regression.choice import NestedChoice as NestedSelection
+from fleet_slip.regression.figures import ErrorSums
+from fleet_slip.regression.folds import CrossValidation, Folds, Procedure, assemble, held_out_errors
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.inference import Evidence
+from fleet_slip.regression.least_squares import Fit, LinearModel, fit
+from fleet_slip.regression.orders import stepwise_order
+from fleet_slip.regression.subsets import CRITERIA, SizeResult, best_subsets, pick_sizes
+
+ALL_SUBSETS = "all-subsets"
+"""Instead of a ranking: the best subset of every size."""
+
+
+@dataclass(frozen=True)
+class SearchChoice:
+    """How a number of signals was chosen.
+
+    Attributes:
+        rule: ranking (or `ALL_SUBSETS`) and criterion.
+        evidence: what the criterion looked at.
+        nested: the ranked signals with the criterion's values; None for all subsets.
+        subsets: the best subsets of size 0, 1, ..., of which each criterion picks a size.
+        honest: figures of the choice, made again in every training fold; None of two folds.
+    """
+
+    rule: Rule
+    evidence: Evidence
+    nested: NestedSelection | None = None
+    subsets: tuple[SizeResult, ...] | None = None
+    picks: dict[str, int] | None = None
+    honest: CrossValidation | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        document: dict[str, Any] = {
+            "ranking": self.rule.ranking,
+            "criterion": self.rule.criterion,
+            "evidence": self.evidence.kind,
+            "effective_rows": self.evidence.rows,
+        }
+        if self.nested is not None:
+            document |= self.nested.as_dict()
+        if self.subsets is not None:
+            document["subsets"] = [result.as_dict() for result in self.subsets]
+            document["picks"] = self.picks
+        if self.honest is not None:
+            document["honest"] = self.honest.as_dict()
+        return document
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """The candidates of a ranking or of all subsets, the winner, and how it was chosen."""
+
+    models: tuple[CrossValidation, ...]
+    winner: Winner
+    choice: SearchChoice
+
+
+def require_criterion(name: str) -> str:
+    """Return a criterion by its name, `cv` for cross-validation. Raises `QuestionError`."""
+    if name == "cv":
+        return CROSS_VALIDATION
+    if name not in (*CRITERIA, CROSS_VALIDATION):
+        known = ", ".join(("cv", *CRITERIA))
+        raise QuestionError(f"unknown criterion {name!r}. Known criteria: {known}.")
+    return name
+
+
+def select_inputs(
+    cohort: Cohort,
+    inputs: Sequence[str],
+    folding: Folding,
+    rule: Rule,
+    request: SelectionRequest,
+) -> SearchResult:
+    """Choose a nested model by the rule's ranking, or of the best subsets, on the drives that fit.
+
+    Raises `DataError` without drives, for dependent inputs or if none is kept, and `QuestionError`
+    for an unknown rule.
+    """
+    label = catalogue().label
+    if folding.by == ROW_FOLDS:
+        training = row_training(cohort, inputs, folding, intercept=request.intercept)
+        fold = np.empty(0, dtype=np.int64)
+    else:
+        ready = drive_folds(
+            cohort,
+            inputs,
+            folding,
+            naive=request.naive,
+            cluster=request.cluster,
+            intercept=request.intercept,
+        )
+        training, fold = ready.training, ready.fold
+    if rule.ranking == ALL_SUBSETS:
+        results = best_subsets(training.total, inputs, label)
+        evidence = training.evidence(training.nested_fits(inputs, label))
+        picks = pick_sizes(results, evidence)
+        models = [
+            training.cross_validate(f"best {result.best.size}", result.best.model.signals, label)
+            for result in results[1:]
+        ]
+        choice = SearchChoice(rule, evidence, subsets=tuple(results), picks=picks)
+        size = picks.get(rule.criterion, 0)
+    else:
+        chosen = select_nested(training, inputs, label, rule)
+        models = cross_validate_nested(training, chosen.order, label)[1:]
+        honest = None
+        if len(training.folds.grams) >= FEWEST_FOLDS:
+            honest = cross_validate_selection(
+                "the choice itself", training, fold, inputs, label, rule
+            )
+        choice = SearchChoice(rule, chosen.evidence, nested=chosen, honest=honest)
+        size = chosen.size
+    if rule.criterion == CROSS_VALIDATION:
+        winner = choose(models, rule.worth)
+    else:
+        winner = _winner(models, size, rule, choice.evidence)
+    return SearchResult(tuple(models), winner, choice)
+
+
+def try_distances(
+    cohort: Cohort, inputs: Sequence[str], folding: Folding, request: SelectionRequest
+) -> NestedDistances | str:
+    """Return the distances of the nested models of an order as given, or why there are none."""
+    try:
+        unit, intercept = request.cluster, request.intercept
+        ready = drive_folds(cohort, inputs, folding, cluster=unit, intercept=intercept)
+        return measure_distances(ready.training, inputs, catalogue().label)
+    except (DataError, QuestionError) as error:
+        return str(error)
+
+
+def _winner(models: Sequence[CrossValidation], size: int, rule: Rule, evidence: Evidence) -> Winner:
+    if size == 0:
+        raise DataError(
+            f"the criterion {rule.criterion} keeps no signal: none says more than chance. Choose "
+            "more drives, other signals, or the criterion cv."
+        )
+    best = max(models, key=lambda model: model.sums.signed_r_squared)
+    among = "the best subsets" if rule.ranking == ALL_SUBSETS else f"the order by {rule.ranking}"
+    reason = (
+        f"{rule.criterion} keeps {size} of {len(models)} signals of {among}, taking "
+        f"{evidence.kind} for independent."
+    )
+    return Winner(models[size - 1], best, reason)
+
+
+@dataclass(frozen=True)
+class SearchedModels:
+    """The models of a search, of sizes 1, 2, ..., cross-validated with the search made again."""
+
+    search: Search
+    inputs: tuple[str, ...]
+    models: tuple[CrossValidation, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {**self.search.model_dump(), "inputs": len(self.inputs), "sizes": len(self.models)}
+
+
+def search_models(
+    cohort: Cohort | SummedCohort,
+    inputs: Sequence[str],
+    folding: Folding,
+    search: Search,
+    *,
+    intercept: bool = True,
+) -> SearchedModels:
+    """Search among the inputs on the drives that have them all. Raises `DataError`."""
+    label = catalogue().label
+    folds = cohort.folds(folding.by, folding.count).serving(inputs, label)
+
+    def fits(gram: Gram) -> list[Fit]:
+        return _fits(gram if intercept else gram.about_origin(), inputs, label, search)
+
+    chosen = fits(folds.total)
+    tests: list[list[ErrorSums]] = [[] for _ in chosen]
+    for training, fold in folds.splits():
+        for sums, fitted in zip(tests, fits(training), strict=False):
+            sums.append(held_out_errors(fitted.model, training, fold))
+    models = tuple(
+        _model(folds, sums, fitted, search)
+        for sums, fitted in zip(tests, chosen, strict=True)
+        if len(sums) == len(folds.grams)
+    )
+    if not models:
+        raise DataError("every input is constant or depends on others: there is nothing to choose.")
+    return SearchedModels(search, tuple(inputs), models)
+
+
+def searching(found: SearchedModels, size: int, *, intercept: bool) -> Procedure:
+    """Return what searches again in given rows for so many columns, or the most that they allow."""
+
+    def procedure(gram: Gram) -> LinearModel:
+        seen, label = gram if intercept else gram.about_origin(), catalogue().label
+        sets = stepwise_order(seen, found.inputs, label, found.search.method, size)
+        return fit(seen, sets[-1] if sets else (), label).model
+
+    return procedure
+
+
+def _model(folds: Folds, sums: Sequence[ErrorSums], fitted: Fit, search: Search) -> CrossValidation:
+    name = f"{search.method} {fitted.size}"
+    return assemble(name, folds, sums, fitted.model, input_scales())
+
+
+def _fits(gram: Gram, inputs: Sequence[str], label: str, search: Search) -> list[Fit]:
+    sets = stepwise_order(gram, inputs, label, search.method, search.most)
+    nested = all(sets[size][:-1] == sets[size - 1] for size in range(1, len(sets)))
+    if sets and nested:
+        return nested_fits(gram, sets[-1], label)[1:]
+    return [fit(gram, chosen, label) for chosen in sets]
+
+
+def choose_by(
+    search: Search | None, models: Sequence[CrossValidation], asked: Worth | None = None
+) -> Winner:
+    """Return the winner by the rule of a search; a worth that was asked for precedes `best`."""
+    if search is None or search.rule != "best" or asked is not None:
+        return choose(models, asked or DEFAULT_WORTH)
+    best = max(models, key=lambda model: model.sums.signed_r_squared)
+    reason = (
+        f"Model {best.name} has the best cross-validated correlation, {best.correlation:.6f}, "
+        f"which is the rule of its list; the columns of each size were chosen again in every fold."
+    )
+    return Winner(best, best, reason)

@@ -1,0 +1,773 @@
+"""Compares candidate models on a cohort by cross-validation and chooses one; no log row is read."""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from fractions import Fraction
+from typing import Any, Generic
+
+import numpy as np
+from typing_extensions import TypeVar
+
+from fleet_slip.base import FloatArray, canonical_json, sha256_of
+from fleet_slip.catalogue.course import STRAIGHT, STRAIGHT_COURSE, TURNED, YAW_RATE
+from fleet_slip.catalogue.facts import TRAINING_DRIVES
+from fleet_slip.catalogue.features import PLAIN, features, input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.config import find_config, load_toml
+from fleet_slip.errors import ConfigError, DataError, NotComputedError, QuestionError, UsageError
+from fleet_slip.grams.cohort import (
+    Cohort,
+    Served,
+    TaughtCohort,
+    clustered_moments,
+    drive_folds,
+    load_cohort,
+    load_taught,
+)
+from fleet_slip.grams.folding import EACH, PARTS, ROW_FOLDS, Folding, make_folding
+from fleet_slip.grams.gram_rows import by_signals, gram_table
+from fleet_slip.grams.reader import CohortOrigin, open_grams
+from fleet_slip.grams.sums import SummedCohort, sum_cohort
+from fleet_slip.models.request import (
+    BOTH,
+    COURSE,
+    DEFAULT_MODELS,
+    LOGGED_MODELS,
+    WHOLE_SET,
+    CandidateModel,
+    ModelList,
+    Search,
+    SelectionRequest,
+    inputs_of,
+    load_model_list,
+    nested_candidates,
+    parse_worth,
+    require_inputs,
+)
+from fleet_slip.models.search import (
+    ALL_SUBSETS,
+    SearchChoice,
+    SearchedModels,
+    choose_by,
+    require_criterion,
+    search_models,
+    select_inputs,
+    try_distances,
+)
+from fleet_slip.pages.page import notebook_table
+from fleet_slip.regression.choice import NestedDistances, Rule, Winner, Worth, fall_short
+from fleet_slip.regression.drives import (
+    ClusterUnit,
+    DriveMoments,
+    Influential,
+    Interval,
+    bootstrap_correlations,
+    find_influential,
+    held_out_products,
+    percentile_interval,
+    repeated_cross_validation,
+)
+from fleet_slip.regression.figures import student_t_two_sided
+from fleet_slip.regression.folds import (
+    CohortFolds,
+    CrossValidation,
+    cross_validate_inputs,
+    least_squares,
+)
+from fleet_slip.regression.gram import GramTable, packed_position
+from fleet_slip.regression.orders import METHODS
+from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.database import sql_text
+from fleet_slip.warehouse.tables import Warehouse
+
+# How far to trust a winner's figures: drawing the drives again, and dealing the folds again.
+#
+# The cars of a cohort whose influence no honest car has, by name, and a cohort without them.
+#
+# The noise of the label, below which no error that is measured against it can be.
+#
+# A cross-validated mean square error is that of the model plus the variance of the label's white
+# noise, since a model cannot know the noise of drives that it has not seen. Only simulated drives
+# state it, in the `[sensors]` of their campaign.
+
+SEED = 1
+"""Resampling is reproducible: the same command prints the same figures."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What resampling says of a model's cross-validated correlation.
+
+    A percentile interval, drawing drives or cars; mean and spread over `repeats` deals of folds.
+    """
+
+    interval: Interval | None
+    drawn: ClusterUnit
+    repeats: int
+    repeated_mean: float | None
+    repeated_spread: float | None
+
+
+def estimate_uncertainty(
+    cohort: Cohort,
+    model: CrossValidation,
+    folding: Folding,
+    request: SelectionRequest,
+) -> Uncertainty:
+    """Draw drives, or cars of several, `bootstrap` times; deal the folds anew `repeat` times.
+
+    Raises `QuestionError` for folds of rows, `DataError` for too few drives.
+    """
+    bootstrap, repeat, intercept = request.bootstrap, request.repeat, request.intercept
+    label = catalogue().label
+    ready = drive_folds(cohort, model.signals, folding, cluster=request.cluster)
+    interval = None
+    if bootstrap:
+        splits = ready.training.folds.splits()
+        refit = least_squares(model.signals, label, intercept=intercept)
+        models = [refit(training) for training, _ in splits]
+        products = held_out_products(ready.moments, ready.fold, models)
+        interval = percentile_interval(bootstrap_correlations(products, bootstrap, SEED))
+    repeated = None
+    if repeat and folding.count != EACH:
+        moments = ready.moments if intercept else DriveMoments.of(ready.served.table, centred=False)
+        repeated = repeated_cross_validation(
+            moments, folding.count, repeat, SEED, intercept=intercept
+        )
+    return Uncertainty(
+        interval,
+        ready.moments.unit,
+        repeat or 0,
+        repeated.mean if repeated else None,
+        repeated.spread if repeated else None,
+    )
+
+
+def influential_cars(served: Served, moments: DriveMoments) -> dict[str, Influential]:
+    """Return cars of unusual influence by name, most unusual first. Raises `DataError` for few."""
+    owners = np.array([name or "" for name in served.drives["vehicle_id"].to_pylist()])
+    names, cars = np.unique(owners, return_inverse=True)
+    found = find_influential(moments, cars.astype(np.int64))
+    return {str(names[one.car]): one for one in found if names[one.car]}
+
+
+def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Condition:
+    """Return a condition without some cars."""
+    if not vehicles:
+        return condition
+    quoted = ", ".join(map(sql_text, sorted(vehicles)))
+    others = f"(vehicle_id IS NULL OR vehicle_id NOT IN ({quoted}))"
+    return parse_condition(f"{condition.sql} AND {others}")
+
+
+def label_noise_deg(warehouse: Warehouse, cohort: CohortOrigin) -> float | None:
+    """Return the standard deviation of the label's noise, of all rows of a cohort together.
+
+    The step of its counts is part of it, as the standard deviation of a uniform error. None where
+    no campaign states it.
+    """
+    if not warehouse.logs.snapshot().rows:  # all rows are of messages: none is read for this
+        return None
+    with open_grams(warehouse, cohort.feature_set, cohort.condition) as opened:
+        rows = opened.label_sources(cohort.condition)
+    stated = [(n, _stated_rad(source, campaign)) for source, campaign, n in rows]
+    total = sum(n for n, _ in stated)
+    if not total or any(std is None for _, std in stated):
+        return None
+    variance = sum(n * std**2 for n, std in stated if std is not None) / total
+    step = float(catalogue()[catalogue().label].scale)
+    return math.degrees(math.sqrt(variance + step**2 / 12))
+
+
+def _stated_rad(source: str, campaign: str | None) -> float | None:
+    """Return the noise that a campaign states; None of measured drives and unknown campaigns."""
+    if source != "simulated" or campaign is None:
+        return None
+    try:
+        content = load_toml(find_config("campaigns", campaign))
+        if "sensors" not in content:
+            content = load_toml(find_config("campaigns", content["base"]))
+        return float(content["sensors"]["sideslip_std_rad"])
+    except (ConfigError, KeyError):  # its file was elsewhere
+        return None
+
+
+# How good a model learned from changes of the course is, where no sensor measures the angle.
+#
+# The error of changes has the noise of two fixes in it, which changes of cars that go straight on
+# show. These are fast, and fast cars have less of it: what is left is more than the angle's error
+# over the change, and each of two independent errors has half the square. What no change tells
+# stands beside as its cost: a late course, an antenna elsewhere.
+
+CURVATURE = "curvature"
+LATE_S, AWAY_M = 0.01, 0.1
+"""A course that is so late and an antenna that is so far from where it was said to be."""
+FEWEST_STRAIGHT = 100
+ONE_WAY = 0.7
+"""Share of one side beyond which bends cannot be told apart: 1 on a skid pad, 0.2 on a circuit."""
+
+
+@dataclass(frozen=True)
+class WithoutLabel:
+    """What changes of the course tell of a model's error, in degrees; None is untold.
+
+    Attributes:
+        change_s: over how long.
+        error: cross-validated, of changes of the course.
+        noise, noise_uncertainty: of the course, where cars go straight on; over drives.
+        angle_at_most: bound of the angle's error over so long: what is left of `error`.
+        late: what a course would cost that is late by `LATE_S`.
+        away: what an antenna would that is `AWAY_M` from its place.
+        to_the_left: mean of the angles turned over their root mean square: 1 where cars turn to
+            the left alone and as hard at any time, −1 to the right.
+    """
+
+    change_s: tuple[float, ...]
+    error: float
+    noise: float | None
+    noise_uncertainty: float | None
+    angle_at_most: float | None
+    late: float | None
+    away: float | None
+    to_the_left: float
+
+    @property
+    def one_way(self) -> str | None:
+        """The side that cars turn to if they hardly ever turn to the other."""
+        if abs(self.to_the_left) < ONE_WAY:
+            return None
+        return "left" if self.to_the_left > 0 else "right"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        found = asdict(self)
+        plain = ("change_s", "to_the_left")
+        return {name if name in plain else f"{name}_deg": one for name, one in found.items()}
+
+
+def without_label(warehouse: Warehouse, cohort: CohortOrigin, error: float) -> WithoutLabel | None:
+    """Return how good a model of such an error in degrees is; None unless changes taught it."""
+    times = features().feature_set(cohort.feature_set).change_s
+    if not times:
+        return None
+    noise = _Noise()
+    squares = {YAW_RATE: [0.0, 0.0], CURVATURE: [0.0, 0.0], TURNED: [0.0, 0.0]}
+    turned = 0.0
+    with open_grams(warehouse, cohort.feature_set, cohort.condition) as opened:
+        for batch in opened.batches(cohort.condition):
+            for names, rows, _ in by_signals(batch):
+                if STRAIGHT not in names.split(","):
+                    continue
+                table = gram_table(names, rows)
+                noise.add(table)
+                _add_squares(squares, table)
+                turned += float(table.sums[:, table.signals.index(TURNED)].astype(np.float64).sum())
+    scale = math.degrees(input_scales()[catalogue().label])
+    spread = {
+        name: math.sqrt(square / rows) * float(input_scales()[name]) if rows else None
+        for name, (square, rows) in squares.items()
+        if name in input_scales()
+    }
+    square, rows = squares[TURNED]
+    own, unsure = noise.told(float(scale)) or (None, None)
+    left = None if own is None else max(0.0, error**2 - max(0.0, own - 2 * (unsure or 0.0)) ** 2)
+    rate, away = spread[YAW_RATE], spread[CURVATURE]
+    return WithoutLabel(
+        change_s=tuple(float(one) for one in times),
+        error=error,
+        noise=own,
+        noise_uncertainty=unsure,
+        angle_at_most=None if left is None else math.sqrt(left / 2),
+        late=None if rate is None else math.degrees(LATE_S * rate),
+        away=None if away is None else math.degrees(AWAY_M * away),
+        to_the_left=turned / math.sqrt(rows * square) if square else 0.0,
+    )
+
+
+class _Noise:
+    """Adds up the changes of drives where they go straight on, about their mean in each drive."""
+
+    def __init__(self) -> None:
+        self.rows: list[FloatArray] = []
+        self.squares: list[FloatArray] = []
+
+    def add(self, table: GramTable) -> None:
+        at, course = table.signals.index(STRAIGHT), table.signals.index(STRAIGHT_COURSE)
+        rows = table.sums[:, at].astype(np.float64)
+        some = rows > 1
+        square = table.products[some, packed_position(course, course)].astype(np.float64)
+        self.rows.append(rows[some] - 1)
+        self.squares.append(square - table.sums[some, course].astype(np.float64) ** 2 / rows[some])
+
+    def told(self, scale: float) -> tuple[float, float] | None:
+        """Return the standard deviation of changes and its standard error; None of few."""
+        rows, squares = (
+            np.concatenate([*parts, np.zeros(0)]) for parts in (self.rows, self.squares)
+        )
+        if rows.sum() < FEWEST_STRAIGHT or len(rows) < 2:
+            return None
+        variance = float(squares.sum() / rows.sum())
+        error = math.sqrt(float(((squares - variance * rows) ** 2).sum())) / float(rows.sum())
+        return math.sqrt(variance) * scale, error / (2 * math.sqrt(variance)) * scale
+
+
+def _add_squares(squares: dict[str, list[float]], table: GramTable) -> None:
+    """Add the squares of what columns change by, in counts, and the rows that they are of."""
+    for name, found in squares.items():
+        if name in table.signals:
+            at = table.signals.index(name)
+            found[0] += float(table.products[:, packed_position(at, at)].astype(np.float64).sum())
+            found[1] += float(table.n.sum())
+
+
+AnyCohort = TypeVar("AnyCohort", bound=Cohort | SummedCohort, default=Cohort)
+
+
+@dataclass(frozen=True)
+class Selection(Generic[AnyCohort]):
+    """All candidates with their figures, in the order of the list, and the winner.
+
+    Attributes:
+        cohort: the Gram rows, or their sums.
+        skipped: candidates that the cohort cannot serve, with the reason.
+        choice: how an order or a subset was chosen; None for a list of models.
+        searched: the models of a search, which are among `models`.
+        distances: of an order's nested models from the full and the true one, or why not told.
+        intercept: whether models have one; without it they go through the origin.
+    """
+
+    cohort: AnyCohort
+    folds: Folding
+    models: tuple[CrossValidation, ...]
+    winner: Winner
+    skipped: dict[str, str]
+    choice: SearchChoice | None = None
+    searched: SearchedModels | None = None
+    uncertainty: Uncertainty | None = None
+    distances: NestedDistances | str | None = None
+    intercept: bool = True
+
+    def __repr__(self) -> str:
+        winner = self.winner.model
+        return (
+            f"<{type(self).__name__}: {winner.name}, {len(winner.signals)} signals, RMSE "
+            f"{winner.pooled.rmse_deg:.4f} deg, correlation {winner.correlation:.4f}, of "
+            f"{len(self.models)} models; {self.cohort.drive_count:,} drives where "
+            f"{self.cohort.condition.text}>"
+        )
+
+    def _repr_html_(self) -> str:
+        best = sorted(self.models, key=lambda model: model.pooled.rmse)[:10]
+        rows = [
+            [
+                one.name,
+                str(len(one.signals)),
+                f"{one.correlation:.4f}",
+                f"{one.pooled.rmse_deg:.4f}",
+            ]
+            for one in best
+        ]
+        header = ["model", "signals", "correlation", "RMSE deg"]
+        title = f"winner: {self.winner.model.name}. {self.winner.reason}"
+        return notebook_table(title, header, rows, [one.pooled.rmse_deg for one in best])
+
+    @property
+    def rows_without(self) -> int:
+        """Rows of the cohort that tell nothing of the winner: the label or a column is missing."""
+        return max(self.cohort.rows - self.winner.model.pooled.rows, 0)
+
+    def _gram_rows(self, model: CrossValidation) -> dict[str, str]:
+        """Return which Gram rows a model is made of, for SQL; it may name cars."""
+        return {"gram_rows": self.cohort.gram_condition(model.signals)}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `select --json` prints."""
+        document: dict[str, Any] = {
+            "models": [{**model.as_dict(), **self._gram_rows(model)} for model in self.models],
+            "winner": self.winner.model.name,
+            "reason": self.winner.reason,
+            "cohort": self.cohort.condition.text,
+            "feature_set": features().identity(self.cohort.feature_set),
+            "drives": self.cohort.drive_count,
+            "rows": self.cohort.rows,
+            "rows_without": self.rows_without,
+            "drives_without_log": self.cohort.members.count_received,
+            "drives_left_out": self.cohort.left_out,
+            "intercept": self.intercept,
+            "folds": {
+                "by": self.folds.by,
+                "count": len(self.models[0].folds),
+                "leaking": self.folds.by == ROW_FOLDS,
+            },
+            "skipped": self.skipped,
+        }
+        for model, shortfall in zip(document["models"], self.winner.shortfalls, strict=False):
+            model["shortfall"] = shortfall.as_dict()
+        if self.choice is not None:
+            document["choice"] = self.choice.as_dict()
+        if self.searched is not None:
+            document["search"] = self.searched.as_dict()
+        if isinstance(self.distances, str):
+            document["nested"] = {"left_out": self.distances}
+        elif self.distances is not None:
+            document["nested"] = self.distances.as_dict()
+        if self.uncertainty is not None:
+            document["uncertainty"] = asdict(self.uncertainty)
+        return document
+
+
+def select(
+    cohort: AnyCohort,
+    candidates: Sequence[CandidateModel],
+    folds: Folding,
+    worth: Worth | None = None,
+    search: Search | None = None,
+    inputs: Sequence[str] = (),
+    *,
+    intercept: bool = True,
+) -> Selection[AnyCohort]:
+    """Cross-validate each candidate, and what a search finds among inputs; choose the winner.
+
+    `worth` overrides the search's rule. Candidates with absent or dependent signals are skipped,
+    with the reason. Raises `DataError` if none is left, or no drive has the label.
+    """
+    divided = cohort.folds(folds.by, folds.count)
+    label = catalogue().label
+    if not any(label in grams[0].signals for grams in divided.tables):
+        raise DataError(
+            f"no drive of the cohort {cohort.condition.text!r} has the label, {label}. Where cars "
+            "log their course, learn from it: fleet-slip select --label course"
+        )
+    models: list[CrossValidation] = []
+    skipped: dict[str, str] = {}
+    for candidate in candidates:
+        try:
+            models.append(validate(candidate, divided, intercept=intercept))
+        except (DataError, QuestionError) as error:
+            skipped[candidate.name] = str(error)
+    searched = None
+    if search:
+        searched = search_models(cohort, inputs, folds, search, intercept=intercept)
+    if searched is not None:
+        models += searched.models
+    if not models:
+        reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())
+        raise DataError(f"no candidate can be fitted on the cohort. {reasons}")
+    winner = choose_by(search, models, worth)
+    return Selection(
+        cohort, folds, tuple(models), winner, skipped, searched=searched, intercept=intercept
+    )
+
+
+def validate(
+    candidate: CandidateModel, folds: CohortFolds, *, intercept: bool = True
+) -> CrossValidation:
+    """Cross-validate one candidate by exact least squares in each fold."""
+    return cross_validate_inputs(
+        candidate.name,
+        folds,
+        candidate.signals,
+        catalogue().label,
+        input_scales(),
+        intercept=intercept,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class RequestedSelection(Selection[Any]):
+    """A selection that can be published: it tells what it was made from.
+
+    Attributes:
+        model_list, config_sha256: what was compared, such as `table1`, and its checksum.
+        left_out: the cars that `robust` left out, and what influence they had.
+        without_label: what changes of the course tell of the winner, if they taught it alone.
+        label_noise_deg: of the label, which every error has in it; None where it is not known.
+        request, asked: what was asked for, and of which drives.
+        remark: why another list than the usual one was compared.
+        examined: which drives were left out since they are not in order, as a sentence.
+    """
+
+    model_list: str
+    config_sha256: str
+    left_out: Mapping[str, Influential] = field(default_factory=dict)
+    without_label: WithoutLabel | None = None
+    label_noise_deg: float | None = None
+    request: SelectionRequest = field(default_factory=SelectionRequest)
+    asked: str = TRAINING_DRIVES
+    remark: str = ""
+    examined: str = ""
+
+    @property
+    def beyond_label_noise_deg(self) -> float | None:
+        """The winner's RMSE without the label's noise."""
+        if self.label_noise_deg is None:
+            return None
+        rmse_deg = self.winner.model.pooled.rmse_deg
+        return math.sqrt(max(rmse_deg**2 - self.label_noise_deg**2, 0.0))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `select --json` prints."""
+        named = {car: one.times for car, one in self.left_out.items()}
+        document = {
+            **super().as_dict(),
+            "vehicles_left_out": named,
+            "label_noise_deg": self.label_noise_deg,
+        }
+        course = {"without_label": self.without_label.as_dict()} if self.without_label else {}
+        said = {"remark": self.remark, "examined": self.examined}
+        return {**document, **course, **{name: text for name, text in said.items() if text}}
+
+    @classmethod
+    def of(
+        cls, selection: Selection[Any], model_list: str, config_sha256: str
+    ) -> "RequestedSelection":
+        """Return a selection with what it was made from."""
+        return cls(**vars(selection), model_list=model_list, config_sha256=config_sha256)
+
+
+# Answers a request: reads the Gram rows it needs, and selects among models.
+
+GIVEN = "given"
+"""The name of a model whose inputs were asked for one by one."""
+
+
+def answer_request(
+    warehouse: Warehouse, request: SelectionRequest, condition: str = TRAINING_DRIVES
+) -> RequestedSelection:
+    """Select on a condition's drives. Raises `UsageError` for options that do not go together."""
+    usual = not (request.models or request.model or request.label or request.chosen_by_inputs)
+    find = _answer_usual if usual else _answer
+    answer = replace(find(warehouse, request, condition), request=request, asked=condition)
+    if isinstance(answer.cohort, TaughtCohort):  # its figures are of the angle
+        return answer
+    told = without_label(warehouse, answer.cohort, answer.winner.model.pooled.rmse_deg)
+    noise_deg = None if told else label_noise_deg(warehouse, answer.cohort)
+    return replace(answer, without_label=told, label_noise_deg=noise_deg)
+
+
+def _answer_usual(
+    warehouse: Warehouse, request: SelectionRequest, condition: str
+) -> RequestedSelection:
+    """Select from the usual list, or from that of logged signals where it cannot be had."""
+    logged = replace(request, models=LOGGED_MODELS)
+    if request.features or request.by in (ROW_FOLDS, PARTS):
+        return _answer(warehouse, logged, condition)
+    why = "Gram rows that cars counted are of the logged signals alone."
+    if warehouse.logs.snapshot().rows:
+        try:
+            return _answer(warehouse, replace(request, models=DEFAULT_MODELS), condition)
+        except NotComputedError as error:
+            why = str(error)
+    remark = f"compared {LOGGED_MODELS}, not the usual list {DEFAULT_MODELS}: {why}"
+    return replace(_answer(warehouse, logged, condition), remark=remark)
+
+
+def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> RequestedSelection:
+    request.check()
+    name = request.models or (COURSE if request.label and not request.chosen_by_inputs else None)
+    model_list = _given(request) or (load_model_list(name) if name else None)
+    if model_list and model_list.label and not request.label:
+        request = replace(request, label=model_list.label)
+        request.check()
+    folds = _folding(request, model_list)
+    feature_set = _feature_set(request, model_list)
+    if request.label == BOTH:
+        folds = folds if request.by else folds.model_copy(update={"by": "vehicle"})
+        taught = load_taught(warehouse, condition, feature_set, folds.by)
+        return weigh(taught, request, model_list, folds)
+    if request.robust:
+        return _answer_without(warehouse, request, condition, model_list, feature_set)
+    distances = bool(request.nested and not request.ordered and not _search_of(request, model_list))
+    if not (request.ordered or request.resampled or distances):
+        return _compare_listed(
+            sum_cohort(warehouse, folds, condition, feature_set), request, model_list, folds
+        )
+    cohort = load_cohort(warehouse, condition, feature_set)
+    answer = (
+        _search(cohort, request, folds)
+        if request.ordered
+        else _compare_listed(cohort, request, model_list, folds)
+    )
+    if distances:
+        inputs = inputs_of(cohort, request.nested or WHOLE_SET)
+        answer = replace(answer, distances=try_distances(cohort, inputs, folds, request))
+    if not request.resampled:
+        return answer
+    figures = estimate_uncertainty(cohort, answer.winner.model, folds, request)
+    return replace(answer, uncertainty=figures)
+
+
+WEIGHTS = tuple(Fraction(4) ** power for power in range(4, -5, -1))
+"""Weights of a change of the course that are tried, where a row with the label has 1."""
+
+
+def weigh(
+    cohort: TaughtCohort,
+    request: SelectionRequest,
+    model_list: ModelList | None,
+    folds: Folding,
+) -> RequestedSelection:
+    """Select with the weight of the course that serves held-out drives with the label best.
+
+    Of those not worse for sure, by Student's t over the folds, the largest: few cars have a label.
+    """
+    found = [
+        _compare_listed(replace(cohort, weight=weight), request, model_list, folds)
+        for weight in WEIGHTS
+    ]
+    best = min((one.winner.model for one in found), key=lambda model: model.pooled.rmse)
+    return next(one for one in found if _may_be_as_good(one.winner.model, best))
+
+
+def _may_be_as_good(model: CrossValidation, best: CrossValidation) -> bool:
+    """Whether a model's error is not larger than that of the best, with 95 %."""
+    short = fall_short(model, best, Worth(0.0))
+    if not short.rmse > 0 or not short.standard_error:
+        return not short.rmse > 0
+    return student_t_two_sided(short.rmse / short.standard_error, len(best.folds) - 1) > 0.05
+
+
+def _answer_without(
+    warehouse: Warehouse,
+    request: SelectionRequest,
+    condition: str,
+    model_list: ModelList | None,
+    feature_set: str,
+) -> RequestedSelection:
+    """Select without the cars whose influence on a model of all compared inputs is unusual."""
+    cohort = load_cohort(warehouse, condition, feature_set)
+    inputs = inputs_of(cohort, request.nested or WHOLE_SET)
+    if model_list and model_list.model and not (request.nested or request.search):
+        listed = {name for one in model_list.model for name in one.signals}
+        inputs = tuple(name for name in cohort.inputs if name in listed)
+    served = cohort.serving(inputs)
+    left_out = influential_cars(served, clustered_moments(served, "drive"))
+    others = without_vehicles(cohort.condition, left_out)
+    answer = _answer(warehouse, replace(request, robust=False), others.text)
+    return replace(answer, left_out=left_out)
+
+
+def _given(request: SelectionRequest) -> ModelList | None:
+    if request.model is None:
+        return None
+    feature_set = request.features or (COURSE if request.label else PLAIN)
+    signals = require_inputs(request.model.split(","), feature_set)
+    model = CandidateModel(name=GIVEN, signals=signals)
+    return ModelList(description="One model", features=feature_set, model=(model,))
+
+
+def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding:
+    listed = model_list.folds if model_list else Folding()
+    folding = make_folding(request.by or listed.by, request.folds, listed.count)
+    if request.repeat and folding.count == EACH:
+        raise UsageError("repeat deals the folds anew, and folds of each drive have one deal only.")
+    return folding
+
+
+def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str:
+    usual = COURSE if request.label else PLAIN
+    named = request.features or (model_list.features if model_list else usual)
+    if request.label and not features().feature_set(named).change_ticks:
+        known = ", ".join(name for name, one in features().sets.items() if one.change_ticks)
+        raise QuestionError(
+            f"the feature set {named} has no changes of the course. Feature sets that have: "
+            f"{known}."
+        )
+    if request.by == ROW_FOLDS and named == PLAIN:
+        return next(name for name, one in features().sets.items() if one.row_folds)
+    return named
+
+
+def _compare_listed(
+    cohort: Cohort | SummedCohort,
+    request: SelectionRequest,
+    model_list: ModelList | None,
+    folds: Folding,
+) -> RequestedSelection:
+    listed = model_list.model if model_list else ()
+    search = _search_of(request, model_list)
+    worth = None if request.worth is None else parse_worth(request.worth)
+    inputs = inputs_of(cohort, request.nested or WHOLE_SET) if search else ()
+    nested = (
+        nested_candidates(inputs_of(cohort, request.nested))
+        if request.nested and not search
+        else ()
+    )
+    if search and not listed:
+        selection = select(cohort, (), folds, worth, search, inputs, intercept=request.intercept)
+        content = {"inputs": list(inputs), **search.model_dump()}
+        label = f"search:{search.method} {search.most}"
+        checksum = _checksum(sha256_of(canonical_json(content)), request.worth, request.intercept)
+        return RequestedSelection.of(selection, label, checksum)
+    described = ModelList(
+        description=model_list.description if model_list else "Nested models of an order",
+        features=cohort.feature_set,
+        folds=folds,
+        model=(*listed, *nested),
+        search=search,
+    )
+    usual = GIVEN if request.model else request.label
+    name = request.models or (usual if listed else None)
+    label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
+    selection = select(
+        cohort, described.model, folds, worth, search, inputs, intercept=request.intercept
+    )
+    checksum = _checksum(described.sha256, request.worth, request.intercept)
+    return RequestedSelection.of(selection, label, checksum)
+
+
+def checksum_of_list(model_list: ModelList, worth: str | None) -> str | None:
+    """Return the `config_sha256` of a selection from a list, None for one that only searches."""
+    return _checksum(model_list.sha256, worth, True) if model_list.model else None
+
+
+def _checksum(compared: str, worth: str | None, intercept: bool) -> str:
+    """Return the checksum of what is compared, and of what else is asked for and not usual."""
+    unusual: dict[str, Any] = {}
+    if worth is not None:
+        unusual["worth"] = worth
+    if not intercept:
+        unusual["intercept"] = False
+    return sha256_of(canonical_json({"compared": compared, **unusual})) if unusual else compared
+
+
+def _search_of(request: SelectionRequest, model_list: ModelList | None) -> Search | None:
+    if request.search:
+        if request.search not in METHODS:
+            raise QuestionError(f"unknown search {request.search!r}. Known: {', '.join(METHODS)}.")
+        asked = {"method": request.search, **({"most": request.most} if request.most else {})}
+        if request.label:
+            # The noise of the course hides in the error what a column is worth to the angle.
+            asked["rule"] = "best"
+        return Search.model_validate(asked)
+    return model_list.search if model_list else None
+
+
+def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> RequestedSelection:
+    nested = request.nested or WHOLE_SET
+    inputs = inputs_of(cohort, nested)
+    criterion = require_criterion(request.criterion or "cv")
+    ranking = ALL_SUBSETS if request.all_subsets else request.rank or "declared"
+    rule = Rule(ranking, criterion, parse_worth(request.worth))
+    found = select_inputs(cohort, inputs, folds, rule, request)
+    described = ModelList(
+        description="Inputs to choose from",
+        features=cohort.feature_set,
+        folds=folds,
+        model=(CandidateModel(name="inputs", signals=inputs),),
+    )
+    content = {"inputs": described.sha256, "ranking": rule.ranking, "criterion": rule.criterion}
+    content |= {"evidence": found.choice.evidence.kind}
+    selection = Selection(
+        cohort,
+        folds,
+        found.models,
+        found.winner,
+        {},
+        choice=found.choice,
+        intercept=request.intercept,
+    )
+    label = f"nested:{nested} {rule.ranking} {rule.criterion}"
+    checksum = _checksum(sha256_of(canonical_json(content)), request.worth, request.intercept)
+    return RequestedSelection.of(selection, label, checksum)

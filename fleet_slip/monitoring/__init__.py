@@ -1,1 +1,0 @@
-"""Keeping a warehouse in service: history of runs, health, data quality, drift."""

@@ -1,0 +1,1 @@
+"""Keep a fleet's data sound: faults, quality, nights, verify, repair, forget, retention."""

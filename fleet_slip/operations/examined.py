@@ -1,0 +1,270 @@
+"""Which drives of a cohort may train a model: those that were examined and are in order.
+
+Drives are examined once: what was found is kept in the user's cache, as hashes of drives, as long
+as Gram rows and thresholds are what they were. Many drives are examined in pieces of whole days, so
+that a night costs its own piece. Simulated drives are not examined: what is wrong in them is meant.
+Whatever trains, scores or publishes asks here, so that all have the same answer.
+"""
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from datetime import date
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from fleet_slip.base import canonical_json, number_of, sha256_of
+from fleet_slip.caches import cache_folder
+from fleet_slip.catalogue.facts import RECEIVED
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.errors import DataError, NotComputedError, UnexaminedError
+from fleet_slip.grams.job import find_backlog, update_grams
+from fleet_slip.grams.reader import GramReader
+from fleet_slip.ingest.drives import SOURCE
+from fleet_slip.operations.faults import Fault
+from fleet_slip.operations.peers import thresholds
+from fleet_slip.operations.quality import SensorFault, examine_drives
+from fleet_slip.storage.runs import hash_drive, without_drives
+from fleet_slip.storage.table import Snapshot, TableFile
+from fleet_slip.warehouse.condition import (
+    Condition,
+    asking,
+    drive_columns,
+    parse_condition,
+    row_columns,
+)
+from fleet_slip.warehouse.tables import (
+    Warehouse,
+    connect_tables,
+    gram_snapshots,
+    lock,
+    open_tables,
+    views_in,
+)
+
+NAME = "drive"
+"""Stands for a model's name in the hashes of drives."""
+
+PIECE = 100_000
+"""Drives that are compared with one another, or a quarter more: some 10 s and 600 MiB."""
+
+READ_ON_THE_WAY = 20_000_000
+"""Rows of logs that are read for their Gram rows before drives are examined: seconds."""
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What was found.
+
+    Attributes:
+        cohort: the condition without the drives that are not in order.
+        drives: how many were long enough to be examined.
+        found: the fault of each drive that is not in order, by its hash.
+        missing: how many measured drives were not, since they have no Gram rows.
+        missing_rows: how many rows of the logs are to be read for these.
+        made: how many drives' Gram rows were made to examine them.
+    """
+
+    cohort: str
+    drives: int = 0
+    found: Mapping[str, Fault] = field(default_factory=dict)
+    missing: int = 0
+    missing_rows: int = 0
+    made: int = 0
+
+    @property
+    def faults(self) -> Mapping[str, int]:
+        """How many drives have each fault, such as `reversed sideslip`."""
+        return Counter(" ".join((one.kind, *one.signals)) for one in self.found.values())
+
+    @property
+    def lacking(self) -> str:
+        """What was not examined and what to do, as a sentence; nothing if all were examined."""
+        if not self.missing:
+            return ""
+        return (
+            f"{number_of(self.missing, 'measured drive')} not examined: the Gram rows of their "
+            "signals are not there. Run: fleet-slip gram"
+        )
+
+    def __str__(self) -> str:
+        """Return what is left out, and what was not examined; nothing if all are in order."""
+        told = []
+        if self.made:
+            drives = number_of(self.made, "measured drive")
+            told.append(f"made the Gram rows of {drives} that were not there, to examine them.")
+        if self.found:
+            out = number_of(len(self.found), "drive")
+            told.append(
+                f"{out} of {self.drives:,} left out, not in order: {self._told_faults}. See "
+                "fleet-slip quality; --unexamined takes them all the same."
+            )
+        return " ".join([*told, self.lacking]).strip()
+
+    @property
+    def _told_faults(self) -> str:
+        return ", ".join(f"{number:,} {fault}" for fault, number in self.faults.items())
+
+    @contextmanager
+    def explaining(self) -> Iterator[None]:
+        """Say in the error of a cohort without a drive that all were left out, if they were."""
+        try:
+            yield
+        except DataError as error:
+            if (
+                len(self.found) < self.drives
+                or not self.found
+                or isinstance(error, NotComputedError)
+            ):
+                raise
+            raise DataError(
+                f"none of {number_of(self.drives, 'drive')} is in order: {self._told_faults}. "
+                "See fleet-slip quality; --unexamined takes them all the same."
+            ) from None
+
+    def findings(self, warehouse: Warehouse) -> tuple[SensorFault, ...]:
+        """Return the drives that are not in order by name, by day and drive."""
+        if not self.found:
+            return ()
+        query = "SELECT DISTINCT drive_id, vehicle_id, day FROM grams ORDER BY day, drive_id"
+        with connect_tables(warehouse, query) as database:
+            rows = database.execute(query).fetchall()
+        named = ((hash_drive(NAME, drive), (drive, car, day)) for drive, car, day in rows)
+        return tuple(SensorFault(*row, self.found[one]) for one, row in named if one in self.found)
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Days whose drives are examined together; `rows` are hashes of their Gram rows."""
+
+    days: tuple[date, ...]
+    drives: int
+    rows: tuple[int, ...]
+
+    def __add__(self, other: "_Piece") -> "_Piece":
+        return _Piece(self.days + other.days, self.drives + other.drives, self.rows + other.rows)
+
+    @property
+    def condition(self) -> Condition:
+        return parse_condition(f"day BETWEEN DATE '{self.days[0]}' AND DATE '{self.days[-1]}'")
+
+
+def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
+    """Examine the drives of a cohort like `quality`; return it without those not in order.
+
+    Drives without Gram rows of `signals` are not examined, and counted. Of a condition on rows all
+    drives are examined. Raises what `examine_drives` raises; where no drive is measured there is
+    nothing to examine.
+    """
+    measured = parse_condition(f"source IN ('{SOURCE}', '{RECEIVED}')")
+    asked = parse_condition(cohort, row_columns())
+    condition = measured if asked.columns - set(drive_columns()) else asked & measured
+    grams, logs = gram_snapshots(warehouse)
+    missing, missing_rows = _lacking(warehouse, grams, logs, condition)
+    parts: list[Mapping[str, Any]] = []
+    for piece in _pieces(warehouse, condition) if grams.rows else []:
+        about = {"cohort": condition.text, "from": piece.days[0], "root": warehouse.root.uri}
+        limits = thresholds().quality.model_dump(mode="json")
+        state = [list(piece.rows), sha256(canonical_json(limits).encode()).hexdigest()]
+        name = sha256(canonical_json({k: str(v) for k, v in about.items()}).encode()).hexdigest()
+        kept = cache_folder("examined") / f"{name[:32]}.json"
+        parts.append(_known(kept, state) or _examine(warehouse, condition & piece.condition))
+        _keep(kept, {**parts[-1], "state": state})
+    found = {
+        name: Fault(kind, tuple(signals), figure)
+        for one in parts
+        for name, (kind, signals, figure) in one["found"].items()
+    }
+    kept_cohort = without_drives(cohort, NAME, found)
+    examined = sum(one["examined"] for one in parts)
+    return Examined(kept_cohort, examined, found, missing, missing_rows)
+
+
+def find_trainable(warehouse: Warehouse, cohort: str) -> Examined:
+    """Return a cohort like `leave_out_faulty`, with Gram rows made first if these are missing.
+
+    Raises `UnexaminedError` if that takes more than seconds.
+    """
+    examined = leave_out_faulty(warehouse, cohort)
+    if not examined.missing:
+        return examined
+    made = examined.missing
+    if examined.missing_rows <= READ_ON_THE_WAY:
+        update_grams(warehouse)
+        examined = leave_out_faulty(warehouse, cohort)
+    if examined.missing:
+        raise UnexaminedError(f"{examined.lacking}; or take them all the same, unexamined")
+    return replace(examined, made=made)
+
+
+def _examine(warehouse: Warehouse, condition: Condition) -> Mapping[str, Any]:
+    report = examine_drives(warehouse, condition)
+    found = {
+        hash_drive(NAME, one.drive_id): [one.fault.kind, list(one.fault.signals), one.fault.figure]
+        for one in report.findings
+    }
+    return {"found": found, "examined": report.drives}
+
+
+def _known(kept: Path, state: list[Any]) -> Mapping[str, Any] | None:
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        known = json.loads(kept.read_bytes())
+        checksum = known.pop("sha256")
+        if known["state"] == state and checksum == sha256_of(canonical_json(known)):
+            found = {
+                str(name): [str(kind), [str(one) for one in signals], str(figure)]
+                for name, (kind, signals, figure) in known["found"].items()
+            }
+            return {"found": found, "examined": int(known["examined"])}
+    return None
+
+
+def _keep(kept: Path, content: Mapping[str, Any]) -> None:
+    with suppress(OSError):
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        draft = kept.with_suffix(f".{os.getpid()}")
+        draft.write_text(json.dumps({**content, "sha256": sha256_of(canonical_json(content))}))
+        draft.replace(kept)
+
+
+def _pieces(warehouse: Warehouse, condition: Condition) -> list[_Piece]:
+    """Divide a cohort's days, so that new days change the last piece alone."""
+    with GramReader(warehouse) as reader:
+        opened = reader.opened(PLAIN, condition)
+        statement = opened.statement("examined_days.sql", condition)
+        with asking(opened.database, condition):
+            found = opened.database.execute(statement).fetchall()
+    pieces: list[_Piece] = []
+    for day in (_Piece((day,), drives, (rows,)) for day, drives, rows in found if drives):
+        if pieces and pieces[-1].drives < PIECE:
+            pieces[-1] += day
+        else:
+            pieces.append(day)
+    if len(pieces) > 1 and 4 * pieces[-1].drives < PIECE:
+        pieces[-2:] = [pieces[-2] + pieces[-1]]
+    return pieces
+
+
+def _lacking(
+    warehouse: Warehouse, grams: Snapshot, logs: Snapshot, condition: Condition
+) -> tuple[int, int]:
+    """Return how many drives of a cohort's logs lack Gram rows, and the rows to read for them."""
+    missing = find_backlog(logs, grams).missing
+    if not missing:
+        return 0, 0
+    query = f"SELECT count(*) FROM drives WHERE {condition.sql} AND source <> '{RECEIVED}'"
+    others = frozenset(_paths(logs.files)) - frozenset(_paths(missing))
+    only = [grams, replace(logs, without=others)]
+    with open_tables(warehouse, views_in(query), only) as database:
+        lock(database, [path for one in only for path in one.paths])
+        with asking(database, condition):
+            [(drives,)] = database.execute(query).fetchall()
+    return int(drives), sum(file.rows for file in missing)
+
+
+def _paths(files: Iterable[TableFile]) -> list[str]:
+    return [file.path for file in files]

@@ -1,0 +1,306 @@
+"""Finds the drives of a car, or of a time: in log files, and in files that no version refers to."""
+
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import date
+
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.signals import catalogue, digest_drive
+from fleet_slip.config import read_sql
+from fleet_slip.errors import FleetSlipError
+from fleet_slip.grams.job import BEING_WRITTEN_HOURS
+from fleet_slip.storage.folder import TEMPORARY_PREFIX, StoredFile
+from fleet_slip.storage.runs import gather_runs
+from fleet_slip.storage.table import Snapshot, Table
+from fleet_slip.warehouse.database import open_database, reading_files
+from fleet_slip.warehouse.forgotten import Forgettable
+from fleet_slip.warehouse.tables import Warehouse
+
+# Removes files that nothing refers to any more: replaced ones, and leftovers of killed jobs.
+#
+# A file stays while a version of the last `retention_hours` refers to it, for queries, and while it
+# is younger, for jobs about to commit; and where a table has no Delta log.
+
+RETENTION_HOURS = 168
+"""Also the longest that can be kept: Delta checkpoints forget removed files after a week."""
+
+
+@dataclass(frozen=True)
+class VacuumReport:
+    """What was removed, or would be."""
+
+    files: tuple[str, ...]
+    size_bytes: int
+    dry_run: bool
+
+
+def vacuum(warehouse: Warehouse, retention_hours: float = RETENTION_HOURS) -> VacuumReport:
+    """Remove what nothing has referred to for some hours; gather the records of runs."""
+    warehouse.require()
+    expired = find_expired(warehouse, retention_hours)
+    removed = [file for file in expired if file.folder.remove(file)]
+    gather_runs(warehouse.root)
+    return _report(warehouse, removed, dry_run=False)
+
+
+def preview_vacuum(warehouse: Warehouse, retention_hours: float = RETENTION_HOURS) -> VacuumReport:
+    """Return what `vacuum` would remove. Raises `StorageError`."""
+    warehouse.require()
+    return _report(warehouse, find_expired(warehouse, retention_hours), dry_run=True)
+
+
+def _report(warehouse: Warehouse, files: Sequence[StoredFile], *, dry_run: bool) -> VacuumReport:
+    return VacuumReport(
+        files=tuple(str(file).removeprefix(f"{warehouse.root}/") for file in files),
+        size_bytes=sum(file.size_bytes for file in files),
+        dry_run=dry_run,
+    )
+
+
+def find_expired(warehouse: Warehouse, retention_hours: float) -> list[StoredFile]:
+    """Return the files that `vacuum` removes: of no version of so many hours, and as old."""
+    found = []
+    for table in warehouse.tables:
+        files = find_unreferenced(table)
+        snapshot = table.snapshot()
+        if snapshot.version is None:  # its Delta log may have been lost, and these be its data
+            continue
+        kept = snapshot.removed() - snapshot.removed(retention_hours)
+        found += [file for file in files if file.path not in kept]
+    found += find_temporary_files(warehouse)
+    return [file for file in found if file.age_hours >= retention_hours]
+
+
+def find_unreferenced(table: Table) -> list[StoredFile]:
+    """Return the data files below a table that its current version does not refer to."""
+    # Listed before the log is read: a file that is committed meanwhile is not taken for a leftover.
+    files = [
+        file
+        for file in table.folder.files()
+        if file.path.endswith(".parquet")
+        and not file.path.startswith("_delta_log/")
+        and not file.name.startswith(TEMPORARY_PREFIX)
+    ]
+    active = {file.path for file in table.snapshot().files}
+    return [file for file in files if file.path not in active]
+
+
+def find_temporary_files(warehouse: Warehouse) -> list[StoredFile]:
+    """Return what killed writers left under temporary names: ours, and the Delta library's."""
+    return [
+        file
+        for file in warehouse.root.files()
+        if file.name.startswith(TEMPORARY_PREFIX) or _OF_DELTA.fullmatch(file.path)
+    ]
+
+
+_OF_DELTA = re.compile(r"[^/]+/_delta_log/[^/]*#[^/]*")
+"""Temporary names of the Delta library, in a file system."""
+
+FILES_PER_QUERY = 256
+"""DuckDB keeps what it read of each file of a query: some 70 KB."""
+
+
+@dataclass(frozen=True)
+class OldFiles:
+    """What became of the files that no version refers to and that have some drives."""
+
+    deleted: int
+    kept: int
+    """Replaced files, which readers of the last week may need."""
+    pending: tuple[str, ...]
+    """Files that may be being written, and may have the drives: they are left alone."""
+
+
+def remove_old_files(warehouse: Warehouse, subject: Forgettable, *, replaced: bool) -> OldFiles:
+    """Delete the files with the drives that no version refers to; `replaced` ones if asked to.
+
+    Uncommitted ones go at once: since the fence none can land. Drives before a day are not barred:
+    there a file younger than an hour is left to its writer.
+    """
+    deleted = kept = 0
+    pending: list[str] = []
+    old = find_old_files(warehouse, subject)
+    for one in old:
+        if one.replaced and not replaced:
+            kept += 1
+        elif (one.is_young and subject.kind == "before") or not one.file.folder.remove(one.file):
+            pending.append(str(one.file))
+        else:
+            deleted += 1
+    gone, left = _remove_half_written(warehouse)
+    names = [name.removeprefix(f"{warehouse.root}/") for name in (*pending, *left)]
+    return OldFiles(deleted + gone, kept, tuple(names))
+
+
+def find_old_files(warehouse: Warehouse, subject: Forgettable) -> list["OldFile"]:
+    """Return unreferenced files with the drives; logs last, which may alone tell a car's drives."""
+    logs = list(_with_subject(warehouse.logs.snapshot(), subject))
+    drives = {drive for one in logs for drive in one.drives}
+    old = [
+        one
+        for one in read_old_files(warehouse.quarantine.snapshot())
+        if pc.any(quarantined_of(one.rows, subject, drives)).as_py()
+    ]
+    return [*old, *_with_subject(warehouse.grams.snapshot(), subject), *logs]
+
+
+def _remove_half_written(warehouse: Warehouse) -> tuple[int, list[str]]:
+    """Delete what killed writers left under temporary names, but for what may be being written."""
+    gone, left = 0, []
+    tables = {table.folder.name for table in warehouse.tables}
+    for file in find_temporary_files(warehouse):
+        table, *folders, _ = file.path.split("/")
+        if table not in tables or "_delta_log" in folders:
+            continue
+        if file.age_hours < BEING_WRITTEN_HOURS:
+            left.append(str(file))
+        else:
+            gone += file.folder.remove(file)
+    return gone, left
+
+
+@dataclass(frozen=True)
+class OldFile:
+    """A file that no version refers to: whether a commit removed it, and the drives concerned."""
+
+    file: StoredFile
+    replaced: bool
+    rows: pa.Table
+    drives: frozenset[str] = frozenset()
+    has_unused_names: bool = False
+    """Whether it was replaced because of names of other files in it: they may be the subject's."""
+
+    @property
+    def is_young(self) -> bool:
+        """Whether it may belong to a job that is running."""
+        return not self.replaced and self.file.age_hours < BEING_WRITTEN_HOURS
+
+
+def read_old_files(snapshot: Snapshot) -> Iterator[OldFile]:
+    """Yield replaced files and leftovers, with what tells the drives."""
+    known = snapshot.removed()
+    wanted = {"drive_id", "drive_name", "source_file", "vehicle_id", "day"}
+    for file in find_unreferenced(snapshot.table):
+        try:
+            names = snapshot.table.read_metadata(file.path).schema.to_arrow_schema().names
+            rows = snapshot.table.read(file.path, [name for name in names if name in wanted])
+            replaced = file.path in known
+            others = replaced and snapshot.table.has_unused_names(file.path)
+        except FleetSlipError:
+            continue  # half a file, or just deleted
+        yield OldFile(file, replaced, _with_day(file, rows), has_unused_names=others)
+
+
+def _with_day(file: StoredFile, rows: pa.Table) -> pa.Table:
+    key, _, day = file.path.partition("/")[0].partition("=")
+    if key != "day":
+        return rows
+    return rows.append_column("day", pa.repeat(date.fromisoformat(day), rows.num_rows))
+
+
+def _with_subject(snapshot: Snapshot, subject: Forgettable) -> Iterator[OldFile]:
+    for one in read_old_files(snapshot):
+        names = one.rows.filter(rows_of(one.rows, subject))["drive_id"].unique().to_pylist()
+        if names or one.has_unused_names:
+            yield replace(one, drives=frozenset(names))
+
+
+def rows_of(rows: pa.Table, subject: Forgettable) -> pa.ChunkedArray:
+    """Return which rows of `logs` or `grams` are of a subject."""
+    if subject.kind == "before":
+        return pc.less(rows["day"], pa.scalar(date.fromisoformat(subject.value)))
+    return pc.equal(rows[subject.column].cast(pa.string()), subject.value)
+
+
+def quarantined_of(
+    rows: pa.Table, subject: Forgettable, drives: Collection[str]
+) -> pa.ChunkedArray:
+    """Return which rows of the quarantine are of a subject, or of drives that are known to be.
+
+    Rows refused before a cut at a gap name the whole drive; older rows name no vehicle.
+    """
+    if subject.kind == "drive":
+        drives = {*drives, subject.value}
+    ids = rows["drive_id"].cast(pa.string())
+    concerned = {
+        name
+        for name in ids.unique().to_pylist()
+        if name and any(drive == name or drive.startswith(f"{name}-") for drive in drives)
+    }
+    of_drives = pc.is_in(ids, pa.array(sorted(concerned), pa.string()))
+    if subject.kind != "vehicle" or "vehicle_id" not in rows.schema.names:
+        return of_drives
+    return pc.or_(of_drives, pc.fill_null(rows_of(rows, subject), False))
+
+
+@dataclass(frozen=True)
+class Located:
+    """A subject's `drives` by log file, and all `known` log files that have such Gram rows."""
+
+    known: frozenset[str]
+    drives: Mapping[str, frozenset[str]]
+
+
+def locate(grams: Snapshot, subject: Forgettable) -> Located:
+    """Look for a subject's drives in the Gram rows."""
+    known: set[str] = set()
+    drives: dict[str, set[str]] = {}
+    columns = ["feature_set", "file", "drive_id", "vehicle_id", "day"]
+    for file in grams.files:
+        rows = grams.table.read(file.path, columns)
+        whole = pc.equal(rows["feature_set"], features().identity(PLAIN))
+        known.update(rows["file"].filter(whole).unique().to_pylist())
+        found = rows.filter(rows_of(rows, subject))
+        for path, drive in zip(
+            found["file"].to_pylist(), found["drive_id"].to_pylist(), strict=True
+        ):
+            drives.setdefault(path, set()).add(drive)
+    return Located(frozenset(known), {path: frozenset(names) for path, names in drives.items()})
+
+
+def drives_by_file(
+    logs: Snapshot, subject: Forgettable, located: Located
+) -> dict[str, frozenset[str]]:
+    """Return the drives concerned by log file, opening only files without Gram rows."""
+    active = [file.path for file in logs.files]
+    found = {path: located.drives[path] for path in active if path in located.drives}
+    unknown = [path for path in active if path not in located.known]
+    statement = read_sql("jobs", "find_drives.sql").format(condition=subject.condition)
+    with (
+        open_database(reading=logs.table.folder) as database,
+        reading_files(database, f"looking for drives in {logs.table.folder}"),
+    ):
+        for first in range(0, len(unknown), FILES_PER_QUERY):
+            paths = {
+                logs.table.uri(path): path for path in unknown[first : first + FILES_PER_QUERY]
+            }
+            database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
+            rows = database.execute(statement, {"value": subject.value}).fetchall()
+            for uri in {uri for _, uri in rows}:
+                names = frozenset(drive for drive, other in rows if other == uri)
+                found[paths[uri]] = names
+    return found
+
+
+def digests_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> Iterator[str]:
+    """Yield what tells a subject's drives by their counts, file by file of the logs."""
+    logs = warehouse.logs.snapshot()
+    drives = drives_by_file(logs, subject, located)
+    for file in logs.files:
+        if file.path not in drives:
+            continue
+        signals = [name for name in catalogue().signals if name in file.null_counts]
+        rows = warehouse.logs.read(file.path, ["drive_id", "vehicle_id", "tick", *signals])
+        ids = rows["drive_id"].cast(pa.string())
+        for name in sorted(drives[file.path]):
+            mine = rows.filter(pc.equal(ids, name)).combine_chunks()
+            [batch] = mine.to_batches()
+            counts = {signal: batch[signal] for signal in signals}
+            car, ticks = str(batch["vehicle_id"][0]), pl.Series(batch["tick"]).to_numpy()
+            yield digest_drive(car, str(file.day), ticks, counts)

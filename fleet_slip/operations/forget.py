@@ -1,0 +1,414 @@
+"""Forgets drives: one car's, a single one, or all before a day.
+
+Rows leave `quarantine`, `logs` (files are written again, in one commit) and `grams` (reconciled) in
+this order, so that what is left tells an interrupted job what to do. The record
+(`fleet_slip/warehouse/audit.py`) is written first, then quarantine and logs are fenced: commits
+that have not seen it conflict. Then Gram rows are fenced, against those that have not seen the new
+logs. What such jobs have written is deleted by them or here.
+"""
+
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from typing import Literal, TypeAlias
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.base import Progress, no_progress
+from fleet_slip.errors import FleetSlipError, QuestionError
+from fleet_slip.grams.gram_rows import Hashes, hash_numbers
+from fleet_slip.grams.job import reconcile
+from fleet_slip.models.manifest import TrainedOn, hash_drives
+from fleet_slip.models.registry import Registry
+from fleet_slip.operations.find_drives import (
+    Located,
+    digests_of,
+    drives_by_file,
+    find_old_files,
+    locate,
+    quarantined_of,
+    read_old_files,
+    remove_old_files,
+)
+from fleet_slip.operations.rewriting import (
+    Rewriting,
+    drop_unused_names,
+    forget_received,
+    rewrite,
+    write_without,
+)
+from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.runs import runs_under_way
+from fleet_slip.storage.table import Change, retry_conflicts, rows_in
+from fleet_slip.views import connect
+from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
+from fleet_slip.warehouse.tables import Warehouse
+
+# Which model versions were trained on drives that were forgotten.
+#
+# Who forgets judges the versions there are. One published meanwhile, of older Gram rows, counts as
+# trained on them until the erasure is done; then if one of its own drives
+# (`models/trained_drives.py`), or an unknown one, has no Gram rows any more.
+
+
+def marked_models(root: Folder) -> frozenset[str]:
+    """Return the model versions, NAME@VERSION, that were or may have been trained on them."""
+    entries = Audit(root).entries()
+    found = {name for entry in entries for name in entry.get("models", ())}
+    judged: dict[str, dict[str, int]] = {}
+    without: dict[str, int | None] = {}
+    for entry in entries:
+        if entry["event"] == "begun" and "judged" in entry:
+            judged[entry["subject"]] = entry["judged"]
+            without[entry["subject"]] = None
+        elif entry["event"] == "done":
+            without[entry["subject"]] = entry.get("grams_version")
+    warehouse = Warehouse(root)
+    registry = Registry.of(warehouse)
+    versions = [(n, number) for n in registry.names() if judged for number in registry.versions(n)]
+    drives = _PresentDrives(warehouse)
+    for subject, numbers in judged.items():
+        found |= {
+            f"{name}@{number}"
+            for name, number in versions
+            if number > numbers.get(name, 0)
+            and _may_have_seen(registry, name, number, without[subject], drives)
+        }
+    return frozenset(found)
+
+
+def newest_versions(root: Folder) -> dict[str, int]:
+    """Return the number of the newest version of each model."""
+    registry = Registry(root / "models")
+    return {name: max(registry.versions(name), default=0) for name in registry.names()}
+
+
+@dataclass(frozen=True)
+class _PresentDrives:
+    warehouse: Warehouse
+    hashed: dict[str, Hashes] = field(default_factory=dict)
+
+    def hashed_for(self, name: str) -> Hashes:
+        """Return them as the versions of a model keep them."""
+        if name not in self.hashed:
+            self.hashed[name] = hash_drives(name, self._hashes)
+        return self.hashed[name]
+
+    @cached_property
+    def _hashes(self) -> Hashes:
+        grams = self.warehouse.grams.snapshot()
+        drives = (grams.table.read(file.path, ["drive_id"])["drive_id"] for file in grams.files)
+        found = [hash_numbers(some.unique()) for some in drives]
+        return np.unique(np.concatenate(found)) if found else np.array([], dtype=np.uint64)
+
+
+def _may_have_seen(
+    registry: Registry, name: str, number: int, without: int | None, present: _PresentDrives
+) -> bool:
+    """Whether a version was, or may have been, trained on drives that Gram rows lack since then."""
+    if without is None:
+        return True
+    try:
+        manifest = registry.load(name, number).manifest
+        here = manifest.imported_from is None
+        if here and manifest.trained_on.grams_version >= without:
+            return False
+        made = registry.trained_drives(manifest)
+        return made is None or not bool(np.isin(made.salted, present.hashed_for(name)).all())
+    except FleetSlipError:
+        return True
+
+
+def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
+    """Return the model versions that were trained on one of the drives.
+
+    Each keeps which; for older ones the cohort is asked again of the Gram rows it could see. Those
+    of which it cannot be told count as trained on them.
+    """
+    registry = Registry.of(warehouse)
+    hashes = hash_numbers(pa.array(sorted(drives), pa.string()))
+    versions: dict[str, TrainedOn] = {}
+    known: list[str] = []
+    for name in registry.names():
+        for number in registry.versions(name):
+            reference = f"{name}@{number}"
+            try:
+                manifest = registry.load(name, number).manifest
+                made = registry.trained_drives(manifest)
+                if made is None:
+                    versions[reference] = manifest.trained_on
+                elif made.among(hashes).any():
+                    known.append(reference)
+            except FleetSlipError:
+                known.append(reference)
+    return sorted([*known, *_asked_again(warehouse, versions, drives)])
+
+
+def _asked_again(
+    warehouse: Warehouse, versions: Mapping[str, TrainedOn], drives: Collection[str]
+) -> list[str]:
+    """Return the versions that may be made of the drives; each Gram file is read once."""
+    cohorts = {trained.cohort for trained in versions.values()}
+    chosen = _in_cohorts(warehouse, cohorts, drives)
+
+    @cache
+    def drives_in(path: str) -> frozenset[str]:
+        ids = warehouse.grams.read(path, ["drive_id"])["drive_id"].cast(pa.string())
+        return frozenset(drives).intersection(ids.unique().to_pylist())
+
+    @cache
+    def drives_at(version: int) -> frozenset[str]:
+        try:
+            files = warehouse.grams.snapshot(version).files
+            return frozenset().union(*(drives_in(file.path) for file in files))
+        except FleetSlipError:
+            return frozenset(drives)  # that version is gone
+
+    return [
+        reference
+        for reference, trained in versions.items()
+        if (mine := chosen[trained.cohort])
+        and not mine.isdisjoint(drives_at(trained.grams_version))
+    ]
+
+
+def _in_cohorts(
+    warehouse: Warehouse, cohorts: Collection[str], drives: Collection[str]
+) -> dict[str, frozenset[str]]:
+    """Return which of some drives each cohort has; all, of a cohort that cannot be asked for."""
+    # Who lists models need not wait for a database.
+    from fleet_slip.views import connect  # noqa: PLC0415
+    from fleet_slip.warehouse.condition import asking, parse_condition  # noqa: PLC0415
+
+    found = {}
+    with connect(warehouse.root, query="grams", scenarios=True) as database:
+        database.register(
+            "forgotten", pa.table({"drive_id": pa.array(sorted(drives), pa.string())})
+        )
+        for cohort in cohorts:
+            asked = "SELECT DISTINCT drive_id FROM grams WHERE drive_id IN (FROM forgotten) AND "
+            try:
+                condition = parse_condition(cohort)
+                with asking(database, condition):
+                    rows = database.execute(asked + condition.sql).fetchall()
+                found[cohort] = frozenset(row[0] for row in rows)
+            except FleetSlipError:
+                found[cohort] = frozenset(drives)
+    return found
+
+
+@dataclass(frozen=True)
+class ForgetReport:
+    """What was done."""
+
+    drives: int
+    rows: int
+    files_rewritten: int
+    files_removed: int
+    """Log files all of whose drives were forgotten."""
+    models: tuple[str, ...]
+    """Model versions, NAME@VERSION, that were trained on the drives."""
+    old_files_deleted: int
+    old_files_left: int
+    """Files with the drives that no version refers to, kept for readers of the last week."""
+    pending: tuple[str, ...] = ()
+    """Files below the root, and runs, that may still have the drives: repeat it when they ended."""
+
+    @property
+    def changed(self) -> bool:
+        """Whether there was anything to do."""
+        return bool(self.drives or self.old_files_deleted)
+
+
+def forget(
+    warehouse: Warehouse,
+    subject: Forgettable,
+    *,
+    now: bool = False,
+    progress: Progress = no_progress,
+    source_file: str | None = None,
+) -> ForgetReport:
+    """Forget drives; with `now`, delete the replaced files at once instead of by `vacuum`.
+
+    `source_file` is the file by whose name they go. It can be repeated after interruptions.
+    `progress` counts files. What was superseded is no drive: of it, `now` deletes the old files.
+    Raises `QuestionError` for no such drive, `StorageError`, `ConflictError`.
+    """
+    audit = Audit(warehouse.root)
+    located = locate(warehouse.grams.snapshot(), subject)
+    drives = _drives_of(warehouse, subject, located)
+    state = audit.state(subject)
+    superseded = False
+    if not drives and state is None and subject.kind != "before":
+        superseded = now and any(one.drives for one in find_old_files(warehouse, subject))
+        if not superseded:
+            raise QuestionError(
+                f"no drive has {subject.column} {subject.value!r}. See: "
+                'fleet-slip sql "SELECT drive_id, vehicle_id, day FROM drives"'
+            )
+    models = audit.models_of(subject)
+    if state == ALLOWED or superseded or (drives and state != "begun"):
+        models = _begin(warehouse, audit, subject, drives, located, source_file)
+    for name in (cleared := warehouse.root / "cleared").names():
+        cleared.delete(name)  # releases up to 0.2 listed cars there that were not forgotten
+    for table in (warehouse.quarantine, warehouse.logs):
+        if drives or state:
+            table.fence()
+    landed = _drives_of(warehouse, subject, located)
+    if not landed <= drives:  # they landed before the fence
+        drives |= landed
+        models = _begin(warehouse, audit, subject, drives, located, source_file)
+    _forget_quarantined(warehouse, subject, drives)
+    rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
+    if not audit.names_are_exact:
+        drop_unused_names(warehouse)
+    if drives or state:
+        warehouse.grams.fence()
+    rows += forget_received(warehouse, subject)
+    uncommitted = remove_old_files(warehouse, subject, replaced=False)
+    reconcile(warehouse)
+    old = remove_old_files(warehouse, subject, replaced=now)
+    if drives or superseded or state in ("begun", ALLOWED):
+        audit.end(subject, warehouse.grams.snapshot().version)
+    under_way = [f"the run {run}" for run in runs_under_way(warehouse.root)] if now else []
+    return ForgetReport(
+        drives=len(drives),
+        rows=rows,
+        files_rewritten=rewritten,
+        files_removed=removed,
+        models=tuple(models),
+        old_files_deleted=uncommitted.deleted + old.deleted,
+        old_files_left=old.kept,
+        pending=(*old.pending, *under_way) if drives or state else (),
+    )
+
+
+def _begin(
+    warehouse: Warehouse,
+    audit: Audit,
+    subject: Forgettable,
+    drives: Collection[str],
+    located: Located,
+    source_file: str | None,
+) -> list[str]:
+    judged = newest_versions(warehouse.root)
+    models = models_trained_on(warehouse, drives)
+    known = () if subject.kind == "before" else digests_of(warehouse, subject, located)
+    audit.begin(subject, len(drives), models, judged, set(known), source_file)
+    return models
+
+
+def _drives_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> frozenset[str]:
+    """Return the drives in the logs and the quarantine, and what interrupted jobs left in grams."""
+    in_logs = drives_by_file(warehouse.logs.snapshot(), subject, located)
+    found: set[str] = set().union(*in_logs.values(), *located.drives.values())
+    for file in warehouse.quarantine.snapshot().files:
+        rows = warehouse.quarantine.read(file.path)
+        names = rows.filter(quarantined_of(rows, subject, ()))["drive_id"].drop_null()
+        found.update(names.to_pylist())
+    return frozenset(found)
+
+
+def _rewrite_logs(
+    warehouse: Warehouse, subject: Forgettable, located: Located, progress: Progress
+) -> tuple[int, int, int]:
+    def attempt() -> tuple[int, int, int]:
+        logs = warehouse.logs.snapshot()
+        drives = drives_by_file(logs, subject, located)
+        concerned = [file for file in logs.files if file.path in drives]
+        if not concerned:
+            return 0, 0, 0
+        kept = rewrite(
+            warehouse,
+            logs,
+            [Rewriting("kept", [file], drives[file.path]) for file in concerned],
+            note={"job": "forget"},
+            data_change=True,
+            progress=progress,
+        )
+        rows = sum(file.rows for file in concerned) - sum(map(rows_in, kept))
+        return rows, len(kept), len(concerned) - len(kept)
+
+    return retry_conflicts(attempt)
+
+
+def _forget_quarantined(
+    warehouse: Warehouse, subject: Forgettable, drives: Collection[str]
+) -> None:
+    def attempt() -> None:
+        snapshot = warehouse.quarantine.snapshot()
+        add, remove = write_without(snapshot, lambda rows: quarantined_of(rows, subject, drives))
+        if remove:
+            snapshot.commit_or_discard(Change(add=add, remove=remove, note={"job": "forget"}))
+
+    if drives:
+        retry_conflicts(attempt)
+
+
+Calling: TypeAlias = Literal["drive_name", "source_file"]
+"""A column of `drives` by which people know a drive; several drives may have the same."""
+
+
+def forget_called(
+    warehouse: Warehouse,
+    calling: Calling,
+    value: str,
+    *,
+    now: bool = False,
+    progress: Progress = no_progress,
+) -> ForgetReport:
+    """Forget every drive of a name or file, also what takes the place of some meanwhile.
+
+    Raises `QuestionError` if there is none.
+    """
+    reports, done = [], set[str]()
+    source_file = value if calling == "source_file" else None
+    while drives := _drives_called(warehouse, calling, value, old=now and not done) - done:
+        for drive in sorted(drives):
+            subject = Forgettable("drive", drive)
+            with suppress(QuestionError):  # it was replaced
+                reports.append(forget(warehouse, subject, now=now, source_file=source_file))
+            progress(1, len(drives))
+        done |= drives
+    if not reports:
+        raise QuestionError(
+            f"no drive has {calling} {value!r}. See: "
+            f'fleet-slip sql "SELECT drive_id, {calling} FROM drives"'
+        )
+    return ForgetReport(
+        drives=sum(one.drives for one in reports),
+        rows=sum(one.rows for one in reports),
+        files_rewritten=sum(one.files_rewritten for one in reports),
+        files_removed=sum(one.files_removed for one in reports),
+        models=tuple(sorted({name for one in reports for name in one.models})),
+        old_files_deleted=sum(one.old_files_deleted for one in reports),
+        old_files_left=max(one.old_files_left for one in reports),
+        pending=tuple(dict.fromkeys(name for one in reports for name in one.pending)),
+    )
+
+
+def _drives_called(
+    warehouse: Warehouse, calling: Calling, value: str, *, old: bool
+) -> frozenset[str]:
+    """Return the drives in logs and Gram rows, and in old files too if these are to go."""
+    with connect(warehouse.root, query="drives", scenarios=True) as database:
+        statement = f"SELECT DISTINCT drive_id FROM drives WHERE {calling} = $value"
+        found = {name for (name,) in database.execute(statement, {"value": value}).fetchall()}
+    for rows in _named_rows(warehouse, calling, old=old):
+        if calling in rows.column_names:
+            mine = pc.equal(rows[calling].cast(pa.string()), value)
+            found.update(rows["drive_id"].filter(mine).cast(pa.string()).unique().to_pylist())
+    return frozenset(found)
+
+
+def _named_rows(warehouse: Warehouse, calling: Calling, *, old: bool) -> Iterator[pa.Table]:
+    grams = warehouse.grams
+    for file in grams.snapshot().files:
+        if calling in grams.read_metadata(file.path).schema.to_arrow_schema().names:
+            yield grams.read(file.path, ["drive_id", calling])
+    if old:
+        for table in (warehouse.logs, warehouse.grams):
+            yield from (one.rows for one in read_old_files(table.snapshot()))

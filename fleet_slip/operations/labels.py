@@ -1,0 +1,346 @@
+"""Days and files whose labels have another factor, or another zero, than all others.
+
+In one drive the car, its tyres and the road hide a label that is half as large again. But a mapping
+or a logger that changes does so for many cars at once: the median over the drives of a day tells
+what none of them does. So each drive's label is compared with what the relation of all drives
+predicts, and the medians of a day, and of a file, with those of all others. Where the road is icy
+or all cars are laden, medians differ as well, by less than `FACTOR` and `LEAST_OFFSET`.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.base import BoolArray, FloatArray, IntArray
+from fleet_slip.catalogue.facts import RECEIVED
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.operations.faults import DriveBatches, Fault
+from fleet_slip.operations.peers import MAD_TO_STD, QualityThresholds
+from fleet_slip.regression.gram import GramTable
+
+# Drives whose label has the sign turned, however many they are.
+#
+# Where the label of a few drives is reversed, they are unlike their peers. Where it is that of
+# half of them, as after a car was logged again with another sign, there is no usual drive to be
+# unlike. But each drive still keeps to one relation between the signals and the label, or to its
+# opposite. So the sign of each drive is found together with the relation, by turns: least squares
+# over all drives with their signs, then the sign with which each drive agrees with it.
+
+ROUNDS = 20
+LEAST_EXPLAINED = 0.5
+"""Part of the label's variance that the relation must explain, else signs mean nothing."""
+
+REVERSED_GAIN = -0.5
+"""A label on its prediction: 1 in order, -1 reversed."""
+
+
+def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> dict[int, Fault]:
+    """Return the drives in order whose label contradicts that of the others, with the fault.
+
+    The fewer drives are the reversed ones; of two halves, the one without the first drive, since
+    drives come in the order of their names, which begin with the day.
+    """
+    if label not in table.signals or len(table.signals) < 2 or in_order.sum() < 2:
+        return {}
+    drives = DriveBatches.of(table, in_order)
+    gains = _gains(drives, table.signals.index(label))
+    if gains is None:
+        return {}
+    return {
+        int(drive): Fault("reversed", (label,), f"gain {gain:.3f} on what the others tell")
+        for drive, gain in zip(drives.rows, gains, strict=True)
+        if gain < REVERSED_GAIN
+    }
+
+
+def _gains(drives: DriveBatches, label: int) -> FloatArray | None:
+    """Return the gain of each drive's label on the relation that most keep to; None without one."""
+    parts = [label_parts(batch.covariances(), label) for batch in drives]
+    inputs = sum(part[0].sum(axis=0) for part in parts)
+    with_label = np.concatenate([part[1] for part in parts])
+    variance = float(sum(part[2].sum() for part in parts))
+    starts = [np.ones(len(drives)), _leading_signs(inputs, with_label)]
+    found = [_settle(drives, label, inputs, with_label, start) for start in starts]
+    explained = [float(weights @ (signs @ with_label)) for signs, weights, _ in found]
+    signs, _, gains = found[int(np.argmax(explained))]
+    if not max(explained) > LEAST_EXPLAINED * variance:
+        return None
+    majority = np.sign(signs.sum()) or signs[0]
+    return np.asarray(gains * majority)
+
+
+def _settle(
+    drives: DriveBatches,
+    label: int,
+    inputs: FloatArray,
+    with_label: FloatArray,
+    signs: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return signs that agree with the relation that they make, the relation, and the gains."""
+    for _ in range(ROUNDS):
+        weights = solve(inputs, signs @ with_label)
+        gains = np.concatenate([_gain(b.covariances(), label, weights) for b in drives])
+        agreeing = np.where(gains < 0, -1.0, 1.0)
+        if (agreeing == signs).all():
+            break
+        signs = agreeing
+    return signs, weights, gains
+
+
+def label_parts(covariances: FloatArray, label: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the covariances of the inputs, theirs with the label, and the label's variances."""
+    others = np.delete(np.arange(covariances.shape[1]), label)
+    inputs = covariances[:, others[:, None], others]
+    return inputs, covariances[:, others, label], covariances[:, label, label]
+
+
+def _gain(covariances: FloatArray, label: int, weights: FloatArray) -> FloatArray:
+    inputs, with_label, _ = label_parts(covariances, label)
+    predicted = np.einsum("i,dij,j->d", weights, inputs, weights)
+    least = np.finfo(np.float64).tiny
+    return np.asarray(with_label @ weights / np.maximum(predicted, least))
+
+
+def _leading_signs(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
+    """Return on which side of the direction that most drives share each of them is."""
+    scale = np.sqrt(np.maximum(np.diagonal(inputs), np.finfo(np.float64).tiny))
+    directions = with_label / scale
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = directions / np.where(lengths > 0, lengths, 1.0)
+    _, vectors = np.linalg.eigh(directions.T @ directions)
+    return np.where(directions @ vectors[:, -1] < 0, -1.0, 1.0)
+
+
+def solve(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
+    """Return the weights of least squares, scaled so that units do not matter."""
+    scale = np.sqrt(np.maximum(np.diagonal(inputs), np.finfo(np.float64).tiny))
+    solution, *_ = np.linalg.lstsq(inputs / np.outer(scale, scale), with_label / scale, rcond=1e-12)
+    return np.asarray(solution / scale)
+
+
+FACTOR = 1.4
+"""A label's median gain on its prediction, over that of others: 0.77 where all cars are laden."""
+
+LEAST_OFFSET = math.radians(0.4)
+"""Of a label's median residual, in rad: 0.1 deg on ice and with load."""
+
+FEWEST_CARS = 4
+
+OFFSET, GAIN = 0, 1
+"""Of a drive's figures: the mean residual in counts, and the logarithm of the gain."""
+
+LEAST_GAIN = 1e-3
+"""Of a label that does not follow its prediction at all."""
+
+
+@dataclass(frozen=True)
+class _Difference:
+    """A group of drives beside all others: medians of offset and gain, and how sure they differ."""
+
+    own: FloatArray
+    others: FloatArray
+    scores: FloatArray
+
+    @classmethod
+    def of(cls, own: FloatArray, others: FloatArray, cars: Sequence[int]) -> "_Difference":
+        """Compare figures, drives first, of so many cars each."""
+        middles = [np.median(figures, axis=0) for figures in (own, others)]
+        variance = np.zeros(2)
+        for figures, middle, many in zip((own, others), middles, cars, strict=True):
+            spread = MAD_TO_STD * np.median(np.abs(figures - middle), axis=0)
+            variance += math.pi / 2 * spread**2 / many
+        error = np.sqrt(np.maximum(variance, np.finfo(np.float64).tiny))
+        return cls(middles[0], middles[1], np.abs(middles[0] - middles[1]) / error)
+
+    def fault(self, label: str, limit: float) -> tuple[int, Fault] | None:
+        """Return which figure is odd, and the fault; None if none is."""
+        scale = float(catalogue()[label].scale)
+        for at, least in ((GAIN, math.log(FACTOR)), (OFFSET, LEAST_OFFSET / scale)):
+            difference = float(self.own[at] - self.others[at])
+            if abs(difference) > least and self.scores[at] > limit:
+                return at, _fault(label, at, difference, "of other days")
+        return None
+
+    def is_nearer(self, figures: FloatArray, at: int) -> BoolArray:
+        """Say which drives are nearer to the group than to the others, by one figure."""
+        own, others = self.own[at], self.others[at]
+        return np.asarray(np.abs(figures[:, at] - own) < np.abs(figures[:, at] - others))
+
+
+def find_odd_days(
+    table: GramTable,
+    in_order: BoolArray,
+    groups: Sequence[IntArray],
+    cars: IntArray,
+    limits: QualityThresholds,
+) -> dict[int, Fault]:
+    """Return the drives of days or files whose labels are unlike the others', with the fault.
+
+    `groups` are ways to number the drives of the table, such as by day. The most unlike group is
+    taken out and the rest is judged again; a group of more than half of the drives is no odd one.
+    """
+    label = catalogue().label
+    if label not in table.signals or len(table.signals) < 2:
+        return {}
+    faults: dict[int, Fault] = {}
+    usual = in_order.copy()
+    while usual.sum() >= limits.min_drives:
+        figures = _figures(DriveBatches.of(table, usual), table.signals.index(label))
+        if figures is None:
+            break
+        found = list(_odd(figures, [group[usual] for group in groups], cars[usual], limits.limit))
+        if not found:
+            rows = np.flatnonzero(usual)
+            alone = _alone(figures, label, limits.limit)
+            return faults | {int(rows[drive]): fault for drive, fault in alone.items()}
+        _, mask, fault = max(found, key=lambda one: one[0])
+        rows = np.flatnonzero(usual)[mask]
+        faults |= dict.fromkeys(rows.tolist(), fault)
+        usual[rows] = False
+    return faults
+
+
+def _figures(drives: DriveBatches, label: int) -> FloatArray | None:
+    """Return offset and gain of each drive's label; None if the others hardly explain labels."""
+    parts = [label_parts(batch.covariances(), label) for batch in drives]
+    inputs, with_label = (np.concatenate([part[at] for part in parts]) for at in (0, 1))
+    weights = solve(inputs.sum(axis=0), with_label.sum(axis=0))
+    explained = with_label @ weights
+    predicted, least = np.einsum("i,dij,j->d", weights, inputs, weights), np.finfo(np.float64).tiny
+    variance = predicted * np.concatenate([part[2] for part in parts])
+    if np.median(explained**2 / np.maximum(variance, least)) < LEAST_EXPLAINED:
+        return None
+    gains = explained / np.maximum(predicted, least)
+    means = drives.each(lambda batch: batch.matrices[:, 0, 1:])
+    offsets = means[:, label] - np.delete(means, label, axis=1) @ weights
+    return np.stack([offsets, np.log(np.maximum(gains, LEAST_GAIN))], axis=1)
+
+
+def _alone(figures: FloatArray, label: str, limit: float) -> dict[int, Fault]:
+    """Return single drives that are far off by twice what a group may be."""
+    middle = np.median(figures, axis=0)
+    apart = figures - middle
+    spread = MAD_TO_STD * np.median(np.abs(apart), axis=0)
+    least = {OFFSET: LEAST_OFFSET / float(catalogue()[label].scale), GAIN: math.log(FACTOR)}
+    return {
+        int(drive): _fault(label, at, float(apart[drive, at]), "of other drives")
+        for at, bound in least.items()
+        for drive in np.flatnonzero(np.abs(apart[:, at]) > max(2 * bound, limit * spread[at]))
+    }
+
+
+def _fault(label: str, at: int, difference: float, of: str) -> Fault:
+    if at == GAIN:
+        return Fault("scaled", (label,), f"gain {math.exp(difference):.3f} of that {of}")
+    return Fault("biased", (label,), f"offset {difference:+.1f} counts from that {of}")
+
+
+def _odd(
+    figures: FloatArray, groups: Sequence[IntArray], cars: IntArray, limit: float
+) -> Iterator[tuple[float, BoolArray, Fault]]:
+    """Yield how sure it is that a group is odd, which drives are of it, and the fault."""
+    several = len(np.unique(cars)) > 1
+    for numbers in groups:
+        for number in np.unique(numbers):
+            mask = numbers == number
+            if 2 * mask.sum() > len(mask):
+                continue
+            many = [len(np.unique(cars[m])) if several else int(m.sum()) for m in (mask, ~mask)]
+            if min(many) < FEWEST_CARS:
+                continue
+            unlike = _Difference.of(figures[mask], figures[~mask], many)
+            if found := unlike.fault(catalogue().label, limit):
+                at, fault = found
+                yield float(unlike.scores[at]), mask & unlike.is_nearer(figures, at), fault
+
+
+# Drives of one car that overlap in time: a car drives once, so that their rows count twice.
+#
+# A drive without a log began when its name says, and lasted as long as its rows: it has no more.
+# Of such a drive and a log that overlap it is named, since the log is what counts where both come;
+# of two drives without one the longer, since one message that covers a day must not accuse all
+# others of that day; of two logs the one that begins later.
+
+LEAST_S = 1.0
+"""Clocks of two loggers differ by less."""
+
+COLUMNS = ("vehicle_id", "started_at", "duration_s", "drive_id", "source", "n")
+
+
+def find_repeated(drives: pa.Table) -> dict[str, Fault]:
+    """Return what is wrong with each drive during which another one of its car was under way.
+
+    `drives` has the columns of `COLUMNS`, a row or more for each drive; those whose time is not
+    known are left out.
+    """
+    known = _timed(drives.select(COLUMNS))
+    known = known.group_by(["vehicle_id", "drive_id"]).aggregate(
+        [("start_s", "min"), ("lasted_s", "max"), ("counted_s", "sum"), ("received", "min")]
+    )
+    order = [(name, "ascending") for name in ("vehicle_id", "start_s_min", "drive_id")]
+    found: dict[str, Fault] = {}
+    longest: dict[str, Any] | None = None
+    for row in _of_busy_cars(known.sort_by(order)).to_pylist():
+        if longest is None or row["vehicle_id"] != longest["vehicle_id"]:
+            longest = row
+            continue
+        common_s = min(_ends_s(longest), _ends_s(row)) - row["start_s_min"]
+        earlier = common_s > LEAST_S and _is_suspect(longest, row)
+        if common_s > LEAST_S:
+            named, other = (longest, row) if earlier else (row, longest)
+            figure = f"{common_s:.0f} s are in {other['drive_id']}"
+            found.setdefault(named["drive_id"], Fault("repeated", (), figure))
+        if earlier or _ends_s(row) > _ends_s(longest):
+            longest = row
+    return found
+
+
+def _is_suspect(earlier: Mapping[str, Any], later: Mapping[str, Any]) -> bool:
+    """Whether the earlier of two drives at once is named, not the later."""
+    if not (earlier["received_min"] and later["received_min"]):
+        return bool(earlier["received_min"])
+    lasted_s = (_ends_s(drive) - drive["start_s_min"] for drive in (earlier, later))
+    return bool(next(lasted_s) > next(lasted_s))
+
+
+def _timed(drives: pa.Table) -> pa.Table:
+    """Return when drives began and how long they lasted, of those that tell."""
+    source, name = (drives[column].cast(pa.string()) for column in ("source", "drive_id"))
+    received = pc.equal(source, RECEIVED)
+    moment = pc.utf8_slice_codeunits(name, -16)
+    said_s = pc.strptime(moment, "%Y%m%dT%H%M%SZ", "s", error_is_null=True).cast(pa.int64())
+    logged_us = drives["started_at"].cast(pa.timestamp("us", tz="UTC")).cast(pa.int64())
+    logged_s = pc.divide(logged_us.cast(pa.float64()), 1e6)
+    start_s = pc.if_else(received, said_s.cast(pa.float64()), logged_s)
+    counted_s = pc.multiply(drives["n"].cast(pa.float64()), float(SAMPLE_TIME_S))
+    columns = {
+        "vehicle_id": drives["vehicle_id"].cast(pa.string()),
+        "drive_id": name,
+        "start_s": start_s,
+        "lasted_s": pc.coalesce(drives["duration_s"].cast(pa.float64()), 0.0),
+        "counted_s": pc.if_else(received, counted_s, 0.0),
+        "received": received,
+    }
+    return pa.table(columns).filter(start_s.is_valid())
+
+
+def _of_busy_cars(drives: pa.Table) -> pa.Table:
+    """Return the drives of cars of which one begins before the one before it has ended."""
+    starts = drives["start_s_min"].to_numpy()
+    ends = starts + np.maximum(
+        drives["lasted_s_max"].to_numpy(), drives["counted_s_sum"].to_numpy()
+    )
+    cars = drives["vehicle_id"].combine_chunks().dictionary_encode()
+    codes = cars.indices.to_numpy(zero_copy_only=False)
+    busy = (codes[1:] == codes[:-1]) & (ends[:-1] - starts[1:] > LEAST_S)
+    return drives.filter(pa.array(np.isin(codes, codes[1:][busy])))
+
+
+def _ends_s(drive: Mapping[str, Any]) -> float:
+    lasted_s: float = max(drive["lasted_s_max"], drive["counted_s_sum"])
+    return float(drive["start_s_min"]) + lasted_s

@@ -1,0 +1,256 @@
+"""Drift: a published model's error on each day since it was trained, on a control chart.
+
+Errors are exact, from Gram rows: with v = (coefficients, -1) the sum of squared errors of a day is
+v'Gv. The chart is one of individuals, a day being an individual, since days differ by more than
+their rows would make them (Montgomery, Introduction to Statistical Quality Control, ch. 6). What
+is usual is learned from the training days, each predicted by the model's signals fitted on the
+other training days; so that no day is judged by a model that it made. A new day is within the
+limits mean +- t s sqrt(1 + 1/m), the prediction interval of a normal individual after m others,
+with Student's t for m - 1 degrees of freedom: with few days the limits are as wide as they must be.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import date
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+from matplotlib.figure import Figure
+
+from fleet_slip.base import number_of
+from fleet_slip.catalogue.features import PLAIN, features, input_scales
+from fleet_slip.errors import ConfigError, DataError, StorageError
+from fleet_slip.grams.sums import sum_days
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.predict import counts_model
+from fleet_slip.models.registry import ModelVersion
+from fleet_slip.operations.peers import MonitorThresholds, thresholds
+from fleet_slip.pages.drawing import DESK, STYLE, Size, colour
+from fleet_slip.regression.figures import error_sums, student_t_quantile
+from fleet_slip.regression.folds import least_squares
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import LinearModel
+from fleet_slip.storage.folder import storage_errors
+from fleet_slip.warehouse.condition import Condition, parse_cohort
+from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Centre line and control limits of one figure, in degrees; the lower may be missing."""
+
+    centre: float
+    lower: float | None
+    upper: float
+
+    @classmethod
+    def of(cls, usual: Sequence[float], false_alarms: float) -> "Limits":
+        """Return the two-sided prediction interval of one more individual."""
+        m = len(usual)
+        t = student_t_quantile(1 - false_alarms / 2, m - 1)
+        half = t * stdev(usual) * math.sqrt(1 + 1 / m)
+        return cls(fmean(usual), fmean(usual) - half, fmean(usual) + half)
+
+    @classmethod
+    def above(cls, usual: Sequence[float], false_alarms: float) -> "Limits":
+        """Return the upper limit of a positive figure, made on its logarithm: less is no alarm."""
+        logarithms = cls.of([math.log(value) for value in usual], 2 * false_alarms)
+        return cls(math.exp(logarithms.centre), None, math.exp(logarithms.upper))
+
+    def beyond(self, value: float) -> bool:
+        """Whether a value is outside."""
+        return value > self.upper or (self.lower is not None and value < self.lower)
+
+
+@dataclass(frozen=True)
+class Day:
+    """Errors of one day.
+
+    Attributes:
+        training: the day made the model; its errors are those of the model without it.
+        alarms: figures beyond their limits, of a new day.
+    """
+
+    day: date
+    drives: int
+    rows: int
+    error_mean_deg: float
+    error_std_deg: float
+    rmse_deg: float
+    training: bool
+    alarms: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A control chart of a model version.
+
+    Attributes:
+        drives_left_out: drives of the cohort without Gram rows of the model's feature set, since
+            their cars sent no log.
+    """
+
+    model: str
+    cohort: str
+    days: tuple[Day, ...]
+    mean_limits: Limits
+    std_limits: Limits
+    feature_set: str = PLAIN
+    drives_left_out: int = 0
+
+    @property
+    def alarms(self) -> tuple[Day, ...]:
+        """The days that are beyond a limit."""
+        return tuple(day for day in self.days if day.alarms)
+
+
+def monitor(
+    warehouse: Warehouse,
+    version: ModelVersion,
+    condition: str | Condition | None = None,
+    since: date | None = None,
+    limits: MonitorThresholds | None = None,
+) -> Chart:
+    """Chart a model's error day by day. Reads Gram rows only.
+
+    `condition` chooses the drives; by default those that satisfy the condition of its training.
+    Days from `since` are new; by default those after the last day of the logs it was trained on.
+    Raises `DataError` if fewer than `min_training_days` are left to learn from.
+    """
+    limits = limits or thresholds().monitor
+    manifest = version.manifest
+    condition = parse_cohort(condition or manifest.trained_on.cohort)
+    feature_set = features().name_of(manifest.trained_on.feature_set)
+    sums = sum_days(warehouse, manifest.signals, condition, feature_set)
+    days, grams = sums.days, sums.grams
+    last = _last_training_day(warehouse, version) if since is None else None
+    training = [day < since if since else last is not None and day <= last for day in days]
+    if sum(training) < limits.min_training_days:
+        raise DataError(
+            f"{version.reference} was trained on {number_of(sum(training), 'day')} of the cohort "
+            f"{condition.text!r}, too few to tell what is usual. {limits.min_training_days} "
+            "days are needed. Choose another cohort, or a later first new day."
+        )
+    models = _models(manifest, feature_set, grams, training)
+    found = [
+        _day(day, gram, count, model, known)
+        for day, gram, count, model, known in zip(
+            days, grams, sums.drives, models, training, strict=True
+        )
+    ]
+    usual = [day for day in found if day.training]
+    mean = Limits.of([day.error_mean_deg for day in usual], limits.false_alarms_per_day)
+    std = Limits.above([day.error_std_deg for day in usual], limits.false_alarms_per_day)
+    judged = tuple(day if day.training else _judged(day, mean, std) for day in found)
+    return Chart(
+        version.reference,
+        condition.text,
+        judged,
+        mean,
+        std,
+        feature_set,
+        sums.left_out,
+    )
+
+
+def _models(
+    manifest: Manifest, feature_set: str, grams: Sequence[Gram], training: Sequence[bool]
+) -> list[LinearModel]:
+    """Return the model that predicts each day: of a training day, the one made without it."""
+    own = [gram for gram, known in zip(grams, training, strict=True) if known]
+    total = sum(own[1:], own[0])
+    champion = counts_model(manifest, feature_set)
+    refit = least_squares(champion.signals, champion.label, intercept=not manifest.through_origin)
+    return [
+        refit(total - gram) if known else champion
+        for gram, known in zip(grams, training, strict=True)
+    ]
+
+
+def _day(day: date, gram: Gram, drives: int, model: LinearModel, training: bool) -> Day:
+    figures = error_sums(model, gram).figures(input_scales()[model.label])
+    mean, std, rmse = figures.error_mean_deg, figures.error_std_deg, figures.rmse_deg
+    return Day(day, drives, gram.n, mean, std, rmse, training)
+
+
+def _judged(day: Day, mean: Limits, std: Limits) -> Day:
+    beyond = {"mean": mean.beyond(day.error_mean_deg), "std": std.beyond(day.error_std_deg)}
+    return replace(day, alarms=tuple(name for name, yes in beyond.items() if yes))
+
+
+_SINCE = "fleet-slip monitor {name} --since DAY"
+
+
+def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | None:
+    """Return the newest day of the logs as they were when the model was trained."""
+    if version.manifest.imported_from is not None:
+        raise DataError(
+            f"{version.reference} was trained in another data root. Say which day is the first new "
+            f"one: {_SINCE.format(name=version.manifest.name)}"
+        )
+    logs = warehouse.logs
+    number = version.manifest.trained_on.logs_version
+    try:
+        then = logs.snapshot(number)
+    except StorageError:
+        raise StorageError(
+            f"{logs.folder}: version {number}, which {version.reference} was trained on, is no "
+            "longer in the Delta log. Say which day is the first new one: "
+            f"{_SINCE.format(name=version.manifest.name)}"
+        ) from None
+    return max((file.day for file in then.files if file.day), default=None)
+
+
+# The control chart of a model: its error on each day, with limits.
+
+HEIGHT_IN = 3.6
+TONES = {"training": "muted", "new": "model_4", "beyond": "unstable"}
+
+
+def control_chart(chart: Chart, size: Size) -> Figure:
+    """Draw mean and standard deviation of the error over the days, in degrees."""
+    figure = Figure(figsize=(size.width_in, HEIGHT_IN), layout="constrained")
+    above, below = figure.subplots(2, sharex=True)
+    panels = (
+        (above, "mean", [day.error_mean_deg for day in chart.days], chart.mean_limits),
+        (below, "std", [day.error_std_deg for day in chart.days], chart.std_limits),
+    )
+    for axes, name, values, limits in panels:
+        groups: dict[str, list[tuple[date, float]]] = {}
+        for day, value in zip(chart.days, values, strict=True):
+            kind = "training" if day.training else "beyond" if name in day.alarms else "new"
+            groups.setdefault(kind, []).append((day.day, value))
+        for kind, points in groups.items():
+            days, errors = zip(*points, strict=True)
+            axes.plot(days, errors, "o", markersize=4, color=colour(TONES[kind]))
+        axes.axhline(limits.centre, color=colour("muted"), linewidth=0.7)
+        for limit in (limits.lower, limits.upper):
+            if limit is not None:
+                axes.axhline(limit, color=colour("unstable"), linewidth=0.8, linestyle="--")
+        axes.set_title(f"{name} of the error, deg", color=colour("muted"))
+    above.set_title(
+        "training days grey, new days blue, beyond a limit red",
+        color=colour("muted"),
+        loc="right" if size.wide else "left",
+        **({} if size.wide else {"y": 1.14}),
+    )
+    locator: Any = AutoDateLocator(minticks=2, maxticks=10 if size.wide else 5)  # type: ignore[no-untyped-call]
+    below.xaxis.set_major_locator(locator)
+    below.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
+    return figure
+
+
+def save_chart(chart: Chart, file: Path) -> None:
+    """Draw to a file, whose suffix says the format. Raises `ConfigError`, `StorageError`."""
+    with mpl.rc_context(STYLE), storage_errors(file):
+        figure = control_chart(chart, DESK)
+        figure.suptitle(f"{chart.model}: error on each day", x=0.01, ha="left")
+        try:
+            # Without a date, the same chart is the same file.
+            figure.savefig(file, metadata={"Date": None} if file.suffix == ".svg" else None)
+        except ValueError as error:
+            raise ConfigError(f"{file}: {error}") from None

@@ -1,0 +1,275 @@
+"""What a night came to: `Fleet.nightly` returns it."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+from fleet_slip.base import number_of
+from fleet_slip.errors import AlarmError, FleetSlipError, printable
+from fleet_slip.operations.monitor import Chart, control_chart
+from fleet_slip.pages.drawing import Picture, draw
+from fleet_slip.pages.page import Cell, Mark, ReportTable, Tile, count, fill_in, table
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.runs import Beginning, PastNight, hash_drive
+
+if TYPE_CHECKING:
+    from fleet_slip.operations.quality import SensorFault
+
+State: TypeAlias = Literal["done", "attention", "failed", "left out"]
+
+
+@dataclass(frozen=True)
+class NightStep:
+    """One step of a night.
+
+    Attributes:
+        state: whether it was done, calls for attention, failed, or could not be asked for.
+        told: what it did or found, in a sentence.
+        error: what it failed with.
+    """
+
+    name: str
+    state: State
+    told: str
+    seconds: float
+    error: FleetSlipError | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the step for a JSON document."""
+        told = {"name": self.name, "state": self.state, "told": self.told}
+        return {**told, "exit_code": self.error.exit_code if self.error else None}
+
+
+@dataclass(frozen=True)
+class NightReport:
+    """The summary of a night. All but `seconds` is the same if the night was killed on its way.
+
+    Attributes:
+        before: what the root had when the night first began.
+        faults: the drives whose sensors are not in order; `new_faults` came with this night. The
+            summary names them.
+        chart: the errors of the champion of before on the days since it was trained, if there are
+            enough days to tell what is usual.
+        past: the nights before, the newest first.
+    """
+
+    model: str
+    night: date
+    root: str
+    steps: tuple[NightStep, ...]
+    before: Beginning
+    drives: int
+    rows: int
+    quarantined: int
+    champion: str | None
+    candidate: str | None
+    faults: "tuple[SensorFault, ...]"
+    chart: "Chart | None"
+    past: Sequence[PastNight]
+    seconds: float
+
+    @property
+    def new_faults(self) -> "tuple[SensorFault, ...]":
+        """The faulty drives that the night before did not know of."""
+        known = self.before.known
+        return tuple(
+            one for one in self.faults if hash_drive(self.model, one.drive_id) not in known
+        )
+
+    @property
+    def problem(self) -> FleetSlipError | None:
+        """The first failure, else what calls for attention; None after a good night."""
+        told = f"the night of {self.night}"
+        for step in self.steps:
+            if step.error is not None:
+                return type(step.error)(f"{told}: {step.name} failed: {step.error}")
+        calling = [f"{one.name}: {one.told}" for one in self.steps if one.state == "attention"]
+        return AlarmError(f"{told}: {' '.join(calling)}") if calling else None
+
+    @property
+    def exit_code(self) -> int:
+        """That of the first failure, 10 if something calls for attention, else 0."""
+        return self.problem.exit_code if self.problem else 0
+
+    @property
+    def verdict(self) -> str:
+        """How the night went, in a few words."""
+        failed = [step.name for step in self.steps if step.state == "failed"]
+        calling = [step.name for step in self.steps if step.state == "attention"]
+        told = [f"{' and '.join(failed)} failed"] if failed else []
+        if calling:
+            calls = "calls" if len(calling) == 1 else "call"
+            told.append(f"{' and '.join(calling)} {calls} for attention")
+        return ", ".join(told) or "all went well"
+
+    @property
+    def gained(self) -> str:
+        """What the night brought in."""
+        rows, drives = self.rows - self.before.rows, self.drives - self.before.drives
+        held = self.quarantined - self.before.quarantined
+        told = f"{number_of(drives, 'drive')}, {number_of(rows, 'row')}"
+        return f"{told}; in quarantine: {number_of(held, 'row')}" if held else told
+
+    def as_past(self) -> PastNight:
+        """Return the night as the record keeps it."""
+        return PastNight(
+            self.night,
+            self.exit_code,
+            self.drives,
+            self.rows,
+            self.champion,
+            {step.name: step.state for step in self.steps},
+            frozenset(hash_drive(self.model, one.drive_id) for one in self.faults),
+        )
+
+    def as_text(self) -> str:
+        """Return the summary for people, lines of text."""
+        wide = max(len(step.name) for step in self.steps)
+        mark = {"done": "ok", "attention": "LOOK", "failed": "FAILED", "left out": "-"}
+        lines = [
+            f"{self.model}, night of {self.night}: {self.verdict} (exit code {self.exit_code})",
+            f"new: {self.gained}; champion: {self.champion or 'none'}"
+            + (f", was {self.before.champion}" if self._moved else ""),
+            *(f"  {one.name:<{wide}}  {mark[one.state]:<6}  {one.told}" for one in self.steps),
+            *(
+                f"  {one.drive_id}: {one.fault.kind} {' '.join(one.fault.signals)}"
+                for one in self.new_faults
+            ),
+        ]
+        return "\n".join(printable(line).rstrip() for line in lines)
+
+    @property
+    def _moved(self) -> bool:
+        return self.before.champion not in (None, self.champion)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `nightly --json` prints."""
+        return {
+            "model": self.model,
+            "night": self.night,
+            "exit_code": self.exit_code,
+            "verdict": self.verdict,
+            "drives": self.drives,
+            "new_drives": self.drives - self.before.drives,
+            "rows": self.rows,
+            "new_rows": self.rows - self.before.rows,
+            "new_rows_quarantined": self.quarantined - self.before.quarantined,
+            "champion": self.champion,
+            "champion_before": self.before.champion,
+            "candidate": self.candidate,
+            "steps": [step.as_dict() for step in self.steps],
+            "faults": [one.as_dict() for one in self.faults],
+            "new_faults": [one.drive_id for one in self.new_faults],
+            "alarms": [str(day.day) for day in self.chart.alarms] if self.chart else [],
+            "seconds": self.seconds,
+        }
+
+
+# The summary of a night as files: text, JSON, and one static page.
+
+MARKS: dict[str, Mark] = {"done": "good", "attention": "miss", "failed": "miss", "left out": ""}
+
+
+def write_summary(report: NightReport, folder: Path) -> list[Path]:
+    """Write NIGHT.txt, .json and .html, each as a whole; return them. Raises `StorageError`."""
+    files = {
+        f"{report.night}.txt": report.as_text() + "\n",
+        f"{report.night}.json": json.dumps(report.as_dict(), indent=2, default=str) + "\n",
+        f"{report.night}.html": render_night(report),
+    }
+    place = LocalFolder(folder)
+    for name, text in files.items():
+        place.put(name, text.encode("utf-8", "backslashreplace"))
+    return [folder / name for name in files]
+
+
+def render_night(report: NightReport) -> str:
+    """Return the page of a night."""
+    drawn = None if report.chart is None else draw(_picture(report.chart))
+    return fill_in(
+        "night.html.j2",
+        night=report,
+        tiles=_tiles(report),
+        steps=_steps(report),
+        faults=_faults(report),
+        drawn=drawn,
+        past=_past(report),
+    )
+
+
+def _tiles(report: NightReport) -> list[Tile]:
+    before = report.before.champion
+    was = f", was {before}" if before not in (None, report.champion) else ""
+    tiles = [
+        Tile(f"{report.exit_code}", "exit code"),
+        Tile(f"{report.drives:,}", f"drives, {count(report.rows)} rows"),
+        Tile(report.champion or "none", f"champion{was}"),
+        Tile(f"{len(report.new_faults)}", f"newly faulty drives, {len(report.faults)} in all"),
+    ]
+    if report.candidate not in (None, report.champion):
+        tiles.append(Tile(report.candidate or "", "candidate, waits for fleet-slip promote"))
+    return tiles
+
+
+def _steps(report: NightReport) -> ReportTable:
+    rows: list[list[str | Cell]] = [
+        [one.name, Cell(one.state, MARKS[one.state]), one.told, f"{one.seconds:.1f}"]
+        for one in report.steps
+    ]
+    return table(
+        "night-steps",
+        "What was done",
+        ["step", "state", "what came of it", "seconds"],
+        rows,
+        left=3,
+    )
+
+
+def _faults(report: NightReport) -> ReportTable | None:
+    if not report.new_faults:
+        return None
+    rows: list[list[str | Cell]] = [
+        [
+            one.drive_id,
+            one.vehicle_id,
+            one.fault.kind,
+            " ".join(one.fault.signals),
+            one.fault.figure,
+        ]
+        for one in report.new_faults
+    ]
+    head = ["drive", "car", "fault", "signals", "what shows it"]
+    return table("night-faults", "Sensors not in order since this night", head, rows, left=5)
+
+
+def _past(report: NightReport) -> ReportTable | None:
+    if not report.past:
+        return None
+    rows: list[list[str | Cell]] = []
+    for one, earlier in zip(report.past, [*report.past[1:], None], strict=True):
+        found = [f"{name} {state}" for name, state in one.steps.items() if MARKS[state] == "miss"]
+        more = "" if earlier is None else f"{one.drives - earlier.drives:+,}"
+        told = Cell("; ".join(found) or "all went well", "miss" if found else "good")
+        rows.append([str(one.night), told, str(one.exit_code), more, one.champion or "none"])
+    head = ["night", "how it went", "exit code", "drives", "champion"]
+    return table("nights", f"The last {number_of(len(rows), 'night')}", head, rows, left=2)
+
+
+def _picture(chart: Chart) -> Picture:
+    new = [day for day in chart.days if not day.training]
+    title = f"{chart.model}: error on each day"
+    caption = (
+        f"Mean and standard deviation of the error on {number_of(len(chart.days), 'day')}, "
+        f"{len(new)} of them new; dashed: the limits that the training days set. "
+        f"Beyond a limit: {number_of(len(chart.alarms), 'day')}."
+    )
+    return Picture(
+        "control-chart",
+        title,
+        caption,
+        "Points over the days, beside their limits.",
+        lambda size: control_chart(chart, size),
+    )

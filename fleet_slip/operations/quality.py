@@ -1,0 +1,268 @@
+"""Faulty sensors, drive by drive, from Gram rows alone."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from datetime import date
+from math import ceil
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.base import BoolArray, IntArray
+from fleet_slip.catalogue.course import relate
+from fleet_slip.catalogue.facts import DELAY, TRAINING_DRIVES
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import DataError
+from fleet_slip.grams.calibration import course_moments
+from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
+from fleet_slip.grams.reader import GramReader
+from fleet_slip.grams.receiver_delay import changed_delays
+from fleet_slip.ingest.load import Origin
+from fleet_slip.operations.faults import DriveBatches, Fault, find_implausible
+from fleet_slip.operations.labels import find_odd_days, find_repeated, find_reversed_labels
+from fleet_slip.operations.peers import QualityThresholds, settle, thresholds
+from fleet_slip.regression.gram import GramTable
+from fleet_slip.warehouse.condition import Condition, asking, parse_cohort, parse_condition
+from fleet_slip.warehouse.database import sql_text
+from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class SensorFault:
+    """A drive whose sensors are not in order."""
+
+    drive_id: str
+    vehicle_id: str
+    day: date
+    fault: Fault
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the finding for a JSON document."""
+        named = {"drive_id": self.drive_id, "vehicle_id": self.vehicle_id, "day": self.day}
+        return named | asdict(self.fault)
+
+
+BY_DAY = attrgetter("day", "drive_id")
+
+
+@dataclass(frozen=True)
+class QualityReport:
+    """What was examined and found.
+
+    Attributes:
+        drives: Gram rows long enough to be examined.
+        compared: those among them that had enough peers to be compared with.
+        findings: one for each that is not in order, by day and drive.
+    """
+
+    drives: int
+    compared: int
+    findings: tuple[SensorFault, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report for a JSON document."""
+        return {
+            "drives": self.drives,
+            "compared": self.compared,
+            "findings": [finding.as_dict() for finding in self.findings],
+        }
+
+
+def examine_drives(
+    warehouse: Warehouse,
+    condition: str | Condition = TRAINING_DRIVES,
+    limits: QualityThresholds | None = None,
+) -> QualityReport:
+    """Examine the drives that satisfy a condition: labels beside all others, then model by model.
+
+    Each drive is examined, whatever signals it has.
+    Raises like `fleet_slip.grams.cohort.load_cohort`.
+    """
+    drives = parse_cohort(condition)
+    with GramReader(warehouse) as reader:
+        models = _vehicle_models(reader, drives)
+        known = _faulty_courses(reader, drives) | _changed_delays(reader, drives)
+        known |= find_wrong_labels(load_cohort(reader, drives), limits)
+        reports = [
+            examine(load_cohort(reader, drives & of_model), limits, known) for of_model in models
+        ]
+    findings = [finding for report in reports for finding in report.findings]
+    return QualityReport(
+        sum(report.drives for report in reports),
+        sum(report.compared for report in reports),
+        tuple(sorted(findings, key=BY_DAY)),
+    )
+
+
+def _faulty_courses(reader: GramReader, condition: Condition) -> dict[str, Fault]:
+    """Return the drives whose course is not one, if Gram rows of its changes are there."""
+    return {
+        drive: Fault(fault.kind, fault.signals, fault.figure)
+        for drives in course_moments(reader, condition).values()
+        for drive, moments in drives.items()
+        if (relation := relate(moments)) and (fault := relation.fault)
+    }
+
+
+def _changed_delays(reader: GramReader, condition: Condition) -> dict[str, Fault]:
+    """Return the drives of cars whose receivers' delays changed: one delay corrects them all.
+
+    If there are Gram rows of the set `delay` for all of the cohort.
+    """
+    try:
+        opened = reader.opened(DELAY, condition)
+    except DataError:
+        return {}
+    return {
+        drive: Fault(
+            "changed delay",
+            ("course",),
+            f"{1000 * one.before:.0f} ms late before {one.since}, {1000 * one.after:.0f} ms since",
+        )
+        for one in changed_delays(opened.batches(condition)).values()
+        for drive in one.drives
+    }
+
+
+def _vehicle_models(reader: GramReader, condition: Condition) -> list[Condition]:
+    """Return, for each vehicle model of a cohort, the condition that a drive is of it."""
+    opened = reader.opened(PLAIN, condition)
+    cohort = opened.statement("cohort.sql", condition)
+    with asking(opened.database, condition):
+        statement = f"SELECT DISTINCT vehicle_model, source FROM ({cohort}\n)"
+        rows = opened.database.sql(statement).fetchall()
+    if not rows:
+        raise empty_cohort_error(opened, condition)
+    found = set(rows)
+    require_training({source for _, source in found}, condition)
+    models = sorted({model for model, _ in found}, key=str)
+    return [
+        parse_condition(f"vehicle_model IS NOT DISTINCT FROM {sql_text(model)}") for model in models
+    ]
+
+
+def find_wrong_labels(cohort: Cohort, limits: QualityThresholds | None = None) -> dict[str, Fault]:
+    """Return the drives whose label contradicts that of the others, of whatever vehicle model.
+
+    One that is reversed, and one with another factor or zero since a day or in a file: what is
+    wrong with many drives at once may be the usual in one vehicle model.
+    """
+    limits = limits or thresholds().quality
+    found: dict[str, Fault] = {}
+    for table, metadata in _long_drives(cohort, limits.min_rows):
+        in_order = np.ones(len(table), dtype=np.bool_)
+        in_order[list(find_implausible(table, limits.min_correlation))] = False
+        if in_order.sum() >= limits.min_drives:
+            faults = find_reversed_labels(table, in_order, catalogue().label)
+            in_order[list(faults)] = False
+            faults |= find_odd_days(table, in_order, *_days_and_files(metadata), limits)
+            names = metadata["drive_id"].to_pylist()
+            found |= {names[drive]: fault for drive, fault in faults.items()}
+    return found
+
+
+def examine(
+    cohort: Cohort,
+    limits: QualityThresholds | None = None,
+    known: Mapping[str, Fault] | None = None,
+) -> QualityReport:
+    """Examine each drive of a cohort, beside other drives of its car and of its vehicle model.
+
+    First for what no car does (`find_implausible`), then by comparison with its peers, if it has
+    `min_drives` of them; see `_peer_groups`. `known` are drives that are not in order.
+    """
+    limits = limits or thresholds().quality
+    drives = compared = 0
+    known = {**(known or {}), **find_repeated(cohort.drives)}
+    findings = []
+    for table, metadata in _groups(cohort, limits.min_rows):
+        names = metadata["drive_id"].to_pylist()
+        faults = find_implausible(table, limits.min_correlation)
+        faults |= _saturated(table, metadata, limits)
+        faults = {drive: known[name] for drive, name in enumerate(names) if name in known} | faults
+        in_order = np.array([drive not in faults for drive in range(len(table))])
+        beside_peers = np.zeros(len(table), dtype=np.bool_)
+        for group in _peer_groups(metadata, limits.min_drives):
+            if in_order[group].sum() >= limits.min_drives:
+                beside_peers[group] = True
+                found = _unlike_peers(table, group, in_order, limits)
+                faults |= {drive: fault for drive, fault in found.items() if drive not in faults}
+        drives += len(table)
+        compared += int(beside_peers.sum())
+        named = enumerate(metadata.select(["drive_id", "vehicle_id", "day"]).to_pylist())
+        findings += [SensorFault(**row, fault=faults[i]) for i, row in named if i in faults]
+    findings.sort(key=BY_DAY)
+    return QualityReport(drives, compared, tuple(findings))
+
+
+def _days_and_files(metadata: pa.Table) -> tuple[list[IntArray], IntArray]:
+    """Return the days of drives and the files that they came in, as numbers, and their cars."""
+    origins = [Origin.of_drive(drive) for drive in metadata["drive_id"].to_pylist()]
+    files = [one.digest if one else "" for one in origins]
+    of_day, of_file, of_car = (
+        np.unique(np.array(values, dtype=str), return_inverse=True)[1]
+        for values in (metadata["day"].to_pylist(), files, metadata["vehicle_id"].to_pylist())
+    )
+    return [of_day, of_file], of_car
+
+
+def _peer_groups(metadata: pa.Table, enough: int) -> Iterator[BoolArray]:
+    """Yield which drives to compare with one another: those of a car, and those of many cars.
+
+    A car with enough drives is compared with itself, which shows what differs between its drives.
+    Among other cars it counts by no more drives than they have, the first by name, so that a car
+    that is logged every day does not say alone what is usual; that shows what is wrong with all of
+    its drives.
+    """
+    ids, cars = (np.array(metadata[n].to_pylist(), dtype=str) for n in ("drive_id", "vehicle_id"))
+    of_car = np.unique(cars, return_inverse=True)[1]
+    counts = np.bincount(of_car)
+    for car in np.flatnonzero(counts >= enough):
+        yield of_car == car
+    if len(counts) > 1:
+        few = counts[counts < enough]
+        most = max(ceil(enough / len(counts)), int(np.median(few)) if len(few) else 1)
+        number = np.empty(len(cars), dtype=np.int64)  # of each drive among those of its car
+        number[np.lexsort((ids, of_car))] = np.concatenate([np.arange(n) for n in counts])
+        yield (counts[of_car] < enough) | (number < most)
+
+
+def _long_drives(cohort: Cohort, min_rows: int) -> Iterator[tuple[GramTable, pa.Table]]:
+    """Yield the drives of each set of signals that are long enough, with their metadata."""
+    start = 0
+    for table in cohort.tables:
+        long = table.n >= min_rows
+        yield table.take(long), cohort.drives.slice(start, len(table)).filter(pa.array(long))
+        start += len(table)
+
+
+def _groups(cohort: Cohort, min_rows: int) -> Iterator[tuple[GramTable, pa.Table]]:
+    """Yield the same, each vehicle model by itself."""
+    for table, metadata in _long_drives(cohort, min_rows):
+        models = np.array([str(name) for name in metadata["vehicle_model"].to_pylist()])
+        for model in sorted(set(models)):
+            yield table.take(models == model), metadata.filter(pa.array(models == model))
+
+
+def _saturated(table: GramTable, metadata: pa.Table, limits: QualityThresholds) -> dict[int, Fault]:
+    clipped = np.array([count or 0 for count in metadata["saturated"].to_pylist()])
+    fraction = clipped / table.n
+    return {
+        int(drive): Fault("saturated", (), f"{clipped[drive]:,} values at the end of their range")
+        for drive in np.flatnonzero(fraction > limits.max_saturated_per_row)
+    }
+
+
+def _unlike_peers(
+    table: GramTable, group: BoolArray, in_order: BoolArray, limits: QualityThresholds
+) -> dict[int, Fault]:
+    """Return the faults of the drives of a group that are not as the others of it."""
+    members = table.take(group)
+    peers, suspects = settle(members, in_order[group], catalogue().label, limits)
+    if not suspects.any():
+        return {}
+    faults = peers.explain(DriveBatches.of(members, suspects))
+    return dict(zip(np.flatnonzero(group)[suspects].tolist(), faults, strict=True))

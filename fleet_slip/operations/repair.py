@@ -1,0 +1,163 @@
+"""Rebuilds what can be rebuilt: Gram rows from the logs, simulated logs from their campaign.
+
+Nothing is deleted that was not. Bytes under another name are put back; simulated files have the
+checksum in the name that the Delta log knows, or are refused.
+"""
+
+import contextlib
+from collections.abc import Collection, Iterable, Mapping, Sequence
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.config import config_names
+from fleet_slip.errors import FleetSlipError, StorageError
+from fleet_slip.grams.gram_files import is_of_received
+from fleet_slip.grams.job import reconcile
+from fleet_slip.operations.verify import Verification, read_whole
+from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
+from fleet_slip.simulation.job import file_name, simulate_batch
+from fleet_slip.storage.commits import (
+    checkpoint_faults,
+    keep_checksums,
+    list_dispensable,
+    remove_checkpoint,
+)
+from fleet_slip.storage.folder import checksum_in, checksum_of, storage_errors
+from fleet_slip.storage.table import Change, TableFile, retry_conflicts
+from fleet_slip.warehouse.tables import Warehouse
+
+
+def repair(
+    warehouse: Warehouse, verification: Verification, campaigns: Sequence[str] = ()
+) -> list[str]:
+    """Rebuild what is damaged, also by files of `campaigns`; return what, below the root."""
+    rebuilt = _sum_up_again(warehouse)
+    damaged = {finding.path for finding in verification.damage if finding.kind == "file"}
+    wrong = {f.path.removeprefix("logs/") for f in verification.damage if f.kind == "gram"}
+    found = _find_elsewhere(warehouse, damaged)
+    rebuilt += found
+    rebuilt += _simulate_again(warehouse, damaged - set(found), campaigns)
+    lost = {path.removeprefix("logs/") for path in damaged.difference(rebuilt)}
+    rebuilt += _aggregate_again(warehouse, damaged, wrong, lost)
+    return rebuilt
+
+
+def _sum_up_again(warehouse: Warehouse) -> list[str]:
+    """Write damaged checkpoints again that can be spared: from what is before them in the log."""
+    rebuilt = []
+    for table in warehouse.tables:
+        for name, _ in list(checkpoint_faults(table.folder)):
+            if not list_dispensable(table.folder, name):
+                continue
+            remove_checkpoint(table.folder, name)
+            delta = table.open_delta()
+            if delta is not None:
+                with storage_errors(table.folder):
+                    delta.create_checkpoint()
+                keep_checksums(table.folder, again=f"{delta.version():020}.checkpoint.parquet")
+            rebuilt.append(f"{table.folder.name}/_delta_log/{name}")
+    return rebuilt
+
+
+def _find_elsewhere(warehouse: Warehouse, damaged: Collection[str]) -> list[str]:
+    """Put back the files whose very bytes a job or a person left under another name."""
+    rebuilt = []
+    for table in warehouse.tables:
+        name = table.folder.name
+        files = table.unchecked_snapshot().files
+        lost = [file for file in files if f"{name}/{file.path}" in damaged]
+        sizes = {file.size_bytes for file in lost}
+        for other in table.folder.files() if lost else ():
+            if other.size_bytes not in sizes or other.path.startswith("_delta_log/"):
+                continue
+            with contextlib.suppress(StorageError):
+                content = table.folder.read(other.path)
+                for file in lost:
+                    if checksum_in(file.path) == checksum_of(content):
+                        table.folder.put(file.path, content)
+                        rebuilt.append(f"{name}/{file.path}")
+                lost = [file for file in lost if f"{name}/{file.path}" not in rebuilt]
+    return rebuilt
+
+
+def _simulate_again(
+    warehouse: Warehouse, damaged: Collection[str], campaigns: Sequence[str]
+) -> list[str]:
+    files = [
+        file for file in warehouse.logs.unchecked_snapshot().files if f"logs/{file.path}" in damaged
+    ]
+    if not files:
+        return []
+    known = [load_campaign(name) for name in (*campaigns, *config_names("campaigns"))]
+    drives = _drives_of(warehouse, {file.path for file in files})
+    rebuilt = []
+    for file in files:
+        for batch in _candidates(file, drives.get(file.path, frozenset()), known):
+            if warehouse.logs.restore_file(file, simulate_batch(batch)):
+                rebuilt.append(f"logs/{file.path}")
+                break
+    return rebuilt
+
+
+def _drives_of(warehouse: Warehouse, paths: Collection[str]) -> dict[str, frozenset[str]]:
+    found: dict[str, set[str]] = {}
+    for rows in _readable_grams(warehouse).values():
+        concerned = rows.filter(pc.is_in(rows["file"], pa.array(sorted(paths), pa.string())))
+        for row in concerned.select(["file", "drive_id"]).to_pylist():
+            found.setdefault(row["file"], set()).add(row["drive_id"])
+    return {path: frozenset(drives) for path, drives in found.items()}
+
+
+def _candidates(
+    file: TableFile, drives: Collection[str], campaigns: Iterable[Campaign]
+) -> Iterable[Batch]:
+    """Yield what the file may have been simulated from: its drives, or a batch of its name."""
+    if file.day is None:
+        return
+    for campaign in campaigns:
+        if file.day not in campaign.days():
+            continue
+        specs: Mapping[str, DriveSpec] = {spec.drive_id: spec for spec in campaign.drives(file.day)}
+        if drives and specs.keys() >= set(drives):
+            chosen = tuple(specs[drive] for drive in sorted(drives))
+            yield Batch(campaign.name, file.day, 0, chosen)
+        for batch in campaign.batches(file.day):
+            if f"/{file_name(batch)}-" in file.path:
+                yield batch
+
+
+def _aggregate_again(
+    warehouse: Warehouse, damaged: Collection[str], wrong: set[str], lost: Collection[str]
+) -> list[str]:
+    """Drop wrong Gram files, and compute what logs that are not `lost` can tell again."""
+    removed: list[str] = []
+
+    def attempt() -> None:
+        removed.clear()
+        snapshot = warehouse.grams.unchecked_snapshot()
+        readable = _readable_grams(warehouse).items()
+        named = {path: rows["file"].unique().to_pylist() for path, rows in readable}
+        bad = [
+            file
+            for file in snapshot.files
+            if (f"grams/{file.path}" in damaged and not is_of_received(file))
+            or not wrong.isdisjoint(named.get(file.path, ()))
+        ]
+        if bad:
+            snapshot.commit(Change(remove=bad, note={"job": "repair"}))
+            removed.extend(f"grams/{file.path}" for file in bad)
+
+    retry_conflicts(attempt)
+    reconcile(warehouse, unreadable=lost)  # also what an interrupted repair has dropped
+    return removed
+
+
+def _readable_grams(warehouse: Warehouse) -> dict[str, pa.Table]:
+    """Return which drives and log files the Gram files name, of those that are whole."""
+    found = {}
+    for file in warehouse.grams.unchecked_snapshot().files:
+        if read_whole(warehouse.grams, file).problem is None:
+            with contextlib.suppress(FleetSlipError):
+                found[file.path] = warehouse.grams.read(file.path, ["file", "drive_id"])
+    return found

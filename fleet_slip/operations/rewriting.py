@@ -1,0 +1,363 @@
+"""Writes rows again, to compact the logs or to forget drives.
+
+Log files hold whole drives by name and tick, and dictionaries of what occurs: their bytes follow
+from the drives, and can be simulated again.
+"""
+
+import dataclasses
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from deltalake.transaction import AddAction
+
+from fleet_slip.base import IntArray, Progress, no_progress
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.errors import ConflictError, FleetSlipError
+from fleet_slip.grams.gram_files import read_rows, write_rows
+from fleet_slip.grams.gram_rows import is_received
+from fleet_slip.grams.job import land_ahead, reconcile
+from fleet_slip.ingest.load import MEASURED, WITHDRAWALS, KnownMarks, Origin, TableName, is_from
+from fleet_slip.operations.find_drives import rows_of
+from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, Unit, retry_conflicts
+from fleet_slip.warehouse.forgotten import Forgettable
+from fleet_slip.warehouse.tables import Warehouse, connect_tables
+
+
+@dataclass(frozen=True)
+class Rewriting:
+    """Files of one day that become one, named after what is done, without some drives."""
+
+    name: str
+    files: Sequence[TableFile]
+    without: Collection[str] = ()
+
+
+def rewrite(
+    warehouse: Warehouse,
+    logs: Snapshot,
+    rewritings: Sequence[Rewriting],
+    *,
+    note: Mapping[str, Any],
+    data_change: bool,
+    progress: Progress = no_progress,
+) -> list[AddAction]:
+    """Exchange log files and their Gram rows in one commit on a snapshot; return what was added.
+
+    Files without kept drives go. `progress` counts rewritings. Raises `ConflictError`, after
+    deleting the new files, and `StorageError`.
+    """
+    new = write_again(warehouse, logs, rewritings, data_change=data_change, progress=progress)
+    replaced = [file for one in rewritings for file in one.files]
+    units = rewriting_units(logs, replaced)
+    logs.commit_or_discard(
+        Change(add=new, remove=replaced, units=units, note=note, data_change=data_change)
+    )
+    return new
+
+
+def write_again(
+    warehouse: Warehouse,
+    logs: Snapshot,
+    rewritings: Sequence[Rewriting],
+    *,
+    data_change: bool = True,
+    progress: Progress = no_progress,
+) -> list[AddAction]:
+    """Write log files, land their Gram rows ahead; return what to add. Raises as `rewrite`."""
+    new: list[AddAction] = []
+    replaced = [file for one in rewritings for file in one.files]
+    try:
+        for one in rewritings:
+            rows = read_kept_drives(logs.table, one.files, one.without)
+            if rows.num_rows:
+                action = logs.table.write_file(one.name, rows, one.files[0].day)
+                new.append(dataclasses.replace(action, data_change=data_change))
+            progress(1, len(rewritings))
+        land_ahead(warehouse, new, replaced)
+    except FleetSlipError:
+        logs.table.discard(new)
+        raise
+    return new
+
+
+def rewriting_units(logs: Snapshot, replaced: Sequence[TableFile]) -> list[Unit]:
+    """Return units that make commits conflict which rewrite the same day; Delta lets them pass."""
+    days = sorted({str(file.day) for file in replaced})
+    return [Unit(f"rewrite/{day}", (logs.version or 0) + 1) for day in days]
+
+
+def read_kept_drives(
+    table: Table, files: Sequence[TableFile], without: Collection[str] = ()
+) -> pa.Table:
+    """Return the rows of log files but for some drives, ordered and typed for a new file."""
+    parts = [_read(table, file, without) for file in files]
+    rows = pa.concat_tables(parts, promote_options="default").combine_chunks()
+    order = _order(rows)
+    if (np.diff(order) != 1).any():
+        rows = rows.take(order)
+    optional = [name for name in table.optional if name in rows.column_names]
+    empty = {name for name in optional if rows[name].null_count == len(rows)}
+    names = dict.fromkeys([*table.schema.names, *rows.column_names])
+    return rows.select([name for name in names if name in rows.column_names and name not in empty])
+
+
+def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:
+    stored = table.read(file.path)
+    columns = {}
+    for field in table.schema:
+        if field.name in table.partition_by:
+            continue
+        there = field.name in stored.schema.names
+        if not there and field.name in table.optional:
+            continue
+        if not there:
+            column = pa.chunked_array([pa.nulls(stored.num_rows, field.type)])
+        else:
+            column = stored[field.name]
+        if pa.types.is_string(field.type):
+            columns[field.name] = pc.dictionary_encode(column).unify_dictionaries()
+        else:
+            columns[field.name] = column.cast(field.type)
+    retired = [name for name in stored.schema.names if name not in table.schema.names]
+    rows = pa.table(columns | {name: stored[name] for name in retired})
+    ids = rows["drive_id"].combine_chunks()
+    unwanted = pc.is_in(ids.dictionary, pa.array(sorted(without), ids.dictionary.type))
+    return rows.filter(pc.invert(unwanted.take(ids.indices)))
+
+
+def _order(rows: pa.Table) -> IntArray:
+    ids = rows["drive_id"].combine_chunks()
+    rank = np.argsort(np.argsort(np.array(ids.dictionary.to_pylist(), dtype=object)))
+    drive = rank[ids.indices.to_numpy()] if len(rank) else np.empty(0, dtype=np.int64)
+    return np.lexsort((rows["tick"].to_numpy(), drive))
+
+
+def write_without(
+    snapshot: Snapshot, gone: Callable[[pa.Table], pa.ChunkedArray]
+) -> tuple[list[AddAction], list[TableFile]]:
+    """Write the files of a table again that have rows which go; return them, and the old ones."""
+    add: list[AddAction] = []
+    remove: list[TableFile] = []
+    for file in snapshot.files:
+        rows = snapshot.table.read(file.path)
+        kept = rows.filter(pc.invert(gone(rows)))
+        if kept.num_rows < rows.num_rows:
+            remove.append(file)
+            add += [snapshot.table.write_file("kept", kept)] if kept.num_rows else []
+    return add, remove
+
+
+def drop_unused_names(warehouse: Warehouse) -> int:
+    """Write files anew without names that none of their rows has; return how many."""
+
+    def attempt() -> int:
+        logs = warehouse.logs.snapshot()
+        files = [file for file in logs.files if warehouse.logs.has_unused_names(file.path)]
+        if files:
+            rewritings = [Rewriting("kept", [file]) for file in files]
+            rewrite(warehouse, logs, rewritings, note={"job": "names"}, data_change=False)
+        return len(files)
+
+    return retry_conflicts(attempt)
+
+
+def forget_received(warehouse: Warehouse, subject: Forgettable) -> int:
+    """Commit the Gram rows without those that came without a log; return how many rows."""
+
+    def attempt() -> int:
+        snapshot = warehouse.grams.snapshot()
+        concerned: list[TableFile] = []
+        rows = 0
+        for file in snapshot.files:
+            told = warehouse.grams.read(file.path, ["file", "drive_id", "vehicle_id", "day", "n"])
+            mine = pc.and_(rows_of(told, subject), is_received(told))
+            if pc.any(mine).as_py():
+                concerned.append(file)
+                rows += pc.sum(told.filter(mine)["n"]).as_py()
+        if concerned:
+            read = (read_rows(warehouse.grams, file) for file in concerned)
+            kept = (r.filter(pc.invert(pc.and_(rows_of(r, subject), is_received(r)))) for r in read)
+            add = write_rows(warehouse, kept)
+            snapshot.commit_or_discard(Change(add=add, remove=concerned, note={"job": "forget"}))
+        return rows
+
+    return retry_conflicts(attempt)
+
+
+# Takes drives out of the logs that others replace, or that somebody withdraws.
+#
+# They may come again: their files' units are withdrawn. Their Gram rows go with the files.
+
+
+@dataclass(frozen=True)
+class TakingOut:
+    """Takes the drives of some origins out of the tables of a data root."""
+
+    warehouse: Warehouse
+
+    def without(self, name: TableName, snapshot: Snapshot, origins: Collection[Origin]) -> Change:
+        """Return the change that takes the drives, or refused rows, of origins out."""
+        if name == "quarantine":
+            return self._without_refused(snapshot, origins)
+        drives = drives_in(self.warehouse, snapshot)
+        gone = {p: {one for one in there if is_from(one, origins)} for p, there in drives.items()}
+        left = {Origin.of_drive(one) for p, there in drives.items() for one in there - gone[p]}
+        files = {one.file for one in origins} - {one.file for one in left if one}
+        units = KnownMarks(snapshot.units).withdraw(origins, files)
+        concerned = [file for file in snapshot.files if gone.get(file.path)]
+        if concerned:
+            units += rewriting_units(snapshot, concerned)
+            units.append(Unit(WITHDRAWALS, (snapshot.version or 0) + 1))
+        kept = [Rewriting("kept", [file], gone[file.path]) for file in concerned]
+        return Change(write_again(self.warehouse, snapshot, kept), concerned, units)
+
+    def _without_refused(self, snapshot: Snapshot, origins: Collection[Origin]) -> Change:
+        def mine(rows: pa.Table) -> pa.ChunkedArray:
+            names = rows["drive_id"].cast(pa.string())
+            some = [n for n in names.unique().drop_null().to_pylist() if is_from(n, origins)]
+            return pc.fill_null(pc.is_in(names, pa.array(some, pa.string())), False)
+
+        add, remove = write_without(snapshot, mine)
+        files = {one for one in origins if one == one.file}
+        return Change(add, remove, KnownMarks(snapshot.units).withdraw((), files))
+
+
+def drives_in(warehouse: Warehouse, logs: Snapshot) -> dict[str, set[str]]:
+    """Return the drives of each log file, opening only files without Gram rows."""
+    grams, identity = warehouse.grams.snapshot(), features().identity(PLAIN)
+    found: dict[str, set[str]] = {}
+    for file in grams.files:
+        rows = grams.table.read(file.path, ["feature_set", "file", "drive_id"])
+        rows = rows.filter(pc.equal(rows["feature_set"], identity)).drop_columns("feature_set")
+        for row in rows.to_pylist():
+            found.setdefault(row["file"], set()).add(row["drive_id"])
+    return {
+        file.path: found.get(file.path) or set(logs.table.read_names(file.path)["drive_id"].used)
+        for file in logs.files
+    }
+
+
+def take_back(warehouse: Warehouse, what: str) -> int:
+    """Take out what was ingested from a file, or through a mapping; return how many drives.
+
+    `what` names either, or begins the names of a file's drives. All of it goes that is there at the
+    commit, whoever replaces it meanwhile.
+    """
+    taking_out = TakingOut(warehouse)
+
+    def attempt() -> int:
+        logs = warehouse.logs.snapshot()
+        drives = _drives_called(warehouse, what)
+        if warehouse.logs.snapshot().version != logs.version:
+            raise ConflictError(f"{warehouse.root}: the logs keep changing. Run it again.")
+        origins = {origin.file for drive in drives if (origin := Origin.of_drive(drive))}
+        refused = warehouse.quarantine.snapshot()
+        changes: dict[TableName, Snapshot] = {"quarantine": refused, "logs": logs}
+        for name, snapshot in changes.items() if drives else ():
+            gone = taking_out.without(name, snapshot, origins)
+            if gone.remove or gone.units:
+                change = Change(gone.add, gone.remove, gone.units, {"job": "undo"})
+                snapshot.commit_or_discard(change)
+        return len(drives)
+
+    return retry_conflicts(attempt)
+
+
+def _drives_called(warehouse: Warehouse, what: str) -> list[str]:
+    query = (
+        "SELECT drive_id FROM drives WHERE regexp_matches(drive_id, $measured) AND (source_file = "
+        "$file OR starts_with(drive_id, $what || '-') OR regexp_replace(drive_id, $measured, '') "
+        "= $what) ORDER BY ALL"
+    )
+    given = {"measured": MEASURED, "file": PurePath(what).name, "what": what}
+    with connect_tables(warehouse, query) as database:
+        return [drive for (drive,) in database.execute(query, given).fetchall()]
+
+
+# Turns small log files of a day into large ones.
+#
+# Gram rows of new files are computed, and land before them; reconciliation drops the old.
+
+TARGET_ROWS = 2_000_000
+"""Rows of a compacted file or fewer. A file of more than half of it is left alone."""
+
+
+@dataclass(frozen=True)
+class CompactionReport:
+    """What a run of the job did."""
+
+    days: int
+    files_before: int
+    files_after: int
+    rows_rewritten: int
+    size_bytes_before: int
+    size_bytes_after: int
+    logs_version: int | None
+
+    @property
+    def changed(self) -> bool:
+        """Whether there was anything to do."""
+        return bool(self.rows_rewritten)
+
+
+def compact(
+    warehouse: Warehouse,
+    target_rows: int = TARGET_ROWS,
+    progress: Progress = no_progress,
+) -> CompactionReport:
+    """Compact each day in a commit, then reconcile Gram rows. Raises `ConflictError`."""
+    warehouse.require()
+    before = warehouse.logs.snapshot()
+    days = sorted({file.day for file in before.files if file.day is not None})
+    rewritten = 0
+    for day in days:
+        rewritten += _compact_day(warehouse, day, target_rows)
+        progress(1, len(days))
+    reconcile(warehouse)
+    after = warehouse.logs.snapshot()
+    return CompactionReport(
+        days=len(days),
+        files_before=len(before.files),
+        files_after=len(after.files),
+        rows_rewritten=rewritten,
+        size_bytes_before=before.size_bytes,
+        size_bytes_after=after.size_bytes,
+        logs_version=after.version,
+    )
+
+
+def _compact_day(warehouse: Warehouse, day: date, target_rows: int) -> int:
+    def attempt() -> int:
+        snapshot = warehouse.logs.snapshot()
+        small = [f for f in snapshot.files if f.day == day and 2 * f.rows <= target_rows]
+        packs = list(_packs(small, target_rows))
+        if packs:
+            rewrite(
+                warehouse,
+                snapshot,
+                [Rewriting("compact", pack) for pack in packs],
+                note={"job": "compact", "day": day.isoformat()},
+                data_change=False,
+            )
+        return sum(file.rows for pack in packs for file in pack)
+
+    return retry_conflicts(attempt)
+
+
+def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableFile]]:
+    """Yield runs of two files or more that fit together; only the last may be packed again."""
+    pack: list[TableFile] = []
+    for file in files:
+        if pack and sum(f.rows for f in pack) + file.rows > target_rows:
+            if len(pack) > 1:
+                yield pack
+            pack = []
+        pack.append(file)
+    if len(pack) > 1:
+        yield pack

@@ -1,0 +1,257 @@
+"""The health of a warehouse on one page: freshness, backlog, last runs, disk, champions."""
+
+import contextlib
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from typing import Any
+
+import pyarrow as pa
+
+from fleet_slip.config import read_sql
+from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
+from fleet_slip.grams.job import find_backlog
+from fleet_slip.limits import memory_bytes
+from fleet_slip.models.registry import Registry
+from fleet_slip.operations.peers import thresholds
+from fleet_slip.storage.folder import TEMPORARY_PREFIX, Folder, storage_errors
+from fleet_slip.storage.runs import (
+    find_changed_lines,
+    find_missing_documents,
+    lend_runs,
+    run_source,
+    state_of,
+)
+from fleet_slip.storage.table import Snapshot
+from fleet_slip.warehouse.database import database_errors, open_database
+from fleet_slip.warehouse.tables import Warehouse
+
+SECONDS_PER_HOUR = 3600
+LEAST_MEMORY_BYTES = 2**30
+"""The largest command that was measured, `verify` of files of a million rows, takes 828 MiB."""
+_FULL = "the disk has {:.1%} left, less than {:.0%}"
+
+REMEMBERED = timedelta(days=366)
+"""Commands that last ran before that are not shown, so that old runs need not be read."""
+
+
+@dataclass(frozen=True)
+class TableStatus:
+    """One table of the warehouse."""
+
+    version: int | None
+    committed_at: datetime | None
+    files: int
+    rows: int
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class ChampionStatus:
+    """The version of a model that is in use.
+
+    `logs_behind` and `grams_behind` are commits to the tables since it was trained.
+    """
+
+    model: str
+    version: int
+    published_at: datetime | None
+    age_hours: float | None
+    logs_behind: int
+    grams_behind: int
+
+
+@dataclass(frozen=True)
+class WarehouseStatus:
+    """What there is to know; `problems` says what calls for attention."""
+
+    root: str
+    checked_at: datetime
+    newest_day: date | None
+    data_age_hours: float | None
+    tables: Mapping[str, TableStatus]
+    backlog_files: int
+    backlog_rows: int
+    disk_free_bytes: int | None
+    """None where the root is not on a disk of this machine."""
+    disk_free_fraction: float | None
+    last_runs: tuple[Mapping[str, Any], ...]
+    champions: tuple[ChampionStatus, ...]
+    problems: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        found = "; ".join(self.problems) or "nothing calls for attention"
+        return f"<{type(self).__name__}: {self.root}, newest day {self.newest_day}; {found}>"
+
+
+def status_of(
+    warehouse: Warehouse, max_age_hours: float | None = None, now: datetime | None = None
+) -> WarehouseStatus:
+    """Examine a warehouse. Reads the Delta logs, the history of runs and the manifests.
+
+    Data older than `max_age_hours`, and log files that old without Gram rows, are a problem; so are
+    a command whose last run failed or was killed, a disk that is nearly full, a champion that
+    cannot be loaded, less than 1 GiB of memory, and an object store that lets a file be made twice.
+    `jobs/last_runs.sql` says which failures are mere mistakes of a person. Raises `StorageError` if
+    there is no data root.
+    """
+    now = now or datetime.now(UTC)
+    warehouse.require()
+    parts = (warehouse.logs, warehouse.grams, warehouse.quarantine)
+    snapshots = {table.folder.name: table.snapshot() for table in parts}
+    tables = {name: _table(snapshot) for name, snapshot in snapshots.items()}
+    logs, grams = snapshots["logs"], snapshots["grams"]
+    backlog = find_backlog(logs, grams).missing
+    free_bytes, disk_bytes = warehouse.root.free_bytes() or (None, 0)
+    free = None if free_bytes is None else free_bytes / disk_bytes
+    champions, damaged = _champions(warehouse, logs, grams, now)
+    since = f"{now - REMEMBERED:%Y-%m}"
+    changed = list(find_changed_lines(warehouse.root, since))
+    last_runs = () if changed else tuple(_last_runs(warehouse.root, since))
+    age = _age_hours(tables["logs"].committed_at, now)
+    least = thresholds().status.min_free_fraction
+    problems = [
+        *_stale(age, _oldest_hours(logs, {f.path for f in backlog}, now), max_age_hours),
+        *_failed(last_runs),
+        *_unfit(warehouse.root),
+        *([_FULL.format(free, least)] if free is not None and free < least else []),
+        *damaged,
+        *(
+            f"{path}: {what}"
+            for path, what in (*changed, *find_missing_documents(warehouse.root, since))
+        ),
+    ]
+    return WarehouseStatus(
+        root=str(warehouse.root),
+        checked_at=now,
+        newest_day=max((file.day for file in logs.files if file.day), default=None),
+        data_age_hours=age,
+        tables=tables,
+        backlog_files=len(backlog),
+        backlog_rows=sum(file.rows for file in backlog),
+        disk_free_bytes=free_bytes,
+        disk_free_fraction=free,
+        last_runs=last_runs,
+        champions=champions,
+        problems=tuple(problems),
+    )
+
+
+def _unfit(root: Folder) -> Iterator[str]:
+    """Yield what of this machine, or of an object store, is not fit for the jobs."""
+    if memory_bytes() < LEAST_MEMORY_BYTES:
+        yield "this process may have less than 1 GiB of memory, which large commands take"
+    if root.free_bytes() is not None:
+        return  # a local disk keeps a file from being made twice
+    probe = f"{TEMPORARY_PREFIX}probe-{uuid.uuid4().hex}"
+    try:
+        if root.create(probe, b"one") and root.create(probe, b"two"):
+            yield f"{root}: this store lets a file be made twice, so commits get lost. Use another"
+    except FleetSlipError:
+        return  # a monitor may have the right to read alone
+    finally:
+        with contextlib.suppress(FleetSlipError):
+            root.delete(probe)
+
+
+def _table(snapshot: Snapshot) -> TableStatus:
+    return TableStatus(
+        version=snapshot.version,
+        committed_at=_committed_at(snapshot),
+        files=len(snapshot.files),
+        rows=snapshot.rows,
+        size_bytes=snapshot.size_bytes,
+    )
+
+
+def _committed_at(snapshot: Snapshot) -> datetime | None:
+    if snapshot.delta is None:
+        return None
+    with storage_errors(snapshot.table.folder):
+        last = snapshot.delta.history(limit=1)
+    return _from_ms(last[0].get("timestamp") if last else None)
+
+
+def _oldest_hours(logs: Snapshot, paths: set[str], now: datetime) -> float | None:
+    """Return how long ago the oldest of some files was written."""
+    if logs.delta is None or not paths:
+        return None
+    with storage_errors(logs.table.folder):
+        actions = pa.table(logs.delta.get_add_actions()).to_pylist()
+    moments = [action["modification_time"] for action in actions if action["path"] in paths]
+    return _age_hours(_from_ms(min(moments, default=None)), now)
+
+
+def _age_hours(moment: datetime | None, now: datetime) -> float | None:
+    return None if moment is None else (now - moment).total_seconds() / SECONDS_PER_HOUR
+
+
+def _from_ms(milliseconds: int | None) -> datetime | None:
+    return None if milliseconds is None else datetime.fromtimestamp(milliseconds / 1000, UTC)
+
+
+def _last_runs(root: Folder, since: str) -> list[dict[str, Any]]:
+    # Not through connect(), which fails with a damaged manifest: that is for the status to tell.
+    with (
+        open_database(reading=root) as database,
+        database_errors(f"reading the history of runs in {root}"),
+    ):
+        view = read_sql("warehouse", "runs.sql")
+        runs = lend_runs(root, database, since=since)
+        database.execute(view.format(stored_runs=run_source(database, runs)))
+        rows = database.sql(read_sql("jobs", "last_runs.sql")).to_arrow_table().to_pylist()
+    return [row | {"state": state_of(row)} for row in rows]
+
+
+def _champions(
+    warehouse: Warehouse, logs: Snapshot, grams: Snapshot, now: datetime
+) -> tuple[tuple[ChampionStatus, ...], list[str]]:
+    registry = Registry(warehouse.root / "models")
+    found, damaged = [], []
+    for name in registry.names():
+        try:
+            champion = registry.champion(name)
+            history = registry.history(name)
+            published_at = history.published_at(champion.version) if champion else None
+        except (StorageError, RefusedError, DataError, QuestionError) as error:
+            damaged.append(str(error))
+            continue
+        if champion is None:
+            continue
+        trained = champion.manifest.trained_on
+        found.append(
+            ChampionStatus(
+                model=name,
+                version=champion.version,
+                published_at=published_at,
+                age_hours=_age_hours(published_at, now),
+                logs_behind=(logs.version or 0) - trained.logs_version,
+                grams_behind=(grams.version or 0) - trained.grams_version,
+            )
+        )
+    return tuple(found), damaged
+
+
+def _stale(age: float | None, backlog_age: float | None, limit: float | None) -> list[str]:
+    if limit is None:
+        return []
+    problems = []
+    if age is None:
+        problems.append("no data has ever been committed")
+    elif age > limit:
+        problems.append(f"no data has been committed for {age:.1f} h, more than {limit:g} h")
+    if backlog_age is not None and backlog_age > limit:
+        problems.append(f"a log file has been waiting for its Gram rows for {backlog_age:.1f} h")
+    return problems
+
+
+def _failed(runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    problems = []
+    for run in runs:
+        when = f"{run['command']} of {run['started_at']:%Y-%m-%d %H:%M}"
+        if run["state"] == "failed":
+            problems.append(f"{when} failed with exit code {run['exit_code']}: {run['error']}")
+        elif run["state"] in ("killed", "interrupted"):
+            problems.append(f"{when} was {run['state']}")
+    return problems

@@ -1,0 +1,528 @@
+"""Compares everything below a data root with everything else that tells what it must be.
+
+Data files with the checksums in their names and the Delta log; drives with the rule that they are
+whole; Gram rows with the logs by another path; documents with checksums; model versions with their
+tables; names with the record of what was forgotten.
+"""
+
+import os
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Literal, TypeAlias
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from fleet_slip.base import Progress, no_progress, number_of
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.compute.tasks import LocalThreads, run_tasks
+from fleet_slip.config import read_sql
+from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
+from fleet_slip.grams.check import (
+    DriveGrams,
+    differing_drives,
+    find_gram_files,
+    grams_by_blocks,
+    read_counts,
+    stored_grams,
+)
+from fleet_slip.grams.gram_rows import by_signals, gram_table, is_received
+from fleet_slip.grams.job import named_files
+from fleet_slip.grams.on_board import CountedSet, counted_by_identity, find_impossible
+from fleet_slip.models.registry import Registry
+from fleet_slip.operations.find_drives import find_temporary_files, find_unreferenced
+from fleet_slip.storage.commits import FOLDER as CHECKSUMS
+from fleet_slip.storage.commits import checkpoint_faults, checkpoints_without_checksum
+from fleet_slip.storage.documents import DocumentFolder
+from fleet_slip.storage.encoding import Names, read_names
+from fleet_slip.storage.folder import Folder, StoredFile, checksum_in, checksum_of, storage_errors
+from fleet_slip.storage.runs import find_changed_lines, find_missing_documents
+from fleet_slip.storage.table import Snapshot, Table, TableFile, find_commit_faults, on_newest
+from fleet_slip.warehouse.database import database_errors, open_database
+from fleet_slip.warehouse.forgotten import Audit
+from fleet_slip.warehouse.tables import Warehouse
+
+# Compares data files with their checksums and the Delta log; looks for forgotten names in them.
+
+DamageKind: TypeAlias = Literal[
+    "file",
+    "drive",
+    "gram",
+    "document",
+    "model",
+    "log",
+    "name",
+    "unreferenced",
+    "backlog",
+    "unchecked",
+]
+
+TASK_BYTES = 2**27
+
+TASK_FILES = 64
+"""A task reads about so many bytes, or so many files."""
+
+
+@dataclass(frozen=True)
+class Damage:
+    """One thing that is not as it must be, or that is worth knowing.
+
+    `kind` is where damage is, or a remark: "unreferenced", "backlog" or "unchecked". `path` is a
+    file below the root, a drive or a model version.
+    """
+
+    kind: DamageKind
+    path: str
+    problem: str
+
+    @property
+    def damage(self) -> bool:
+        """Whether something is lost, or would be computed wrongly."""
+        return self.kind not in {"unreferenced", "backlog", "unchecked"}
+
+
+@dataclass
+class Verification:
+    """What was looked at, and what was found."""
+
+    files: int = 0
+    size_bytes: int = 0
+    rows: int = 0
+    log_files_recomputed: int = 0
+    documents: int = 0
+    findings: list[Damage] = field(default_factory=list)
+
+    def note(self, kind: DamageKind, path: str, problem: str) -> None:
+        """Add a finding."""
+        self.findings.append(Damage(kind, path, problem))
+
+    @property
+    def damage(self) -> list[Damage]:
+        """The findings that are damage."""
+        return [finding for finding in self.findings if finding.damage]
+
+
+@dataclass(frozen=True)
+class ReadFile:
+    """What was found in a data file: what is wrong with it, or the names in its dictionaries."""
+
+    file: TableFile
+    problem: str | None
+    names: Mapping[str, Names] = field(default_factory=dict)
+
+
+def verify_files(
+    snapshot: Snapshot, report: Verification, progress: Progress, executor: Executor | None
+) -> list[ReadFile]:
+    """Return the files of a table that are what they must be."""
+    table = snapshot.table
+    read: list[ReadFile] = []
+    with LocalThreads(os.cpu_count() or 1) as threads:
+        groups = _groups(snapshot.files)
+        task = partial(_read_files, table)
+        for group, found in run_tasks(executor or threads, task, groups, _group_name):
+            read += found
+            progress(sum(file.size_bytes for file in group), snapshot.size_bytes)
+    read.sort(key=lambda one: one.file.path)
+    for one in read:
+        if one.problem:
+            told = f"{one.problem} (it held {one.file.rows:,} rows)"
+            report.note("file", f"{table.folder.name}/{one.file.path}", told)
+    report.files += len(snapshot.files)
+    report.size_bytes += snapshot.size_bytes
+    report.rows += snapshot.rows if table.folder.name == "logs" else 0
+    return [one for one in read if not one.problem]
+
+
+def _groups(files: Sequence[TableFile]) -> Iterator[tuple[TableFile, ...]]:
+    group: tuple[TableFile, ...] = ()
+    for file in files:
+        group = (*group, file)
+        if sum(one.size_bytes for one in group) >= TASK_BYTES or len(group) == TASK_FILES:
+            yield group
+            group = ()
+    if group:
+        yield group
+
+
+def _group_name(group: Sequence[TableFile]) -> str:
+    return f"the bytes of {len(group)} files from {group[0].path}"
+
+
+def _read_files(table: Table, files: Sequence[TableFile]) -> list[ReadFile]:
+    return [read_whole(table, file) for file in files]
+
+
+def read_whole(table: Table, file: TableFile) -> ReadFile:
+    """Read every byte of a data file, and compare it with what tells of it."""
+    path = f"{table.folder}/{file.path}"
+    try:
+        content = table.folder.read(file.path)
+        if len(content) != file.size_bytes:
+            problem = f"has {len(content):,} bytes instead of {file.size_bytes:,}"
+            return ReadFile(file, problem)
+        expected = checksum_in(file.path)
+        if expected and checksum_of(content) != expected:
+            return ReadFile(file, "its bytes do not match the checksum in its name")
+        with storage_errors(path):
+            metadata = pq.read_metadata(pa.BufferReader(content))
+            names = read_names(pa.BufferReader(content), table.encoding.dictionary)
+    except FleetSlipError as error:
+        return ReadFile(file, str(error).removeprefix(f"{path}: "))
+    return ReadFile(file, _contradiction(file, metadata), names)
+
+
+def _contradiction(file: TableFile, metadata: pq.FileMetaData) -> str | None:
+    if metadata.num_rows != file.rows:
+        return f"has {metadata.num_rows:,} rows, the Delta log says {file.rows:,}"
+    if (nulls := _null_counts(metadata)).items() - file.null_counts.items():
+        wrong = [name for name, count in nulls.items() if file.null_counts.get(name) != count]
+        return f"the Delta log states other numbers of nulls of {', '.join(wrong)}"
+    if file.day and not file.path.startswith(f"day={file.day}/"):
+        return f"the Delta log says that it is of {file.day}"
+    return None
+
+
+def _null_counts(metadata: pq.FileMetaData) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for group in range(metadata.num_row_groups):
+        for number in range(metadata.num_columns):
+            column = metadata.row_group(group).column(number)
+            statistics = column.statistics
+            if "." not in column.path_in_schema and statistics and statistics.has_null_count:
+                name = column.path_in_schema
+                counts[name] = counts.get(name, 0) + statistics.null_count
+    return counts
+
+
+def verify_names(
+    warehouse: Warehouse, read: Mapping[str, Sequence[ReadFile]], report: Verification, full: bool
+) -> None:
+    """Look for forgotten cars; for forgotten drives too with `full`."""
+    unused = frozenset(name for one in _all(read) for name in _unused(one))
+    cars, drives = (_used(_all(read), column) for column in ("vehicle_id", "drive_id"))
+    audit = Audit(warehouse.root)
+    barred = audit.barred(cars | unused, (drives if full else frozenset()) | unused, ended=True)
+    wrong = {"vehicle_id": barred.vehicles, "drive_id": barred.drives}
+    for table, files in read.items():
+        for one in files:
+            if any(not wrong[name].isdisjoint(_used([one], name)) for name in wrong):
+                problem = "has rows of a car or drive that was forgotten; give forget again"
+            elif not (barred.vehicles | barred.drives).isdisjoint(_unused(one)):
+                problem = (
+                    "has the name of a car or drive that was forgotten; run: fleet-slip migrate"
+                )
+            else:
+                continue
+            report.note("name", f"{table}/{one.file.path}", problem)
+        if many := sum(bool(_unused(one)) for one in files):
+            problem = (
+                f"{number_of(many, 'file')} with names that no row has; run: fleet-slip migrate"
+            )
+            report.note("backlog", table, problem)
+
+
+def _all(read: Mapping[str, Sequence[ReadFile]]) -> Iterator[ReadFile]:
+    return (one for files in read.values() for one in files)
+
+
+def _unused(one: ReadFile) -> frozenset[str]:
+    return frozenset().union(*(names.unused for names in one.names.values()))
+
+
+def _used(files: Collection[ReadFile] | Iterator[ReadFile], column: str) -> frozenset[str]:
+    return frozenset().union(*(one.names[column].used for one in files if column in one.names))
+
+
+# Looks for drives that are not whole, and for Gram rows that are not those of their logs.
+
+SAMPLE = 4
+"""Log files whose Gram rows are computed again, evenly chosen, unless all are asked for."""
+
+
+def verify_drives(warehouse: Warehouse, files: Sequence[TableFile], report: Verification) -> None:
+    """Look for drives that are not whole, or stand in several files."""
+    paths = [warehouse.logs.uri(file.path) for file in files]
+    database = open_database(reading=warehouse.logs.folder)
+    with database, database_errors("verifying the drives"):
+        database.execute("SET VARIABLE log_files = $files", {"files": paths})
+        rows = database.execute(read_sql("jobs", "verify_drives.sql")).fetchall()
+    for drive, in_files, beginnings, n, file in rows:
+        problem = (
+            f"{n:,} rows in {number_of(in_files, 'file')} with {number_of(beginnings, 'row')} of "
+            f"tick 0; one is {file}"
+        )
+        report.note("drive", drive, problem)
+
+
+@dataclass(frozen=True)
+class SoundFiles:
+    """The files of a data root whose bytes are what they must be, and what the logs consist of."""
+
+    logs: Sequence[TableFile]
+    grams: Sequence[TableFile]
+    active: Collection[str]
+    """Paths of all active log files, sound or not."""
+
+
+def verify_grams(
+    warehouse: Warehouse,
+    sound: SoundFiles,
+    report: Verification,
+    full: bool,
+    executor: Executor | None,
+) -> None:
+    """Look for Gram rows that are doubled, missing, left over, or wrong (in a sample, or all)."""
+    _verify_unique(warehouse, sound.grams, report)
+    _verify_each(warehouse, sound.grams, report)
+    where = find_gram_files(warehouse, sound.grams)
+    covered = [file for file in sound.logs if file.path in where]
+    step = 1 if full else max(1, len(covered) // SAMPLE)
+    by_place: dict[tuple[str, ...], list[TableFile]] = {}
+    for file in covered[::step]:
+        by_place.setdefault(where[file.path], []).append(file)
+    for places, files in by_place.items():
+        stored = stored_grams(warehouse, files, places)
+        task = partial(_compute_grams, warehouse)
+        for file, computed in run_tasks(executor, task, files, _name_task):
+            for drive in differing_drives(stored[file.path], computed):
+                problem = f"the stored Gram row of drive {drive} is not that of its rows"
+                report.note("gram", f"logs/{file.path}", problem)
+            report.log_files_recomputed += 1
+    missing = len(sound.logs) - len(covered)
+    stale = where.keys() - set(sound.active)
+    if missing or stale:
+        problem = (
+            f"no Gram rows of {number_of(missing, 'log file')}, Gram rows of {len(stale)} that "
+            "are gone"
+        )
+        report.note("backlog", "grams", f"{problem}; run: fleet-slip gram")
+
+
+def _verify_unique(warehouse: Warehouse, grams: Sequence[TableFile], report: Verification) -> None:
+    paths = [warehouse.grams.uri(file.path) for file in grams]
+    database = open_database(reading=warehouse.grams.folder)
+    with database, database_errors("verifying the Gram rows"):
+        database.execute("SET VARIABLE gram_files = $files", {"files": paths})
+        twice = database.execute(read_sql("jobs", "verify_grams.sql")).fetchall()
+    for identity, file, drive, n in twice:
+        problem = f"the Gram row {identity} of drive {drive} stands {n} times"
+        report.note("gram", f"logs/{file}", problem)
+
+
+def _verify_each(warehouse: Warehouse, grams: Sequence[TableFile], report: Verification) -> None:
+    """Look for received Gram rows that no counts or drives can have."""
+    for file in grams:
+        rows = warehouse.grams.read(file.path)
+        for drive, problem in _impossible(rows):
+            told = f"the Gram row that a car sent of drive {drive} {problem}"
+            report.note("gram", f"grams/{file.path}", told)
+
+
+def _impossible(rows: pa.Table) -> Iterator[tuple[str, str]]:
+    """Yield the drives whose Gram rows, counted in the car, cannot be, and why."""
+    came = rows.filter(is_received(rows))
+    for identity in came["feature_set"].unique().to_pylist():
+        one = counted_by_identity().get(identity)
+        if one is None:  # it is defined otherwise today
+            continue
+        some = came.filter(pc.equal(came["feature_set"], identity)).combine_chunks()
+        for batch in some.to_batches():
+            for signals, alike, _ in by_signals(batch):
+                yield from _impossible_among(one, signals, alike)
+
+
+def _impossible_among(
+    one: CountedSet, signals: str, rows: pa.RecordBatch
+) -> Iterator[tuple[str, str]]:
+    drives, names = rows["drive_id"].to_pylist(), signals.split(",") if signals else []
+    if not set(names) <= set(one.columns):
+        yield from ((drive, "has signals that there are not") for drive in drives)
+    elif names:
+        told, ranges = gram_table(signals, rows), one.ranges_of(names)
+        for why, at in find_impossible(told.n, told.sums, told.products, ranges).items():
+            yield from ((drives[place], why) for place in at.tolist())
+
+
+def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:
+    return grams_by_blocks(warehouse, read_counts(warehouse, file))
+
+
+def _name_task(file: TableFile) -> str:
+    return f"the Gram rows of {file.path}"
+
+
+def verify_documents(root: Folder, report: Verification) -> None:
+    """Look for documents and lines of the history that were changed, and documents gone."""
+    for folder in _document_folders(root):
+        report.documents += len(folder.numbers())
+        for file, problem in folder.faults().items():
+            report.note("document", file.removeprefix(f"{root}/"), problem)
+    for path, problem in find_missing_documents(root):
+        report.note("document", path, problem)
+    for path, problem in find_changed_lines(root):
+        report.note("document", path, problem)
+
+
+def _document_folders(root: Folder) -> list[DocumentFolder]:
+    found: set[str] = set()
+    for name in root.names():
+        if not (root / name / "_delta_log").exists():
+            files = (root / name).files()
+            documents = (f"{name}/{f.path}" for f in files if f.path.endswith(".json"))
+            found.update(path.rpartition("/")[0] for path in documents)
+    return [DocumentFolder(root / path) for path in sorted(found)]
+
+
+def verify_models(
+    warehouse: Warehouse, snapshots: dict[str, Snapshot], report: Verification
+) -> None:
+    """Look for versions that nothing present can have made, and aliases that point at nothing."""
+    registry = Registry.of(warehouse)
+    for name in registry.names():
+        numbers = registry.versions(name)
+        for number in numbers:
+            try:
+                manifest = registry.load(name, number).manifest
+                registry.require_drives(manifest)
+            except RefusedError as error:  # its signature
+                report.note("model", f"{name}@{number}", str(error))
+                continue
+            except (StorageError, DataError, QuestionError) as error:
+                if "drives" in str(error):  # anything else is told as a document
+                    report.note("model", f"{name}@{number}", str(error))
+                continue
+            trained = manifest.trained_on
+            if manifest.imported_from is not None:  # the tables that made it are elsewhere
+                continue
+            made_of = {"grams": trained.grams_version}
+            if trained.drives_without_log != trained.drives:
+                made_of["logs"] = trained.logs_version
+            for table, version in made_of.items():
+                latest = snapshots[table].version if table in snapshots else None
+                if latest is None or version > latest:
+                    problem = f"was made of version {version} of {table}, which does not exist"
+                    report.note("model", f"{name}@{number}", problem)
+        try:
+            aliases = registry.history(name).aliases()
+        except (FleetSlipError, ValueError):
+            continue
+        for alias, version in aliases.items():
+            if version not in numbers:
+                problem = f"points at version {version}, which does not exist"
+                report.note("model", f"{name}@{alias}", problem)
+
+
+def verify(
+    warehouse: Warehouse,
+    *,
+    full: bool = False,
+    progress: Progress = no_progress,
+    executor: Executor | None = None,
+) -> Verification:
+    """Verify a data root; `full` computes the Gram rows of all log files again.
+
+    Workers of an executor, or threads, read; `progress` counts bytes. What jobs meanwhile take away
+    is looked for again.
+    """
+    warehouse.require()
+    look = partial(_verify, warehouse, full, progress, executor)
+    return on_newest(warehouse.tables, look, lambda report: bool(report.damage))
+
+
+def _verify(
+    warehouse: Warehouse, full: bool, progress: Progress, executor: Executor | None
+) -> Verification:
+    report = Verification()
+    snapshots = _open_tables(warehouse, report)
+    read = {table: verify_files(s, report, progress, executor) for table, s in snapshots.items()}
+    logs, grams = ([one.file for one in read.get(table, [])] for table in ("logs", "grams"))
+    verify_names(warehouse, read, report, full)
+    if logs:
+        verify_drives(warehouse, logs, report)
+    _report_missing_logs(snapshots, grams, report)
+    if grams:
+        active = {file.path for file in snapshots["logs"].files} if "logs" in snapshots else set()
+        verify_grams(warehouse, SoundFiles(logs, grams, active), report, full, executor)
+    verify_documents(warehouse.root, report)
+    verify_models(warehouse, snapshots, report)
+    _list_unreferenced(warehouse, snapshots, report)
+    written = any(snapshot.version is not None for snapshot in snapshots.values())
+    if not report.findings and not report.documents and not written:
+        raise StorageError(
+            f"{warehouse.root}: there is nothing to verify, neither tables nor models. Is it the "
+            "right folder, and is its disk there? Choose another data root."
+        )
+    return report
+
+
+def _open_tables(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot]:
+    found = {}
+    for table in warehouse.tables:
+        _verify_checkpoints(table, report)
+        try:
+            snapshot = table.unchecked_snapshot()
+            _ = snapshot.files
+        except FleetSlipError as error:
+            report.note("log", table.folder.name, str(error))
+        else:
+            found[table.folder.name] = snapshot
+            for file, problem in find_commit_faults(snapshot):
+                path = f"{table.folder.name}/_delta_log/{file}"
+                report.note("log", path, problem)
+    return found
+
+
+def _verify_checkpoints(table: Table, report: Verification) -> None:
+    name = table.folder.name
+    documents = DocumentFolder(table.folder / CHECKSUMS)
+    report.documents += len(documents.numbers())
+    if faults := documents.faults():
+        for file, problem in faults.items():
+            where = f"{name}/{CHECKSUMS}/{file.rpartition('/')[2]}"
+            report.note("document", where, problem)
+        return
+    for checkpoint, problem in checkpoint_faults(table.folder):
+        report.note("log", f"{name}/_delta_log/{checkpoint}", problem)
+    for checkpoint in checkpoints_without_checksum(table.folder):
+        problem = "no checksum was kept of this checkpoint; the next one comes with both"
+        report.note("backlog", f"{name}/_delta_log/{checkpoint}", problem)
+
+
+def _report_missing_logs(
+    snapshots: Mapping[str, Snapshot], sound: Sequence[TableFile], report: Verification
+) -> None:
+    """Report a table of logs that is gone, as a folder that was not mounted is."""
+    logs, grams = snapshots.get("logs"), snapshots.get("grams")
+    if not logs or not grams or logs.version is not None:
+        return
+    damaged = frozenset(file.path for file in grams.files).difference(file.path for file in sound)
+    if gone := named_files(replace(grams, without=damaged), PLAIN)[1]:
+        problem = f"the table is gone that the Gram rows of {number_of(len(gone), 'file')} are of"
+        report.note("log", "logs", problem)
+
+
+def _list_unreferenced(
+    warehouse: Warehouse, snapshots: dict[str, Snapshot], report: Verification
+) -> None:
+    for snapshot in snapshots.values():
+        try:
+            known, files = snapshot.removed(), find_unreferenced(snapshot.table)
+        except StorageError:  # its log is damaged, as was told: it says of no file what that is
+            continue
+        for file in files:
+            what = "replaced" if file.path in known else "never committed"
+            then = "fleet-slip vacuum removes it in time"
+            if snapshot.version is None:
+                then = "if the table had a Delta log, restore that from a backup"
+            _remark(warehouse, file, f"{what}; {then}", report)
+    for file in find_temporary_files(warehouse):
+        _remark(warehouse, file, "left by a killed job, or being written", report)
+
+
+def _remark(warehouse: Warehouse, file: StoredFile, problem: str, report: Verification) -> None:
+    where = str(file).removeprefix(f"{warehouse.root}/")
+    report.note("unreferenced", where, problem)

@@ -1,0 +1,159 @@
+"""What pages are made of: numbers as people read them, tables, and templates that are filled in."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from typing import Any, Literal
+
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup
+
+from fleet_slip.pages.drawing import PALETTE
+
+
+def number(value: float | None, digits: int = 3, *, sign: bool = False) -> str:
+    """Return a number with so many decimals and a true minus sign; a dash for None."""
+    if value is None:
+        return "\N{EN DASH}"
+    text = f"{value:+.{digits}f}" if sign else f"{value:.{digits}f}"
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
+def degrees(value: float | None, digits: int = 3, *, sign: bool = False) -> str:
+    """Return an angle in degrees with its sign °; a dash for None."""
+    return number(value, digits, sign=sign) + ("" if value is None else "\N{DEGREE SIGN}")
+
+
+def percent(share: float, digits: int = 0) -> str:
+    """Return a share as a percentage."""
+    return f"{number(100 * share, digits)} %"
+
+
+def count(value: int) -> str:
+    """Return a whole number with its thousands apart."""
+    return f"{value:,}"
+
+
+def scientific(value: float, digits: int = 2) -> str:
+    """Return a number with so many digits after the first, as 1.23 × 10⁻⁴ where it is small."""
+    if value == 0 or 1e-3 <= abs(value) < 1e5:
+        return f"{value:.{digits + 1}g}".replace("-", "\N{MINUS SIGN}")
+    mantissa, _, exponent = f"{value:.{digits}e}".partition("e")
+    raised = str(int(exponent)).translate(_SUPERSCRIPTS)
+    return f"{mantissa} × 10{raised}".replace("-", "\N{MINUS SIGN}")
+
+
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def size(value: int) -> str:
+    """Return a number of bytes in its largest unit."""
+    amount = float(value)
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if amount < 1000 or unit == "TB":
+            break
+        amount /= 1000
+    return f"{amount:.0f} {unit}" if unit == "B" else f"{amount:.1f} {unit}"
+
+
+def listed(words: list[str]) -> str:
+    """Return words as a list in a sentence: a, b and c."""
+    if len(words) < 2:
+        return "".join(words)
+    return f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+Mark = Literal["", "good", "miss"]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell: its text, and whether it is marked."""
+
+    text: str
+    mark: Mark = ""
+
+
+@dataclass(frozen=True)
+class ReportTable:
+    """A table with a caption; the first `left` columns are text, the others are numbers."""
+
+    key: str
+    caption: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    left: int = 1
+    note: str = ""
+
+
+def table(
+    key: str,
+    caption: str,
+    head: Sequence[str],
+    rows: Sequence[Sequence[str | Cell]],
+    *,
+    left: int = 1,
+    note: str = "",
+) -> ReportTable:
+    """Return a table of plain texts and marked cells."""
+    cells = [[cell if isinstance(cell, Cell) else Cell(cell) for cell in row] for row in rows]
+    return ReportTable(key, caption, head, cells, left, note)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One number of a page's summary."""
+
+    value: str
+    label: str
+
+
+TEMPLATES = files("fleet_slip.pages") / "templates"
+
+
+def fill_in(template: str, **values: Any) -> str:
+    """Return a page: a template with values, and the style sheet and colours of all pages."""
+    environment = Environment(
+        loader=FunctionLoader(lambda name: (TEMPLATES / name).read_text(encoding="utf-8")),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template(template).render(
+        css=Markup((TEMPLATES / "report.css").read_text(encoding="utf-8")),  # noqa: S704
+        palette={name.replace("_", "-"): tone for name, tone in PALETTE.items()},
+        **values,
+    )
+    return page + "\n"
+
+
+# What a notebook shows of an answer: a table, with a bar in each row.
+
+
+def notebook_table(
+    title: str, header: Sequence[str], rows: Sequence[Sequence[str]], sizes: Sequence[float]
+) -> str:
+    """Return HTML of rows of text, each with a bar as long as its size beside the largest."""
+    largest = max((abs(size) for size in sizes), default=0.0) or 1.0
+    names = "".join(f"<th>{escape(name)}</th>" for name in header)
+    lines = "".join(
+        f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}<td>{_bar(size / largest)}</td>"
+        "</tr>"
+        for row, size in zip(rows, sizes, strict=True)
+    )
+    return (
+        f"<table><caption>{escape(title)}</caption><thead><tr>{names}<th></th></tr></thead>"
+        f"<tbody>{lines}</tbody></table>"
+    )
+
+
+def _bar(part: float) -> str:
+    """Return a drawing of a share from -1 to 1, to the left or to the right of its middle."""
+    length = 60 * abs(part)
+    return (
+        '<svg width="122" height="10" role="img" aria-hidden="true">'
+        f'<rect x="{61 - (length if part < 0 else 0):.1f}" y="1" width="{length:.1f}" height="8" '
+        'fill="#4269d0"/></svg>'
+    )

@@ -1,0 +1,390 @@
+"""Ranking and criterion together: which of the k+1 nested models, and how well that choice does.
+
+A choice flatters its winner, so that it is made again inside every training fold.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.base import IntArray
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.exact import eliminate
+from fleet_slip.regression.folds import (
+    CrossValidation,
+    Folds,
+    assemble,
+    cross_validate,
+    error_of_mean,
+    held_out_errors,
+    least_squares,
+)
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.inference import Evidence
+from fleet_slip.regression.least_squares import Fit, Scales, dependence, fit_leading, moments
+from fleet_slip.regression.orders import rank
+from fleet_slip.regression.subsets import best_size, criterion_values
+
+# Which model wins: the fewest signals whose shortfall from the best is negligible.
+#
+# A gain must be worth having, which a user says. What a model lacks is sqrt(MSE - MSE of the
+# best), in which the label's noise cancels: of nested models, how far their estimates lie apart.
+# And it must be real: larger than its standard error, paired over the same folds, whose difficulty
+# cancels (Breiman, Friedman, Olshen and Stone 1984, section 3.4.3, take that of the best model's
+# own figure).
+#
+# Without folds, the same rows are divided into groups of independent units, cars or drives. With d
+# a group's difference of squared errors and n its rows, the difference of the mean squared errors
+# is sum d / sum n, with the standard error of a ratio (Cochran, Sampling Techniques, 1977, section
+# 6.4).
+
+
+@dataclass(frozen=True)
+class Worth:
+    """The smallest gain that is worth a signal.
+
+    Absolute: sqrt(MSE - MSE of the best), in rad. Relative: of RMSEs, as a part of the best's.
+    """
+
+    amount: float
+    relative: bool = False
+
+    def squared(self, rmse: float) -> float:
+        """Return the difference of mean squared errors, in rad^2, the best having this RMSE."""
+        share = self.amount * (2 + self.amount) * rmse**2  # ((1 + amount) rmse)^2 - rmse^2
+        return share if self.relative else self.amount**2
+
+    def __str__(self) -> str:
+        if self.relative:
+            return f"{100 * self.amount:.3g} % of the best"
+        return f"{math.degrees(self.amount):.4g} deg"
+
+
+DEFAULT_WORTH = Worth(math.radians(0.025))
+"""A quarter of what the best reference sensors are accurate to, about 0.1 deg."""
+
+
+@dataclass(frozen=True)
+class Shortfall:
+    """How much larger a `model`'s RMSE (rad) is than the best's, over the same folds.
+
+    `square` is the difference of mean squared errors, rad^2; `worthless` if not worth having.
+    """
+
+    model: CrossValidation
+    rmse: float
+    standard_error: float
+    square: float
+    worthless: bool
+
+    @property
+    def lacks(self) -> float:
+        """What the model lacks, in rad, without the noise of the label; 0 if it is the better."""
+        return math.sqrt(max(self.square, 0.0))
+
+    @property
+    def real(self) -> bool:
+        """Whether it is larger than its standard error."""
+        return self.rmse > self.standard_error
+
+    @property
+    def negligible(self) -> bool:
+        """Whether the best model is no reason to do without this one."""
+        return self.worthless or not self.real
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {
+            "rmse_deg": math.degrees(self.rmse),
+            "standard_error_deg": math.degrees(self.standard_error),
+            "lacks_deg": math.degrees(self.lacks),
+            "real": self.real,
+            "negligible": self.negligible,
+        }
+
+    def __str__(self) -> str:
+        return f"{math.degrees(self.rmse):.4f} +- {math.degrees(self.standard_error):.2g} deg"
+
+
+@dataclass(frozen=True)
+class Winner:
+    """The chosen model, the best-correlated one, the reason, and the shortfalls of all if any."""
+
+    model: CrossValidation
+    best: CrossValidation
+    reason: str
+    shortfalls: tuple[Shortfall, ...] = ()
+
+
+def choose(models: Sequence[CrossValidation], worth: Worth = DEFAULT_WORTH) -> Winner:
+    """Return the winner of cross-validated models, given in their declared order.
+
+    Among those negligibly worse than the best pooled correlation the fewest signals win, then the
+    higher exact correlation, then the declared order. Raises `QuestionError` for none.
+    """
+    if not models:
+        raise QuestionError("no model to choose from: the list of models is empty.")
+    best = max(models, key=lambda model: model.sums.signed_r_squared)
+    shortfalls = tuple(fall_short(model, best, worth) for model in models)
+    near = [one for one in shortfalls if one.model is best or one.negligible]
+    fewest = min(len(one.model.signals) for one in near)
+    smallest = [one for one in near if len(one.model.signals) == fewest]
+    winner = max(smallest, key=lambda one: one.model.sums.signed_r_squared)
+    reason = _reason(winner, best, len(near), len(models), worth)
+    return Winner(winner.model, best, reason, shortfalls)
+
+
+def fall_short(model: CrossValidation, best: CrossValidation, worth: Worth) -> Shortfall:
+    """Return how much larger a model's RMSE is than another's, over the same folds."""
+    difference, square = _differences(model, best)
+    worthless = square < worth.squared(best.pooled.rmse)
+    return Shortfall(model, difference, _standard_error(model, best), square, worthless)
+
+
+def _differences(model: CrossValidation, other: CrossValidation) -> tuple[float, float]:
+    """Return how much larger a model's pooled RMSE is than another's, and its square."""
+    one, two = model.pooled.rmse, other.pooled.rmse
+    return one - two, (one - two) * (one + two)
+
+
+def _standard_error(one: CrossValidation, other: CrossValidation) -> float:
+    """Return the standard error of the difference of RMSEs over folds, paired where rows agree."""
+    first, second = ([fold.rmse for fold in model.folds] for model in (one, other))
+    rows = [[fold.rows for fold in model.folds] for model in (one, other)]
+    if one.fold_names == other.fold_names and rows[0] == rows[1]:
+        return error_of_mean([a - b for a, b in zip(first, second, strict=True)])
+    return math.hypot(error_of_mean(first), error_of_mean(second))
+
+
+def _reason(winner: Shortfall, best: CrossValidation, near: int, total: int, worth: Worth) -> str:
+    if winner.model is best and near == total == 1:
+        return f"Model {best.name} is the only one."
+    rmse = f"RMSE {best.pooled.rmse_deg:.4f} deg"
+    if winner.model is best:
+        others = "every other model" if near == 1 else "every model with fewer signals"
+        return (
+            f"Model {best.name} has the best cross-validated correlation, {best.correlation:.4f}, "
+            f"with {rmse}. The error of {others} is larger by {worth} or more, and by more than "
+            "one standard error of the difference."
+        )
+    real = "real, but less than" if winner.real else "not real; worth having would be"
+    lacks_deg = math.degrees(winner.lacks)
+    lacking = "" if worth.relative else f", what an independent error of {lacks_deg:.2g} deg adds"
+    return (
+        f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of the "
+        f"{near} models whose error is negligibly larger than that of model {best.name}, the best "
+        f"({len(best.signals)} signals, {rmse}). The difference, {winner} over the same folds"
+        f"{lacking}, is {real} {worth}."
+    )
+
+
+def compare_paired(model: CrossValidation, other: CrossValidation, worth: Worth) -> Shortfall:
+    """Return how much larger a model's RMSE is, folds being independent. Raises `ValueError`."""
+    rows = _common_rows(model, other)
+    differences = [
+        n * (one.rmse - two.rmse) * (one.rmse + two.rmse)
+        for n, one, two in zip(rows, model.folds, other.folds, strict=True)
+    ]
+    ratio, groups = math.fsum(differences) / sum(rows), len(rows)
+    square = math.fsum((d - ratio * n) ** 2 for d, n in zip(differences, rows, strict=True))
+    error = math.sqrt(square * groups / (groups - 1)) / sum(rows)
+    both = model.pooled.rmse + other.pooled.rmse
+    rmse, lacking = _differences(model, other)
+    worthless = lacking < worth.squared(other.pooled.rmse)
+    return Shortfall(model, rmse, error / both if both else 0.0, lacking, worthless)
+
+
+def compare_typical(model: CrossValidation, other: CrossValidation, worth: Worth) -> Shortfall:
+    """Return how much larger a model's RMSE is than another's in the median group, a vote each.
+
+    After the median of means (Lugosi and Mendelson 2019); the standard error is that of a median of
+    normals, their deviation from the median absolute one. Raises `ValueError` for other rows.
+    """
+    _common_rows(model, other)
+    differences = [one.rmse - two.rmse for one, two in zip(model.folds, other.folds, strict=True)]
+    middle = median(differences)
+    deviation = 1.4826 * median(abs(one - middle) for one in differences)
+    error = math.sqrt(math.pi / 2 / len(differences)) * deviation
+    square = middle * (2 * other.pooled.rmse + middle)
+    worthless = square < worth.squared(other.pooled.rmse)
+    return Shortfall(model, middle, error, square, worthless)
+
+
+def _common_rows(model: CrossValidation, other: CrossValidation) -> list[int]:
+    rows = [fold.rows for fold in model.folds]
+    if model.fold_names != other.fold_names or rows != [fold.rows for fold in other.folds]:
+        raise ValueError("the models were not tested on the same rows")
+    return rows
+
+
+def nested_fits(
+    gram: Gram, order: Sequence[str], label: str, *, intercept: bool = True
+) -> list[Fit]:
+    """Return the exact fits of the first 0..k signals. Raises `DataError` for dependent ones."""
+    part = gram.restrict([*order, label])
+    triangle = eliminate(moments(part, intercept=intercept))
+    if triangle.singular is not None:
+        raise DataError(dependence(part, order, intercept=intercept))
+    sizes = range(len(order) + 1)
+    return [fit_leading(part, triangle, size, intercept=intercept) for size in sizes]
+
+
+CROSS_VALIDATION = "cross-validation"
+"""The criterion that cross-validates all nested models; the smallest that is nearly best wins."""
+
+
+FEWEST_FOLDS = 3
+"""To make a choice again inside the training folds, two of them must be left."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A ranking, a criterion or `CROSS_VALIDATION`, and what a signal must gain to be kept."""
+
+    ranking: str
+    criterion: str
+    worth: Worth = DEFAULT_WORTH
+
+
+@dataclass(frozen=True)
+class NestedChoice:
+    """A choice of the first `size` signals of an order, their exact fit and its evidence.
+
+    `values` of the criterion are for 0..k signals, smaller being better; of cross-validation they
+    are the negative correlations.
+    """
+
+    order: tuple[str, ...]
+    size: int
+    fit: Fit
+    evidence: Evidence
+    values: tuple[float, ...]
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The chosen signals."""
+        return self.order[: self.size]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {
+            "order": list(self.order),
+            "signals": list(self.signals),
+            "criterion_values": list(self.values),
+            **self.evidence.as_dict(),
+        }
+
+
+@dataclass(frozen=True)
+class NestedDistances:
+    """Distances D of the nested models of an order; `null` is the model without any signal."""
+
+    order: tuple[str, ...]
+    evidence: Evidence
+    null: CrossValidation
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {"order": list(self.order), **self.evidence.as_dict(), "null": self.null.as_dict()}
+
+
+@dataclass(frozen=True)
+class TrainingFolds:
+    """The rows to choose on: their folds, and per-drive moments of them (None: rows independent).
+
+    `scales` is the physical value of a count of each signal. Without `intercept` moments are about
+    zero.
+    """
+
+    folds: Folds
+    drives: DriveMoments | None
+    scales: Scales
+    intercept: bool = True
+
+    @property
+    def total(self) -> Gram:
+        """The Gram to rank and search on."""
+        return self.folds.total if self.intercept else self.folds.total.about_origin()
+
+    def nested_fits(self, order: Sequence[str], label: str) -> list[Fit]:
+        """Return the k+1 nested fits of an order. Raises `DataError` for dependent signals."""
+        return nested_fits(self.folds.total, order, label, intercept=self.intercept)
+
+    def evidence(self, fits: Sequence[Fit]) -> Evidence:
+        """Return what the rows say of the nested models of an order; raises like `Evidence`."""
+        if self.drives is None:
+            return Evidence.naive(fits)
+        return Evidence.clustered(fits, self.drives)
+
+    def cross_validate(self, name: str, inputs: Sequence[str], label: str) -> CrossValidation:
+        """Cross-validate least squares on given inputs."""
+        procedure = least_squares(inputs, label, intercept=self.intercept)
+        return cross_validate(name, self.folds, procedure, self.scales)
+
+
+def select_nested(
+    training: TrainingFolds, inputs: Sequence[str], label: str, rule: Rule
+) -> NestedChoice:
+    """Rank the inputs and choose a nested model. Raises `DataError` and `QuestionError`."""
+    order = rank(rule.ranking, training.total, inputs, label)
+    fits = training.nested_fits(order, label)
+    evidence = training.evidence(fits)
+    if rule.criterion == CROSS_VALIDATION:
+        models = cross_validate_nested(training, order, label)
+        size = len(choose(models, rule.worth).model.signals)
+        values = tuple(-model.correlation for model in models)
+    else:
+        size = best_size(rule.criterion, evidence)
+        values = tuple(criterion_values(rule.criterion, evidence).tolist())
+    return NestedChoice(order, size, fits[size], evidence, values)
+
+
+def measure_distances(training: TrainingFolds, order: Sequence[str], label: str) -> NestedDistances:
+    """Return the distances of an order as it is given. Raises `DataError` as `select_nested`."""
+    evidence = training.evidence(training.nested_fits(order, label))
+    null = training.cross_validate("none", (), label)
+    return NestedDistances(tuple(order), evidence, null)
+
+
+def cross_validate_nested(
+    training: TrainingFolds, order: Sequence[str], label: str
+) -> list[CrossValidation]:
+    """Cross-validate the k+1 nested models of a given order; model j is called "first j"."""
+    return [
+        training.cross_validate(f"first {size}", order[:size], label)
+        for size in range(len(order) + 1)
+    ]
+
+
+def cross_validate_selection(
+    name: str,
+    training: TrainingFolds,
+    fold: IntArray,
+    inputs: Sequence[str],
+    label: str,
+    rule: Rule,
+) -> CrossValidation:
+    """Cross-validate the choice itself, `fold` saying each drive's fold. Raises `DataError`."""
+    folds = training.folds
+    tests = []
+    for number, test in enumerate(folds.grams):
+        rest = _without(training, fold, number)
+        model = select_nested(rest, inputs, label, rule).fit.model
+        tests.append(held_out_errors(model, rest.folds.total, test))
+    chosen = select_nested(training, inputs, label, rule).fit.model
+    return assemble(name, folds, tests, chosen, training.scales)
+
+
+def _without(training: TrainingFolds, fold: IntArray, number: int) -> TrainingFolds:
+    if len(training.folds.grams) < FEWEST_FOLDS:
+        raise QuestionError("choosing inside the training folds needs at least three folds.")
+    drives = training.drives
+    rest = training.folds.without(number, int(np.count_nonzero(fold != number)))
+    return replace(
+        training, folds=rest, drives=drives.take(fold != number) if drives is not None else None
+    )

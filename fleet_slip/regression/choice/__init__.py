@@ -1,1 +1,0 @@
-"""Which inputs: nested models, subsets, orders and criteria."""

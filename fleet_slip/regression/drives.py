@@ -1,0 +1,509 @@
+"""Per-drive moments in float64 for what needs every drive: clusters and resampling.
+
+They are about the cohort's mean, rounded to a count, while integers: nothing cancels.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from statistics import NormalDist
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.base import BoolArray, FloatArray, IntArray, number_of
+from fleet_slip.errors import DataError
+from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.gram import Gram, GramTable, packed_position, packed_size
+from fleet_slip.regression.least_squares import Fit, LinearModel, fit
+
+ClusterUnit = Literal["drive", "vehicle"]
+"""What counts as one independent piece of evidence."""
+
+
+def missing_signals_error(signals: Sequence[str]) -> DataError:
+    """Return the error that no drive of a cohort has all of some signals."""
+    return DataError(
+        f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or another "
+        "cohort."
+    )
+
+
+def require_serving_drives(tables: Sequence[GramTable], signals: Sequence[str]) -> None:
+    """Raise `DataError` if no drive has all the signals."""
+    if not any(set(signals) <= set(table.signals) for table in tables):
+        raise missing_signals_error(signals)
+
+
+def serving_drives(
+    tables: Sequence[GramTable], signals: Sequence[str]
+) -> tuple[GramTable, BoolArray]:
+    """Return one table of drives with all signals, and their mask. Raises `DataError` for none."""
+    require_serving_drives(tables, signals)
+    served = [set(signals) <= set(table.signals) for table in tables]
+    parts = [table.restrict(signals) for table, yes in zip(tables, served, strict=True) if yes]
+    mask = np.repeat(served, [len(table) for table in tables])
+    if len(parts) == 1:
+        return parts[0], mask
+    stacked = GramTable(
+        tuple(signals),
+        np.concatenate([part.n for part in parts]),
+        np.concatenate([part.sums for part in parts]),
+        np.concatenate([part.products for part in parts]),
+    )
+    return stacked, mask
+
+
+@dataclass(frozen=True)
+class DriveMoments:
+    """Moments of u = (1, (count - centre) / spread) of each drive; the label is last.
+
+    Attributes:
+        centre: mean count of each signal over all drives, rounded to an integer.
+        spread: standard deviation of each signal's counts; 1 for a constant.
+        packed: lower triangle of the (k+1) x (k+1) moments of u, shape (drives, (k+1)(k+2)/2).
+        cluster: number of each drive's piece of evidence, shape (drives,); None: its own.
+        unit: what a piece of evidence is: drives of a car share its biases and tyres.
+    """
+
+    signals: tuple[str, ...]
+    centre: tuple[int, ...]
+    spread: FloatArray
+    packed: FloatArray
+    cluster: IntArray | None = None
+    unit: ClusterUnit = "drive"
+
+    @classmethod
+    def of(
+        cls,
+        table: GramTable,
+        cluster: IntArray | None = None,
+        unit: ClusterUnit = "drive",
+        *,
+        centred: bool = True,
+    ) -> "DriveMoments":
+        """Scale a table of drives, about zero unless centred. Raises `DataError` without rows."""
+        total = table.total()
+        if total.n == 0:
+            raise DataError(f"no rows have all of {', '.join(table.signals)}.")
+        k = len(table.signals)
+        centre = tuple(round(s / total.n) if centred else 0 for s in total.sums)
+        squares = np.array([total.centred()[i][i] for i in range(k)], dtype=np.float64)
+        spread = np.where(squares > 0, np.sqrt(squares) / total.n, 1.0)
+        about = table.about(centre)
+        row, column = np.tril_indices(k)
+        packed = np.empty((len(table), packed_size(k + 1)))
+        packed[:, 0] = about.n
+        for i in range(k):
+            start = packed_position(i + 1, 0)
+            packed[:, start] = about.sums[:, i] / spread[i]
+        inner = [
+            packed_position(i, j)
+            for i, j in zip((row + 1).tolist(), (column + 1).tolist(), strict=True)
+        ]
+        packed[:, inner] = about.products / (spread[row] * spread[column])
+        return cls(table.signals, centre, spread, packed, cluster, unit)
+
+    def __len__(self) -> int:
+        return len(self.packed)
+
+    @property
+    def size(self) -> int:
+        """Length of u: the constant, the inputs and the label."""
+        return len(self.signals) + 1
+
+    def take(self, rows: NDArray[Any]) -> "DriveMoments":
+        """Return the drives at an index array or a mask, with the same centre and spread."""
+        cluster = None if self.cluster is None else self.cluster[rows]
+        return replace(self, packed=self.packed[rows], cluster=cluster)
+
+    @property
+    def clusters(self) -> "DriveMoments":
+        """The moments of each independent piece of evidence, in the order of their numbers."""
+        if self.cluster is None:
+            return self
+        numbers = np.unique(self.cluster)
+        return replace(self, packed=self.sum_clusters(self.packed), cluster=numbers)
+
+    def sum_clusters(self, values: FloatArray) -> FloatArray:
+        """Add up what is given for each drive, shape (drives, columns), over each cluster."""
+        if self.cluster is None:
+            return values
+        order = np.argsort(self.cluster, kind="stable")
+        _, first = np.unique(self.cluster[order], return_index=True)
+        return np.add.reduceat(values[order], first, axis=0)
+
+    def matrix(self, packed: FloatArray) -> FloatArray:
+        """Unpack moments, shape (..., p), to symmetric matrices, shape (..., k+1, k+1)."""
+        k = range(self.size)
+        at = np.array([[packed_position(i, j) for j in k] for i in k])
+        return packed[..., at]
+
+    def direction(self, model: LinearModel) -> FloatArray:
+        """Return w with w'u = prediction minus label, in spreads of the label; model in counts."""
+        if model.label != self.signals[-1]:
+            raise ValueError(f"the moments end with {self.signals[-1]}, not {model.label}")
+        weights = dict(zip(model.signals, model.coefficients, strict=True))
+        inputs = self.signals[:-1]
+        level = model.intercept - self.centre[-1]
+        level += sum(weights.get(s, 0) * c for s, c in zip(inputs, self.centre, strict=False))
+        unit = self.spread[-1]
+        slopes = [
+            float(weights.get(s, 0)) * spread / unit
+            for s, spread in zip(inputs, self.spread, strict=False)
+        ]
+        return np.array([float(level) / unit, *slopes, -1.0])
+
+    def products_with(self, w: FloatArray) -> FloatArray:
+        """Return sum over a drive's rows of u times w'u, shape (drives, k+1)."""
+        k = self.size
+        expand = np.zeros((self.packed.shape[1], k))
+        for i in range(k):
+            for j in range(k):
+                expand[packed_position(i, j), i] += w[j]
+        return self.packed @ expand
+
+
+# Cars whose influence on a model no honest car has, from Gram matrices alone.
+#
+# Influence is the root mean square, over all rows, of how the estimate changes without the car:
+# Cook's distance (1977) of a group, exact leave-one-out. With M the moments of the inputs, M_c a
+# car's and H = M^-1 M_c its leverage, its mean square is a tr(H H) if coefficients differ by car,
+# and b tr(H) if by drive; a car may have the larger of both beside that of median leverage.
+
+FALSE_ALARMS = 0.001
+"""One honest car in so many would be left out, were the logarithms of influences normal."""
+
+MOST_LEFT_OUT = 10
+"""At most one car in so many is left out: where more are unusual, nothing is usual."""
+
+LEAST_CARS = 20
+
+
+@dataclass(frozen=True)
+class Influential:
+    """A car, its influence over what its leverage gives and the median car's, and its rows."""
+
+    car: int
+    times: float
+    rows: float
+
+
+def find_influential(moments: DriveMoments, cars: IntArray) -> list[Influential]:
+    """Return the cars of unusual influence, the most unusual first.
+
+    `cars` numbers each drive's car from 0. One by one the car goes whose log influence lies above
+    the median by more spreads (1.4826 median absolute deviations) than `FALSE_ALARMS` would. Raises
+    `DataError` for fewer than `LEAST_CARS` cars.
+    """
+    number = int(cars.max()) + 1
+    if number < LEAST_CARS:
+        raise DataError(
+            f"what is usual among cars takes {LEAST_CARS} of them, and these drives are of "
+            f"{number}. Select without leaving cars out, or widen the cohort."
+        )
+    each = np.zeros((number, moments.size, moments.size))
+    np.add.at(each, cars, moments.matrix(moments.packed))
+    rest = np.arange(number)
+    found: list[Influential] = []
+    limit = NormalDist().inv_cdf(1 - FALSE_ALARMS)
+    while len(found) < number // MOST_LEFT_OUT:
+        some = each[rest]
+        influence = influences(some) / allowances(some)
+        logs = np.log(np.maximum(influence, np.finfo(np.float64).tiny))
+        spread = 1.4826 * float(np.median(np.abs(logs - np.median(logs))))
+        worst = int(np.argmax(logs))
+        if logs[worst] <= np.median(logs) + limit * spread:
+            break
+        times = float(np.exp(logs[worst] - np.median(logs)))
+        rows = float(each[rest[worst], 0, 0] / each[:, 0, 0].sum())
+        found.append(Influential(int(rest[worst]), times, rows))
+        rest = np.delete(rest, worst)
+    return found
+
+
+def influences(each: FloatArray) -> FloatArray:
+    """Return the influence of each car, from its moments of (1, inputs, label), label last."""
+    total = each.sum(axis=0)
+    left = total - each
+    whole = _solve(total[None])[0]
+    change = whole - _solve(left)
+    squares = np.einsum("ci,ij,cj->c", change, total[:-1, :-1], change) / total[0, 0]
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0)), dtype=np.float64)
+
+
+def allowances(each: FloatArray) -> FloatArray:
+    """Return the influence that its leverage gives each car, beside a car of median leverage."""
+    inputs = each[:, :-1, :-1]
+    leverage = _inverse(inputs.sum(axis=0)) @ inputs
+    squared = np.einsum("cij,cji->c", leverage, leverage)
+    single = np.einsum("cii->c", leverage)
+    largest = np.maximum(squared / np.median(squared), single / np.median(single))
+    return np.asarray(np.sqrt(largest), dtype=np.float64)
+
+
+def _solve(moments: FloatArray) -> FloatArray:
+    """Return the coefficients of each; inputs that depend on others share theirs."""
+    inverse = _inverse(moments[:, :-1, :-1])
+    return np.asarray((inverse @ moments[:, :-1, -1:])[..., 0], dtype=np.float64)
+
+
+def _inverse(inputs: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.pinv(inputs, rcond=1e-13, hermitian=True), dtype=np.float64)
+
+
+# Repeated k-fold cross-validation and the cluster bootstrap over drives.
+#
+# Both work in float64 on centred and scaled moments: thousands of refits are matrix products.
+
+_BATCH_BYTES = 2**26
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A percentile interval of so many resampled figures, of which the share `level` is inside."""
+
+    low: float
+    high: float
+    level: float
+    replicates: int
+
+
+def percentile_interval(values: FloatArray) -> Interval:
+    """Return the central 95 % percentile interval of finite values."""
+    level = 0.95
+    finite = values[np.isfinite(values)]
+    low, high = np.quantile(finite, [(1 - level) / 2, (1 + level) / 2])
+    return Interval(float(low), float(high), level, len(finite))
+
+
+def held_out_products(
+    drives: DriveMoments,
+    fold: np.ndarray[tuple[int], np.dtype[np.int64]],
+    models: Sequence[LinearModel],
+) -> FloatArray:
+    """Return each cluster's moments of (1, error, label) under the fold's model that left it out.
+
+    Shape (clusters, 6), packed lower triangle, in spreads of the label.
+    """
+    result = np.empty((len(drives), 6))
+    label = drives.size - 1
+    for number, model in enumerate(models):
+        rows = np.flatnonzero(fold == number)
+        part = drives.packed[rows]
+        change = np.zeros((3, drives.size))
+        change[0, 0] = change[2, label] = 1.0
+        change[1] = drives.direction(model)
+        result[rows] = part @ _congruence(change)
+    return drives.sum_clusters(result)
+
+
+def bootstrap_correlations(products: FloatArray, replicates: int, seed: int) -> FloatArray:
+    """Return pooled correlations of resampled `held_out_products`. Raises `DataError`."""
+    totals = _resampled_totals(products, replicates, seed)
+    n, e, ee, y, ye, yy = totals.T
+    # The prediction is the label plus the error.
+    p, py, pp = y + e, yy + ye, yy + 2 * ye + ee
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(_correlation(n, p, pp, py, y, yy))
+
+
+def _correlation(n: Any, p: Any, pp: Any, py: Any, y: Any, yy: Any) -> Any:
+    return (py - p * y / n) / np.sqrt((pp - p * p / n) * (yy - y * y / n))
+
+
+def solve(totals: FloatArray, *, intercept: bool = True) -> FloatArray:
+    """Solve for (constant, inputs) in each moment matrix, label last; the constant may be zero."""
+    if not intercept:
+        slopes = solve(totals[..., 1:, 1:])
+        return np.concatenate([np.zeros_like(slopes[..., :1]), slopes], axis=-1)
+    try:
+        return np.asarray(np.linalg.solve(totals[..., :-1, :-1], totals[..., :-1, -1:])[..., 0])
+    except np.linalg.LinAlgError:
+        raise DataError(
+            "a resampled cohort cannot be fitted: too few drives have these signals."
+        ) from None
+
+
+@dataclass(frozen=True)
+class RepeatedCrossValidation:
+    """Pooled figures of k-fold cross-validation, one a repeat; the RMSE in counts of the label."""
+
+    correlations: FloatArray
+    rmse: FloatArray
+
+    @property
+    def mean(self) -> float:
+        """Mean correlation."""
+        return float(self.correlations.mean())
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the correlation between repeats."""
+        return float(self.correlations.std(ddof=1)) if len(self.correlations) > 1 else 0.0
+
+
+def repeated_cross_validation(
+    drives: DriveMoments, folds: int, repeats: int, seed: int, *, intercept: bool = True
+) -> RepeatedCrossValidation:
+    """Cross-validate least squares with `repeats` random deals into folds. Raises `DataError`."""
+    if len(drives) < folds:
+        raise DataError(
+            f"{number_of(len(drives), 'drive')} cannot fill {number_of(folds, 'fold')}."
+        )
+    rng = np.random.default_rng(seed)
+    batch = max(1, _BATCH_BYTES // (8 * folds * len(drives)))
+    figures = []
+    for start in range(0, repeats, batch):
+        size = min(batch, repeats - start)
+        fold = np.stack([rng.permutation(len(drives)) % folds for _ in range(size)])
+        member = (fold[:, None, :] == np.arange(folds)[:, None]).astype(np.float64)
+        totals = member.reshape(size * folds, -1) @ drives.packed
+        for tests in drives.matrix(totals).reshape(size, folds, drives.size, drives.size):
+            solutions = solve(tests.sum(axis=0) - tests, intercept=intercept)
+            figures.append(_correlation_and_rmse(tests, solutions))
+    correlations, rmse = np.array(figures).T
+    return RepeatedCrossValidation(correlations, rmse * float(drives.spread[-1]))
+
+
+def _correlation_and_rmse(tests: FloatArray, solutions: FloatArray) -> tuple[float, float]:
+    """Return the figures of models, one a fold, on the moments of their test rows together."""
+    inputs, cross = tests[:, :-1, :-1], tests[:, :-1, -1]
+    n, y, yy = tests[:, 0, 0].sum(), tests[:, 0, -1].sum(), tests[:, -1, -1].sum()
+    p = np.einsum("fi,fi->", tests[:, 0, :-1], solutions)
+    pp = np.einsum("fi,fij,fj->", solutions, inputs, solutions)
+    py = np.einsum("fi,fi->", cross, solutions)
+    v = np.concatenate([solutions, -np.ones((len(solutions), 1))], axis=1)
+    error = np.einsum("fi,fij,fj->", v, tests, v)
+    return float(_correlation(n, p, pp, py, y, yy)), math.sqrt(max(float(error), 0.0) / n)
+
+
+def _congruence(change: FloatArray) -> FloatArray:
+    """Return the map from packed moments of u to packed moments of `change @ u`."""
+    new, old = change.shape
+    i, j = np.tril_indices(old)
+    columns = []
+    for a, b in zip(*np.tril_indices(new), strict=True):
+        both = change[a, i] * change[b, j]
+        other = change[a, j] * change[b, i]
+        columns.append(np.where(i == j, both, both + other))
+    return np.column_stack(columns)
+
+
+def _resampled_totals(values: FloatArray, replicates: int, seed: int) -> FloatArray:
+    """Return sums over as many drives drawn with replacement, shape (replicates, columns)."""
+    drives = len(values)
+    if drives < 2:
+        raise DataError("a bootstrap needs at least two drives, or cars, to draw from.")
+    # SFC64 and 64-bit draws are the fastest that bincount takes without a copy.
+    rng = np.random.Generator(np.random.SFC64(seed))
+    batch = max(1, _BATCH_BYTES // (8 * drives))
+    totals = []
+    for start in range(0, replicates, batch):
+        size = min(batch, replicates - start)
+        times = np.empty((size, drives))
+        for row in times:
+            row[:] = np.bincount(rng.integers(0, drives, drives), minlength=drives)
+        totals.append(times @ values)
+    return np.concatenate(totals)
+
+
+# Serial correlation of the residuals, from a Gram of signals and their previous values.
+#
+# Over rows with a predecessor: S0 = sum u_t u_t', S1 = sum u_t u_{t-1}', Sm = sum u_{t-1} u_{t-1}'.
+
+_GRID = 2**20
+_ROUNDS = 50
+
+
+@dataclass(frozen=True)
+class LagGram:
+    """A Gram of signals `x` and of their previous values, `x` with the suffix."""
+
+    gram: Gram
+    suffix: str
+
+    def before(self, name: str) -> str:
+        """Return the name of a signal's previous value."""
+        return name + self.suffix
+
+
+@dataclass(frozen=True)
+class SerialCorrelation:
+    """Correlation rho of a residual with the one before, and sum (e_t - e_{t-1})^2 / sum e_t^2."""
+
+    rho: float
+    durbin_watson: float
+
+
+def serial_correlation(model: LinearModel, gram: Gram, lagged: LagGram) -> SerialCorrelation:
+    """Return the serial correlation of a model of counts. Raises `DataError` without residuals."""
+    now_before, before = _residual_products(model, lagged)
+    steps = error_sums(_difference(model), _with_differences(model, lagged)).squared_error
+    total = error_sums(model, gram).squared_error
+    if total == 0 or before == 0:
+        raise DataError("the model has no residual: serial correlation is undefined.")
+    return SerialCorrelation(float(now_before / before), float(steps / total))
+
+
+def quasi_difference(lagged: LagGram, signals: Sequence[str], rho: Fraction) -> Gram:
+    """Return the Gram of q u_t - p u_{t-1} for rho = p / q, exactly, in counts worth 1/q.
+
+    Coefficients stay; the intercept becomes q - p times that of the levels.
+    """
+    p, q = rho.numerator, rho.denominator
+    return lagged.gram.combine({name: {name: q, lagged.before(name): -p} for name in signals})
+
+
+@dataclass(frozen=True)
+class AutoregressiveFit:
+    """The AR(1) model of counts for levels, its rho, and the fit of the differenced signals."""
+
+    model: LinearModel
+    rho: float
+    differenced: Fit
+
+
+def fit_autoregressive(lagged: LagGram, inputs: Sequence[str], label: str) -> AutoregressiveFit:
+    """Fit AR(1) by Cochrane-Orcutt (1949), rho on a grid of 2^-20, exactly. Raises `DataError`."""
+    signals = [*inputs, label]
+    rho = Fraction(0)
+    for _ in range(_ROUNDS):
+        differenced = fit(quasi_difference(lagged, signals, rho), inputs, label)
+        level = differenced.model.intercept / (rho.denominator - rho.numerator)
+        coefficients = differenced.model.coefficients
+        model = LinearModel(tuple(inputs), label, coefficients, level)
+        now_before, before = _residual_products(model, lagged)
+        if before == 0:
+            raise DataError("the model has no residual: serial correlation is undefined.")
+        new = Fraction(round(now_before / before * _GRID), _GRID)
+        if abs(new) >= 1:
+            raise DataError(f"the residuals are a random walk (rho = {float(new):.4f}).")
+        if new == rho:
+            break
+        rho = new
+    return AutoregressiveFit(model, float(rho), differenced)
+
+
+def _residual_products(model: LinearModel, lagged: LagGram) -> tuple[Fraction, Fraction]:
+    before = LinearModel(
+        tuple(map(lagged.before, model.signals)),
+        lagged.before(model.label),
+        model.coefficients,
+        model.intercept,
+    )
+    square = error_sums(before, lagged.gram).squared_error
+    now = error_sums(model, lagged.gram).squared_error
+    step = error_sums(_difference(model), _with_differences(model, lagged)).squared_error
+    # (e_t - e_{t-1})^2 = e_t^2 - 2 e_t e_{t-1} + e_{t-1}^2
+    return (now + square - step) / 2, square
+
+
+def _difference(model: LinearModel) -> LinearModel:
+    return LinearModel(model.signals, model.label, model.coefficients, Fraction(0))
+
+
+def _with_differences(model: LinearModel, lagged: LagGram) -> Gram:
+    return quasi_difference(lagged, [*model.signals, model.label], Fraction(1))

@@ -1,1 +1,0 @@
-"""Gram matrices and their exact solution, rounded once."""

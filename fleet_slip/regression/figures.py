@@ -1,0 +1,220 @@
+"""Figures of merit from exact sums of predictions and labels.
+
+Distribution functions: normal, Student's t, F and chi-square, instead of all of SciPy.
+"""
+
+import math
+import operator
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.base import FloatArray
+from fleet_slip.regression import exact
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import LinearModel
+
+
+@dataclass(frozen=True)
+class ErrorSums:
+    """Sums over n rows of a prediction p, a label y and their products; they add over folds.
+
+    `null` is the sum of (y - m)^2, with m the mean label of the training rows.
+    """
+
+    n: int
+    p: Fraction
+    y: Fraction
+    pp: Fraction
+    py: Fraction
+    yy: Fraction
+    null: Fraction
+
+    def __add__(self, other: "ErrorSums") -> "ErrorSums":
+        return ErrorSums(
+            self.n + other.n,
+            self.p + other.p,
+            self.y + other.y,
+            self.pp + other.pp,
+            self.py + other.py,
+            self.yy + other.yy,
+            self.null + other.null,
+        )
+
+    @property
+    def squared_error(self) -> Fraction:
+        """Sum of (p - y)^2."""
+        return self.pp - 2 * self.py + self.yy
+
+    @property
+    def signed_r_squared(self) -> Fraction:
+        """Squared correlation with the correlation's sign: ranks models without rounding."""
+        covariance = self.py - self.p * self.y / self.n
+        variances = (self.pp - self.p**2 / self.n) * (self.yy - self.y**2 / self.n)
+        if variances <= 0:
+            return Fraction(0)
+        return covariance * abs(covariance) / variances
+
+    def figures(self, unit: Fraction) -> "Figures":
+        """Round each figure once; `unit` is the physical value of one count of the label."""
+        bias = (self.p - self.y) / self.n
+        spread = self.squared_error - self.n * bias**2
+        square = self.signed_r_squared
+        return Figures(
+            rows=self.n,
+            correlation=math.copysign(exact.sqrt(abs(square)), square),
+            rmse=exact.sqrt(self.squared_error / self.n * unit**2),
+            error_mean=float(bias * unit),
+            error_std=exact.sqrt(spread / (self.n - 1) * unit**2) if self.n > 1 else 0.0,
+            relative_rmse=exact.sqrt(self.squared_error / self.null) if self.null else math.inf,
+        )
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How well a model predicts rows it was not fitted on, in units of the label (rad).
+
+    Attributes:
+        correlation: of prediction and label (0 if one of them is constant), as in Table I.
+        error_mean, error_std: of prediction minus label, as in Table II.
+        relative_rmse: RMSE over that of always predicting the mean of the training rows.
+    """
+
+    rows: int
+    correlation: float
+    rmse: float
+    error_mean: float
+    error_std: float
+    relative_rmse: float
+
+    @property
+    def rmse_deg(self) -> float:
+        """Root mean square error in degrees."""
+        return math.degrees(self.rmse)
+
+    @property
+    def error_mean_deg(self) -> float:
+        """Mean error in degrees."""
+        return math.degrees(self.error_mean)
+
+    @property
+    def error_std_deg(self) -> float:
+        """Standard deviation of the error in degrees."""
+        return math.degrees(self.error_std)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures for a JSON document, errors in degrees."""
+        return {
+            "rows": self.rows,
+            "correlation": self.correlation,
+            "rmse_deg": self.rmse_deg,
+            "error_mean_deg": self.error_mean_deg,
+            "error_std_deg": self.error_std_deg,
+            "relative_rmse": self.relative_rmse,
+        }
+
+
+def error_sums(model: LinearModel, gram: Gram, training_mean: Fraction | None = None) -> ErrorSums:
+    """Return a model's sums over the rows of a Gram, exactly: sum (p - y)^2 = v'Gv, v = (b, -1).
+
+    Without a training mean, the rows' own mean is the reference of `null`.
+    """
+    part = gram.restrict([*model.signals, model.label])
+    k, n = len(model.signals), part.n
+    numbers = (model.intercept, *model.coefficients)
+    denominator = math.lcm(*(number.denominator for number in numbers))
+    # Integers over one common denominator: far cheaper than a sum of fractions.
+    w = [int(b * denominator) for b in model.coefficients]
+    w0 = int(model.intercept * denominator)
+    raw = part.raw()
+    linear = sum(b * s for b, s in zip(w, part.sums, strict=False))
+    quadratic = sum(b * sum(map(operator.mul, w, row)) for b, row in zip(w, raw, strict=False))
+    cross = sum(w[i] * raw[i][k] for i in range(k))
+    y, yy = Fraction(part.sums[k]), Fraction(raw[k][k])
+    mean = y / n if training_mean is None else training_mean
+    return ErrorSums(
+        n=n,
+        p=Fraction(linear + n * w0, denominator),
+        y=y,
+        pp=Fraction(quadratic + 2 * w0 * linear + n * w0 * w0, denominator**2),
+        py=Fraction(cross + w0 * part.sums[k], denominator),
+        yy=yy,
+        null=yy - 2 * mean * y + n * mean**2,
+    )
+
+
+_TINY = 1e-300
+_erfc = np.vectorize(math.erfc, otypes=[np.float64])
+
+
+def normal_density(x: FloatArray | float) -> FloatArray:
+    """Return the density of the standard normal distribution."""
+    return np.asarray(np.exp(-0.5 * np.square(x)) / math.sqrt(2 * math.pi), dtype=np.float64)
+
+
+def normal_cdf(x: FloatArray | float) -> FloatArray:
+    """Return the distribution function of the standard normal distribution."""
+    return np.asarray(0.5 * _erfc(-np.asarray(x) / math.sqrt(2)), dtype=np.float64)
+
+
+def student_t_two_sided(t: float, degrees: float) -> float:
+    """Return P(|T| >= |t|) for Student's t distribution."""
+    if math.isinf(t):
+        return 0.0
+    return incomplete_beta(degrees / 2, 0.5, degrees / (degrees + t * t))
+
+
+def student_t_quantile(p: float, degrees: float) -> float:
+    """Return the t exceeded with probability 1 - p, p > 1/2, by bisection to adjacent numbers."""
+    low, high = 0.0, 1.0
+    while student_t_two_sided(high, degrees) > 2 * (1 - p):
+        high *= 2
+    while low < (middle := (low + high) / 2) < high:
+        if student_t_two_sided(middle, degrees) > 2 * (1 - p):
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def f_upper(f: float, numerator: float, denominator: float) -> float:
+    """Return P(F >= f) for the F distribution with the given degrees of freedom."""
+    if f <= 0:
+        return 1.0
+    x = denominator / (denominator + numerator * f)
+    return incomplete_beta(denominator / 2, numerator / 2, x)
+
+
+def incomplete_beta(a: float, b: float, x: float) -> float:
+    """Return I_x(a, b), by Lentz's method on Abramowitz and Stegun 26.5.8."""
+    if x <= 0:
+        return 0.0
+    if x >= 1:
+        return 1.0
+    if x > (a + 1) / (a + b + 2):
+        return 1 - incomplete_beta(b, a, 1 - x)
+    log_front = (
+        math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b) + a * math.log(x) + b * math.log1p(-x)
+    )
+    return math.exp(log_front) * _beta_fraction(a, b, x) / a
+
+
+def _beta_fraction(a: float, b: float, x: float) -> float:
+    c, d = 1.0, 1 / _away_from_zero(1 - (a + b) * x / (a + 1))
+    result = d
+    for m in range(1, 100_000):
+        even = m * (b - m) * x / ((a + 2 * m - 1) * (a + 2 * m))
+        odd = -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1))
+        for term in (even, odd):
+            d = 1 / _away_from_zero(1 + term * d)
+            c = _away_from_zero(1 + term / c)
+            result *= c * d
+        if abs(c * d - 1) < 1e-15:
+            break
+    return result
+
+
+def _away_from_zero(value: float) -> float:
+    return value if abs(value) > _TINY else _TINY

@@ -1,0 +1,314 @@
+"""Which fold a drive belongs to: the SHA-256 of its id modulo the number of folds.
+
+It depends on the drive alone, so that models of different days share a split, which rules that even
+the folds out cannot. Sizes vary by chance; an empty fold is an error.
+"""
+
+import hashlib
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.base import IntArray, number_of
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.regression.figures import ErrorSums, Figures, error_sums
+from fleet_slip.regression.gram import Gram, GramTable, require_signals
+from fleet_slip.regression.least_squares import LinearModel, Scales, condition_number, fit
+
+
+def hash_number(key: str) -> int:
+    """Return a key's number below 2^64, the same on every machine and for ever."""
+    return int.from_bytes(hashlib.sha256(key.encode("utf-8")).digest()[:8], "big")
+
+
+def hash_fold(key: str, count: int) -> int:
+    """Return the fold 0..count-1 of a key."""
+    return hash_number(key) % count
+
+
+@dataclass(frozen=True)
+class FoldAssignment:
+    """The fold 0..len(names)-1 of each drive, shape (drives,), and what each fold is called."""
+
+    fold: IntArray
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        used = set(self.fold.tolist())
+        if len(self.names) < 2:
+            raise DataError(
+                "cross-validation needs at least two folds, and the cohort has one: "
+                f"{', '.join(self.names) or 'no drives'}. Widen the cohort, or fold by another key."
+            )
+        empty = [name for number, name in enumerate(self.names) if number not in used]
+        if empty:
+            raise DataError(
+                f"no drive falls into fold {', '.join(empty)} of {len(self.names)}: the cohort has "
+                f"{number_of(len(self.fold), 'drive')}. Choose fewer folds, or more drives."
+            )
+
+
+def by_hash(keys: Sequence[str], count: int) -> FoldAssignment:
+    """Deal drives into `count` folds by the hash of a key: the drive id, or a vehicle or track.
+
+    Folds that no drive falls into are left out. Raises `DataError` if fewer than two are left,
+    `QuestionError` if fewer are asked for.
+    """
+    if count < 2:
+        raise QuestionError(f"cross-validation needs at least two folds, not {count}.")
+    numbers = [hash_fold(key, count) for key in keys]
+    used = sorted(set(numbers))
+    fold = np.searchsorted(used, numbers).astype(np.int64)
+    return FoldAssignment(fold, tuple(str(number + 1) for number in used))
+
+
+def by_value(values: Sequence[Any]) -> FoldAssignment:
+    """Make one fold of each distinct value. Raises `DataError` if one is missing or all agree."""
+    if any(value is None for value in values):
+        raise DataError(
+            "a drive has no value of the column to fold by: fold by another, or leave such drives "
+            "out of the cohort."
+        )
+    distinct = sorted(set(values))
+    number = {value: i for i, value in enumerate(distinct)}
+    fold = np.array([number[value] for value in values], dtype=np.int64)
+    return FoldAssignment(fold, tuple(str(value) for value in distinct))
+
+
+def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
+    """Cut a number's range into `count` bands of about as many distinct values: whole folds.
+
+    Unlike the other folds these move with the cohort. Raises `DataError` as `by_value`.
+    """
+    assignment = by_value(values)
+    if len(assignment.names) <= count:
+        return assignment
+    bands = np.array_split(np.arange(len(assignment.names)), count)
+    band = np.repeat(np.arange(count), [len(one) for one in bands])
+    names = tuple(f"{assignment.names[one[0]]} to {assignment.names[one[-1]]}" for one in bands)
+    return FoldAssignment(band[assignment.fold].astype(np.int64), names)
+
+
+@dataclass(frozen=True)
+class Folds:
+    """One Gram a fold, their names and numbers of drives; rows `beside` are always trained on."""
+
+    grams: tuple[Gram, ...]
+    names: tuple[str, ...]
+    drives: int
+    beside: Gram | None = None
+    weight: Fraction = Fraction(1)
+
+    @cached_property
+    def total(self) -> Gram:
+        """The Gram of all that a model is trained on, in whole parts of a row's weight."""
+        own = sum(self.grams[1:], self.grams[0]).times(self.weight.denominator)
+        return own if self.beside is None else own + self.beside.times(self.weight.numerator)
+
+    def splits(self) -> Iterator[tuple[Gram, Gram]]:
+        """Yield for each fold the Gram of all others, to train on, and its own, to test on."""
+        for fold in self.grams:
+            yield self.total - fold.times(self.weight.denominator), fold
+
+    def without(self, number: int, drives: int) -> "Folds":
+        """Return the other folds, which hold so many drives."""
+        return Folds(
+            self.grams[:number] + self.grams[number + 1 :],
+            self.names[:number] + self.names[number + 1 :],
+            drives,
+            self.beside,
+            self.weight,
+        )
+
+
+@dataclass(frozen=True)
+class CohortFolds:
+    """The folds of a cohort whose drives may have different signals: `tables` of Grams by set.
+
+    `count_drives` tells how many drives have a row in some of the tables, by their places; for
+    `beside` and `weight` see `Folds`.
+    """
+
+    names: tuple[str, ...]
+    tables: tuple[tuple[Gram, ...], ...]
+    count_drives: Callable[[Sequence[int]], int]
+    beside: tuple[Gram, ...] = ()
+    weight: Fraction = Fraction(1)
+
+    @classmethod
+    def of(
+        cls, tables: Sequence[GramTable], assignment: FoldAssignment, drives: IntArray | None = None
+    ) -> "CohortFolds":
+        """Add up each fold's Gram rows; `drives` numbers their drives, by default one each."""
+        sizes = [len(table) for table in tables]
+        if sum(sizes) != len(assignment.fold):
+            raise ValueError("the assignment is not of these drives")
+        stops = np.cumsum(sizes)[:-1]
+        parts = np.split(assignment.fold, stops)
+        numbers = np.arange(sum(sizes)) if drives is None else drives
+        grams = tuple(
+            tuple(table.totals(fold, len(assignment.names)))
+            for table, fold in zip(tables, parts, strict=True)
+        )
+        of_table = np.split(numbers, stops)
+
+        def count_drives(chosen: Sequence[int]) -> int:
+            rows_of_drive = np.bincount(np.concatenate([of_table[i] for i in chosen]))
+            return int(np.count_nonzero(rows_of_drive))
+
+        return cls(assignment.names, grams, count_drives)
+
+    def serving(self, inputs: Sequence[str], label: str, *, sparse: bool = False) -> Folds:
+        """Return the folds of drives that have the label and all the inputs; `sparse` skips others.
+
+        Raises `DataError` if a fold, or all but one, has no such row.
+        """
+        signals = (*inputs, label)
+        served = [i for i, grams in enumerate(self.tables) if set(signals) <= set(grams[0].signals)]
+        if not served:
+            known = sorted({name for grams in self.tables for name in grams[0].signals})
+            require_signals(known, signals)
+            raise DataError(
+                f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or "
+                "another cohort."
+            )
+        folds = tuple(
+            sum((self.tables[i][f].restrict(signals) for i in served), Gram.zero(signals))
+            for f in range(len(self.names))
+        )
+        empty = [name for name, gram in zip(self.names, folds, strict=True) if gram.n == 0]
+        names = self.names
+        if sparse:
+            names = tuple(name for name in names if name not in empty)
+            folds = tuple(gram for gram in folds if gram.n)
+        if len(folds) < 2 or (empty and not sparse):
+            raise DataError(
+                f"fold {', '.join(empty)} has no rows with all of {', '.join(signals)}. Choose "
+                "fewer folds, another key to fold by, or fewer signals."
+            )
+        others = [one.restrict(signals) for one in self.beside if set(signals) <= set(one.signals)]
+        beside = sum(others[1:], others[0]) if others else None
+        return Folds(folds, names, self.count_drives(served), beside, self.weight)
+
+
+# Cross-validation from one Gram a fold: train on the total minus it; pool all sums (Table I).
+
+Procedure = Callable[[Gram], LinearModel]
+"""Makes a model of counts from a training Gram: any fit, with any selection inside."""
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """A model's figures on rows that it was not fitted on, and its fit to all rows.
+
+    Attributes:
+        drives: number of drives it used: those that have all its signals.
+        pooled, folds: figures over all folds' test rows together, and of each fold.
+        condition_number: of the correlation matrix of the inputs, all rows.
+        model, counts: exact fit to all rows, in physical units and in counts.
+        sums: exact pooled sums behind `pooled`, in counts.
+    """
+
+    name: str
+    signals: tuple[str, ...]
+    drives: int
+    pooled: Figures
+    folds: tuple[Figures, ...] = field(repr=False)
+    fold_names: tuple[str, ...] = field(repr=False)
+    condition_number: float
+    model: LinearModel = field(repr=False)
+    counts: LinearModel = field(repr=False)
+    sums: ErrorSums = field(repr=False)
+
+    @property
+    def correlation(self) -> float:
+        """Pooled cross-validated correlation, as in Table I."""
+        return self.pooled.correlation
+
+    @property
+    def standard_error(self) -> float:
+        """Standard error of the correlation over folds: std of the folds' / sqrt(folds)."""
+        return error_of_mean([fold.correlation for fold in self.folds])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {
+            "name": self.name,
+            "signals": list(self.signals),
+            "drives": self.drives,
+            **self.pooled.as_dict(),
+            "correlation_standard_error": self.standard_error,
+            "condition_number": self.condition_number,
+            "coefficients": self.model.weights,
+            "intercept": self.model.offset,
+            "folds": [
+                {"fold": name, **figures.as_dict()}
+                for name, figures in zip(self.fold_names, self.folds, strict=True)
+            ],
+        }
+
+
+def error_of_mean(values: Sequence[float]) -> float:
+    """Return the standard error of the mean of independent values."""
+    mean = math.fsum(values) / len(values)
+    square = math.fsum((value - mean) ** 2 for value in values)
+    return math.sqrt(square / (len(values) - 1) / len(values))
+
+
+def least_squares(inputs: Sequence[str], label: str, *, intercept: bool = True) -> Procedure:
+    """Return the procedure that fits the label on given inputs."""
+    return lambda gram: fit(gram, inputs, label, intercept=intercept).model
+
+
+def cross_validate(
+    name: str, folds: Folds, procedure: Procedure, scales: Scales
+) -> CrossValidation:
+    """Cross-validate a procedure that sees training Grams alone. Raises `DataError`."""
+    tests = [
+        held_out_errors(procedure(training), training, test) for training, test in folds.splits()
+    ]
+    return assemble(name, folds, tests, procedure(folds.total), scales)
+
+
+def assemble(
+    name: str, folds: Folds, tests: Sequence[ErrorSums], counts: LinearModel, scales: Scales
+) -> CrossValidation:
+    """Put together the held-out sums of each fold and the model of counts fitted to all rows."""
+    pooled = sum(tests[1:], tests[0])
+    unit = scales[counts.label]
+    return CrossValidation(
+        name=name,
+        signals=counts.signals,
+        drives=folds.drives,
+        pooled=pooled.figures(unit),
+        folds=tuple(sums.figures(unit) for sums in tests),
+        fold_names=folds.names,
+        condition_number=condition_number(folds.total, counts.signals),
+        model=counts.physical(scales),
+        counts=counts,
+        sums=pooled,
+    )
+
+
+def cross_validate_inputs(
+    name: str,
+    cohort: CohortFolds,
+    inputs: Sequence[str],
+    label: str,
+    scales: Scales,
+    *,
+    intercept: bool = True,
+) -> CrossValidation:
+    """Cross-validate least squares over all drives that have the inputs. Raises `DataError`."""
+    folds = cohort.serving(inputs, label)
+    return cross_validate(name, folds, least_squares(inputs, label, intercept=intercept), scales)
+
+
+def held_out_errors(model: LinearModel, training: Gram, test: Gram) -> ErrorSums:
+    """Return the error sums on a test Gram of a model that was fitted on the training Gram."""
+    return error_sums(model, test, Fraction(training.sum(model.label), training.n))

@@ -1,0 +1,343 @@
+"""Gram matrices of integer counts: the exact sufficient statistics of every linear model.
+
+Sums and products are integers, so Grams add and subtract without rounding: training on all minus a
+fold is, bit for bit, training on the rest.
+"""
+
+import operator
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.base import IntArray, ObjectArray
+from fleet_slip.errors import DataError
+
+SomeSize = TypeVar("SomeSize", int, IntArray)
+
+BLOCK_ROWS = 2**18
+"""Most rows of one matrix product. 16-bit counts would allow 2^21; this keeps the block small."""
+
+_SMALLEST_BLOCK = 2**10
+
+
+def packed_size(k: SomeSize) -> SomeSize:
+    """Return k(k+1)/2, the number of entries of a packed lower triangle."""
+    return k * (k + 1) // 2
+
+
+def packed_position(i: int, j: int) -> int:
+    """Return where the product of signals i and j stands: (0,0), (1,0), (1,1), (2,0), ..."""
+    return packed_size(max(i, j)) + min(i, j)
+
+
+@dataclass(frozen=True)
+class Gram:
+    """Number of rows, k sums and k(k+1)/2 products (lower triangle by rows) of integer counts."""
+
+    signals: tuple[str, ...]
+    n: int
+    sums: tuple[int, ...]
+    products: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        k = len(self.signals)
+        if len(set(self.signals)) != k:
+            raise ValueError(f"a signal stands twice in {self.signals}")
+        if len(self.sums) != k or len(self.products) != packed_size(k):
+            raise ValueError(
+                f"{k} signals need {k} sums and {packed_size(k)} products, "
+                f"not {len(self.sums)} and {len(self.products)}"
+            )
+
+    @classmethod
+    def zero(cls, signals: Sequence[str]) -> "Gram":
+        """Return the Gram of no rows."""
+        k = len(signals)
+        return cls(tuple(signals), 0, (0,) * k, (0,) * packed_size(k))
+
+    @classmethod
+    def from_counts(cls, signals: Sequence[str], counts: NDArray[Any]) -> "Gram":
+        """Return the Gram of rows of integer counts, shape (n, k).
+
+        Counts up to 2^21 take float64 products of at most `BLOCK_ROWS` rows, whose partial sums
+        stay below 2^53 and so are exact in any order; larger ones take Python integers.
+        """
+        if counts.ndim != 2 or counts.shape[1] != len(signals):
+            raise ValueError(f"counts of shape {counts.shape} do not have {len(signals)} columns")
+        if counts.dtype.kind not in "iuO":
+            raise ValueError(f"counts must be integers, not {counts.dtype}")
+        largest = max(1, -int(counts.min()), int(counts.max())) if counts.size else 1
+        rows = min(BLOCK_ROWS, 2**53 // largest**2)
+        if rows < _SMALLEST_BLOCK:
+            return _gram_of_integers(signals, counts.astype(object))
+        total = cls.zero(signals)
+        for start in range(0, len(counts), rows):
+            total += _gram_of_block(signals, counts[start : start + rows])
+        return total
+
+    def __add__(self, other: "Gram") -> "Gram":
+        """Return the Gram of both sets of rows. Raises `DataError` if the signals differ."""
+        self._require_same_signals(other)
+        return Gram(
+            self.signals,
+            self.n + other.n,
+            tuple(map(operator.add, self.sums, other.sums)),
+            tuple(map(operator.add, self.products, other.products)),
+        )
+
+    def __sub__(self, other: "Gram") -> "Gram":
+        """Return the Gram of the other rows. Raises `DataError` if `other` was no part of it."""
+        self._require_same_signals(other)
+        rest = Gram(
+            self.signals,
+            self.n - other.n,
+            tuple(map(operator.sub, self.sums, other.sums)),
+            tuple(map(operator.sub, self.products, other.products)),
+        )
+        squares = [rest.products[packed_position(i, i)] for i in range(len(self.signals))]
+        if rest.n < 0 or min(squares, default=0) < 0:
+            raise DataError(
+                "cannot subtract a Gram that is not part of the total: a sum of squares would be "
+                "negative. Rebuild the Gram rows from the logs."
+            )
+        return rest
+
+    def times(self, count: int) -> "Gram":
+        """Return the Gram in which each row counts so many times."""
+        return Gram(
+            self.signals,
+            self.n * count,
+            tuple(total * count for total in self.sums),
+            tuple(total * count for total in self.products),
+        )
+
+    def restrict(self, signals: Sequence[str]) -> "Gram":
+        """Return the Gram of some signals, in this order. Raises `DataError` if one is missing."""
+        at = positions(self.signals, signals)
+        return Gram(
+            tuple(signals),
+            self.n,
+            tuple(self.sums[i] for i in at),
+            tuple(self.products[p] for p in packed_positions(tuple(at))),
+        )
+
+    def about_origin(self) -> "Gram":
+        """Return the Gram with all sums zero, of the rows and their mirror: no intercept."""
+        return Gram(self.signals, self.n, (0,) * len(self.sums), self.products)
+
+    def combine(self, combinations: Mapping[str, Mapping[str, int]]) -> "Gram":
+        """Return the Gram of integer combinations, such as {"difference": {"a": 1, "b": -1}}.
+
+        Raises `DataError` for a signal that the Gram lacks.
+        """
+        weights = [
+            dict(zip(positions(self.signals, [*old]), old.values(), strict=True))
+            for old in combinations.values()
+        ]
+        products = tuple(
+            sum(
+                u * v * self.products[packed_position(a, b)]
+                for a, u in weights[i].items()
+                for b, v in weights[j].items()
+            )
+            for i in range(len(weights))
+            for j in range(i + 1)
+        )
+        sums = tuple(sum(u * self.sums[a] for a, u in new.items()) for new in weights)
+        return Gram(tuple(combinations), self.n, sums, products)
+
+    def sum(self, signal: str) -> int:
+        """Return the sum of a signal's counts."""
+        return self.sums[positions(self.signals, [signal])[0]]
+
+    def product(self, a: str, b: str) -> int:
+        """Return the sum of the products of two signals' counts."""
+        i, j = positions(self.signals, [a, b])
+        return self.products[packed_position(i, j)]
+
+    def raw(self) -> list[list[int]]:
+        """Return the k x k matrix of product sums about zero, as integers."""
+        return _mirrored([self._packed_row(i) for i in range(len(self.signals))])
+
+    def centred(self) -> list[list[int]]:
+        """Return n S_ab = n sum(a b) - sum(a) sum(b), with S the product sums about the means."""
+        return _mirrored(
+            [
+                [
+                    self.n * product - own * other
+                    for product, other in zip(self._packed_row(i), self.sums, strict=False)
+                ]
+                for i, own in enumerate(self.sums)
+            ]
+        )
+
+    def _packed_row(self, i: int) -> Sequence[int]:
+        """Return the products of a signal with those up to itself."""
+        return self.products[packed_size(i) : packed_size(i + 1)]
+
+    def _require_same_signals(self, other: "Gram") -> None:
+        if self.signals != other.signals:
+            raise DataError(
+                f"Grams of different signals cannot be combined: {', '.join(self.signals)} and "
+                f"{', '.join(other.signals)}. Restrict both to the signals that they share."
+            )
+
+
+def _mirrored(lower: Sequence[Sequence[int]]) -> list[list[int]]:
+    return [[*row, *(below[i] for below in lower[i + 1 :])] for i, row in enumerate(lower)]
+
+
+def require_signals(signals: Sequence[str], wanted: Sequence[str]) -> None:
+    """Raise `DataError` for a wanted signal that is absent."""
+    missing = [name for name in wanted if name not in signals]
+    if missing:
+        raise DataError(
+            f"no Gram of {', '.join(missing)}: the drives have {', '.join(signals)}. "
+            "Leave the signal out, or choose a cohort that has it."
+        )
+
+
+def positions(signals: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    """Return the index of each wanted signal. Raises `DataError` for an absent one."""
+    require_signals(signals, wanted)
+    return [signals.index(name) for name in wanted]
+
+
+@cache
+def packed_positions(at: tuple[int, ...]) -> tuple[int, ...]:
+    """Return where the products of some of the signals stand, in the order of a packed triangle."""
+    places = np.array(at, dtype=np.int64)
+    row, column = np.tril_indices(len(at))
+    larger = np.maximum(places[row], places[column])
+    found = packed_size(larger) + np.minimum(places[row], places[column])
+    return tuple(found.tolist())
+
+
+def _gram_of_block(signals: Sequence[str], counts: NDArray[Any]) -> Gram:
+    block = counts.astype(np.float64)
+    matrix = block.T @ block
+    return Gram(
+        tuple(signals),
+        len(block),
+        tuple(int(total) for total in block.sum(axis=0)),
+        tuple(int(total) for total in matrix[np.tril_indices(len(signals))]),
+    )
+
+
+def _gram_of_integers(signals: Sequence[str], counts: ObjectArray) -> Gram:
+    columns = [[int(count) for count in column] for column in counts.T]
+    return Gram(
+        tuple(signals),
+        len(counts),
+        tuple(sum(column) for column in columns),
+        tuple(
+            sum(a * b for a, b in zip(columns[i], columns[j], strict=True))
+            for i in range(len(columns))
+            for j in range(i + 1)
+        ),
+    )
+
+
+# Gram matrices of many drives side by side, and their exact sums.
+
+_MODULUS = 2**64
+
+
+@dataclass(frozen=True)
+class GramTable:
+    """Many Grams of the same k signals, one a drive: packed products are (drives, k(k+1)/2).
+
+    Numbers are int64; sums and products that need more bits are integers of Python.
+    """
+
+    signals: tuple[str, ...]
+    n: IntArray
+    sums: IntArray
+    products: IntArray
+
+    def __post_init__(self) -> None:
+        drives, k = len(self.n), len(self.signals)
+        if self.sums.shape != (drives, k) or self.products.shape != (drives, packed_size(k)):
+            raise ValueError(
+                f"{drives} drives of {k} signals do not have sums of shape {self.sums.shape} and "
+                f"products of shape {self.products.shape}"
+            )
+        kinds = {self.n.dtype, self.sums.dtype, self.products.dtype}
+        if not kinds <= {np.dtype(np.int64), np.dtype(object)}:
+            raise ValueError("a GramTable holds int64, or integers of Python")
+
+    def __len__(self) -> int:
+        return len(self.n)
+
+    def row(self, index: int) -> Gram:
+        """Return one drive's Gram."""
+        sums, products = self.sums[index].tolist(), self.products[index].tolist()
+        return Gram(self.signals, int(self.n[index]), tuple(sums), tuple(products))
+
+    def take(self, rows: NDArray[Any]) -> "GramTable":
+        """Return the drives at an index array or a boolean mask."""
+        return GramTable(self.signals, self.n[rows], self.sums[rows], self.products[rows])
+
+    def total(self, rows: NDArray[Any] | None = None) -> Gram:
+        """Return the exact sum over all drives, or over those at an index array or a mask."""
+        return self._sum() if rows is None else self.take(rows)._sum()
+
+    def totals(self, groups: NDArray[Any], count: int) -> list[Gram]:
+        """Return the exact sum over each group of drives; `groups` says each one's, 0..count-1."""
+        if groups.shape != self.n.shape:
+            raise ValueError(f"{len(self)} drives need as many groups, not {groups.shape}")
+        if len(groups) and not 0 <= groups.min() <= groups.max() < count:
+            raise ValueError(f"groups must lie in 0..{count - 1}")
+        order = np.argsort(groups, kind="stable")
+        stops = np.cumsum(np.bincount(groups, minlength=count))
+        return [self.take(rows)._sum() for rows in np.split(order, stops[:-1])]
+
+    def restrict(self, signals: Sequence[str]) -> "GramTable":
+        """Return the drives with some of the signals. Raises `DataError` if one is missing."""
+        at = positions(self.signals, signals)
+        packed = list(packed_positions(tuple(at)))
+        return GramTable(tuple(signals), self.n, self.sums[:, at], self.products[:, packed])
+
+    def about(self, origin: Sequence[int]) -> "GramTable":
+        """Return the table of the counts minus an integer origin, exactly.
+
+        sum((a - u)(b - v)) = sum(ab) - u sum(b) - v sum(a) + n u v; wrap-around on the way cancels.
+        """
+        u = np.array(origin, dtype=np.int64)
+        i, j = np.tril_indices(len(self.signals))
+        n = self.n[:, None]
+        products = (
+            self.products - u[i] * self.sums[:, j] - u[j] * self.sums[:, i] + n * (u[i] * u[j])
+        )
+        return GramTable(self.signals, self.n, self.sums - n * u, products)
+
+    def about_origin(self) -> "GramTable":
+        """Return the table of `Gram.about_origin` of each drive."""
+        return GramTable(self.signals, self.n, np.zeros_like(self.sums), self.products)
+
+    def _sum(self) -> Gram:
+        return Gram(
+            self.signals,
+            exact_sum(self.n[:, None])[0],
+            tuple(exact_sum(self.sums)),
+            tuple(exact_sum(self.products)),
+        )
+
+
+def exact_sum(values: IntArray) -> list[int]:
+    """Return the sums of an int64 array's columns, shape (rows < 2^26, columns), exactly.
+
+    The int64 sum is right modulo 2^64; the float64 sum tells how often it wrapped around.
+    """
+    wrapped = values.sum(axis=0)
+    totals: list[int] = [int(total) for total in wrapped.tolist()]
+    if values.dtype != object:
+        near = values.sum(axis=0, dtype=np.float64)
+        turns = np.rint((near - wrapped.astype(np.float64)) / _MODULUS)
+        for at in np.flatnonzero(turns).tolist():
+            totals[at] += int(turns[at]) * _MODULUS
+    return totals

@@ -1,1 +1,0 @@
-"""How sure coefficients are, and what they rest on."""

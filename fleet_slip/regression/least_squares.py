@@ -1,0 +1,367 @@
+"""Ordinary least squares of a Gram, solved exactly and rounded once (equation (4) of the paper)."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cached_property
+from math import lcm
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.base import FloatArray, number_of
+from fleet_slip.errors import DataError
+from fleet_slip.regression import exact
+from fleet_slip.regression.exact import (
+    Elimination,
+    eliminate,
+    solve_by_lifting,
+    symmetric_eigenvalues,
+)
+from fleet_slip.regression.gram import Gram
+
+MANY_INPUTS = 40
+"""From so many on, lifting is faster than elimination; both give the same fractions."""
+
+Scales = Mapping[str, Fraction]
+"""Physical value of one count of each signal: `catalogue()[name].exact_scale`."""
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """label = intercept + sum of coefficient times signal, exactly; of counts, or `physical`."""
+
+    signals: tuple[str, ...]
+    label: str
+    coefficients: tuple[Fraction, ...] = field(repr=False)  # of thousands of digits
+    intercept: Fraction = field(repr=False)
+
+    def physical(self, scales: Scales) -> "LinearModel":
+        """Return the model of physical values, from a model of counts."""
+        unit = scales[self.label]
+        return LinearModel(
+            self.signals,
+            self.label,
+            tuple(
+                b * unit / scales[name]
+                for name, b in zip(self.signals, self.coefficients, strict=True)
+            ),
+            self.intercept * unit,
+        )
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Coefficient of each signal, each rounded once to binary64."""
+        return {name: float(b) for name, b in zip(self.signals, self.coefficients, strict=True)}
+
+    @property
+    def offset(self) -> float:
+        """Intercept, rounded once to binary64."""
+        return float(self.intercept)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Exact least-squares fit of a Gram of inputs and label, in counts; `rss` is in counts^2."""
+
+    gram: Gram
+    model: LinearModel
+    rss: Fraction
+    has_intercept: bool = True
+
+    @property
+    def size(self) -> int:
+        """Number of inputs."""
+        return len(self.model.signals)
+
+    @cached_property
+    def tss(self) -> Fraction:
+        """Sum of squares of the label, about its mean if there is an intercept."""
+        y = self.model.label
+        square = Fraction(self.gram.product(y, y))
+        if not self.has_intercept:
+            return square
+        return square - Fraction(self.gram.sum(y) ** 2, self.gram.n)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Rows minus the number of estimated coefficients."""
+        return self.gram.n - self.size - int(self.has_intercept)
+
+    @property
+    def r_squared(self) -> float:
+        """1 - RSS / TSS; 0 for a constant label."""
+        return float(1 - self.rss / self.tss) if self.tss else 0.0
+
+
+def fit(gram: Gram, inputs: Sequence[str], label: str, *, intercept: bool = True) -> Fit:
+    """Fit the label by exact least squares. Raises `DataError` that names dependent signals."""
+    part = gram.restrict([*inputs, label])
+    matrix = moments(part, intercept=intercept)
+    if len(inputs) >= MANY_INPUTS and (lifted := _lifted(part, matrix, intercept=intercept)):
+        return lifted
+    triangle = eliminate(matrix)
+    if triangle.singular is not None:
+        raise DataError(dependence(part, inputs, intercept=intercept))
+    return fit_leading(part, triangle, len(inputs), intercept=intercept)
+
+
+def fit_leading(gram: Gram, triangle: Elimination, size: int, *, intercept: bool = True) -> Fit:
+    """Return the fit of the first `size` inputs of an eliminated Gram (label last)."""
+    part = gram.restrict([*gram.signals[:size], gram.signals[-1]])
+    return _fit_of(part, *triangle.solve(size), triangle.residual(size), intercept=intercept)
+
+
+def _lifted(part: Gram, matrix: list[list[int]], *, intercept: bool) -> Fit | None:
+    """Return the same fit from p-adic lifting; None if inputs are linearly dependent."""
+    right = matrix[-1][:-1]
+    solution = solve_by_lifting([row[:-1] for row in matrix[:-1]], right)
+    if solution is None:
+        return None
+    numerators, denominator = solution
+    explained = sum(x * b for x, b in zip(numerators, right, strict=True))
+    residual = matrix[-1][-1] - Fraction(explained, denominator)
+    return _fit_of(part, numerators, denominator, residual, intercept=intercept)
+
+
+def _fit_of(
+    part: Gram, numerators: Sequence[int], denominator: int, residual: Fraction, *, intercept: bool
+) -> Fit:
+    """Return the fit of a Gram (label last) whose equations have this solution and residual."""
+    inputs, label = part.signals[:-1], part.signals[-1]
+    coefficients = tuple(Fraction(x, denominator) for x in numerators)
+    offset = Fraction(0)
+    if intercept:
+        explained = sum(x * s for x, s in zip(numerators, part.sums, strict=False))
+        offset = Fraction(denominator * part.sums[-1] - explained, denominator * part.n)
+    model = LinearModel(inputs, label, coefficients, offset)
+    return Fit(part, model, residual / (part.n if intercept else 1), intercept)
+
+
+def moments(gram: Gram, *, intercept: bool = True) -> list[list[int]]:
+    """Return n S about the means, or raw products. Raises `DataError` if there are no rows."""
+    if gram.n == 0:
+        raise DataError("no rows to fit: choose a cohort with drives that have all signals.")
+    return gram.centred() if intercept else gram.raw()
+
+
+def dependence(gram: Gram, inputs: Sequence[str], *, intercept: bool = True) -> str:
+    """Say which inputs are linearly dependent, and how, exactly; empty if none is."""
+    independent: list[str] = []
+    found = []
+    for name in inputs:
+        part = gram.restrict([*independent, name])
+        triangle = eliminate(moments(part, intercept=intercept))
+        if triangle.corners[-1] == 0:
+            size = len(independent)
+            found.append(_relation(fit_leading(part, triangle, size, intercept=intercept)))
+        else:
+            independent.append(name)
+    if not found:
+        return ""
+    rows = f" There are only {number_of(gram.n, 'row')}." if gram.n <= len(inputs) else ""
+    relations = "; ".join(found)
+    return f"the model has no unique solution: {relations}.{rows} Leave out one signal of each."
+
+
+def _relation(fitted: Fit) -> str:
+    model = fitted.model
+    terms = {name: b for name, b in zip(model.signals, model.coefficients, strict=True) if b != 0}
+    if not terms:
+        return f"{model.label} is constant ({model.intercept} counts)"
+    text = f"{model.label} is a linear combination of {', '.join(terms)}"
+    numbers = [*terms.values(), model.intercept]
+    if len(terms) <= 3 and all(b.denominator <= 1000 for b in numbers):
+        right = " + ".join(f"{b} {other}" if b != 1 else other for other, b in terms.items())
+        constant = f" + {model.intercept}" if model.intercept else ""
+        text += f" (in counts: {model.label} = {right}{constant})".replace("+ -", "- ")
+    return text
+
+
+def correlation_matrix(gram: Gram) -> FloatArray:
+    """Return all correlations, (k, k), each rounded once; zeros for a constant signal."""
+    centred = gram.centred()
+    correlations = np.zeros((len(centred), len(centred)))
+    for i, row in enumerate(centred):
+        for j in range(i + 1):
+            correlation = exact.signed_ratio(row[j], row[i] * centred[j][j])
+            correlations[i, j] = correlations[j, i] = correlation
+    return correlations
+
+
+def condition_number(gram: Gram, inputs: Sequence[str]) -> float:
+    """Return the 2-norm condition number of correlations, within k of the best scaling's."""
+    if not inputs:
+        return 1.0
+    eigenvalues = symmetric_eigenvalues(correlation_matrix(gram.restrict(inputs)))
+    smallest, largest = eigenvalues[0], eigenvalues[-1]
+    return largest / smallest if smallest > 0 else float("inf")
+
+
+def through_means(gram: Gram, label: str, slopes: dict[str, Fraction]) -> LinearModel:
+    """Return the model with given slopes whose intercept makes the mean error zero."""
+    intercept = Fraction(gram.sum(label)) - sum(b * gram.sum(s) for s, b in slopes.items())
+    return LinearModel(tuple(slopes), label, tuple(slopes.values()), intercept / gram.n)
+
+
+# Relations that hold on average, from sums of products: exactly, and how single drives move them.
+#
+# A relation says y = theta_1 x_1 + theta_2 x_2 + ... + noise. Multiplied by instruments z and
+# summed up, it is as many linear equations. Products z x of three columns are often those of two
+# others, as (ay/v)(r v) = ay r, so that Gram rows have them although they have no x.
+
+ONE = "1"
+"""The constant among the terms."""
+
+Terms = Mapping[str, Mapping[str, Fraction]]
+"""Linear combinations of columns by name: the weight of each column."""
+Product = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Relation:
+    """What is summed up: for each instrument its products with the unknowns' terms, and with y.
+
+    Attributes:
+        instruments: names of terms, as many as unknowns.
+        left: a row for each instrument, of the products with each unknown's term.
+        right: the products with y.
+        noise: products that noise of unit variance adds, by row and unknown; that of y is -1.
+    """
+
+    instruments: tuple[str, ...]
+    left: tuple[tuple[Product, ...], ...]
+    right: tuple[Product, ...]
+    noise: Mapping[tuple[int, int], Product]
+
+    def system(
+        self, sums: Callable[[str, str], Any], variance: Fraction | float
+    ) -> list[list[Any]]:
+        """Return the rows of the equations, each with its right side last, free of noise.
+
+        Entries are what `sums` gives: fractions, or arrays of drives.
+        """
+        rows = [
+            [sums(a, b) for a, b in (*row, of_y)]
+            for row, of_y in zip(self.left, self.right, strict=True)
+        ]
+        for (row, column), (a, b) in self.noise.items():
+            rows[row][column] = rows[row][column] - variance * sums(a, b)
+        return rows
+
+
+class ExactSums:
+    """Sums of products of terms over the rows of a Gram, as fractions."""
+
+    def __init__(self, gram: Gram, terms: Terms) -> None:
+        """Raises `DataError` for a column that the Gram lacks."""
+        self._factors = {
+            name: lcm(*(weight.denominator for weight in one.values()))
+            for name, one in terms.items()
+        }
+        self.gram = gram.combine(
+            {
+                name: {column: int(weight * self._factors[name]) for column, weight in one.items()}
+                for name, one in terms.items()
+            }
+        )
+
+    def __call__(self, a: str, b: str) -> Fraction:
+        """Return the sum of the products of two terms."""
+        if a == ONE:
+            a, b = b, a
+        if a == ONE:
+            return Fraction(self.gram.n)
+        if b == ONE:
+            return Fraction(self.gram.sum(a), self._factors[a])
+        return Fraction(self.gram.product(a, b), self._factors[a] * self._factors[b])
+
+    def mean(self, name: str) -> Fraction:
+        """Return a term's mean."""
+        return self(name, ONE) / self.gram.n
+
+    def variance(self, name: str) -> Fraction:
+        """Return a term's variance."""
+        return self(name, name) / self.gram.n - self.mean(name) ** 2
+
+    def residual_variance(self, name: str, inputs: Sequence[str]) -> Fraction | None:
+        """Return what least squares on other terms leave of a variance; None if undetermined."""
+        about = self.gram.restrict((*inputs, name)).centred()
+        found = eliminate(about)
+        if found.singular is not None:
+            return None
+        return found.residual(len(inputs)) / (self.gram.n * self._factors[name]) ** 2
+
+
+def solve(rows: Sequence[Sequence[Fraction]]) -> tuple[Fraction, ...] | None:
+    """Return the solution of equations whose rows end with the right side; None if singular."""
+    work = [list(row) for row in rows]
+    for at in range(len(work)):
+        pivot = next((i for i in range(at, len(work)) if work[i][at]), None)
+        if pivot is None:
+            return None
+        work[at], work[pivot] = work[pivot], work[at]
+        lead = work[at][at]
+        work[at] = [value / lead for value in work[at]]
+        for i, row in enumerate(work):
+            if i != at and row[at]:
+                work[i] = [x - row[at] * y for x, y in zip(row, work[at], strict=True)]
+    return tuple(row[-1] for row in work)
+
+
+@dataclass(frozen=True)
+class Influence:
+    """By drive, how far it moves a combination of unknowns, and its share of the variance."""
+
+    shifts: FloatArray
+    shares: FloatArray
+
+
+def influence(
+    relation: Relation,
+    sums: Callable[[str, str], FloatArray],
+    noise: float,
+    gradient: Sequence[float],
+) -> Influence | None:
+    """Return the influence of drives on a combination of the unknowns; None if singular.
+
+    `sums` gives the sums of each drive, shape (drives,). With the equations A_g of a drive, A of
+    all, and h = A'^-1 a, a drive moves a'theta by h'(y_g - A_g theta); its share is h'Z_g'Z_g h.
+    """
+    each = _stacked(relation.system(sums, noise))
+    left, right = each[:, :, :-1], each[:, :, -1]
+    total = left.sum(axis=0)
+    try:
+        unknowns = np.linalg.solve(total, right.sum(axis=0))
+        h = np.linalg.solve(total.T, np.asarray(gradient))
+    except np.linalg.LinAlgError:
+        return None
+    squares = _stacked([[sums(a, b) for b in relation.instruments] for a in relation.instruments])
+    return Influence(
+        shifts=(right - left @ unknowns) @ h,
+        shares=np.einsum("i,gij,j->g", h, squares, h),
+    )
+
+
+class DriveTermSums:
+    """Sums of products of terms in each of several drives, in floating point."""
+
+    def __init__(self, moments: FloatArray, columns: Sequence[str], terms: Terms) -> None:
+        """Take the moments of (1, columns) about zero, shape (drives, k+1, k+1)."""
+        self._at = {name: i for i, name in enumerate((ONE, *terms))}
+        turn = np.zeros((len(self._at), moments.shape[1]))
+        turn[0, 0] = 1.0
+        for name, one in terms.items():
+            for column, weight in one.items():
+                turn[self._at[name], 1 + columns.index(column)] = float(weight)
+        self._sums = turn @ moments @ turn.T
+
+    def __call__(self, a: str, b: str) -> FloatArray:
+        """Return the sum of the products of two terms in each drive."""
+        found: FloatArray = self._sums[:, self._at[a], self._at[b]]
+        return found
+
+
+def _stacked(rows: Sequence[Sequence[Any]]) -> FloatArray:
+    """Return entries of each drive as one array, shape (drives, rows, columns)."""
+    return np.moveaxis(np.array(rows, dtype=np.float64), -1, 0)

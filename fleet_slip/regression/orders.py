@@ -1,0 +1,351 @@
+"""Rankings: the predefined order on which nested models depend (Section II-B).
+
+All decide exactly; ties go to the declared order.
+"""
+
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.regression.exact import adjugate, eliminate
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import dependence, moments
+
+Matrix = list[list[int]]
+Score = Callable[[list[int], int], Fraction]
+Ranking = Callable[[Gram, Sequence[str], str], tuple[str, ...]]
+"""Orders inputs, given a Gram with them and the label. Raises `DataError` if dependent."""
+
+
+def declared(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:  # noqa: ARG001
+    """Keep the declared order, as the paper does."""
+    return tuple(inputs)
+
+
+def correlation(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
+    """Order by the absolute correlation with the label, largest first."""
+    matrix = _moments(gram, inputs, label)
+    scores = [_gain(matrix[i], i) for i in range(len(inputs))]
+    return _descending(inputs, scores)
+
+
+def t_value(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
+    """Order by |t| in the full model, largest first: b_i^2 / (S^-1)_ii."""
+    matrix, _ = _full_model(_moments(gram, inputs, label))
+    return _descending(inputs, [_gain(matrix[i], i) for i in range(len(inputs))])
+
+
+def forward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
+    """Add, at each step, the signal that reduces the residual sum of squares most."""
+    order = _pivot(_moments(gram, inputs, label), _gain, largest=True)
+    return tuple(inputs[i] for i in order)
+
+
+def backward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
+    """Remove the signal whose loss costs least, of equals the later: Wang's and WEKA's order."""
+    k = len(inputs)
+    matrix = _moments(gram, inputs, label)
+    later_first = [*reversed(range(k)), k]
+    rows, determinant = _full_model([[matrix[i][j] for j in later_first] for i in later_first])
+    removed = _pivot(rows, _gain, largest=False, divisor=determinant)
+    return tuple(inputs[k - 1 - i] for i in reversed(removed))
+
+
+def pivoted_cholesky(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
+    """Take the signal that those before it explain least, as a column-pivoted QR does."""
+    matrix = _moments(gram, inputs, label)
+    squares = [matrix[i][i] for i in range(len(inputs))]
+
+    def remaining(row: list[int], i: int) -> Fraction:
+        return Fraction(row[i], squares[i])
+
+    return tuple(inputs[i] for i in _pivot(matrix, remaining, largest=True))
+
+
+def replacement(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
+    """Order by sequential replacement (Miller 2002, section 3.3): after each step exchange signals.
+
+    Sets need not be nested: a signal ranks by the first size at which it appears.
+    """
+    order: list[str] = []
+    for chosen in replacement_sets(gram, inputs, label):
+        order += [name for name in inputs if name in chosen and name not in order]
+    return tuple(order)
+
+
+def replacement_sets(gram: Gram, inputs: Sequence[str], label: str) -> list[frozenset[str]]:
+    """Return the sets of 1, ..., k signals that sequential replacement ends with."""
+    matrix = _moments(gram, inputs, label)
+    chosen: list[int] = []
+    sets = []
+    for _ in inputs:
+        outside = [i for i in range(len(inputs)) if i not in chosen]
+        chosen.append(min(outside, key=lambda i: (_rss(matrix, [*chosen, i]), i)))
+        _exchange(matrix, chosen)
+        sets.append(frozenset(inputs[i] for i in chosen))
+    return sets
+
+
+RANKINGS: dict[str, Ranking] = {
+    "declared": declared,
+    "correlation": correlation,
+    "t": t_value,
+    "forward": forward,
+    "backward": backward,
+    "replacement": replacement,
+    "pivoted-cholesky": pivoted_cholesky,
+}
+
+
+def rank(name: str, gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
+    """Order the inputs. Raises `QuestionError` for an unknown ranking, `DataError` if dependent."""
+    if name not in RANKINGS:
+        raise QuestionError(f"unknown ranking {name!r}. Known rankings: {', '.join(RANKINGS)}.")
+    return RANKINGS[name](gram, inputs, label)
+
+
+def _moments(gram: Gram, inputs: Sequence[str], label: str) -> Matrix:
+    matrix = moments(gram.restrict([*inputs, label]))
+    if eliminate(matrix).singular is not None:
+        raise DataError(dependence(gram, inputs))
+    return matrix
+
+
+def _full_model(matrix: Matrix) -> tuple[Matrix, int]:
+    """Return the rows (adj N, d b) of the full model and its determinant d (Jacobi's identity)."""
+    inverse, determinant = adjugate([row[:-1] for row in matrix[:-1]])
+    numerators = [
+        sum(a * row[-1] for a, row in zip(line, matrix, strict=False)) for line in inverse
+    ]
+    return [[*line, b] for line, b in zip(inverse, numerators, strict=True)], determinant
+
+
+def _gain(row: list[int], i: int) -> Fraction:
+    return Fraction(row[-1] ** 2, row[i])
+
+
+def _pivot(matrix: Matrix, score: Score, *, largest: bool, divisor: int = 1) -> list[int]:
+    """Eliminate inputs by the best score, fraction-free: entries share one positive factor."""
+    sign = -1 if largest else 1
+    inputs = len(matrix[0]) - 1
+    work = {i: matrix[i] for i in range(inputs)}
+    order = []
+    while work:
+        scores = {i: sign * score(row, i) for i, row in work.items()}
+        pivot = min(work, key=lambda i: (scores[i], i))
+        pivot_row = work.pop(pivot)
+        d = pivot_row[pivot]
+        for i, row in work.items():
+            f = row[pivot]
+            work[i] = [(x * d - f * y) // divisor for x, y in zip(row, pivot_row, strict=True)]
+        divisor = d
+        order.append(pivot)
+    return order
+
+
+def _descending(inputs: Sequence[str], scores: Sequence[Fraction]) -> tuple[str, ...]:
+    order = sorted(range(len(inputs)), key=lambda i: (-scores[i], i))
+    return tuple(inputs[i] for i in order)
+
+
+def _rss(matrix: Matrix, chosen: Sequence[int]) -> Fraction:
+    at = [*chosen, len(matrix) - 1]
+    return eliminate([[matrix[i][j] for j in at] for i in at]).residual(len(chosen))
+
+
+def _exchange(matrix: Matrix, chosen: list[int]) -> None:
+    """Exchange chosen inputs, in place, until no exchange lowers the residual sum of squares."""
+    best = _rss(matrix, chosen)
+    improved = True
+    while improved:
+        improved = False
+        for position in range(len(chosen)):
+            for i in range(len(matrix) - 1):
+                trial = [*chosen[:position], i, *chosen[position + 1 :]]
+                if i not in chosen and (rss := _rss(matrix, trial)) < best:
+                    chosen[:], best, improved = trial, rss, True
+
+
+# Choosing among many inputs: forward, backward, or exchange.
+#
+# Steps are taken in extended precision (`numpy.longdouble`); where the two best sums of squares
+# differ by less than rounding could make, exact elimination decides, so an order is that of exact
+# arithmetic. A column that others explain but for 10^-9 of its variance counts as dependent, and is
+# left out.
+
+LongArray = NDArray[np.longdouble]
+
+DEPENDENT = 1e-9
+"""Share of a column's variance that others must leave unexplained."""
+
+ROUNDING = 1e-6
+"""Relative difference of two gains below which they are compared exactly: far above what 64-bit
+fractions lose where no column is dependent."""
+
+METHODS: Final = ("forward", "backward", "exchange")
+
+
+def stepwise_order(
+    gram: Gram, inputs: Sequence[str], label: str, method: str, most: int
+) -> tuple[tuple[str, ...], ...]:
+    """Return the chosen inputs of sizes 1, 2, ... up to `most`; all but exchange's are nested.
+
+    Raises `QuestionError` for an unknown method, `DataError` for no rows.
+    """
+    if method not in METHODS:
+        raise QuestionError(f"unknown search {method!r}. Known: {', '.join(METHODS)}.")
+    search = _Search(gram.restrict([*inputs, label]))
+    most = min(most, len(search.usable))
+    steps: dict[str, Callable[[int], list[list[int]]]] = {
+        "forward": search.forward,
+        "backward": search.backward,
+        "exchange": partial(search.forward, exchanging=True),
+    }
+    return tuple(tuple(inputs[i] for i in chosen) for chosen in steps[method](most))
+
+
+def sweep(matrix: LongArray, pivot: int) -> LongArray:
+    """Return a matrix swept on a pivot (Goodnight 1979), which done again undoes it."""
+    row = matrix[pivot] / matrix[pivot, pivot]
+    swept: LongArray = np.multiply.outer(matrix[:, pivot], row)
+    np.subtract(matrix, swept, out=swept)
+    swept[pivot] = row
+    swept[:, pivot] = matrix[:, pivot] / matrix[pivot, pivot]
+    swept[pivot, :] = row
+    swept[pivot, pivot] = -1 / matrix[pivot, pivot]
+    return swept
+
+
+class _Search:
+    """The correlation matrix of inputs and label, and exact sums of squares where it matters."""
+
+    def __init__(self, gram: Gram) -> None:
+        self.exact = moments(gram)
+        size = len(self.exact)
+        # An integer to 64 bits or more: its float, and what that leaves.
+        half = [x for i, row in enumerate(self.exact) for x in row[: i + 1]]
+        high = np.array([float(x) for x in half])
+        low = np.array([float(x - int(near)) for x, near in zip(half, high.tolist(), strict=True)])
+        matrix = np.empty((size, size), dtype=np.longdouble)
+        matrix[np.tril_indices(size)] = high.astype(np.longdouble) + low.astype(np.longdouble)
+        matrix.T[np.tril_indices(size)] = matrix[np.tril_indices(size)]
+        length = np.sqrt(np.diag(matrix))
+        length[length == 0] = 1
+        self.matrix: LongArray = matrix / np.outer(length, length)
+        self.inputs = size - 1
+        self.usable = self._independent()
+
+    def _independent(self) -> list[int]:
+        """Return inputs that explain the others, each time the one that is explained least."""
+        if self._far_from_dependent():
+            return list(range(self.inputs))
+        work, names = self.matrix[:-1, :-1].copy(), np.arange(self.inputs)
+        buffer, taken = np.empty_like(work), list[int]()
+        left = np.ones(self.inputs, dtype=np.bool_)
+        while left.any():
+            best = int(np.argmax(np.where(left, work.diagonal(), -1)))
+            if work[best, best] < DEPENDENT:
+                break
+            np.multiply.outer(work[:, best], work[best] / work[best, best], out=buffer)
+            work -= buffer
+            taken.append(int(names[best]))
+            left[best] = False
+            if 8 * left.sum() < 7 * len(left):  # what was taken is not looked at again
+                work, names = work[np.ix_(left, left)], names[left]
+                buffer, left = np.empty_like(work), np.ones(len(work), dtype=np.bool_)
+        return sorted(taken)
+
+    def _far_from_dependent(self) -> bool:
+        """Whether no combination of inputs has twice as little variance as `DEPENDENT`.
+
+        What others leave of an input is no less than the least eigenvalue of the matrix.
+        """
+        correlation = self.matrix[:-1, :-1].astype(np.float64)
+        try:
+            np.linalg.cholesky(correlation - 2 * DEPENDENT * np.eye(self.inputs))
+        except np.linalg.LinAlgError:
+            return False
+        return True
+
+    def forward(self, most: int, *, exchanging: bool = False) -> list[list[int]]:
+        work, chosen = self.matrix.copy(), list[int]()
+        sets = []
+        for _ in range(most):
+            best = self._best_entry(work.diagonal(), work[:, -1], chosen)
+            if best is None:
+                break
+            work = sweep(work, best)
+            chosen.append(best)
+            if exchanging:
+                work = self._exchanged(work, chosen)
+            sets.append(list(chosen))
+        return sets
+
+    def backward(self, most: int) -> list[list[int]]:
+        work, chosen = self.matrix.copy(), list(self.usable)
+        for i in chosen:
+            work = sweep(work, i)
+        removed: list[int] = []
+        while chosen:
+            worst = self._least_loss(work, chosen)
+            work = sweep(work, worst)
+            chosen.remove(worst)
+            removed.append(worst)
+        order = removed[::-1]
+        return [order[:size] for size in range(1, most + 1)]
+
+    def _best_entry(
+        self, variance: LongArray, with_label: LongArray, chosen: Sequence[int]
+    ) -> int | None:
+        """Return the input that explains most beside those chosen, from what these leave."""
+        there = np.zeros(len(variance), dtype=np.bool_)
+        there[self.usable] = True
+        there[chosen] = False
+        free = np.flatnonzero(there & (variance >= DEPENDENT))
+        if not len(free):
+            return None
+        gains = with_label[free] ** 2 / variance[free]
+        near: list[int] = free[gains >= gains.max() * (1 - ROUNDING)].tolist()
+        if len(near) == 1:
+            return near[0]
+        return min(near, key=lambda i: (self._rss([*chosen, i]), i))
+
+    def _least_loss(self, work: LongArray, chosen: Sequence[int]) -> int:
+        """Return the chosen input whose loss costs least; of equals, the later declared."""
+        losses = work[chosen, -1] ** 2 / -work.diagonal()[chosen]
+        cheap = np.flatnonzero(losses <= losses.min() * (1 + ROUNDING))
+        near = [chosen[int(place)] for place in cheap]
+        if len(near) == 1:
+            return near[0]
+        return min(near, key=lambda i: (self._rss([j for j in chosen if j != i]), -i))
+
+    def _exchanged(self, work: LongArray, chosen: list[int]) -> LongArray:
+        """Exchange chosen inputs, in place, while that lowers the residual sum of squares."""
+        improved = True
+        while improved:
+            improved = False
+            for position, old in enumerate(chosen):
+                # Of the matrix swept on the old one only this is needed, until it is exchanged.
+                row = work[old] / work[old, old]
+                variance = work.diagonal() - work[:, old] * row
+                with_label = work[:, -1] - work[:, old] * row[-1]
+                variance[old], with_label[old] = -1 / work[old, old], row[-1]
+                others = [*chosen[:position], *chosen[position + 1 :]]
+                new = self._best_entry(variance, with_label, others)
+                if new is None or new == old:
+                    continue
+                gain = with_label[new] ** 2 / variance[new]
+                if variance[-1] - gain < work[-1, -1] * (1 - ROUNDING):
+                    work = sweep(sweep(work, old), new)
+                    chosen[position], improved = new, True
+        return work
+
+    def _rss(self, chosen: Sequence[int]) -> Fraction:
+        at = [*chosen, self.inputs]
+        found = eliminate([[self.exact[i][j] for j in at] for i in at])
+        return found.residual(len(found.rows))

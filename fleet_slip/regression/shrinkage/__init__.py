@@ -1,1 +1,0 @@
-"""Estimates other than least squares: Pace, ridge, errors in variables."""

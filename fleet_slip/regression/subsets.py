@@ -1,0 +1,310 @@
+"""The best models of every size among all 2^k subsets of the signals.
+
+Up to `DOUBLING_LIMIT` signals, each doubles a list of moments into copies without it and with it
+(Schur complement) until 2^k residual sums of squares are left, by bit mask; beyond, leaps and
+bounds (Furnival and Wilson 1974). That is float64 on correlations; the best are ordered exactly.
+
+Selection criteria: each is a value per model, and the smallest wins.
+
+All are written in the excess x = (RSS - RSS_full) / sigma^2 of a model with j of k signals, for
+nested models and subsets and any effective number of rows n, less constants that models share. With
+nu = n - k - 1, RSS / RSS_full = 1 + x / nu.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.base import FloatArray, IntArray
+from fleet_slip.compiling import kernel
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.regression.figures import normal_cdf, normal_density
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.inference import Evidence
+from fleet_slip.regression.least_squares import Fit, correlation_matrix, dependence, fit
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a criterion looks at: x and j of each model, n (effective) rows, k inputs."""
+
+    excess: FloatArray
+    size: FloatArray
+    rows: float
+    inputs: int
+
+    @property
+    def log_rss(self) -> FloatArray:
+        """ln(RSS / RSS_full)."""
+        return np.asarray(np.log1p(self.excess / (self.rows - self.inputs - 1)))
+
+
+@cache
+def expected_squares(k: int) -> tuple[float, ...]:
+    """Return E[Z_(l:k)^2] for l = 1..k, the expected order statistics of k squared normals.
+
+    Integral of z^2 k! / ((l-1)! (k-l)!) (1-F)^(l-1) F^(k-l) dF, F = 2 Phi(z) - 1, by trapezia.
+    """
+    z = np.linspace(0.0, 12.0, 6001)
+    inside = normal_cdf(z) - normal_cdf(-z)
+    outside = 2 * normal_cdf(-z)
+    weight = 2 * normal_density(z) * z**2 * (z[1] - z[0])
+    result = []
+    factor = float(k)
+    for rank in range(1, k + 1):
+        result.append(float(np.sum(factor * weight * outside ** (rank - 1) * inside ** (k - rank))))
+        factor *= (k - rank) / rank
+    return tuple(result)
+
+
+def _cic(problem: Problem, squares: Sequence[float]) -> FloatArray:
+    """Return x + 2 sum_{l<=j} of squares, which are those that k chance effects have in order."""
+    penalties = np.cumsum([0.0, *squares])[problem.size.astype(np.intp)]
+    return np.asarray(problem.excess + 2 * penalties)
+
+
+CRITERIA: dict[str, Callable[[Problem], FloatArray]] = {
+    # C_p = RSS / sigma^2 - n + 2(j + 1) = x + 2j - k + 1 (Mallows 1973)
+    "cp": lambda p: p.excess + 2 * p.size - p.inputs + 1,
+    # Sigma known: x + 2j (Akaike 1973). The same order as C_p.
+    "aic": lambda p: p.excess + 2 * p.size,
+    # Sigma unknown: n ln(RSS / n) + 2(j + 1)
+    "aic-likelihood": lambda p: p.rows * p.log_rss + 2 * (p.size + 1),
+    # Sigma known: x + j ln n (Schwarz 1978)
+    "bic": lambda p: p.excess + p.size * math.log(p.rows),
+    # Sigma unknown: n ln(RSS / n) + (j + 1) ln n
+    "bic-likelihood": lambda p: p.rows * p.log_rss + (p.size + 1) * math.log(p.rows),
+    # Risk inflation: x + 2 j ln k (Foster and George 1994)
+    "ric": lambda p: p.excess + 2 * p.size * math.log(max(p.inputs, 1)),
+    # Covariance inflation: x + 2 sum_{l<=j} E[Z_(l:k)^2] (Tibshirani and Knight 1999)
+    "cic": lambda p: _cic(p, expected_squares(p.inputs)),
+    # The same with E[Z_(l:k)^2] = 2 ln(k / l), about twice the exact penalty
+    "cic-log": lambda p: _cic(p, [2 * math.log(p.inputs / i) for i in range(1, p.inputs + 1)]),
+    # Adjusted R^2, to be maximised: ln(RSS / RSS_full) - ln(n - j - 1) (Theil 1961)
+    "adjusted-r2": lambda p: p.log_rss - np.log(p.rows - p.size - 1),
+}
+
+
+def criterion_values(name: str, evidence: Evidence) -> FloatArray:
+    """Return a criterion for the k+1 nested models. Raises `QuestionError` for an unknown name."""
+    size = np.arange(evidence.inputs + 1, dtype=np.float64)
+    return _criterion(name)(Problem(evidence.excess(), size, evidence.rows, evidence.inputs))
+
+
+def subset_values(name: str, evidence: Evidence, rss: FloatArray, size: FloatArray) -> FloatArray:
+    """Return a criterion for subset models, from their RSS in counts^2 and their sizes."""
+    problem = Problem(evidence.excess_of(rss), size, evidence.rows, evidence.inputs)
+    return _criterion(name)(problem)
+
+
+def best_size(name: str, evidence: Evidence) -> int:
+    """Return j of the nested model that the criterion picks; the smaller one of equals."""
+    return int(np.argmin(criterion_values(name, evidence)))
+
+
+def _criterion(name: str) -> Callable[[Problem], FloatArray]:
+    try:
+        return CRITERIA[name]
+    except KeyError:
+        known = ", ".join(CRITERIA)
+        raise QuestionError(f"unknown criterion {name!r}. Known criteria: {known}.") from None
+
+
+DOUBLING_LIMIT = 22
+"""Most signals for which all subsets are computed: 2^22 take about two seconds."""
+
+MOST_INPUTS = 62
+"""Most signals of a search: bit masks are 64-bit integers."""
+
+_SPARE = 3
+
+
+@dataclass(frozen=True)
+class SizeResult:
+    """Exact fits of the best models of one size, best first; signals in declared order."""
+
+    fits: tuple[Fit, ...]
+
+    @property
+    def best(self) -> Fit:
+        """The best model of this size."""
+        return self.fits[0]
+
+    @property
+    def gap(self) -> float | None:
+        """Relative distance of the second best residual sum of squares."""
+        if len(self.fits) < 2 or self.best.rss == 0:
+            return None
+        return float(self.fits[1].rss / self.best.rss - 1)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a JSON document needs."""
+        return {
+            "size": self.best.size,
+            "signals": list(self.best.model.signals),
+            "r_squared": self.best.r_squared,
+            "gap": self.gap,
+        }
+
+
+def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) -> list[SizeResult]:
+    """Return the `count` best models of each size 0..k, ordered exactly; ties as declared.
+
+    Raises `DataError` for dependence or a constant label, `QuestionError` beyond `MOST_INPUTS`.
+    """
+    relations = dependence(gram, inputs)
+    if relations:
+        raise DataError(relations)
+    if len(inputs) > MOST_INPUTS:
+        raise QuestionError(
+            f"all subsets of {len(inputs)} signals are too many: give at most {MOST_INPUTS}."
+        )
+    part = gram.restrict([*inputs, label])
+    matrix = correlation_matrix(part)
+    if matrix[-1, -1] == 0:
+        raise DataError(f"{label} is constant: there is nothing to explain.")
+    found = candidates(matrix, count + _SPARE)
+    return [_exact_best(part, inputs, label, masks, count) for masks in found]
+
+
+def pick_sizes(results: Sequence[SizeResult], evidence: Evidence) -> dict[str, int]:
+    """Return the size that each criterion picks; the evidence is that of the full model."""
+    rss = np.array([float(result.best.rss) for result in results])
+    size = np.arange(len(results), dtype=np.float64)
+    return {name: int(np.argmin(subset_values(name, evidence, rss, size))) for name in CRITERIA}
+
+
+def candidates(matrix: FloatArray, count: int) -> list[list[int]]:
+    """Return bit masks of the `count` best subsets of each size, by float64 RSS."""
+    k = len(matrix) - 1
+    if k > DOUBLING_LIMIT:
+        return best_by_leaps(matrix, count)
+    rss = all_rss(matrix)
+    sizes = subset_sizes(k)
+    result = []
+    order = np.argsort(sizes, kind="stable")
+    stops = np.cumsum(np.bincount(sizes, minlength=k + 1))
+    for start, stop in zip([0, *stops[:-1]], stops, strict=True):
+        masks = order[start:stop]
+        if len(masks) > count:
+            masks = masks[np.argpartition(rss[masks], count - 1)[:count]]
+        result.append(masks.tolist())
+    return result
+
+
+def subset_sizes(k: int) -> NDArray[np.uint8]:
+    """Return the number of signals of each of the 2^k bit masks."""
+    return np.bitwise_count(np.arange(2**k, dtype=np.uint32))
+
+
+def all_rss(matrix: FloatArray) -> FloatArray:
+    """Return the RSS of all 2^k subsets of moments, label last; element m has the bits of m."""
+    work: FloatArray = np.asarray(matrix, dtype=np.float64)[:, :, None]
+    # Signals are taken from the last to the first, so that the first ends in the lowest bit.
+    # The label moves to the front, out of the way.
+    order = [len(matrix) - 1, *range(len(matrix) - 1)]
+    work = work[np.ix_(order, order)]
+    while len(work) > 1:
+        row, rest = work[-1, :-1], work[:-1, :-1]
+        size = len(rest)
+        doubled = np.empty((size, size, 2 * work.shape[2]))
+        doubled[:, :, 0::2] = rest
+        scaled = row / work[-1, -1]
+        for i in range(size):
+            doubled[i, : i + 1, 1::2] = rest[i, : i + 1] - scaled[i] * row[: i + 1]
+            doubled[: i + 1, i, 1::2] = doubled[i, : i + 1, 1::2]
+        work = doubled
+    return np.asarray(np.maximum(work[0, 0], 0.0))
+
+
+def signals_of(mask: int, inputs: Sequence[str]) -> list[str]:
+    """Return the signals whose bit is set, in declared order."""
+    return [name for i, name in enumerate(inputs) if mask >> i & 1]
+
+
+def _exact_best(
+    gram: Gram, inputs: Sequence[str], label: str, masks: Sequence[int], count: int
+) -> SizeResult:
+    fits = [fit(gram, signals_of(mask, inputs), label) for mask in masks]
+
+    def rank(fitted: Fit) -> tuple[Fraction, list[int]]:
+        return fitted.rss, [inputs.index(name) for name in fitted.model.signals]
+
+    return SizeResult(tuple(sorted(fits, key=rank)[:count]))
+
+
+# Leaps and bounds: best subsets of each size without computing all (Furnival and Wilson 1974).
+
+
+def best_by_leaps(matrix: FloatArray, count: int) -> list[list[int]]:
+    """Return bit masks of the `count` best subsets of each size 0..k, best first; k is at most 62.
+
+    The label is last. A branch keeps some signals for good and may drop the others one by one; it
+    is left once its largest model's residuals exceed what every size in reach already has.
+    """
+    k = len(matrix) - 1
+    best = np.full((k + 1, count), np.inf)
+    masks = np.full((k + 1, count), -1, dtype=np.int64)
+    inverse: FloatArray = np.linalg.inv(matrix).astype(np.float64)
+    _offer(best, masks, k, 1 / inverse[-1, -1], 2**k - 1)
+    _branch(inverse, np.arange(k), 0, best, masks)
+    return [
+        [int(line[i]) for i in np.argsort(rss, kind="stable") if line[i] >= 0]
+        for rss, line in zip(best, masks, strict=True)
+    ]
+
+
+@kernel
+def _offer(best: FloatArray, masks: IntArray, size: int, rss: float, mask: int) -> None:
+    worst = np.argmax(best[size])
+    if rss < best[size, worst]:
+        best[size, worst] = rss
+        masks[size, worst] = mask
+
+
+@kernel
+def _branch(
+    inverse: FloatArray, present: IntArray, kept: int, best: FloatArray, masks: IntArray
+) -> None:
+    """Visit the models that drop signals of `present[kept:]`; `inverse` is of present and label."""
+    size = len(present)
+    # The dearest signal first: dropping it has the most models below, and is cut off soonest.
+    losses = np.empty(size - kept)
+    for i in range(kept, size):
+        losses[i - kept] = inverse[i, size] ** 2 / inverse[i, i]
+    order = np.arange(size + 1)
+    order[kept:size] = kept + np.argsort(-losses)
+    inverse = inverse[order][:, order]
+    present = present[order[:size]]
+    mask = np.int64(0)
+    for name in present:
+        mask |= np.int64(1) << name
+    rss = np.empty(size)
+    for i in range(kept, size):
+        rss[i] = 1 / (inverse[size, size] - inverse[i, size] ** 2 / inverse[i, i])
+        _offer(best, masks, size - 1, rss[i], mask ^ (np.int64(1) << present[i]))
+    for i in range(kept, size - 1):
+        # Models below keep present[:i] and lack at least one more: i to size - 2 signals.
+        reach = False
+        for reached in range(i, size - 1):
+            reach = reach or rss[i] < best[reached].max()
+        if reach:
+            _branch(_without(inverse, i), np.delete(present, i), i, best, masks)
+
+
+@kernel
+def _without(inverse: FloatArray, i: int) -> FloatArray:
+    """Return the inverse of the moments without signal i: a Schur complement of the inverse."""
+    keep = np.delete(np.arange(len(inverse)), i)
+    smaller = np.empty((len(keep), len(keep)))
+    for a, row in enumerate(keep):
+        factor = inverse[row, i] / inverse[i, i]
+        for b, column in enumerate(keep):
+            smaller[a, b] = inverse[row, column] - factor * inverse[i, column]
+    return smaller

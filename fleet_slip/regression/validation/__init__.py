@@ -1,1 +1,0 @@
-"""Cross-validation over folds of drives, and differences between models."""

@@ -1,1 +1,0 @@
-"""The record that every job leaves: what ran, when, and how it ended."""

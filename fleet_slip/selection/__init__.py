@@ -1,1 +1,0 @@
-"""Which model: comparison, search, uncertainty and diagnosis, all from Gram matrices."""

@@ -1,0 +1,462 @@
+"""Writes what is missing of a campaign: each batch of drives is a file that lands exactly once.
+
+What a campaign lands in the logs, and whether it did: batches of drives, and complete days.
+
+Units of work, their version made of what defines them: a changed campaign is noticed.
+"""
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from datetime import date
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+import pyarrow as pa
+from deltalake.transaction import AddAction
+
+from fleet_slip.base import FloatArray, Progress, no_progress
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.compute.tasks import run_tasks
+from fleet_slip.errors import RefusedError
+from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec
+from fleet_slip.simulation.receivers import ReceiverFixes, ReceiverLog
+from fleet_slip.simulation.roads import road_with
+from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
+from fleet_slip.storage.table import Change, Snapshot, Unit, retry_conflicts
+from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
+from fleet_slip.warehouse.forgotten import Audit
+from fleet_slip.warehouse.tables import Warehouse
+
+# From drives to the rows of a log: choose the speed, drive the car, measure, tabulate counts.
+
+DRIVES_AT_ONCE = 128
+"""Drives of a batch that are simulated together, which bounds the memory for their roads."""
+
+CHUNK_ROWS = 2**16
+"""Rows of a chunk of a column that is the same in all rows of a drive."""
+
+
+@dataclass(frozen=True)
+class DriveLog:
+    """One drive as its car logged it."""
+
+    spec: DriveSpec
+    measurement: Measurement
+    lost_control_s: float | None
+    fixes: ReceiverFixes | None = None
+    """What its satellite receiver logged, if the campaign has receivers."""
+
+    @property
+    def signals(self) -> set[str]:
+        """Names of the signals that it has."""
+        return {*self.measurement.counts, *(self.fixes.counts if self.fixes else ())}
+
+    @property
+    def rows(self) -> int:
+        """Number of ticks."""
+        return len(self.measurement.gps_fix)
+
+    @property
+    def metadata(self) -> dict[str, object]:
+        """The columns of `SignalCatalogue.drive_schema`."""
+        spec = self.spec
+        return {
+            "drive_id": spec.drive_id,
+            "vehicle_id": spec.vehicle_id,
+            "vehicle_model": spec.vehicle.name,
+            "source": spec.source,
+            "campaign": spec.campaign,
+            "track": spec.track.name,
+            "mass_kg": spec.vehicle.body.sprung_mass_kg,
+            "receiver": spec.receiver.name if spec.receiver else None,
+            "adhesion": spec.adhesion,
+            "speed_factor": spec.speed_factor,
+            "duration_s": (self.rows - 1) / SAMPLE_RATE_HZ,
+            "rows": self.rows,
+            "lost_control_s": self.lost_control_s,
+            "saturated": self.measurement.saturated,
+        }
+
+
+def lane_drive(spec: DriveSpec) -> LaneDrive:
+    """Return the drive as the simulator takes it."""
+    profile = spec.profile
+    road = Road(
+        spacing_m=profile.spacing_m,
+        curvature_1pm=spec.track.curvature(profile.station_m),
+        speed_mps=spec.speed_factor * profile.speed_mps,
+        length_m=spec.track.length_m,
+        closed=spec.track.closed,
+        surface=spec.surface(profile.station_m),
+    )
+    felt = spec.distortion() is not None
+    road = road_with(road, spec.script)
+    return LaneDrive(spec.vehicle, road, spec.adhesion, spec.laps, spec.flaws.car, felt)
+
+
+def simulate_batch(batch: Batch) -> pa.Table:
+    """Simulate and measure the drives of a batch, a function of the batch alone.
+
+    Columns are in the order of `SignalCatalogue.log_schema`, without unlogged extras, strings as
+    dictionaries; rows by drive, then tick.
+    """
+    logs: list[DriveLog] = []
+    for first in range(0, len(batch.drives), DRIVES_AT_ONCE):
+        logs += simulate_logs(batch.drives[first : first + DRIVES_AT_ONCE])
+    return tabulate(batch, logs)
+
+
+def simulate_logs(specs: Sequence[DriveSpec]) -> list[DriveLog]:
+    """Simulate drives together, each measured block by block by its own sensors and generator."""
+    recorders = [Recorder(s.sensors, s.generator(), s.distortion()) for s in specs]
+    receivers = [
+        ReceiverLog(s.receiver, s.satellite_generator()) if s.receiver else None for s in specs
+    ]
+    logs: dict[int, DriveLog] = {}
+    for block in simulate_blocks([lane_drive(spec) for spec in specs]):
+        recorder, receiver = recorders[block.drive], receivers[block.drive]
+        recorder.record(block.channels)
+        if receiver:
+            receiver.record(block.channels)
+        if block.last:
+            lost = block.lost_control_tick
+            logs[block.drive] = DriveLog(
+                specs[block.drive],
+                recorder.measurement(),
+                None if lost is None else lost / SAMPLE_RATE_HZ,
+                receiver.fixes() if receiver else None,
+            )
+    return [logs[drive] for drive in range(len(specs))]
+
+
+MOTION = ("vx_mps", "vy_mps", "station_m", "lateral_offset_m")
+"""What of the truth an evaluation needs, as no sensor measures it."""
+
+
+def exact_motion(specs: Sequence[DriveSpec]) -> list[dict[str, FloatArray]]:
+    """Return the channels of `MOTION` of each drive at 100 Hz, not rounded to counts."""
+    blocks: list[list[dict[str, FloatArray]]] = [[] for _ in specs]
+    for block in simulate_blocks([lane_drive(spec) for spec in specs]):
+        blocks[block.drive].append({name: block.channels[name].copy() for name in MOTION})
+    return [
+        {name: np.concatenate([part[name] for part in parts]) for name in MOTION}
+        for parts in blocks
+    ]
+
+
+def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
+    """Return the rows of the logs as one table."""
+    rows = [log.rows for log in logs]
+    columns = {"day": pa.repeat(pa.scalar(batch.day), sum(rows))}
+    for column in catalogue().drive_schema:
+        values = pa.array([log.metadata.get(column.name) for log in logs], type=column.type)
+        if column.name not in catalogue().optional or values.null_count < len(values):
+            columns[column.name] = _repeated(values, rows)
+    ticks = pa.array(np.arange(max(rows), dtype=np.int32))
+    columns["tick"] = pa.chunked_array([ticks[:n] for n in rows])
+    for name in catalogue().signals:
+        if name not in catalogue().extras or any(name in log.signals for log in logs):
+            columns[name] = pa.chunked_array([_counts(log, name) for log in logs])
+    names = [name for name in catalogue().log_schema.names if name in columns]
+    return pa.table({name: columns[name] for name in names})
+
+
+def _counts(log: DriveLog, name: str) -> pa.Array:
+    if log.fixes and name in log.fixes.counts:
+        return pa.array(log.fixes.counts[name], mask=~log.fixes.fix)
+    if name not in log.measurement.counts:
+        return pa.nulls(log.rows, pa.int16())
+    no_fix = ~log.measurement.gps_fix if name in GPS_SIGNALS else None
+    return pa.array(log.measurement.counts[name], mask=no_fix)
+
+
+def _repeated(values: pa.Array, times: Sequence[int]) -> pa.ChunkedArray:
+    """Return each value so many times, strings as a dictionary; chunks of a drive share memory."""
+    encoded = values.dictionary_encode() if pa.types.is_string(values.type) else values
+    chunks = []
+    for drive, count in enumerate(times):
+        same = encoded.take(pa.array(np.full(min(count, CHUNK_ROWS), drive)))
+        chunks += [same[: count - first] for first in range(0, count, CHUNK_ROWS)]
+    return pa.chunked_array(chunks, type=encoded.type)
+
+
+def has_landed(snapshot: Snapshot, batch: Batch) -> bool:
+    """Whether a batch is in the logs. Raises `RefusedError` if another batch has its place."""
+    landed = snapshot.landed(unit_name(batch.campaign, batch.day, batch.index))
+    if landed is not None and landed != unit_of(batch).version:
+        raise changed_campaign(batch.campaign, batch.day)
+    return landed is not None
+
+
+def changed_campaign(campaign: str, day: date) -> RefusedError:
+    """Return the error that a day's batches, or the day, landed as something else."""
+    return RefusedError(
+        f"{day}: the campaign {campaign!r} was changed since this day was simulated, and logs are "
+        "never replaced. Give the changed campaign another name, or use another data root."
+    )
+
+
+def unit_of(batch: Batch) -> Unit:
+    """Return the unit of work that lands a batch; its version is from the batch's content."""
+    name = unit_name(batch.campaign, batch.day, batch.index)
+    return Unit(name, int(batch.digest[:15], base=16))
+
+
+def unit_name(campaign: str, day: date, index: int) -> str:
+    """Return the name of the unit of work that lands a day's batch of an index."""
+    return f"simulate/{campaign}/{day}/{index}"
+
+
+def file_name(batch: Batch) -> str:
+    """Return the name of a batch's file, before the checksum of its bytes."""
+    return f"{batch.campaign}-{batch.index:04d}-{batch.digest[:12]}"
+
+
+def day_units(campaign: Campaign, days: Iterable[date]) -> Iterator[tuple[Unit, date]]:
+    """Yield the unit of work that records that a day is complete, for each of some days."""
+    version = int(campaign.digest[:15], base=16)
+    return ((Unit(f"simulate/{campaign.name}/{day}", version), day) for day in days)
+
+
+@dataclass
+class Seconds:
+    """Where the time went; tasks run side by side and may add up to more than `elapsed`."""
+
+    elapsed: float = 0.0
+    simulate: float = 0.0
+    """Driving, measuring and tabulating, summed over tasks."""
+    encode: float = 0.0
+    """Parquet and its checksum, summed over tasks."""
+    write: float = 0.0
+    """Writing and flushing files, summed over tasks."""
+    commit: float = 0.0
+    """Committing to the Delta log, which the coordinator does."""
+
+    @property
+    def tasks(self) -> float:
+        """Time of all tasks."""
+        return self.simulate + self.encode + self.write
+
+
+@dataclass
+class SimulationReport:
+    """What a run of the job did."""
+
+    batches_written: int = 0
+    batches_present: int = 0
+    """Batches of the days that were planned that had landed before."""
+    days_present: int = 0
+    """Days that were complete, and so not planned."""
+    drives: int = 0
+    drives_forgotten: int = 0
+    """Drives that were left out: of cars that were forgotten, or forgotten themselves."""
+    rows: int = 0
+    size_bytes: int = 0
+    logs_version: int | None = None
+    seconds: Seconds = field(default_factory=Seconds)
+
+    @property
+    def changed(self) -> bool:
+        """Whether there was anything to do."""
+        return bool(self.batches_written)
+
+
+@dataclass(frozen=True)
+class _Written:
+    batch: Batch
+    drives: tuple[DriveSpec, ...]
+    """Those of the batch that were not forgotten."""
+    action: AddAction | None
+    """What adds their file; None without drives."""
+    rows: int
+    simulate_s: float
+    encode_s: float
+    write_s: float
+
+
+def simulate_campaign(
+    warehouse: Warehouse,
+    campaign: Campaign,
+    days: Iterable[date],
+    executor: Executor,
+    progress: Progress = no_progress,
+) -> SimulationReport:
+    """Simulate what has not landed of the given days of a campaign, and land each batch.
+
+    A day is planned in its turn; a complete one is recorded and never planned again, so that nights
+    stay short for years. Raises like `simulate_batches`.
+    """
+    snapshot = warehouse.logs.snapshot()
+    every = tuple(days)
+    open_days = _open_days(snapshot, campaign, every)
+    begun = [d for d in open_days if snapshot.landed(unit_name(campaign.name, d, 0)) is not None]
+    for day in begun:  # before anything is written, so that a changed campaign is refused
+        for batch in campaign.batches(day):
+            has_landed(snapshot, batch)
+    plan = (campaign.batches(day) for day in open_days)
+    report = _simulate(warehouse, plan, len(open_days), executor, progress)
+    report.days_present = len(every) - len(open_days)
+    retry_conflicts(lambda: _complete(warehouse, campaign, open_days))
+    report.logs_version = warehouse.logs.snapshot().version
+    return report
+
+
+def _open_days(snapshot: Snapshot, campaign: Campaign, days: Iterable[date]) -> tuple[date, ...]:
+    """Return the days not recorded as complete. Raises `RefusedError` for a changed campaign."""
+    found = []
+    for unit, day in day_units(campaign, days):
+        landed = snapshot.landed(unit.name)
+        if landed is None:
+            found.append(day)
+        elif landed != unit.version:
+            raise changed_campaign(campaign.name, day)
+    return tuple(found)
+
+
+def _complete(warehouse: Warehouse, campaign: Campaign, days: Iterable[date]) -> None:
+    snapshot = warehouse.logs.snapshot()
+    units = [unit for unit, _ in day_units(campaign, _open_days(snapshot, campaign, days))]
+    if units:
+        snapshot.commit(Change(units=units, note={"job": "simulate", "campaign": campaign.name}))
+
+
+def simulate_batches(
+    warehouse: Warehouse,
+    batches: Sequence[Batch],
+    executor: Executor,
+    progress: Progress = no_progress,
+) -> SimulationReport:
+    """Simulate the batches that have not landed, and land each.
+
+    Raises `RefusedError` if a different version of a batch is there, `StorageError`, and at the end
+    `ClusterError` for batches that workers died of.
+    """
+    snapshot = warehouse.logs.snapshot()
+    for batch in batches:
+        has_landed(snapshot, batch)
+    return _simulate(warehouse, [batches], 1, executor, progress)
+
+
+def _simulate(
+    warehouse: Warehouse,
+    plan: Iterable[Sequence[Batch]],
+    days: int,
+    executor: Executor,
+    progress: Progress,
+) -> SimulationReport:
+    start = time.perf_counter()
+    backlog = _Backlog(warehouse.logs.snapshot(), plan, days)
+    report = SimulationReport()
+    for _, result in run_tasks(executor, partial(_write, warehouse), backlog, _name):
+        before_s = time.perf_counter()
+        landed = _land(warehouse, result)
+        if landed:
+            _count(report, landed)
+        report.seconds.commit += time.perf_counter() - before_s
+        progress(result.rows, backlog.expected_rows)
+    report.batches_present = backlog.present
+    report.logs_version = warehouse.logs.snapshot().version
+    report.seconds.elapsed = time.perf_counter() - start
+    return report
+
+
+def _count(report: SimulationReport, result: _Written) -> None:
+    report.batches_written += 1
+    report.drives += len(result.drives)
+    report.drives_forgotten += len(result.batch.drives) - len(result.drives)
+    report.rows += result.rows
+    report.size_bytes += result.action.size if result.action else 0
+    report.seconds.simulate += result.simulate_s
+    report.seconds.encode += result.encode_s
+    report.seconds.write += result.write_s
+
+
+class _Backlog:
+    """Batches that have not landed, planned day by day as they are asked for."""
+
+    def __init__(self, snapshot: Snapshot, plan: Iterable[Sequence[Batch]], days: int) -> None:
+        self._snapshot = snapshot
+        self._plan = plan
+        self._days = days
+        self._days_planned = 0
+        self._rows = 0
+        self.present = 0
+
+    @property
+    def expected_rows(self) -> int:
+        """Rows to simulate; those of days not planned yet are taken to be like the others'."""
+        return self._rows * self._days // max(self._days_planned, 1)
+
+    def __iter__(self) -> Iterator[Batch]:
+        for batches in self._plan:
+            missing = [batch for batch in batches if not has_landed(self._snapshot, batch)]
+            self.present += len(batches) - len(missing)
+            self._days_planned += 1
+            self._rows += sum(drive.expected_rows for batch in missing for drive in batch.drives)
+            yield from missing
+
+
+def _name(batch: Batch) -> str:
+    return f"{batch.campaign}, {batch.day}, file {batch.index}"
+
+
+def _write(warehouse: Warehouse, batch: Batch) -> _Written:
+    drives = _not_forgotten(warehouse, batch.drives)
+    if not drives:
+        return _Written(batch, (), None, 0, 0.0, 0.0, 0.0)
+    times = [time.perf_counter()]
+    rows = simulate_batch(replace(batch, drives=drives))
+    times.append(time.perf_counter())
+    content = warehouse.logs.encode(rows)
+    times.append(time.perf_counter())
+    action = warehouse.logs.put(file_name(batch), content, batch.day)
+    times.append(time.perf_counter())
+    simulate_s, encode_s, write_s = (b - a for a, b in pairwise(times))
+    return _Written(batch, drives, action, rows.num_rows, simulate_s, encode_s, write_s)
+
+
+def _not_forgotten(warehouse: Warehouse, drives: tuple[DriveSpec, ...]) -> tuple[DriveSpec, ...]:
+    barred = Audit(warehouse.root).barred(
+        {drive.vehicle_id for drive in drives}, {drive.drive_id for drive in drives}
+    )
+    return tuple(
+        drive
+        for drive in drives
+        if drive.vehicle_id not in barred.vehicles and drive.drive_id not in barred.drives
+    )
+
+
+def _land(warehouse: Warehouse, written: _Written) -> _Written | None:
+    """Commit a batch, and return what has landed; None if another process landed it first."""
+
+    def attempt() -> _Written | None:
+        nonlocal written
+        snapshot = warehouse.logs.snapshot()
+        landed = has_landed(snapshot, written.batch)
+        # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
+        while landed or written.drives != _not_forgotten(warehouse, written.drives):
+            warehouse.logs.discard(_files(written))
+            if landed:
+                return None
+            written = _write(warehouse, written.batch)
+        snapshot.commit(
+            Change(
+                add=_files(written),
+                units=[unit_of(written.batch)],
+                note={
+                    "job": "simulate",
+                    "campaign": written.batch.campaign,
+                    "digest": written.batch.digest,
+                },
+            )
+        )
+        return written
+
+    return retry_conflicts(attempt)
+
+
+def _files(written: _Written) -> list[AddAction]:
+    return [written.action] if written.action else []

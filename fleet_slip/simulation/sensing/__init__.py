@@ -1,1 +1,0 @@
-"""What sensors and satellite receivers make of the truth."""

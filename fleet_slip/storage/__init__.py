@@ -1,0 +1,1 @@
+"""Where tables and documents lie: folders, object stores, Delta tables, runs."""

@@ -1,0 +1,123 @@
+"""Rows as the bytes of a Parquet file, and its checksum."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from fleet_slip.storage.folder import checksum_of, fast_checksum_of
+
+DAY = "day"
+"""The one column of which the Delta log tells the least and the largest value."""
+
+ROW_GROUP_ROWS = 2**17
+WRITE_BATCH_ROWS = 2**14
+"""Rows that the encoder takes at once: 16 times its default is a sixth faster."""
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """The content of a Parquet file, its checksums, and its statistics for the Delta log."""
+
+    content: pa.Buffer
+    checksum: str
+    fast_checksum: str
+    statistics: str
+
+    def path(self, name: str, day: date | None) -> str:
+        """Return where a table has this content: in the folder of a day, if it has one."""
+        folder = f"day={day.isoformat()}/" if day else ""
+        return f"{folder}{name}-x{self.fast_checksum}-{self.checksum}.parquet"
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How the columns of a table become Parquet."""
+
+    dictionary: tuple[str, ...] = ()
+    delta_packed: tuple[str, ...] = ()
+    compression: str = "none"
+
+    def options(self) -> dict[str, Any]:
+        """Return the arguments of `pyarrow.parquet.ParquetWriter`."""
+        return {
+            "use_dictionary": list(self.dictionary),
+            "column_encoding": dict.fromkeys(self.delta_packed, "DELTA_BINARY_PACKED"),
+            "compression": self.compression,
+        }
+
+    def encode(self, rows: pa.Table, omitted: Sequence[str] = ()) -> Encoded:
+        """Return a file of these rows, with dictionaries of what occurs."""
+        kept = rows.drop_columns([name for name in omitted if name in rows.schema.names])
+        # A dictionary that is shared with rows of another file, or of a drive that was forgotten,
+        # would bring their names along: Parquet stores one as it is given.
+        columns = [_only_used_values(column) for column in kept.columns]
+        # Declared so, a column without a null has no list of which values are null, which takes an
+        # eighth of the time to write.
+        fields = [f.with_nullable(kept[f.name].null_count > 0) for f in kept.schema]
+        stored = pa.Table.from_arrays(columns, schema=pa.schema(fields))
+        sink = pa.BufferOutputStream()
+        with pq.ParquetWriter(
+            sink, stored.schema, write_batch_size=WRITE_BATCH_ROWS, **self.options()
+        ) as writer:
+            writer.write_table(stored, row_group_size=ROW_GROUP_ROWS)
+        content = sink.getvalue()
+        statistics = json.dumps(_statistics(rows, stored.column_names))
+        return Encoded(content, checksum_of(content), fast_checksum_of(content), statistics)
+
+
+def _statistics(rows: pa.Table, stored: Sequence[str]) -> dict[str, Any]:
+    nulls = {name: rows[name].null_count for name in rows.schema.names}
+    told: dict[str, Any] = {"numRecords": rows.num_rows, "nullCount": nulls}
+    if DAY in stored:
+        limits = pc.min_max(rows[DAY]).as_py()
+        if limits["min"] is not None:
+            told["minValues"] = {DAY: limits["min"].isoformat()}
+            told["maxValues"] = {DAY: limits["max"].isoformat()}
+    return told
+
+
+def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return a column whose dictionary has only values that occur, in the order they occur in."""
+    if not pa.types.is_dictionary(column.type):
+        return column
+    whole = column.combine_chunks()
+    used = whole.indices.unique().drop_null()
+    if used.to_pylist() == list(range(len(whole.dictionary))):
+        return column
+    codes = whole.indices.dictionary_encode()
+    values = whole.dictionary.take(codes.dictionary)
+    return pa.chunked_array([pa.DictionaryArray.from_arrays(codes.indices, values)])
+
+
+@dataclass(frozen=True)
+class Names:
+    """The values of one column's dictionary that rows have, and those that none has."""
+
+    used: frozenset[str]
+    unused: frozenset[str]
+
+
+def read_names(file: pa.NativeFile, columns: Sequence[str]) -> dict[str, Names]:
+    """Return the names in each dictionary of a Parquet file, of the columns with texts."""
+    metadata = pq.read_metadata(file)
+    stored = [name for name in columns if name in metadata.schema.names]
+    with pq.ParquetFile(file, metadata=metadata, read_dictionary=stored) as parquet:
+        schema = parquet.schema_arrow
+        there = [n for n in schema.names if pa.types.is_dictionary(schema.field(n).type)]
+        groups = [parquet.read_row_group(i, there) for i in range(parquet.num_row_groups)]
+    return {n: _names([part for rows in groups for part in rows[n].chunks]) for n in there}
+
+
+def _names(parts: Sequence[pa.DictionaryArray]) -> Names:
+    every: set[str] = set()
+    used: set[str] = set()
+    for part in parts:
+        every.update(part.dictionary.to_pylist())
+        used.update(part.dictionary.take(part.indices.unique().drop_null()).to_pylist())
+    return Names(frozenset(used), frozenset(every - used))

@@ -1,0 +1,270 @@
+"""Folders of a file system, where no reader sees half a file and files survive a power cut.
+
+Files are flushed under a temporary name, then renamed; numbers are taken by hard links.
+"""
+
+import contextlib
+import errno
+import fcntl
+import os
+import shutil
+import stat
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import pyarrow as pa
+
+from fleet_slip.errors import StorageError
+from fleet_slip.storage.folder import (
+    TEMPORARY_PREFIX,
+    Content,
+    StoredFile,
+    check_local_files,
+    storage_errors,
+)
+
+if TYPE_CHECKING:
+    import duckdb
+
+
+@dataclass(frozen=True)
+class LocalFolder:
+    """A folder of a file system; see `fleet_slip.storage.folder.Folder`."""
+
+    path: Path
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def uri(self) -> str:
+        return str(self.path)
+
+    @property
+    def delta_options(self) -> dict[str, str] | None:
+        return None
+
+    @property
+    def spill(self) -> Path:
+        return self.path
+
+    @property
+    def is_local(self) -> bool:
+        return True
+
+    def __truediv__(self, name: str) -> Self:
+        return type(self)(self.path / name)
+
+    def exists(self) -> bool:
+        with storage_errors(self):
+            return self.path.is_dir()
+
+    def names(self) -> list[str]:
+        with storage_errors(self):
+            return sorted(e.name for e in self.path.iterdir()) if self.path.is_dir() else []
+
+    def files(self) -> list[StoredFile]:
+        with storage_errors(self):
+            walked = os.walk(self.path, onerror=_pass_over)
+            paths = sorted(Path(folder) / name for folder, _, names in walked for name in names)
+            return [file for file in map(self._judge, filter(Path.is_file, paths)) if file]
+
+    def read(self, path: str, longest: int | None = None) -> bytes:
+        with (
+            _regular_file(self.path / path, os.O_RDONLY) as descriptor,
+            open(descriptor, "rb", closefd=False) as file,
+        ):
+            return file.read(-1 if longest is None else longest)
+
+    def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
+        return [self.read(path) if (self.path / path).is_file() else None for path in paths]
+
+    def check(self, path: str) -> None:
+        check_local_files([str(self.path / path)])
+
+    def open(self, path: str) -> pa.NativeFile:
+        with storage_errors(self.path / path):
+            if not (self.path / path).is_file():  # a pipe would be waited for
+                raise FileNotFoundError(errno.ENOENT, "there is no such file")
+            return pa.OSFile(str(self.path / path), "rb")
+
+    def put(self, path: str, content: Content) -> None:
+        target = self.path / path
+        with _written_aside(target, content) as temporary:
+            temporary.replace(target)
+
+    def create(self, path: str, content: Content) -> bool:
+        target = self.path / path
+        with _written_aside(target, content) as temporary:
+            try:
+                target.hardlink_to(temporary)
+            except FileExistsError:
+                return False
+        return True
+
+    def append(self, path: str, content: bytes) -> None:
+        file = self.path / path
+        with storage_errors(file):
+            file.parent.mkdir(exist_ok=True)
+        with _regular_file(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT) as descriptor:
+            os.write(descriptor, content)
+            os.fsync(descriptor)
+
+    def remove(self, file: StoredFile) -> bool:
+        """Delete the very file that a listing found; False if it is gone or was replaced.
+
+        It is compared before and after it is moved aside, and put back if a repair replaced it.
+        """
+        path = self.path / file.path
+        if self._judge(path) != file:
+            return False
+        aside = path.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}")
+        with storage_errors(path):
+            try:
+                path.rename(aside)
+            except FileNotFoundError:
+                return False
+            found = self._judge(aside)
+            same = found is not None and replace(found, path=file.path) == file
+            if not same:
+                with contextlib.suppress(FileExistsError):
+                    path.hardlink_to(aside)
+            aside.unlink()
+        return same
+
+    def delete(self, path: str) -> None:
+        with storage_errors(self.path / path):
+            (self.path / path).unlink(missing_ok=True)
+
+    def settle_commits(self, before: int | None) -> None:
+        folder = self.path / "_delta_log"
+        with contextlib.suppress(FileNotFoundError):
+            for version in count(0 if before is None else before + 1):
+                with (folder / f"{version:020}.json").open("rb") as file:
+                    os.fsync(file.fileno())
+        _flush(folder)
+
+    def free_bytes(self) -> tuple[int, int] | None:
+        with storage_errors(self):
+            disk = shutil.disk_usage(self.path)
+        return disk.free, disk.total
+
+    @contextlib.contextmanager
+    def exclusive(self, name: str, waiting: Callable[[], None]) -> Iterator[None]:
+        """Hold a lock among the processes of this machine; a killed process releases it.
+
+        Calls `waiting` once if another has it. A read-only file system needs none.
+        """
+        lock = self.path / name
+        with contextlib.ExitStack() as stack:
+            with storage_errors(lock):
+                try:
+                    lock.parent.mkdir(parents=True, exist_ok=True)
+                    file = stack.enter_context(_opened(lock, os.O_WRONLY | os.O_CREAT))
+                except OSError as error:
+                    if error.errno != errno.EROFS:
+                        raise
+                    file = None
+                if file is not None:
+                    try:
+                        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    except BlockingIOError:
+                        waiting()
+                        fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+    def let_read(self, database: "duckdb.DuckDBPyConnection") -> None:
+        """Enable a connection to read files below this folder, as every one is."""
+
+    def lend(
+        self,
+        database: "duckdb.DuckDBPyConnection",  # noqa: ARG002
+        wanted: Callable[[str], bool],
+    ) -> list[str]:
+        """Return the URIs of the wanted files but links, which may lead anywhere."""
+        paths = [self.path / file.path for file in self.files() if wanted(file.path)]
+        return [f"{self.uri}/{p.relative_to(self.path)}" for p in paths if not p.is_symlink()]
+
+    def _judge(self, path: Path) -> StoredFile | None:
+        try:
+            found = path.stat(follow_symlinks=False)
+        except FileNotFoundError:
+            return None
+        return StoredFile(
+            self,
+            path.relative_to(self.path).as_posix(),
+            found.st_size,
+            found.st_mtime_ns,
+            str(found.st_ino),
+        )
+
+
+@contextlib.contextmanager
+def _opened(file: Path, flags: int) -> Iterator[int]:
+    """Open a file, but no link, which may lead to another's, nor a pipe; yield its descriptor."""
+    safe = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(file, flags | safe, 0o666)
+    except OSError:
+        if file.is_symlink() or file.is_fifo():
+            raise _no_file(file) from None
+        raise
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise _no_file(file)
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def _regular_file(file: Path, flags: int) -> Iterator[int]:
+    """Do the same; what fails is a `StorageError`."""
+    with storage_errors(file), _opened(file, flags) as descriptor:
+        yield descriptor
+
+
+def _no_file(path: Path) -> StorageError:
+    return StorageError(
+        f"{path}: it is a link, a folder or a pipe where this program has a file. Find out who put "
+        "it there and remove it, or restore the file from a backup."
+    )
+
+
+@contextlib.contextmanager
+def _written_aside(target: Path, content: Content) -> Iterator[Path]:
+    """Write a temporary sibling of a file, and make durable what is done with it."""
+    temporary = target.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}")
+    with storage_errors(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with temporary.open("xb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            yield temporary
+        finally:
+            temporary.unlink(missing_ok=True)
+        _flush(target.parent)
+
+
+def _pass_over(error: OSError) -> None:
+    """Go on where a folder is gone, or not ours to see, or none; raise any other error."""
+    if not isinstance(error, FileNotFoundError | NotADirectoryError | PermissionError):
+        raise error
+
+
+def _flush(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

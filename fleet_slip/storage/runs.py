@@ -1,0 +1,642 @@
+"""Lines of the history of runs, each with its own checksum, and what is wrong with a line.
+
+    {"run_id":…,"documents":…,"sha256":"0123456789abcdef0123456789abcdef"}
+
+The checksum is of the bytes before it: a changed line differs from a torn one, which lacks its end,
+and an old one, which has none. Lines are no chain: processes add them without a lock.
+
+Every run keeps number and checksum of the newest document of each folder, to tell that the last
+ones are gone; whoever deletes these and rewrites all records leaves no trace: docs/security.md.
+"""
+
+import contextlib
+import hashlib
+import json
+import logging
+import os
+import re
+import socket
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
+from dataclasses import dataclass, field, fields, replace
+from datetime import UTC, date, datetime, timedelta
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import duckdb
+
+from fleet_slip.config import read_sql
+from fleet_slip.errors import HIDDEN, StorageError, hide_passwords
+from fleet_slip.storage.documents import DocumentFolder
+from fleet_slip.storage.folder import Folder, StoredFile
+
+PROC = Path("/proc")
+START = 19
+"""Place of the start among the fields behind the name, proc(5): ticks since the machine booted."""
+
+FOLDER = "runs"
+NEWEST_DOCUMENTS = "documents"
+"""Name of the newest documents in the record of a run."""
+
+RECORD_COLUMNS = {
+    "run_id": "VARCHAR",
+    "command": "VARCHAR",
+    "arguments": "VARCHAR[]",
+    "started_at": "VARCHAR",
+    "ended_at": "VARCHAR",
+    "outcome": "VARCHAR",
+    "exit_code": "INTEGER",
+    "error": "VARCHAR",
+    "seconds": "DOUBLE",
+    "steps": "STRUCT(name VARCHAR, seconds DOUBLE, rows BIGINT, size_bytes BIGINT)[]",
+    "host": "VARCHAR",
+    "process": "INTEGER",
+    "process_began": "VARCHAR",
+    "package_version": "VARCHAR",
+}
+"""What a line of the history may say, with DuckDB's types."""
+
+_DOCUMENT_FOLDER = re.compile(r"forgotten|models/(?!\.\./)[^/]*/(?:versions|history)")
+
+_DIGITS = 32
+_END = b',"sha256":"' + b"0" * _DIGITS + b'"}'
+_WITH_CHECKSUM = re.compile(rb'(.*),"sha256":"([0-9a-f]{%d})"\}' % _DIGITS)
+
+
+def process_began(number: int) -> str | None:
+    """Return a process's boot and start, whatever the clock, since numbers are reused; or None."""
+    try:
+        boot = (PROC / "sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        status = (PROC / str(number) / "stat").read_bytes()
+    except OSError:
+        return None
+    return f"{boot}/{status.rpartition(b')')[2].split()[START].decode()}"
+
+
+def write_line(record: Mapping[str, Any]) -> bytes:
+    """Return a record as a line with its checksum, without the end of the line."""
+    body = json.dumps(record, separators=(",", ":")).encode().removesuffix(b"}")
+    return body + b',"sha256":"' + _checksum(body) + b'"}'
+
+
+def is_intact(line: bytes) -> bool:
+    """Whether a line is what was written."""
+    return bool(line) and not _is_torn(line) and not _is_changed(line)
+
+
+def changed_lines(content: bytes) -> list[int]:
+    """Return the numbers of the lines, from 1, that are not what was written; torn ones are."""
+    lines = enumerate(content.split(b"\n"), 1)
+    return [n for n, line in lines if line and not _is_torn(line) and _is_changed(line)]
+
+
+def find_changed_lines(root: Folder, since: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the files, from a month YYYY-MM on, that have changed lines, and which."""
+    folder = root / FOLDER
+    for file in folder.files():
+        if not file.path.endswith(".jsonl") or file.path < since:
+            continue
+        try:
+            (content,) = folder.read_many([file.path])
+        except StorageError:
+            continue
+        for number in changed_lines(content or b""):
+            yield f"{FOLDER}/{file.path}", f"line {number} is not what a run has written"
+
+
+def require_unchanged(root: Folder, since: str = "") -> None:
+    """Raise `StorageError` if a line of the history was changed."""
+    for path, problem in find_changed_lines(root, since):
+        raise StorageError(
+            f"{root}/{path}: {problem}; it was changed or damaged. Restore the file from a backup, "
+            "or delete the line: the others stand for themselves."
+        )
+
+
+def _is_torn(line: bytes) -> bool:
+    """Whether a line lacks its end, as a write that did not finish leaves it."""
+    return not (_ends(line) or _ends(line[:-1]) or _parsed(line) is not None)
+
+
+def _ends(line: bytes) -> bool:
+    """Whether a line ends as a line with a checksum does, but for one byte."""
+    there = line[-len(_END) :]
+    if len(there) < len(_END):
+        return False
+    pairs = zip(there, _END, strict=True)
+    hexadecimal = b"0123456789abcdef"
+    return sum(a != b and not (b == 48 and a in hexadecimal) for a, b in pairs) <= 1
+
+
+def _is_changed(line: bytes) -> bool:
+    if found := _WITH_CHECKSUM.fullmatch(line):
+        return _checksum(found[1]) != found[2]
+    record = _parsed(line)
+    # An earlier version wrote no checksum, but no other keys either.
+    return record is None or not record.keys() <= {*RECORD_COLUMNS, NEWEST_DOCUMENTS}
+
+
+def _parsed(line: bytes) -> dict[str, Any] | None:
+    try:
+        record = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return record if isinstance(record, dict) else None
+
+
+def _checksum(body: bytes) -> bytes:
+    return hashlib.sha256(body).hexdigest()[:_DIGITS].encode()
+
+
+def newest_documents(root: Folder) -> dict[str, tuple[int, str]]:
+    """Return the newest documents as they are now; nothing of a folder that cannot be read."""
+    found = {}
+    for path in _document_folders(root):
+        documents = DocumentFolder(root / path)
+        with contextlib.suppress(StorageError):
+            if numbers := documents.numbers():
+                found[path] = (numbers[-1], documents.read(numbers[-1]).sha256)
+    return found
+
+
+def find_missing_documents(root: Folder, since: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the folders that lost documents that a run since YYYY-MM had seen, and what."""
+    for path, (number, digest) in sorted(_newest_seen(root, since).items()):
+        documents = DocumentFolder(root / path)
+        newest = max(documents.numbers(), default=0)
+        if newest < number:
+            yield path, f"had {number} documents when a run ended, and has {newest} now"
+            continue
+        with contextlib.suppress(StorageError):  # told as a document
+            if documents.read(number).sha256 != digest:
+                yield path, f"{number}.json is not the document that a run had seen"
+
+
+def _newest_seen(root: Folder, since: str) -> dict[str, tuple[int, str]]:
+    folder = root / FOLDER
+    paths = [f.path for f in folder.files() if f.path.endswith(".jsonl") and f.path >= since]
+    kept: dict[str, tuple[int, str]] = {}
+    for content in folder.read_many(paths):
+        for line in (content or b"").splitlines():
+            for path, number, digest in _newest_in(line):
+                if number >= kept.get(path, (0, ""))[0]:
+                    kept[path] = (number, digest)
+    return kept
+
+
+def _newest_in(line: bytes) -> Iterator[tuple[str, int, str]]:
+    """Yield the newest documents that a line tells, none if it is torn, changed or without them."""
+    if not is_intact(line):
+        return
+    try:
+        record: Any = json.loads(line)
+        found = record.get(NEWEST_DOCUMENTS) or {}
+        for path, (number, sha256) in found.items():
+            if _DOCUMENT_FOLDER.fullmatch(str(path)):
+                yield str(path), int(number), str(sha256)
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return
+
+
+def _document_folders(root: Folder) -> list[str]:
+    models = [f"models/{name}" for name in (root / "models").names()]
+    return [
+        "forgotten",
+        *(f"{model}/{kind}" for model in models for kind in ("versions", "history")),
+    ]
+
+
+# The history of runs: which commands changed a warehouse, when, and what came of it.
+#
+#     runs/2026-11.jsonl     one line when a command starts, one when it ends
+#
+# A line is one write, with a checksum (`fleet_slip.runs.records`), never changed: no lock, and a
+# killed run lacks its second line. Torn lines are skipped; each record begins a new line. What
+# cannot be written is not: nothing here fails or delays the command.
+
+LOGGER = logging.getLogger("fleet_slip")
+INTERRUPTED = 130
+ARGUMENTS_MAX = 50
+"""So many arguments are kept; a glob may have given a hundred thousand."""
+ERROR_MAX = 2000
+"""So many characters of a message are kept."""
+
+_PRIVATE_OPTION = re.compile(
+    r"(?i)--?(?:[\w-]*(?:key|token|secret|passw)[\w-]*|vehicle|drive(?:-name)?|source-file)"
+)
+_NAMES = re.compile(r"(?i)\b(?:vehicle_id|drive_id|drive_name|source_file|trip_id)\b")
+_DATA_FILE = re.compile(
+    r"(?is).*(\.(?:csv|parquet|mf4|mdf|dat|mat|blf|asc|log|trc|mcap|duckdb|ddb)(?:\.\w+)?)"
+)
+_ADDRESS = re.compile(r"(--?[\w-]+=)?[^\s:/@=]+:\S*@([^\s@]+)")
+"""Of a user with a password, without a scheme."""
+
+_current: ContextVar["Run | None"] = ContextVar("run", default=None)
+
+
+@dataclass
+class MeasuredStep:
+    """One step of a run. Whoever does it fills in the figures while it lasts."""
+
+    name: str
+    seconds: float = 0.0
+    rows: int | None = None
+    size_bytes: int | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the step for the record."""
+        return {
+            "name": self.name,
+            "seconds": round(self.seconds, 6),
+            "rows": self.rows,
+            "size_bytes": self.size_bytes,
+        }
+
+
+@dataclass
+class Run:
+    """A command under way."""
+
+    command: str
+    arguments: tuple[str, ...]
+    started_at: datetime
+    run_id: str
+    steps: list[MeasuredStep] = field(default_factory=list)
+
+    @classmethod
+    def start(cls, command: str, arguments: Sequence[str]) -> "Run":
+        """Begin a run now. Its name sorts by time."""
+        now = datetime.now(UTC)
+        run_id = f"{now:%Y%m%dT%H%M%S.%fZ}-{os.urandom(4).hex()}"
+        return cls(command, tuple(arguments), now, run_id)
+
+    @property
+    def shown_arguments(self) -> list[str]:
+        """The command line without what the history must not keep."""
+        kept = publishable(self.arguments)
+        more = len(kept) - ARGUMENTS_MAX
+        return [*kept[:ARGUMENTS_MAX], f"... and {more} more"] if more > 0 else kept
+
+    def beginning(self) -> dict[str, Any]:
+        """Return the line that is written when the run starts."""
+        from importlib.metadata import version  # noqa: PLC0415 - what is not recorded needs none
+
+        return {
+            "run_id": self.run_id,
+            "command": self.command,
+            "arguments": self.shown_arguments,
+            "started_at": _timestamp(self.started_at),
+            "host": os.uname().nodename,
+            "process": os.getpid(),
+            "process_began": process_began(os.getpid()),
+            "package_version": version("fleet-slip"),
+        }
+
+    def end(self, error: BaseException | None, seconds: float) -> dict[str, Any]:
+        """Return the line that is written when the run ends."""
+        exit_code = _exit_code(error)
+        told = _without(str(error), self.arguments, publishable(self.arguments))
+        told = hide_passwords(told)[:ERROR_MAX]
+        outcome = {0: "done", INTERRUPTED: "interrupted"}.get(exit_code, "failed")
+        return {
+            "run_id": self.run_id,
+            "ended_at": _timestamp(datetime.now(UTC)),
+            "seconds": round(seconds, 6),
+            "outcome": outcome,
+            "exit_code": exit_code,
+            "error": told if error is not None and exit_code else None,
+            "steps": [one.as_dict() for one in self.steps],
+        }
+
+
+def current_run_id() -> str | None:
+    """Return the name of the run under way."""
+    run = _current.get()
+    return run.run_id if run else None
+
+
+@contextlib.contextmanager
+def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[Run]:
+    """Record a command that may change a root, only at its end if it made the root itself."""
+    run = Run.start(command, arguments)
+    file = f"{FOLDER}/{run.started_at:%Y-%m}.jsonl"
+    begun = time.monotonic()
+    token = _current.set(run)
+    told = _exists(root) and _append(root, file, run.beginning())
+    log_event("run started", command=command, arguments=run.shown_arguments)
+    error: BaseException | None = None
+    try:
+        yield run
+    except BaseException as caught:
+        error = caught
+        raise
+    finally:
+        end = run.end(error, time.monotonic() - begun)
+        log_event("run ended", **{key: end[key] for key in ("outcome", "exit_code", "seconds")})
+        if _exists(root):
+            with contextlib.suppress(StorageError):
+                end[NEWEST_DOCUMENTS] = newest_documents(root)
+            _append(root, file, *([] if told else [run.beginning()]), end)
+        _current.reset(token)
+
+
+@contextlib.contextmanager
+def step(name: str) -> Iterator[MeasuredStep]:
+    """Time a step of the run under way, and log it. Without a run it is logged only."""
+    run = _current.get()
+    one = MeasuredStep(name)
+    begun = time.monotonic()
+    try:
+        yield one
+    finally:
+        one.seconds = time.monotonic() - begun
+        if run:
+            run.steps.append(one)
+        log_event(
+            "step ended", step=name, **{k: v for k, v in one.as_dict().items() if k != "name"}
+        )
+
+
+def publishable(arguments: Sequence[str]) -> list[str]:
+    """Return command line arguments without what the history must not keep.
+
+    That is keys, tokens, secrets and passwords, users and queries of URLs, and what may name a
+    person's car, since the history outlives it: --vehicle, --drive, --drive-name, --source-file,
+    conditions on such columns, names of data files.
+    """
+    kept: list[str] = []
+    hide_next = False
+    for argument in arguments:
+        text = hide_passwords(argument.encode(errors="replace").decode(), whole=True)
+        if "://" not in text and (address := _ADDRESS.fullmatch(text)):
+            text = f"{address[1] or ''}{HIDDEN}@{address[2]}"
+        if _NAMES.search(text):
+            text = HIDDEN
+        option, equals, _ = text.partition("=")
+        private = bool(_PRIVATE_OPTION.fullmatch(option))
+        if hide_next:
+            text = HIDDEN
+        elif private and equals:
+            text = f"{option}={HIDDEN}"
+        elif data_file := _DATA_FILE.fullmatch(text):
+            text = f"{HIDDEN}{data_file[1]}"
+        hide_next = private and not equals and not hide_next
+        kept.append(text)
+    return kept
+
+
+def _without(text: str, arguments: Sequence[str], shown: Sequence[str]) -> str:
+    """Return a message with the arguments that are not shown replaced, wherever it quotes them."""
+    for argument, instead in zip(arguments, shown, strict=True):
+        if argument != instead:
+            secret = argument.partition("=")[2] if instead.endswith(f"={HIDDEN}") else argument
+            text = text.replace(secret, HIDDEN) if secret else text
+    return text
+
+
+def _exists(root: Folder) -> bool:
+    with contextlib.suppress(StorageError):
+        return root.exists()
+    return False
+
+
+def _append(root: Folder, file: str, *records: Mapping[str, Any]) -> bool:
+    text = b"".join(b"\n" + write_line(record) + b"\n" for record in records)
+    try:
+        root.append(file, text)
+    except StorageError as error:
+        log_event("run not recorded", logging.WARNING, file=f"{root}/{file}", reason=str(error))
+        return False
+    return True
+
+
+def log_event(event: str, level: int = logging.INFO, **fields: Any) -> None:
+    """Log what happened, with figures: a line for machines, nothing for people."""
+    LOGGER.log(level, event, extra={"event": event, "fields": fields})
+
+
+def _exit_code(error: BaseException | None) -> int:
+    if error is None:
+        return 0
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED
+    return int(getattr(error, "exit_code", 1))
+
+
+def _timestamp(moment: datetime) -> str:
+    return moment.isoformat(timespec="microseconds")
+
+
+# Reading the history of runs, and keeping it short where every record is an object of its own.
+#
+#     runs/2026-11.jsonl                        the records of a month, in a folder
+#     runs/2026-11.jsonl/TIME-RANDOM.jsonl      a record, on an object store
+#     runs/2026-11.jsonl/CHECKSUM.jsonl         records of that month, gathered
+#
+# Gathering takes no lock: a record is deleted by who has written an object that has it, so that
+# each is there once or more; the view `runs` counts by name, and readers list again.
+
+REMOVALS_AT_ONCE = 16
+RUNNING = "running"
+KILLED = "killed"
+
+
+def lend_runs(root: Folder, database: duckdb.DuckDBPyConnection, since: str = "") -> list[str]:
+    """Let a connection read the history since a month; return its URIs. Raises `StorageError`."""
+    require_unchanged(root, since)
+    return (root / FOLDER).lend(database, lambda path: _is_record(path) and path >= since)
+
+
+def runs_under_way(root: Folder) -> list[str]:
+    """Return other runs of the last day that have no end, but for dead ones of this machine."""
+    since = datetime.now(UTC) - timedelta(days=1)
+    begun: dict[str, Mapping[str, Any]] = {}
+    folder = root / FOLDER
+    paths = [f.path for f in folder.files() if _is_record(f.path) and f.path >= f"{since:%Y-%m}"]
+    for content in folder.read_many(paths):
+        for line in (content or b"").splitlines():
+            if is_intact(line):
+                record = json.loads(line)
+                begun[record["run_id"]] = {**begun.get(record["run_id"], {}), **record}
+    return [
+        run_id
+        for run_id, run in sorted(begun.items())
+        if run_id != current_run_id()
+        and f"{run_id:.16}" >= f"{since:%Y%m%dT%H%M%S}"
+        and state_of({"outcome": None, "host": None, "process": None, **run}) == RUNNING
+    ]
+
+
+def state_of(run: Mapping[str, Any]) -> str:
+    """Return done, failed, interrupted, running, or killed: no outcome, and its process is gone.
+
+    Another machine's process counts as running; a reused number differs in its beginning.
+    """
+    if run["outcome"] is not None:
+        return str(run["outcome"])
+    if run["host"] != socket.gethostname():
+        return RUNNING
+    try:
+        os.kill(run["process"], 0)
+    except ProcessLookupError:
+        return KILLED
+    except (PermissionError, TypeError):
+        pass  # another user's, or a record without a number
+    began = run.get("process_began")
+    now = process_began(run["process"]) if began is not None else None
+    return RUNNING if now is None or now == began else KILLED
+
+
+def gather_runs(root: Folder) -> int:
+    """Gather the records of each month in one object, on a store; return how many there were."""
+    folder = root / FOLDER
+    months: dict[str, list[StoredFile]] = defaultdict(list)
+    for file in folder.files():
+        month, _, name = file.path.partition("/")
+        if name and _is_record(name):
+            months[month].append(file)
+    scattered = {month: files for month, files in months.items() if len(files) > 1}
+    for month, files in scattered.items():
+        _gather(folder, month, files)
+    return sum(len(files) for files in scattered.values())
+
+
+def _gather(folder: Folder, month: str, files: list[StoredFile]) -> None:
+    contents = folder.read_many([file.path for file in files])
+    read = {file: content for file, content in zip(files, contents, strict=True) if content}
+    # Sorted and each once: the same records are the same object, whoever gathers them.
+    lines = sorted({line for content in read.values() for line in content.splitlines() if line})
+    whole = b"".join(line + b"\n" for line in lines)
+    target = f"{month}/{hashlib.sha256(whole).hexdigest()[:32]}.jsonl"
+    folder.create(target, whole)
+    with ThreadPoolExecutor(REMOVALS_AT_ONCE) as executor:
+        list(executor.map(folder.remove, (file for file in read if file.path != target)))
+
+
+def _is_record(path: str) -> bool:
+    return path.endswith(".jsonl")
+
+
+def run_source(database: duckdb.DuckDBPyConnection, files: list[str]) -> str:
+    """Return what stands after FROM for the history of runs, or some of its files."""
+    columns = ", ".join(f"{name} {kind}" for name, kind in RECORD_COLUMNS.items())
+    database.execute("SET VARIABLE run_files = $paths", {"paths": files})
+    if files:
+        return read_sql("warehouse", "stored_runs.sql").format(run_columns=RECORD_COLUMNS)
+    database.execute(f"CREATE TABLE empty_runs ({columns})")
+    return "empty_runs"
+
+
+# The record of nights: where each began, and how it ended.
+#
+#     nights/1.json, 2.json, ...    two of a night: its beginning and its end
+#
+# A killed night that is given again starts from its beginning, and tells the whole. Faulty drives
+# are hashes: the record outlives what is forgotten.
+
+NIGHTS_FOLDER = "nights"
+HASH_CHARACTERS = 16
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What a root had when a night began: its champion, and hashes of drives `known` as faulty."""
+
+    champion: str | None
+    drives: int
+    rows: int
+    quarantined: int
+    known: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class PastNight:
+    """How a night ended; `steps` are the state of each by name."""
+
+    night: date
+    exit_code: int
+    drives: int
+    rows: int
+    champion: str | None
+    steps: Mapping[str, str]
+    faulty: frozenset[str] = frozenset()
+
+
+def hash_drive(model: str, drive_id: str) -> str:
+    """Return `left(sha256('MODEL ' || drive_id), 16)`, which stands for a drive in the record."""
+    return sha256(f"{model} {drive_id}".encode()).hexdigest()[:HASH_CHARACTERS]
+
+
+@dataclass(frozen=True)
+class Nights:
+    """The nights of one model in a data root."""
+
+    root: Folder
+    model: str
+
+    def begin(self, night: date, now: Beginning) -> Beginning:
+        """Record the beginning of a night; return the one that is there, if the night has one."""
+        for content in self._newest_first():
+            if content["night"] < night.isoformat():
+                break
+            if content["night"] == night.isoformat() and content["event"] == "begun":
+                kept = {name: content[name] for name in vars(now)}
+                return Beginning(**{**kept, "known": frozenset(content["known"])})
+        before = next(self.ended(before=night), None)
+        known = before.faulty if before else frozenset()
+        begun = replace(now, known=known)
+        self._append("begun", night, {**vars(begun), "known": sorted(begun.known)})
+        return begun
+
+    def end(self, past: PastNight) -> None:
+        """Record how a night ended."""
+        content = {**vars(past), "steps": dict(past.steps), "faulty": sorted(past.faulty)}
+        self._append("ended", content.pop("night"), content)
+
+    def ended(self, before: date | None = None) -> Iterator[PastNight]:
+        """Yield the nights that ended, the newest first and each once, as it ended at last."""
+        seen = {before.isoformat()} if before else set()
+        for content in self._newest_first():
+            late = before is not None and content["night"] > before.isoformat()
+            if content["event"] == "ended" and content["night"] not in seen and not late:
+                seen.add(content["night"])
+                kept = {field.name: content[field.name] for field in fields(PastNight)}
+                kept |= {"night": date.fromisoformat(content["night"])}
+                yield PastNight(**{**kept, "faulty": frozenset(content["faulty"])})
+
+    def _newest_first(self) -> Iterator[Mapping[str, Any]]:
+        documents = DocumentFolder(self.root / NIGHTS_FOLDER)
+        for number in reversed(documents.numbers()):
+            content = documents.read(number).content
+            if content["model"] == self.model:
+                yield content
+
+    def _append(self, event: str, night: date, content: Mapping[str, Any]) -> None:
+        known = {"event": event, "model": self.model, "night": night.isoformat()}
+        DocumentFolder(self.root / NIGHTS_FOLDER).append({**known, **content})
+
+
+def without_drives(cohort: str, model: str, hashes: Iterable[str]) -> str:
+    """Return a condition that also leaves out the drives of these hashes."""
+    listed = ", ".join(f"'{one}'" for one in sorted(hashes))
+    if not listed:
+        return cohort
+    return (
+        f"({cohort}) AND left(sha256('{model} ' || drive_id), {HASH_CHARACTERS}) NOT IN ({listed})"
+    )
+
+
+_LEFT_OUT = re.compile(
+    r"\((.*)\) AND left\(sha256\('[^']*' \|\| drive_id\), \d+\) NOT IN \([^()]*\)", re.DOTALL
+)
+
+
+def with_all_drives(cohort: str) -> str:
+    """Return a condition as it was before `without_drives` left out some."""
+    while found := _LEFT_OUT.fullmatch(cohort):
+        cohort = found[1]
+    return cohort

@@ -1,0 +1,802 @@
+"""A Delta table of a data root: its files, and what it takes to open and make it."""
+
+import functools
+import hashlib
+import json
+import math
+import random
+import re
+import time
+import uuid
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import date
+from decimal import Decimal
+from functools import cached_property
+from typing import Any, TypeVar
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from deltalake import CommitProperties, DeltaTable, Transaction
+from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
+from deltalake.transaction import AddAction, RemoveAction
+
+from fleet_slip.errors import ConflictError, RefusedError, StorageError
+from fleet_slip.storage.commits import (
+    CHECKSUM_KEY,
+    COMMIT_FILE,
+    LOG,
+    NOTE,
+    Commit,
+    checked_note,
+    keep_checksum_of_new,
+    newest_checkpoint,
+    problem_of_commit,
+    read_commit,
+    read_landed_units,
+    require_kept_checksum,
+    version_of,
+)
+from fleet_slip.storage.encoding import Encoded, Encoding, Names, read_names
+from fleet_slip.storage.folder import Folder, StoredFile, checksum_in, first_line, storage_errors
+
+# The files of a table as the Delta log has them, and what one commit does to them.
+
+_DATA_FILE = re.compile(r"[\w.=-][\w.=/-]*\.parquet", re.ASCII)
+"""Path of a data file below its table: relative, and without characters that could be a pattern."""
+
+_NULLS = "null_count."
+"""Before a column's name: how many nulls a file has in it. Null, if it has no such column."""
+
+
+@dataclass(frozen=True)
+class TableFile:
+    """An active file of a table, as the Delta log has it, and the first and last of its days."""
+
+    path: str
+    rows: int
+    size_bytes: int
+    null_counts: Mapping[str, int]
+    day: date | None = None
+    days: tuple[date, date] | None = None
+
+
+def absent_columns(files: Iterable[TableFile], names: Iterable[str]) -> tuple[str, ...]:
+    """Return the columns that none of the files has: they came to the table later."""
+    absent = dict.fromkeys(names)
+    for file in files:
+        if not absent:
+            break
+        for name in [name for name in absent if name in file.null_counts]:
+            del absent[name]
+    return tuple(absent)
+
+
+def read_actions(delta: DeltaTable | None) -> pa.Table:
+    """Return what the log says of each active file, a row a file; none without a table."""
+    if delta is None:
+        return pa.Table.from_pylist([])
+    # pa.table() would import pandas, which takes half a second.
+    stream = delta.get_add_actions(flatten=True)
+    return pa.RecordBatchReader.from_stream(stream).read_all().combine_chunks()
+
+
+def active_files(actions: pa.Table, where: object) -> tuple[TableFile, ...]:
+    """Return the active files, by path. Raises `StorageError` if the log names one wrongly."""
+    files = sorted(_table_files(actions), key=lambda file: file.path)
+    for file in files:
+        _require_sound(file, where)
+    return tuple(files)
+
+
+def have_same_columns(actions: pa.Table, names: Iterable[str]) -> bool:
+    """Whether each of the columns is in all active files or in none."""
+    counts = [actions[f"{_NULLS}{n}"] for n in names if f"{_NULLS}{n}" in actions.column_names]
+    return all(column.null_count in (0, len(column)) for column in counts)
+
+
+def _require_sound(file: TableFile, where: object) -> None:
+    parts = file.path.split("/")
+    if not _DATA_FILE.fullmatch(file.path) or ".." in parts or "." in parts:
+        raise StorageError(
+            f"{where}: the Delta log names the file {file.path[:200]!r}, which is "
+            "not one of this table. Restore the log from a backup."
+        )
+    if file.rows is None or file.rows < 0 or file.size_bytes is None or file.size_bytes < 0:
+        raise StorageError(
+            f"{where}: the Delta log does not say how large {file.path} is. "
+            "Another program wrote it, or it was damaged: restore the log from a backup."
+        )
+
+
+class _NullCounts(Mapping[str, int]):
+    """Null counts of a file, looked up when asked for: of 100,000 files few jobs need many."""
+
+    def __init__(self, columns: Mapping[str, pa.ChunkedArray], row: int) -> None:
+        self._columns = columns
+        self._row = row
+
+    def __getitem__(self, name: str) -> int:
+        count: int | None = self._columns[name][self._row].as_py()
+        if count is None:
+            raise KeyError(name)
+        return count
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name in self._columns if name in self)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def __reduce__(self) -> tuple[type[dict[str, int]], tuple[dict[str, int]]]:
+        """Send another process what is of this file only."""
+        return dict, (dict(self),)
+
+
+def _table_files(actions: pa.Table) -> Iterator[TableFile]:
+    nulls = {
+        name.removeprefix(_NULLS): actions[name]
+        for name in actions.column_names
+        if name.startswith(_NULLS)
+    }
+    unknown = [None] * actions.num_rows
+    columns = (
+        actions[name].to_pylist() if name in actions.column_names else unknown
+        for name in ("path", "num_records", "size_bytes", "partition.day", "min.day", "max.day")
+    )
+    for row, (path, rows, size_bytes, day, first, last) in enumerate(zip(*columns, strict=True)):
+        days = (first, last) if first and last else None
+        yield TableFile(path, rows, size_bytes, _NullCounts(nulls, row), day, days)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A piece of work that lands exactly once: its name, and a number that its content determines.
+
+    A Delta transaction identifier: of two processes that land it at once, one is in conflict.
+    """
+
+    name: str
+    version: int
+
+
+@dataclass(frozen=True)
+class Change:
+    """What a commit does; files added and removed stay. `data_change` is false if rows move."""
+
+    add: Sequence[AddAction] = ()
+    remove: Sequence[TableFile] = ()
+    units: Sequence[Unit] = ()
+    note: Mapping[str, Any] = field(default_factory=dict)
+    data_change: bool = True
+
+    def actions(self) -> list[AddAction | RemoveAction]:
+        """Return what the commit says to the Delta log, as of now."""
+        both = {action.path for action in self.add} & {file.path for file in self.remove}
+        return [
+            *(action for action in self.add if action.path not in both),
+            *(
+                RemoveAction(
+                    path=file.path,
+                    data_change=self.data_change,
+                    deletion_timestamp=_now_ms(),
+                    size=file.size_bytes,
+                    partition_values=_partition(file.day),
+                )
+                for file in self.remove
+                if file.path not in both
+            ),
+        ]
+
+
+def rows_in(action: AddAction) -> int:
+    """Return the number of rows of a file that an action adds."""
+    return int(json.loads(action.stats)["numRecords"])
+
+
+def columns_in(action: AddAction) -> frozenset[str]:
+    """Return the columns of a file that an action adds."""
+    return frozenset(json.loads(action.stats)["nullCount"])
+
+
+def addition(path: str, encoded: Encoded, day: date | None) -> AddAction:
+    """Return the action that adds a file to a table."""
+    return AddAction(
+        path=path,
+        size=len(encoded.content),
+        partition_values=_partition(day),
+        modification_time=_now_ms(),
+        data_change=True,
+        stats=encoded.statistics,
+    )
+
+
+def _partition(day: date | None) -> dict[str, str | None]:
+    return {"day": day.isoformat()} if day else {}
+
+
+def _now_ms() -> int:
+    return int(time.time() * 1000)
+
+
+# Commits in conflict: how one is recognised, and how it is tried again.
+
+ATTEMPTS = 12
+FIRST_WAIT_S = 0.02
+LONGEST_WAIT_S = 5.0
+LOOKS = 8
+"""So often tables are looked at again that do not rest."""
+
+_CONFLICT = re.compile(
+    r"concurrent|changed since last commit|existing table version|already exists|"
+    r"exceeded maximum commit attempts|^Failed to commit transaction: \d+$",
+    re.IGNORECASE,
+)
+"""What the Delta library says when another commit was faster; anything else is a fault."""
+
+Result = TypeVar("Result")
+
+
+def is_conflict(error: CommitFailedError) -> bool:
+    """Whether a commit failed because another one was faster."""
+    return _CONFLICT.search(str(error)) is not None
+
+
+def on_newest(
+    tables: Sequence["Table"],
+    look: Callable[[], Result],
+    is_damage: Callable[[Result], bool] = lambda _: False,
+) -> Result:
+    """Look at tables, and again if what is found may be of files that a newer version removed.
+
+    Damage, or a `StorageError`, is told only if the tables rested meanwhile, or never rest.
+    """
+    for _ in range(LOOKS):
+        before = _versions(tables)
+        try:
+            found = look()
+            if not is_damage(found) or _versions(tables) == before:
+                return found
+        except StorageError:
+            if _versions(tables) == before:
+                raise
+    return look()
+
+
+def _versions(tables: Sequence["Table"]) -> list[int | None]:
+    found: list[int | None] = []
+    for table in tables:
+        try:
+            delta = table.open_delta()
+        except StorageError:
+            delta = None
+        found.append(None if delta is None else delta.version())
+    return found
+
+
+def retry_conflicts(attempt: Callable[[], Result]) -> Result:
+    """Call until it raises no `ConflictError`, waiting ever longer, at random, between."""
+    for number in range(ATTEMPTS - 1):
+        try:
+            return attempt()
+        except ConflictError:
+            longest = min(FIRST_WAIT_S * 2**number, LONGEST_WAIT_S)
+            time.sleep(random.uniform(0, longest))  # noqa: S311 - not a secret
+    return attempt()
+
+
+# Which signals and scales a stored table has, beside those of the catalogue.
+#
+# A count means nothing without its scale, so the schema in the Delta log records each. It changes
+# in the commit that exchanges the files (`fleet_slip.maintenance.migration`).
+
+SCALE = "scale"
+"""Key of a field's metadata: the physical value of one count, as in the catalogue."""
+
+TARGET = "migrating_to"
+"""Key of a field's metadata: the new scale while a migration is under way, else empty or absent."""
+
+
+@dataclass(frozen=True)
+class Evolution:
+    """How a stored table and the catalogue differ.
+
+    Attributes:
+        added, retired: columns of the catalogue alone, and of the table alone.
+        rescaled: old and new scale of the signals whose counts mean something else.
+        unrecorded: signals whose scale the table does not record, and which is taken to be ours.
+        migrating: a migration was begun and has not ended.
+    """
+
+    added: tuple[str, ...]
+    retired: tuple[str, ...]
+    rescaled: Mapping[str, tuple[Decimal, Decimal]]
+    unrecorded: tuple[str, ...]
+    migrating: bool
+
+    @property
+    def pending(self) -> bool:
+        """Whether there is anything to migrate. A retired signal needs nothing."""
+        return bool(self.added or self.rescaled or self.unrecorded or self.migrating)
+
+
+def compare_schemas(schema: pa.Schema, delta: DeltaTable) -> Evolution:
+    """Compare the schema of the catalogue with that of a stored table."""
+    try:
+        stored = {field.name: field.metadata for field in delta.schema().fields}
+    except DeltaError as error:
+        raise StorageError(f"{delta.table_uri}: its schema cannot be read: {error}") from None
+    scales = {name: scale for name, scale in scales_of(schema).items() if name in stored}
+    return Evolution(
+        added=tuple(name for name in schema.names if name not in stored),
+        retired=tuple(name for name in stored if name not in schema.names),
+        rescaled={
+            name: (Decimal(stored[name][SCALE]), scale)
+            for name, scale in scales.items()
+            if SCALE in stored[name] and Decimal(stored[name][SCALE]) != scale
+        },
+        unrecorded=tuple(name for name in scales if SCALE not in stored[name]),
+        migrating=any(metadata.get(TARGET) for metadata in stored.values()),
+    )
+
+
+def scales_of(schema: pa.Schema) -> dict[str, Decimal]:
+    """Return the scales that a schema records, by column."""
+    key = SCALE.encode()
+    return {
+        field.name: Decimal(field.metadata[key].decode())
+        for field in schema
+        if field.metadata and key in field.metadata
+    }
+
+
+def require_readable(folder: Folder, schema: pa.Schema, delta: DeltaTable) -> None:
+    """Raise `RefusedError` if a table's counts are in other scales than the catalogue's."""
+    found = compare_schemas(schema, delta)
+    if found.rescaled:
+        changes = ", ".join(f"{n} {old} -> {new}" for n, (old, new) in found.rescaled.items())
+        raise RefusedError(
+            f"{folder}: the counts are in other scales than those of the signal catalogue "
+            f"({changes}). Use the catalogue that the data was written with, or convert the data: "
+            "fleet-slip migrate"
+        )
+
+
+def require_writable(
+    folder: Folder, schema: pa.Schema, delta: DeltaTable, unneeded: Collection[str] = ()
+) -> None:
+    """Raise `RefusedError` if a table is being migrated, or lacks other than `unneeded` columns."""
+    found = compare_schemas(schema, delta)
+    if found.migrating:
+        raise RefusedError(
+            f"{folder}: a migration to other scales is under way, or was interrupted. Wait for it, "
+            "or run it again: fleet-slip migrate"
+        )
+    if needed := [name for name in found.added if name not in unneeded]:
+        raise RefusedError(
+            f"{folder}: the signal catalogue has columns that the table has not: "
+            f"{', '.join(needed)}. Add them with: fleet-slip migrate"
+        )
+
+
+# One version of a Delta table: its files, what has landed in it, and committing on top of it.
+
+MANY_UNITS = 8
+"""So many units of work are not asked for one by one."""
+
+WITHDRAWN = -1
+"""Number of a unit whose rows were taken out again: it may land anew."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One version of a table. Reading it is not disturbed by later commits."""
+
+    table: "Table"
+    delta: DeltaTable | None
+    without: frozenset[str] = frozenset()
+    """Paths of files that are left out."""
+
+    @property
+    def version(self) -> int | None:
+        """Version of the Delta table; None before the first commit."""
+        return None if self.delta is None else self.delta.version()
+
+    @cached_property
+    def files(self) -> tuple[TableFile, ...]:
+        """Active files, sorted by path."""
+        if self.delta is None:
+            return ()
+        with storage_errors(self.table.folder):
+            every = active_files(self._actions, self.table.folder)
+        return tuple(file for file in every if file.path not in self.without)
+
+    @property
+    def has_same_columns(self) -> bool:
+        """Whether all active files have the same ones of the table's columns."""
+        with storage_errors(self.table.folder):
+            return have_same_columns(self._actions, self.table.schema.names)
+
+    @cached_property
+    def _actions(self) -> pa.Table:
+        return read_actions(self.delta)
+
+    @property
+    def paths(self) -> list[str]:
+        """Where the active files are, as DuckDB knows it, sorted."""
+        return [self.table.uri(file.path) for file in self.files]
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of all active files."""
+        return sum(file.rows for file in self.files)
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of all active files."""
+        return sum(file.size_bytes for file in self.files)
+
+    def renewed(self) -> "Snapshot":
+        """Return the newest version: this snapshot, or another, which takes its place."""
+        if self.delta is None:
+            return self.table.snapshot()
+        version = self.version
+        with storage_errors(self.table.folder):
+            self.delta.update_incremental()
+        return self if self.version == version else self.table.snapshot()
+
+    def removed(self, before_hours: float = 0) -> set[str]:
+        """Return the paths of files removed so many hours ago or earlier; of a week at least."""
+        if self.delta is None:
+            return set()
+        with storage_errors(self.table.folder):
+            found = self.delta.vacuum(
+                math.ceil(before_hours), dry_run=True, enforce_retention_duration=False, full=False
+            )
+        return set(found)
+
+    def landed(self, unit_name: str) -> int | None:
+        """Return the version of a unit of work that has landed, or None."""
+        if self.delta is None:
+            return None
+        with storage_errors(self.table.folder):
+            return self.delta.transaction_version(unit_name)
+
+    def landed_among(self, number: int) -> Callable[[str], bool]:
+        """Return what tells whether a unit has landed; for many questions it reads the log once."""
+        if self.version is None or number < MANY_UNITS:
+            return lambda name: self.landed(name) not in {None, WITHDRAWN}
+        return lambda name: self.units.get(name, WITHDRAWN) != WITHDRAWN
+
+    @cached_property
+    def units(self) -> Mapping[str, int]:
+        """The numbers of all units that have landed, `WITHDRAWN` ones among them."""
+        if self.version is None:
+            return {}
+        with storage_errors(self.table.folder):
+            return read_landed_units(self.table.folder, self.version)
+
+    def moment(self, version: int) -> str | None:
+        """Return the digest of a version's commit, which also stands for all before it, or None."""
+        if self.version is None or version > self.version:
+            return None
+        try:
+            content = (self.table.folder / "_delta_log").read(f"{version:020}.json")
+        except StorageError:
+            return None
+        return hashlib.sha256(content).hexdigest()
+
+    def commit_or_discard(self, change: Change) -> None:
+        """Apply a change like `commit`; after a conflict delete the files that it was to add."""
+        try:
+            self.commit(change)
+        except ConflictError:
+            self.table.discard(change.add)
+            raise
+
+    def commit(self, change: Change) -> None:
+        """Apply a change in one atomic commit. Raises `ConflictError` and `StorageError`."""
+        table, actions = self.table, change.actions()
+        note = checked_note(change.note, actions, {u.name: u.version for u in change.units})
+        with storage_errors(table.folder):
+            try:
+                delta = self.delta or table.create()
+                require_writable(table.folder, table.schema, delta, table.unneeded(change.add))
+                delta.create_write_transaction(
+                    actions,
+                    mode="append",
+                    schema=table.schema,
+                    partition_by=list(table.partition_by),
+                    commit_properties=CommitProperties(
+                        custom_metadata={NOTE: note},
+                        app_transactions=[Transaction(u.name, u.version) for u in change.units],
+                    ),
+                )
+            except CommitFailedError as error:
+                raise table.conflict_of(error) from None
+            table.folder.settle_commits(self.version)
+            keep_checksum_of_new(table.folder, self.version)
+
+
+# Checks a table's Delta log against the checksums that it states and that are kept of it.
+#
+# A flipped bit loses a file, or brings one back. So on opening, the newest checkpoint and the
+# commits after it are compared; `verify` looks at all commits, and at what they add up to.
+
+REMEMBERED_COMMITS = 2**14
+
+
+def require_sound_log(table: Folder, version: int) -> None:
+    """Raise `StorageError` if what a version of a table is told from was damaged.
+
+    Each file is read once by a process; of an object store, `verify` alone looks.
+    """
+    if not table.is_local:
+        return
+    files = (table / LOG).files()
+    checkpoint = newest_checkpoint(files, version)
+    if checkpoint is not None:
+        require_kept_checksum(table, checkpoint.name)
+    after = version_of(checkpoint.name) if checkpoint else -1
+    commits = [file for file in files if COMMIT_FILE.fullmatch(file.name)]
+    checked = bool(commits) and _states_checksum(commits[0])
+    for file in commits:
+        if after < version_of(file.name) <= version and (problem := _problem(file, checked)):
+            raise StorageError(
+                f"{file}: {problem}. See what can be repaired with: fleet-slip verify --repair; or "
+                "restore the log from a backup."
+            )
+
+
+@functools.lru_cache(maxsize=REMEMBERED_COMMITS)
+def _problem(file: StoredFile, must_state_checksum: bool) -> str | None:
+    try:
+        return problem_of_commit(read_commit(file.folder, file.name), must_state_checksum)
+    except ValueError as error:
+        return str(error)
+
+
+@functools.lru_cache(maxsize=REMEMBERED_COMMITS)
+def _states_checksum(file: StoredFile) -> bool:
+    """Whether a commit states its checksum, after which all later ones do."""
+    try:
+        return CHECKSUM_KEY in read_commit(file.folder, file.name).note
+    except ValueError:
+        return False
+
+
+def find_commit_faults(snapshot: Snapshot) -> Iterator[tuple[str, str]]:
+    """Yield what is wrong with the log up to a snapshot: the commit's file below it, and what."""
+    if snapshot.version is None:
+        return
+    commits = []
+    must_state_checksum = False
+    log, last = snapshot.table.folder / LOG, f"{snapshot.version:020}.json"
+    there = {name for name in log.names() if COMMIT_FILE.fullmatch(name) and name <= last}
+    # Earlier ones were cleaned away.
+    first = min(map(version_of, there), default=snapshot.version)
+    for name in (f"{number:020}.json" for number in range(first, snapshot.version + 1)):
+        if name not in there:
+            yield name, "is missing"
+            continue
+        try:
+            commit = read_commit(log, name)
+        except ValueError as error:
+            yield name, str(error)
+            continue
+        must_state_checksum |= CHECKSUM_KEY in commit.note
+        if problem := problem_of_commit(commit, must_state_checksum):
+            yield name, problem
+        commits.append(commit)
+    if len(commits) == snapshot.version + 1:
+        yield from _state_problems(snapshot, commits)
+
+
+def _state_problems(snapshot: Snapshot, commits: Sequence[Commit]) -> Iterator[tuple[str, str]]:
+    """Compare what the commits add up to with what the Delta library says, from a checkpoint."""
+    files: set[str] = set()
+    units: dict[str, int] = {}
+    for action in (action for commit in commits for action in commit.actions):
+        match action:
+            case {"add": {"path": path}}:
+                files.add(path)
+            case {"remove": {"path": path}}:
+                files.discard(path)
+            case {"txn": {"appId": name, "version": number}}:
+                units[name] = number
+    if files != {file.path for file in snapshot.files}:
+        yield "_last_checkpoint", "the active files are not those that the commits add up to"
+    known = snapshot.units
+    wrong = [name for name, number in units.items() if known.get(name) != number]
+    if wrong:
+        yield "_last_checkpoint", f"does not know what has landed: {', '.join(wrong[:3])}"
+
+
+FENCE = "fleet_slip.fence"
+"""Property of a table that is changed so that commits under way are in conflict."""
+
+ALL_STATISTICS = {"delta.dataSkippingNumIndexedCols": "-1"}
+"""Property of a table of which all columns have statistics: as a rule Delta reads those of 32."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A Delta table below a data root."""
+
+    folder: Folder
+    schema: pa.Schema
+    encoding: Encoding
+    partition_by: tuple[str, ...] = ()
+    description: str = ""
+    optional: tuple[str, ...] = ()
+    """Columns that a file has only where it has values of them."""
+
+    @property
+    def usual_schema(self) -> pa.Schema:
+        """The schema without the optional columns."""
+        return pa.schema([field for field in self.schema if field.name not in self.optional])
+
+    def snapshot(self, version: int | None = None) -> Snapshot:
+        """Return the table as it is, or at a version; empty if unwritten. Raises `StorageError`."""
+        delta = self.open_delta(version)
+        if delta is not None:
+            require_sound_log(self.folder, delta.version())
+        if delta is not None and version is None:
+            require_readable(self.folder, self.schema, delta)
+        return Snapshot(self, delta)
+
+    def unchecked_snapshot(self) -> Snapshot:
+        """Return the table as it is now, though its log may be damaged: to look for damage."""
+        delta = self.open_delta()
+        if delta is not None:
+            require_readable(self.folder, self.schema, delta)
+        return Snapshot(self, delta)
+
+    def open_delta(self, version: int | None = None) -> DeltaTable | None:
+        """Return the Delta table as it is now, or was; None if nobody has written it yet."""
+        with storage_errors(self.folder):
+            try:
+                return DeltaTable(
+                    self.folder.uri, version=version, storage_options=self.folder.delta_options
+                )
+            except TableNotFoundError:
+                return None
+
+    def uri(self, path: str) -> str:
+        """Return where one of the table's files is, as DuckDB knows it."""
+        return f"{self.folder.uri}/{path}"
+
+    def read(self, path: str, columns: Sequence[str] | None = None) -> pa.Table:
+        """Return the rows of a file, or some columns. Raises `StorageError` if it is damaged."""
+        self.folder.check(path)
+        with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
+            wanted = None if columns is None else list(columns)
+            # Not `read_table`: it imports pyarrow.dataset, and with it pandas if that is installed.
+            with pq.ParquetFile(file, pre_buffer=True) as parquet:
+                rows = parquet.read(columns=wanted)
+        if absent := set(wanted or ()).difference(rows.column_names):
+            raise StorageError(f"{self.folder}/{path}: no column {min(absent)}.")
+        return rows
+
+    def read_combinations(self, path: str, columns: Sequence[str]) -> pa.Table:
+        """Return each combination of the texts of some columns in a file, once, from dictionaries.
+
+        That takes a third of the time of reading the columns. Raises `StorageError` as `read`.
+        """
+        self.folder.check(path)
+        names = list(columns)
+        with (
+            storage_errors(f"{self.folder}/{path}"),
+            self.folder.open(path) as file,
+            pq.ParquetFile(file, read_dictionary=names, pre_buffer=True) as parquet,
+        ):
+            rows = parquet.read(columns=names).unify_dictionaries()
+        found = rows.group_by(names, use_threads=False).aggregate([])
+        return found.cast(pa.schema([(name, pa.string()) for name in found.column_names]))
+
+    def read_metadata(self, path: str) -> pq.FileMetaData:
+        """Return the footer of one of the table's files."""
+        with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
+            return pq.read_metadata(file)
+
+    def read_names(self, path: str) -> dict[str, Names]:
+        """Return the names in the dictionaries of one of the table's files, by column."""
+        with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
+            return read_names(file, self.encoding.dictionary)
+
+    def has_unused_names(self, path: str) -> bool:
+        """Whether a dictionary of one of the table's files has names that none of its rows has."""
+        return any(names.unused for names in self.read_names(path).values())
+
+    def write_file(self, name: str, rows: pa.Table, day: date | None = None) -> AddAction:
+        """Write rows to the file NAME-CHECKSUMS.parquet, durably; see `put`."""
+        return self.put(name, self.encode(rows), day)
+
+    def put(self, name: str, encoded: Encoded, day: date | None = None) -> AddAction:
+        """Write a content to the file NAME-CHECKSUMS.parquet, durably; return its add action.
+
+        It is in the table once committed. Where that name is taken, the new file gets a longer one:
+        what is not committed is its writer's alone, to delete.
+        """
+        path = encoded.path(name, day)
+        while not self.folder.create(path, encoded.content):
+            path = encoded.path(f"{name}-{uuid.uuid4().hex[:8]}", day)
+        return addition(path, encoded, day)
+
+    def discard(self, actions: Iterable[AddAction]) -> None:
+        """Delete files that this process wrote and its conflict left uncommitted.
+
+        The log is asked first: a commit whose answer was lost conflicts with itself.
+        """
+        landed = {file.path for file in Snapshot(self, self.open_delta()).files}
+        for action in actions:
+            if action.path not in landed:
+                self.folder.delete(action.path)
+
+    def restore_file(self, file: TableFile, rows: pa.Table) -> bool:
+        """Write a file again if rows make the very bytes that its name tells; False if not."""
+        encoded = self.encode(rows)
+        if encoded.checksum != checksum_in(file.path):
+            return False
+        self.folder.put(file.path, encoded.content)
+        return True
+
+    def encode(self, rows: pa.Table) -> Encoded:
+        """Return the content of a file with these rows."""
+        return self.encoding.encode(rows, self.partition_by)
+
+    def require_writable(self, columns: Iterable[str]) -> None:
+        """Raise `RefusedError` if rows with some of the optional columns cannot be committed."""
+        delta = self.open_delta()
+        if delta is not None:
+            without = frozenset(self.optional).difference(columns)
+            require_writable(self.folder, self.schema, delta, without)
+
+    def unneeded(self, added: Iterable[AddAction]) -> frozenset[str]:
+        """Return the optional columns that none of some new files has."""
+        return frozenset(self.optional).difference(*map(columns_in, added))
+
+    def fence(self) -> None:
+        """Make a conflict of every commit that began before now and has not landed.
+
+        Delta refuses commits that began before a change of metadata, here of a property. Raises
+        `ConflictError` if others keep changing the table.
+        """
+        note = CommitProperties(custom_metadata={NOTE: checked_note({"job": "fence"}, [], {})})
+
+        def attempt() -> None:
+            with storage_errors(self.folder):
+                try:
+                    delta = self.open_delta() or self.create()
+                    delta.alter.set_table_properties(
+                        {FENCE: uuid.uuid4().hex}, raise_if_not_exists=False, commit_properties=note
+                    )
+                except CommitFailedError as error:
+                    raise self.conflict_of(error) from None
+                self.folder.settle_commits(delta.version() - 1)
+
+        retry_conflicts(attempt)
+
+    def conflict_of(self, error: CommitFailedError) -> Exception:
+        """Return what a failed commit is to be raised as: a conflict, or the fault that it is."""
+        if not is_conflict(error):
+            return error
+        return ConflictError(
+            f"{self.folder}: another process changed the table at the same moment "
+            f"({first_line(error)}). Run the same command again."
+        )
+
+    def create(self) -> DeltaTable:
+        """Make the table, and return it as made, so that a commit on it meets those of others."""
+        delta = DeltaTable.create(
+            self.folder.uri,
+            schema=self.schema,
+            mode="ignore",
+            partition_by=list(self.partition_by),
+            name=self.folder.name,
+            description=self.description,
+            configuration=ALL_STATISTICS,
+            storage_options=self.folder.delta_options,
+            commit_properties=CommitProperties(custom_metadata={NOTE: checked_note({}, [], {})}),
+        )
+        return (self.open_delta(version=0) if delta.version() else delta) or delta

@@ -1,1 +1,0 @@
-"""Many drives at once: each is a lane of a compiled loop."""

@@ -1,0 +1,111 @@
+"""The blind set: drives that follow from the hash of what they judge, and are kept nowhere."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.cli.accuracy import print_blind
+from fleet_slip.errors import UsageError
+from fleet_slip.evaluation import blind
+from fleet_slip.evaluation.blind import blind_scenarios, judge_blindly
+from fleet_slip.evaluation.drives import simulate_drives
+from fleet_slip.evaluation.filters import Signals
+from fleet_slip.simulation.job import simulate_logs
+from fleet_slip.simulation.scenario import load_scenario
+from tests.support.commands import run_on
+from tests.support.reported import call
+
+HASH = "5e" * 32
+
+
+@pytest.fixture(scope="module")
+def seeds() -> list[int]:
+    """The seeds of the drives of one hash."""
+    return [one.seed for one in blind_scenarios(HASH)]
+
+
+@given(drawn=st.binary(min_size=32, max_size=32))
+@settings(max_examples=3, deadline=None)  # half a second each
+def test_every_hash_has_a_set_of_its_own(seeds: list[int], drawn: bytes) -> None:
+    scenarios = blind_scenarios(drawn.hex())
+    assert len({one.name for one in scenarios}) == len(scenarios) >= 24
+    assert len({one.track.name for one in scenarios}) >= 8
+    assert [one.seed for one in scenarios] != seeds
+    assert all(one.car.body.sprung_mass_kg > 0 for one in scenarios), "every car can be"
+
+
+def test_the_same_hash_has_the_same_set() -> None:
+    first, again = ([one.model_dump_json() for one in blind_scenarios(HASH)] for _ in range(2))
+    assert first == again
+
+
+def test_estimators_see_what_a_log_would_hold_and_the_truth_is_exact() -> None:
+    scenario = load_scenario("imperfect")
+    (drive,) = simulate_drives([scenario])
+    (log,) = simulate_logs(scenario.batch().drives)
+    for name in catalogue().inputs:
+        one = catalogue()[name]
+        np.testing.assert_array_equal(
+            np.rint(drive.signals[one.column] / float(one.scale)), log.measurement.counts[name]
+        )
+    np.testing.assert_array_equal(np.isfinite(drive.signals["gps_vx_mps"]), log.measurement.gps_fix)
+    scale = float(catalogue()["vy"].scale)
+    assert np.abs(drive.vy_mps - scale * log.measurement.counts["vy"]).max() <= scale / 2 + 1e-12
+    assert len(np.unique(drive.vy_mps)) > 0.99 * len(drive.vy_mps), "no counts"
+
+
+def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drives = simulate_drives(blind_scenarios(HASH))
+    truths = iter([drive.sideslip_rad for drive in drives])
+    monkeypatch.setattr(blind, "simulate_drives", lambda scenarios: drives)  # the same again
+
+    def right(signals: Signals) -> np.ndarray:
+        return next(truths)
+
+    def zero(signals: Signals) -> np.ndarray:
+        return np.zeros_like(signals["ay_mps2"])
+
+    def silent(signals: Signals) -> np.ndarray:
+        return np.full_like(signals["ay_mps2"], np.nan)
+
+    judged = judge_blindly(HASH, {"right": right, "zero": zero, "silent@1": silent})
+    rows = {row.name: row for row in judged}
+    assert rows["all"].drives == 24
+    assert sum(rows[name].drives for name in ("dry", "wet", "ice")) == 24
+    assert all(row.figures["right"].rmse_deg == 0 for row in rows.values())
+    whole = rows["all"].figures["zero"]
+    assert whole.error_std_deg == pytest.approx(rows["all"].sideslip_std_deg, rel=1e-4)
+    print_blind(judged, everything=False)
+    told = capsys.readouterr().out
+    assert "switchback" in told
+    assert "0.000" in told
+    assert "silent@1 has no estimate on any of them" in " ".join(told.split())
+
+
+@pytest.mark.long
+def test_the_command_judges_and_writes_nothing(
+    smoke_root: Path, tuned: Path, tmp_path: Path
+) -> None:
+    root = shutil.copytree(smoke_root, tmp_path / "data")
+    shutil.copytree(tuned, root / "tuned")
+    before = {path for path in root.rglob("*") if "runs" not in path.parts}
+    told = json.loads(call(root, "evaluate", "smoke", "--blind", "--json"))
+    rows = {row["name"]: row["figures"] for row in told["blind"]}
+    assert rows["all"]["smoke@1"]["coverage"] > 0.95
+    assert rows["all"]["smoke@1"]["rmse_deg"] > rows["all"]["smoke@1"]["error_std_deg"] > 0
+    assert {path for path in root.rglob("*") if "runs" not in path.parts} == before
+
+
+def test_it_has_drives_of_its_own(smoke_root: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(smoke_root, tmp_path / "data")
+    done = run_on(root, "evaluate", "smoke", "--blind", "--scenario", "nominal")
+    assert done.exit_code == UsageError.exit_code
+    assert "leave out --scenario" in done.stderr

@@ -1,0 +1,256 @@
+"""`fleet-slip evaluate` from end to end, on a small warehouse."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fleet_slip
+from fleet_slip.base import FloatArray
+from fleet_slip.errors import DataError, RefusedError
+from fleet_slip.evaluation import drives as evaluated_drives
+from fleet_slip.evaluation import kalman
+from fleet_slip.evaluation.drives import load_drives
+from fleet_slip.evaluation.evaluate import keep
+from fleet_slip.evaluation.filters import FILTERS, FilterEstimate, class_car, published_estimate
+from fleet_slip.evaluation.identify import checksum_of_sources
+from fleet_slip.evaluation.single_track import read_drive
+from fleet_slip.models.registry import Registry
+from fleet_slip.models.score import score
+from fleet_slip.simulation.campaign import DriveSpec
+from fleet_slip.simulation.job import exact_motion
+from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.storage.documents import DocumentFolder
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.vehicle.parameters import load_vehicle
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support import reported
+
+SCENARIOS = ("nominal", "adhesion_0_4", "wheel_missing")
+
+
+def call(root: Path, *words: str) -> Any:
+    return json.loads(reported.call(root, *words, "--json"))
+
+
+def evaluate(root: Path, *scenarios: str) -> Any:
+    options = [word for name in scenarios for word in ("--scenario", name)]
+    return call(root, "evaluate", "smoke", *options)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, tuned: Path) -> Path:
+    folder = tmp_path_factory.mktemp("evaluated") / "data"
+    shutil.copytree(smoke_root, folder)
+    shutil.copytree(tuned, folder / "tuned")
+    evaluate(folder, *SCENARIOS)
+    return folder
+
+
+def test_evaluating_again_changes_nothing(root: Path) -> None:
+    logs_version = Warehouse(LocalFolder(root)).logs.snapshot().version
+    again = evaluate(root, *SCENARIOS)
+    assert again["number"] == 1
+    assert Warehouse(LocalFolder(root)).logs.snapshot().version == logs_version
+
+
+def test_an_evaluation_that_another_process_has_just_kept_is_not_kept_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = DocumentFolder(LocalFolder(tmp_path))
+    numbers = DocumentFolder.numbers
+
+    def overtaken(folder: DocumentFolder) -> list[int]:
+        before = numbers(folder)
+        monkeypatch.undo()
+        keep(kept, {"models": 5})
+        return before
+
+    monkeypatch.setattr(DocumentFolder, "numbers", overtaken)
+    assert keep(kept, {"models": 5}).number == 1
+    assert keep(kept, {"models": 6}).number == 2
+    assert keep(kept, {"models": 6}).number == 2
+
+
+def test_no_model_is_trained_on_scenarios(root: Path) -> None:
+    with pytest.raises(RefusedError, match="scenario"):
+        call(root, "select", "--cohort", "source = 'scenario'")
+    with pytest.raises(RefusedError, match="scenario"):
+        call(root, "publish", "leaking", "--cohort", "source IN ('simulation', 'scenario')")
+    assert call(root, "select")["drives"] == 8
+    assert not call(root, "run", "--campaign", "smoke")["changed"]
+
+
+def test_a_cohort_that_does_not_ask_for_test_drives_has_none(root: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "data"
+    shutil.copytree(root, copy)
+    asked = ("--cohort", "speed_factor > 0.1")
+    assert call(copy, "select", *asked)["drives"] == 8
+    assert call(copy, "publish", "fast", *asked)["version"] == 1
+    with pytest.raises(DataError, match="trained on 2 days"):  # and not for its test drives
+        call(copy, "monitor", "fast")
+    assert call(copy, "quality", *asked)["drives"] == 8
+    every = call(copy, "score", "fast", *asked)["rows"]
+    tests = call(copy, "score", "fast", "--cohort", "source = 'scenario'")["rows"]
+    assert call(copy, "score", "fast", "--cohort", "source <> ''")["rows"] == every + tests
+
+
+def test_a_changed_scenario_is_refused(root: Path, tmp_path: Path) -> None:
+    file = tmp_path / "nominal.toml"
+    file.write_text('name = "mine"\ndescription = "x"\nbase = "nominal"\nlaps = 0.1\n')
+    copy = tmp_path / "data"
+    shutil.copytree(root, copy)
+    evaluate(copy, str(file))
+    file.write_text(file.read_text().replace("0.1", "0.2"))
+    with pytest.raises(RefusedError, match="was changed"):
+        evaluate(copy, str(file))
+
+
+def test_views_show_test_drives_to_those_who_ask(root: Path) -> None:
+    fleet = fleet_slip.open(root)
+    count = "SELECT count(*) FROM drives"
+    for hidden in (
+        count,
+        "SELECT count(DISTINCT drive_id) FROM log",
+        "SELECT count(DISTINCT drive_id) FROM grams",
+    ):
+        assert fleet.sql(hidden).fetchall() == [(8,)]
+        ((shown,),) = fleet.sql(hidden, scenarios=True).fetchall()
+        assert shown > 8
+    asked = fleet.sql("SELECT count(*) FROM drives WHERE source = 'scenario'").fetchall()
+    with fleet.session() as fleet_alone, fleet.session(scenarios=True) as everything:
+        hidden_too = "SELECT count(*) FROM drives WHERE source = 'scenario'"
+        assert fleet_alone.sql(hidden_too).fetchall() == [(0,)]
+        assert everything.sql(hidden_too).fetchall() == asked != [(0,)]
+    assert call(root, "sql", count) == [{"count_star()": 8}]
+    assert call(root, "sql", "--scenarios", count) == [{"count_star()": 8 + asked[0][0]}]
+
+
+def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path) -> None:
+    """SQL measures against the noisy label, here the truth counts: 0.03 degrees between them."""
+    manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
+    in_sql = score(Warehouse(LocalFolder(root)), manifest, "drive_id = 'scenario-nominal'")
+    one = evaluate(root, *SCENARIOS)["scenarios"][0]
+    here = one["results"]["smoke@1"]
+    assert here["rows"] == in_sql.rows == one["truth"]["rows"]
+    assert here["error_mean_deg"] == pytest.approx(in_sql.error_mean_deg, abs=0.001)
+    label_noise_deg = np.degrees(load_scenario("nominal").sensors.sideslip_std_rad)
+    expected = np.hypot(here["error_std_deg"], label_noise_deg)
+    assert in_sql.error_std_deg == pytest.approx(expected, rel=0.01)
+
+
+def test_the_truth_is_the_simulators_and_not_the_logs(root: Path) -> None:
+    (drive,) = load_drives(Warehouse(LocalFolder(root)), [load_scenario("nominal")])
+    with connect(root, scenarios=True) as database:
+        logged = database.sql(
+            "SELECT vy_mps FROM log WHERE drive_id = 'scenario-nominal' ORDER BY time_s"
+        ).fetchnumpy()["vy_mps"]
+    off = np.abs(drive.vy_mps - logged)
+    assert 0.002 < off.max() <= 0.0025 + 1e-9, "half a count of 0.005 m/s"
+
+
+def test_a_drive_that_this_program_drives_otherwise_has_no_exact_truth(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def faster(specs: Sequence[DriveSpec]) -> list[dict[str, FloatArray]]:
+        return [{**one, "vx_mps": one["vx_mps"] + 0.1} for one in exact_motion(specs)]
+
+    monkeypatch.setattr(evaluated_drives, "exact_motion", faster)
+    with pytest.raises(RefusedError, match="exact angle is not known"):
+        load_drives(Warehouse(LocalFolder(root)), [load_scenario("nominal")])
+
+
+def test_stability_is_lost_on_the_slippery_road_alone(root: Path) -> None:
+    content = {one["name"]: one for one in evaluate(root, *SCENARIOS)["scenarios"]}
+    sections = {
+        name: [section["name"] for section in one["sections"]] for name, one in content.items()
+    }
+    assert "unstable" not in sections["nominal"]
+    assert "unstable" in sections["adhesion_0_4"]
+    result = content["adhesion_0_4"]["results"]["smoke@1/4"]
+    inside, outside = result["inside"]["unstable"], result["outside"]["unstable"]
+    assert inside["rows"] + outside["rows"] == result["rows"]
+    assert inside["error_std_deg"] > 3 * outside["error_std_deg"]
+
+
+def test_a_missing_signal_costs_the_models_that_need_it(root: Path) -> None:
+    one = next(
+        one for one in evaluate(root, *SCENARIOS)["scenarios"] if one["name"] == "wheel_missing"
+    )
+    assert one["results"]["smoke@1/1"]["coverage"] == 1
+    expected = 60 / one["truth"]["duration_s"]
+    assert one["results"]["smoke@1/4"]["coverage"] == pytest.approx(expected, abs=0.001)
+
+
+def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
+    (drive,) = load_drives(Warehouse(LocalFolder(root)), [load_scenario("nominal")])
+    assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.signals)
+    manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
+    estimate = published_estimate(manifest)(drive.signals)
+    assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
+
+
+def test_the_filters_are_tuned_once(root: Path) -> None:
+    documents = sorted(path.relative_to(root) for path in (root / "tuned").rglob("*.json"))
+    assert [path.parts[1:] for path in documents] == [
+        (name, "1.json") for name in ("ekf", "identified", "kalman")
+    ]
+    tuned = json.loads((root / "tuned" / "kalman" / "1.json").read_text())["content"]
+    assert tuned["key"]["program"] == checksum_of_sources()
+    seconds, *drives = tuned["key"]["drives"]
+    assert seconds == reported.LITTLE_S
+    assert [model for _, model, _ in drives] == ["d_class_sedan"] * 8
+    assert all(name.startswith("smoke-") for name, _, _ in drives)
+    assert all(mass_kg is None for _, _, mass_kg in drives), "the model does not know it"
+
+
+def test_a_car_identified_from_the_same_drives_competes(root: Path) -> None:
+    content = evaluate(root, *SCENARIOS)
+    about = content["estimators"]["ekf_identified"]
+    assert (about["kind"], about["gps"], about["told"]) == ("filter", False, "labelled drives")
+    results = content["scenarios"][0]["results"]
+    assert results["ekf_identified"]["rmse_deg"] < 1.5 * results["ekf_class_tuned"]["rmse_deg"]
+
+
+def test_filters_know_the_mass_where_the_model_does(root: Path) -> None:
+    (drive,) = load_drives(Warehouse(LocalFolder(root)), [load_scenario("adhesion_0_4")])
+    scenario = drive.scenario.model_copy(update={"sprung_mass_kg": 1500.0})
+    heavy = replace(drive, scenario=scenario)
+    for weighed, kg in ((False, drive.scenario.vehicle.body.sprung_mass_kg), (True, 1500.0)):
+        one = FilterEstimate(FILTERS[1], FILTERS[1].parameters, scenario.vehicle, weighed)
+        assert one.in_drive(heavy).car.body.sprung_mass_kg == kg
+    assert class_car("suv", 2000.0) == load_vehicle("suv").with_sprung_mass(2000.0)
+    assert class_car("a_strangers_car", None) is None
+
+
+def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None:
+    scenario = load_scenario("nominal")
+    (drive,) = load_drives(Warehouse(LocalFolder(root)), [scenario])
+    with connect(root, scenarios=True) as database:
+        alone = read_drive(database, scenario.drive_id)
+    expected = kalman.estimate(alone.signals, scenario.car, kalman.FilterNoise())
+    found = FilterEstimate(FILTERS[0], FILTERS[0].parameters, scenario.car)(drive.signals)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_every_check_of_the_paper_is_made(root: Path) -> None:
+    content = evaluate(root, *SCENARIOS)
+    made = {check["requirement"].partition(":")[0] for check in content["checks"]}
+    assert made == {"nominal", "adhesion 0.4"}
+    for check in content["checks"]:
+        assert check["reached"] == (not check["explanation"])
+    (at_0_4,) = [
+        check
+        for check in content["checks"]
+        if check["scenario"] == "adhesion_0_4" and check["estimator"] == "smoke@1/4"
+    ]
+    run = next(one for one in content["scenarios"] if one["name"] == "adhesion_0_4")
+    outside = run["results"]["smoke@1/4"]["outside"]["unstable"]
+    assert at_0_4["found"] == outside["correlation"]
+    assert at_0_4["reached"] == (outside["correlation"] >= 0.9)

@@ -1,0 +1,123 @@
+"""What every estimator must do alike: on the simulated car, in a mirror, at rest, with gaps."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.rivals.observers import ObserverPoles, SlidingGains, luenberger, sliding_mode
+from fleet_slip.base import FloatArray
+from fleet_slip.errors import DataError
+from fleet_slip.evaluation import ekf, kalman
+from fleet_slip.evaluation.single_track import LabelledDrive
+from fleet_slip.vehicle.parameters import load_vehicle
+from tests.support.drives import mirrored, noisy, rolling_drive, simulated_drive, slalom
+
+CAR = load_vehicle("d_class_sedan")
+ESTIMATORS: dict[str, tuple[Callable[..., FloatArray], Any]] = {
+    "kalman": (kalman.estimate, kalman.FilterNoise()),
+    "ekf": (ekf.estimate, ekf.EkfNoise()),
+    "luenberger": (luenberger, ObserverPoles()),
+    "sliding_mode": (sliding_mode, SlidingGains()),
+}
+ALL = pytest.mark.parametrize("name", ESTIMATORS)
+OBSERVERS = pytest.mark.parametrize("name", ["ekf", "luenberger", "sliding_mode"])
+
+simulated = cache(simulated_drive)
+
+
+def run(name: str, drive: LabelledDrive) -> FloatArray:
+    estimate, parameters = ESTIMATORS[name]
+    return estimate(drive.signals, CAR, parameters)
+
+
+@ALL
+def test_follows_the_simulated_car(name: str) -> None:
+    drive = simulated()
+    error = np.degrees(run(name, drive) - drive.sideslip_rad)
+    error = error[np.isfinite(error)]
+    assert len(error) > 0.95 * len(drive.signals)
+    assert error.std() < 0.35 * np.degrees(drive.sideslip_rad.std())
+    assert abs(error.mean()) < 0.15
+
+
+@ALL
+def test_mirrored_drive_gives_mirrored_sideslip(name: str) -> None:
+    estimate, parameters = ESTIMATORS[name]
+    drive = noisy(slalom(CAR, 2000)[0], seed=1)
+    found = estimate(drive, CAR, parameters)
+    other = estimate(mirrored(drive), CAR, parameters)
+    np.testing.assert_allclose(other, -found, rtol=0, atol=1e-12)
+
+
+@ALL
+def test_at_rest_with_the_wheels_turned_the_angle_stays_small(name: str) -> None:
+    estimate, parameters = ESTIMATORS[name]
+    zero = np.zeros(5000)
+    drive = noisy(rolling_drive(CAR, zero, zero, zero, zero + 0.3), seed=2)
+    assert np.abs(estimate(drive, CAR, parameters)[500:]).max() < 0.1
+
+
+@ALL
+def test_a_gap_of_the_sensors_is_bridged(name: str) -> None:
+    estimate, parameters = ESTIMATORS[name]
+    drive = noisy(slalom(CAR, 2000)[0], seed=3)
+    gap = (np.arange(2000) >= 900) & (np.arange(2000) < 905)
+    gappy = replace(
+        drive,
+        **{
+            field: np.where(gap, np.nan, getattr(drive, field))
+            for field in ("ax_mps2", "ay_mps2", "yaw_rate_rad_s", "wheel_rl_rad_s", "steer_fl_rad")
+        },
+    )
+    found, expected = (estimate(each, CAR, parameters) for each in (gappy, drive))
+    assert np.isfinite(found).all()
+    assert np.abs(found - expected).max() < 0.02
+    np.testing.assert_array_equal(found[:900], expected[:900])
+
+
+@OBSERVERS
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [("ay_mps2", "no ay"), ("wheel_rl_rad_s", "wheel speeds"), ("steer_f._rad", "steer_fl")],
+)
+def test_an_absent_sensor_is_named(name: str, field: str, message: str) -> None:
+    estimate, parameters = ESTIMATORS[name]
+    drive = slalom(CAR, 50)[0]
+    absent = {one: np.full(50, np.nan) for one in vars(drive) if re.fullmatch(field, one)}
+    with pytest.raises(DataError, match=message):
+        estimate(replace(drive, **absent), CAR, parameters)
+
+
+@OBSERVERS
+def test_a_car_that_logs_one_front_wheels_angle_steers_by_it(name: str) -> None:
+    estimate, parameters = ESTIMATORS[name]
+    drive = slalom(CAR, 500)[0]
+    for field in ("steer_fl_rad", "steer_fr_rad"):
+        one = replace(drive, **{field: np.full(500, np.nan)})
+        np.testing.assert_array_equal(
+            estimate(one, CAR, parameters), estimate(drive, CAR, parameters)
+        )
+
+
+@OBSERVERS
+def test_observers_do_not_look_at_gps(name: str) -> None:
+    estimate, parameters = ESTIMATORS[name]
+    drive = noisy(slalom(CAR, 500)[0], seed=4)
+    without = replace(drive, gps_vx_mps=np.full(500, np.nan), gps_vy_mps=np.full(500, np.nan))
+    expected = estimate(drive, CAR, parameters)
+    np.testing.assert_array_equal(estimate(without, CAR, parameters), expected)
+
+
+@ALL
+def test_the_future_is_not_read(name: str) -> None:
+    estimate, parameters = ESTIMATORS[name]
+    drive = noisy(slalom(CAR, 1000)[0], seed=5)
+    half = type(drive)(**{field: getattr(drive, field)[:500] for field in vars(drive)})
+    np.testing.assert_array_equal(
+        estimate(half, CAR, parameters), estimate(drive, CAR, parameters)[:500]
+    )

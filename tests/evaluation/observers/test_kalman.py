@@ -1,0 +1,336 @@
+"""The paper's filter against textbook algebra, the joint Gaussian, and what its model must give."""
+
+from dataclasses import replace
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from fleet_slip.base import FloatArray
+from fleet_slip.errors import DataError
+from fleet_slip.evaluation import kalman
+from fleet_slip.evaluation.belief import Belief, belief_of
+from fleet_slip.evaluation.kalman import FilterNoise, covariances, fuse, predict, update
+from fleet_slip.evaluation.single_track import STEP_S, DriveSignals
+from fleet_slip.vehicle.parameters import load_vehicle
+from tests.support.drives import (
+    GPS_EVERY,
+    TUNNEL_S,
+    mirrored,
+    noisy,
+    rolling_drive,
+    slalom,
+    tunnel,
+    without_fixes,
+)
+
+CAR = load_vehicle("d_class_sedan")
+H = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0]])
+NOISE = FilterNoise(ax_std_mps2=0.1, ay_std_mps2=0.2, bias_walk_mps2_per_sqrt_s=0.02)
+
+
+def transition(yaw_rate: float) -> FloatArray:
+    """F(k), from equation (5) by the paper's differences."""
+    kinematics = np.array([[0, -1, yaw_rate, 0], [0] * 4, [-yaw_rate, 0, 0, -1], [0] * 4])
+    return np.eye(4) + STEP_S * kinematics
+
+
+def matrices(noise: FilterNoise) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Q, R and the first P."""
+    b1 = STEP_S * H.T
+    walk = noise.bias_walk_mps2_per_sqrt_s**2 * STEP_S
+    q = b1 @ np.diag([noise.ax_std_mps2**2, noise.ay_std_mps2**2]) @ b1.T
+    r = np.diag([noise.gps_vx_std_mps**2, noise.gps_vy_std_mps**2])
+    first = np.diag([r[0, 0], noise.bias_std_mps2**2, r[1, 1], noise.bias_std_mps2**2])
+    return q + np.diag([0, walk, 0, walk]), r, first
+
+
+def textbook_filter(drive: DriveSignals, yaw_rate: FloatArray, noise: FilterNoise) -> FloatArray:
+    """Equations (9) to (11) as they stand, dense and without Joseph."""
+    q, r, p = matrices(noise)
+    x = np.array([drive.gps_vx_mps[0], 0, drive.gps_vy_mps[0], 0])
+    means = [x]
+    for k in range(1, len(drive)):
+        f = transition(yaw_rate[k])
+        x = f @ x + STEP_S * H.T @ np.array([drive.ax_mps2[k], drive.ay_mps2[k]])
+        p = f @ p @ f.T + q
+        z = np.array([drive.gps_vx_mps[k], drive.gps_vy_mps[k]])
+        if np.isfinite(z).all():
+            gain = p @ H.T @ np.linalg.inv(H @ p @ H.T + r)
+            x = x + gain @ (z - H @ x)
+            p = (np.eye(4) - gain @ H) @ p
+        means.append(x)
+    return np.array(means).T
+
+
+def generate(
+    rows: int, noise: FilterNoise, seed: int
+) -> tuple[DriveSignals, FloatArray, FloatArray]:
+    """Return signals, yaw rate and true states of a drive that the filter's own model makes."""
+    generator = np.random.default_rng(seed)
+    drive, _ = slalom(CAR, rows)
+    yaw_rate = drive.yaw_rate_rad_s
+    q, r, p = matrices(noise)
+    measured = np.stack([drive.ax_mps2, drive.ay_mps2])
+    x = np.array([20.0, 0.0, 0.0, 0.0]) + np.sqrt(np.diag(p)) * [0, 1, 0, 1] * (
+        generator.standard_normal(4)
+    )
+    states = [x]
+    for k in range(1, rows):
+        w = np.sqrt(np.diag(q)) * generator.standard_normal(4)
+        x = transition(yaw_rate[k]) @ x + STEP_S * H.T @ measured[:, k] + w
+        states.append(x)
+    truth = np.array(states).T
+    fix = np.where(np.arange(rows) % GPS_EVERY == 0, 0.0, np.nan)
+    gps = truth[[0, 2]] + np.sqrt(np.diag(r))[:, None] * generator.standard_normal((2, rows)) + fix
+    return replace(drive, gps_vx_mps=gps[0], gps_vy_mps=gps[1]), yaw_rate, truth
+
+
+def stacked(found: kalman.KalmanEstimate) -> FloatArray:
+    return np.stack([found.vx_mps, found.ax_bias_mps2, found.vy_mps, found.ay_bias_mps2])
+
+
+def test_agrees_with_the_textbook_filter_to_1e_10() -> None:
+    drive, yaw_rate, _ = generate(20_000, NOISE, seed=1)
+    drive = without_fixes(drive, tunnel(len(drive), 60.0))
+    expected = textbook_filter(drive, yaw_rate, NOISE)
+    np.testing.assert_allclose(stacked(fuse(drive, yaw_rate, NOISE)), expected, rtol=0, atol=1e-10)
+
+
+def test_agrees_with_the_joint_gaussian_posterior() -> None:
+    """Least squares over the first state and all noises of a short drive at once."""
+    rows = 41
+    drive, yaw_rate, _ = generate(rows, NOISE, seed=2)
+    q, r, p = matrices(NOISE)
+    first = np.array([drive.gps_vx_mps[0], 0, drive.gps_vy_mps[0], 0])
+    mean, lever = first, np.eye(4, 4 * rows)
+    equations = [np.eye(4 * rows) / np.sqrt(np.tile(np.diag(q), rows))[:, None]]
+    equations[0][:4, :4] = np.diag(1 / np.sqrt(np.diag(p)))
+    values = [np.zeros(4 * rows)]
+    for k in range(1, rows):
+        f = transition(yaw_rate[k])
+        mean = f @ mean + STEP_S * H.T @ np.array([drive.ax_mps2[k], drive.ay_mps2[k]])
+        lever = f @ lever
+        lever[:, 4 * k : 4 * k + 4] = np.eye(4)
+        if k % GPS_EVERY == 0:
+            z = np.array([drive.gps_vx_mps[k], drive.gps_vy_mps[k]])
+            equations.append(np.diag(1 / np.sqrt(np.diag(r))) @ H @ lever)
+            values.append((z - H @ mean) / np.sqrt(np.diag(r)))
+    whole = np.concatenate(equations)
+    solution = np.linalg.lstsq(whole, np.concatenate(values), rcond=None)[0]
+    posterior = lever @ np.linalg.inv(whole.T @ whole) @ lever.T
+
+    belief = last_belief(drive, yaw_rate, NOISE)
+    np.testing.assert_allclose(belief.mean, mean + lever @ solution, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(belief.covariance, posterior, rtol=0, atol=1e-9)
+
+
+def last_belief(drive: DriveSignals, yaw_rate: FloatArray, noise: FilterNoise) -> Belief:
+    c = covariances(noise)
+    belief = kalman.first_belief(drive.gps_vx_mps[0], drive.gps_vy_mps[0], c)
+    for k in range(1, len(drive)):
+        predict(belief, drive.ax_mps2[k], drive.ay_mps2[k], yaw_rate[k], STEP_S, c)
+        if np.isfinite(drive.gps_vx_mps[k]):
+            update(belief, drive.gps_vx_mps[k], drive.gps_vy_mps[k], c)
+    return belief
+
+
+@numba.njit
+def normalised_innovations(
+    ax: Any, ay: Any, yaw_rate: Any, vx: Any, vy: Any, c: Any
+) -> NDArray[np.float64]:
+    """Return S^(−1/2) (z − H x̂) at the fixes after the first."""
+    belief = kalman.first_belief(vx[0], vy[0], c)
+    found = np.full((2, len(ax)), np.nan)
+    for k in range(1, len(ax)):
+        predict(belief, ax[k], ay[k], yaw_rate[k], STEP_S, c)
+        if not np.isnan(vx[k]):
+            ux, _, uy, _ = belief.mean
+            p = belief.covariance
+            l00 = np.sqrt(p[0, 0] + c.r_ux)
+            l10 = p[0, 2] / l00
+            found[0, k] = (vx[k] - ux) / l00
+            found[1, k] = (vy[k] - uy - l10 * found[0, k]) / np.sqrt(p[2, 2] + c.r_uy - l10 * l10)
+            update(belief, vx[k], vy[k], c)
+    return found
+
+
+def innovations(assumed: FilterNoise) -> FloatArray:
+    drive, yaw_rate, _ = generate(100_000, NOISE, seed=3)
+    found = normalised_innovations(
+        drive.ax_mps2,
+        drive.ay_mps2,
+        yaw_rate,
+        drive.gps_vx_mps,
+        drive.gps_vy_mps,
+        covariances(assumed),
+    )
+    whole: FloatArray = found[:, np.isfinite(found[0])]
+    return whole
+
+
+def ljung_box(series: FloatArray, lags: int = 20) -> float:
+    """Return the p-value of the hypothesis that a series is white."""
+    n = len(series)
+    centred = series - series.mean()
+    autocorrelation = [centred[lag:] @ centred[:-lag] / (centred @ centred) for lag in range(1, 21)]
+    statistic = n * (n + 2) * sum(r**2 / (n - lag) for lag, r in enumerate(autocorrelation, 1))
+    return float(stats.chi2.sf(statistic, lags))
+
+
+def test_innovations_are_white_and_of_the_predicted_size_on_data_of_the_model() -> None:
+    found = innovations(NOISE)
+    count = found.shape[1]
+    for series in found:
+        assert ljung_box(series) > 1e-3
+        assert abs(series.mean()) < 4 / np.sqrt(count)
+    low, high = stats.chi2.ppf([1e-4, 1 - 1e-4], 2 * count)
+    assert low < np.sum(found**2) < high
+    assert abs(found[0] @ found[1]) < 4 * np.sqrt(count)
+
+
+def test_innovations_of_a_wrong_noise_are_not_white() -> None:
+    wrong = NOISE.model_copy(update={"gps_vx_std_mps": 0.5, "gps_vy_std_mps": 0.5})
+    assert all(ljung_box(series) < 1e-6 for series in innovations(wrong))
+
+
+@numba.njit
+def covariances_over(steps: int, every: int, turn: float, c: Any) -> NDArray[np.float64]:
+    belief = kalman.first_belief(20.0, 0.0, c)
+    kept = np.empty((steps // every, 4, 4))
+    for k in range(steps):
+        predict(belief, 0.0, 0.0, turn * np.sin(0.001 * k), STEP_S, c)
+        if k % 10 == 0:
+            update(belief, 20.0, 0.0, c)
+        if k % every == every - 1:
+            kept[k // every] = belief.covariance
+    return kept
+
+
+@pytest.mark.parametrize("gps_std", [1e-5, pytest.param(0.05, marks=pytest.mark.long)])
+def test_covariance_stays_positive_definite_over_a_million_steps(gps_std: float) -> None:
+    """With no bias walk the biases' variance falls for ever; that is where definiteness is lost."""
+    noise = FilterNoise(gps_vx_std_mps=gps_std, gps_vy_std_mps=gps_std)
+    for covariance in covariances_over(1_000_000, 1000, 0.4, covariances(noise)):
+        assert np.array_equal(covariance, covariance.T)
+        scale = 1 / np.sqrt(np.diag(covariance))
+        assert np.linalg.eigvalsh(covariance * np.outer(scale, scale)).min() > 0
+
+
+def test_joseph_keeps_the_variance_that_rounding_would_lose() -> None:
+    """P (I − K H) of a very precise fix after great uncertainty rounds to zero and below."""
+    vague = FilterNoise(gps_vx_std_mps=1e-5, gps_vy_std_mps=1e-5)
+    belief = belief_of((0.0, 0.0, 0.0, 0.0), (1e10, 1.0, 1e10, 1.0))
+    update(belief, 1.0, 2.0, covariances(vague))
+    np.testing.assert_allclose(belief.mean, [1, 0, 2, 0], atol=1e-12)
+    np.testing.assert_allclose(np.diag(belief.covariance), [1e-10, 1, 1e-10, 1], rtol=1e-9)
+
+
+def test_biases_are_found() -> None:
+    exact, _ = slalom(CAR, 30_000)
+    found = fuse(noisy(exact, seed=4), exact.yaw_rate_rad_s, FilterNoise())
+    assert found.ax_bias_mps2[-1] == pytest.approx(0.15, abs=0.01)
+    assert found.ay_bias_mps2[-1] == pytest.approx(0.15, abs=0.01)
+
+
+def test_steady_circle_persists_without_a_fix() -> None:
+    """The sign of ψ̇ u_x in (6b): with the printed plus, a circle would not persist."""
+    constant = np.full(3000, 1.0)
+    vx, vy, yaw_rate = 15 * constant, -0.4 * constant, 0.3 * constant
+    drive = rolling_drive(CAR, vx, vy, yaw_rate, 0.05 * constant)
+    only_first = without_fixes(drive, np.arange(3000) > 0)
+    found = fuse(only_first, yaw_rate, FilterNoise())
+    np.testing.assert_allclose(found.vx_mps, vx, atol=1e-9)
+    np.testing.assert_allclose(found.vy_mps, vy, atol=1e-9)
+
+
+def test_error_grows_in_a_tunnel_and_recovers_after_it() -> None:
+    exact, truth = slalom(CAR, 10_000)
+    begin_s = 60.0
+    lost = tunnel(len(exact), begin_s)
+    errors = np.stack(
+        [
+            kalman.estimate(without_fixes(noisy(exact, seed), lost), CAR, FilterNoise()) - truth
+            for seed in range(40)
+        ]
+    )
+    spread = np.sqrt(np.mean(errors**2, axis=0))
+
+    def around(time_s: float) -> float:
+        return float(spread[int(time_s / STEP_S) :][:100].mean())
+
+    before, inside, after = around(begin_s - 2), around(begin_s + 18), around(begin_s + 25)
+    assert inside > 2.5 * before
+    assert around(begin_s + 9) < inside
+    assert after < 1.3 * before
+    assert begin_s + TUNNEL_S < 100
+
+
+def test_mirrored_drive_gives_mirrored_sideslip() -> None:
+    drive = noisy(slalom(CAR, 3000)[0], seed=5)
+    found = kalman.estimate(drive, CAR, FilterNoise())
+    other = kalman.estimate(mirrored(drive), CAR, FilterNoise())
+    np.testing.assert_allclose(other, -found, rtol=0, atol=1e-13)
+
+
+def test_turned_axes_give_turned_velocities() -> None:
+    """Equation (5) has no preferred direction: with equal noises, axes may stand at any angle."""
+    drive = noisy(slalom(CAR, 3000)[0], seed=6)
+    cosine, sine = float(np.cos(0.7)), float(np.sin(0.7))
+
+    def turned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return cosine * x - sine * y, sine * x + cosine * y
+
+    ax, ay = turned(drive.ax_mps2, drive.ay_mps2)
+    gps = turned(drive.gps_vx_mps, drive.gps_vy_mps)
+    other = replace(drive, ax_mps2=ax, ay_mps2=ay, gps_vx_mps=gps[0], gps_vy_mps=gps[1])
+    found = fuse(drive, drive.yaw_rate_rad_s, FilterNoise())
+    again = fuse(other, drive.yaw_rate_rad_s, FilterNoise())
+    expected = turned(found.vx_mps, found.vy_mps)
+    np.testing.assert_allclose([again.vx_mps, again.vy_mps], expected, rtol=0, atol=1e-10)
+
+
+def test_begins_at_the_first_fix() -> None:
+    drive = without_fixes(noisy(slalom(CAR, 500)[0], seed=7), np.arange(500) < 205)
+    found = fuse(drive, drive.yaw_rate_rad_s, FilterNoise())
+    assert np.isnan(found.vx_mps[:210]).all()
+    assert found.vx_mps[210] == drive.gps_vx_mps[210]
+    assert np.isfinite(stacked(found)[:, 210:]).all()
+    beta = kalman.estimate(drive, CAR, FilterNoise())
+    assert np.array_equal(np.isnan(beta), np.arange(500) < 210)
+
+
+def test_half_a_fix_is_none() -> None:
+    drive = noisy(slalom(CAR, 500)[0], seed=8)
+    half = replace(drive, gps_vy_mps=np.where(np.arange(500) >= 100, np.nan, drive.gps_vy_mps))
+    without = without_fixes(drive, np.arange(500) >= 100)
+    expected = stacked(fuse(without, drive.yaw_rate_rad_s, FilterNoise()))
+    assert np.array_equal(stacked(fuse(half, drive.yaw_rate_rad_s, FilterNoise())), expected)
+
+
+def test_gaps_of_the_accelerometers_are_bridged() -> None:
+    drive = noisy(slalom(CAR, 500)[0], seed=9)
+    gap = (np.arange(500) >= 200) & (np.arange(500) < 203)
+    held = np.where(gap, drive.ax_mps2[199], drive.ax_mps2)
+    found = kalman.estimate(
+        replace(drive, ax_mps2=np.where(gap, np.nan, drive.ax_mps2)), CAR, FilterNoise()
+    )
+    expected = kalman.estimate(replace(drive, ax_mps2=held), CAR, FilterNoise())
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3)
+    assert np.isfinite(found).all()
+
+
+def test_drive_without_gps_is_refused() -> None:
+    drive = without_fixes(slalom(CAR, 50)[0], np.ones(50, dtype=bool))
+    with pytest.raises(DataError, match="no GPS fix"):
+        kalman.estimate(drive, CAR, FilterNoise())
+
+
+def test_at_rest_the_angle_stays_small() -> None:
+    zero = np.zeros(6000)
+    drive = noisy(rolling_drive(CAR, zero, zero, zero, zero), seed=10)
+    beta = kalman.estimate(drive, CAR, FilterNoise())
+    assert np.abs(beta[500:]).max() < 0.1

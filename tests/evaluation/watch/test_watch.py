@@ -1,0 +1,93 @@
+"""A drive as a page that plays."""
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fleet_slip
+from fleet_slip.errors import QuestionError, UsageError
+from fleet_slip.evaluation.watch import DriveFrames, drive_frames, render_watch
+
+DRIVE = "smoke-2024-05-01-0000"
+
+
+@pytest.fixture(scope="module")
+def frames(smoke_root: Path) -> DriveFrames:
+    fleet = fleet_slip.open(smoke_root)
+    return drive_frames(fleet.warehouse, DRIVE, fleet.model("smoke"))
+
+
+def data_of(page: str) -> Any:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+    assert found
+    return json.loads(found[1])
+
+
+def test_frames_are_those_of_the_log(frames: DriveFrames, smoke_root: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    log = fleet.sql(
+        f"SELECT time_s, sideslip_rad FROM log WHERE drive_id = '{DRIVE}' ORDER BY time_s"
+    ).pl()
+    assert np.diff(frames.time_s) == pytest.approx(0.04)
+    assert len(frames.time_s) == math.ceil(len(log) / 4)
+    true = np.degrees(log["sideslip_rad"].to_numpy())[::4]
+    assert frames.sideslip_deg == pytest.approx(true, abs=1e-12)
+    assert np.nanstd(frames.estimate_deg - frames.sideslip_deg) < 0.2
+
+
+def test_the_car_moves_as_fast_as_it_drives_and_where_it_goes(frames: DriveFrames) -> None:
+    vx, vy = np.gradient(frames.x_m, frames.time_s), np.gradient(frames.y_m, frames.time_s)
+    inner = slice(15, -15)  # at the ends of a drive places are smoothed from one side
+    assert np.hypot(vx, vy)[inner] == pytest.approx(frames.speed_mps[inner], abs=1.0)
+    course = np.arctan2(vy, vx) - frames.heading_rad
+    wrapped = np.degrees(np.angle(np.exp(1j * course)))
+    off = abs(wrapped - frames.sideslip_deg)[inner]
+    assert np.percentile(off, 95) < 1.0
+    assert off.max() < 3.0
+
+
+def test_the_page_holds_the_drive_and_asks_for_nothing(frames: DriveFrames) -> None:
+    page = render_watch(frames)
+    data = data_of(page)
+    assert len(data["t"]) == len(data["beta"]) == len(data["wheels"][0]) == len(frames.time_s)
+    assert "default-src 'none'" in page
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
+
+
+def test_hostile_names_and_missing_signals_do_not_break_the_page(frames: DriveFrames) -> None:
+    nothing = np.full(len(frames.time_s), np.nan)
+    hostile = replace(
+        frames,
+        title="</script><script>alert(1)</script>",
+        estimate_deg=nothing,
+        wheel_rad_s=dict.fromkeys(frames.wheel_rad_s, nothing),
+        gates={"<b>": nothing},
+    )
+    page = render_watch(hostile)
+    assert "<script>alert" not in page
+    assert "<b>" not in page
+    assert set(data_of(page)["estimate"]) == {None}
+
+
+def test_a_part_is_a_part(frames: DriveFrames) -> None:
+    part = frames.part(5.0, 6.0)
+    assert (part.time_s[0], part.time_s[-1]) == (pytest.approx(5.0), pytest.approx(6.0))
+    assert len(part.gates) == len(frames.gates)
+    assert all(len(values) == len(part.time_s) for values in part.wheel_rad_s.values())
+    assert len(part.track[0]) == len(frames.track[0])
+    with pytest.raises(UsageError, match="the drive lasts from"):
+        frames.part(1e6, None)
+
+
+def test_what_cannot_be_shown_is_told(root_to_fail_in: Path, tmp_path: Path) -> None:
+    fleet = fleet_slip.open(root_to_fail_in)
+    with pytest.raises(UsageError, match="shown as a page"):
+        fleet.watch(DRIVE, "smoke", tmp_path / "film.mp4")
+    with pytest.raises(QuestionError, match="no drive of the logs, and no scenario"):
+        fleet.watch("nobody's", "smoke", tmp_path / "page.html")

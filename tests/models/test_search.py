@@ -1,0 +1,203 @@
+"""Which signals of a set: rankings, all subsets, and what the choice is worth."""
+
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.cohort import drive_folds
+from fleet_slip.grams.folding import Folding, assign_folds
+from fleet_slip.models.request import Search, SelectionRequest, parse_worth
+from fleet_slip.models.search import (
+    ALL_SUBSETS,
+    choose_by,
+    require_criterion,
+    search_models,
+    select_inputs,
+)
+from fleet_slip.regression.choice import CROSS_VALIDATION, Rule, select_nested
+from fleet_slip.regression.drives import ClusterUnit
+from fleet_slip.regression.folds import cross_validate, least_squares
+from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
+from tests.support.counts import dense_fit
+
+STRONG_FIRST = (0.0, 0.4, 0.9, 0.0)
+"""Only ay and yaw_rate say anything of the label, yaw_rate more."""
+
+USUAL = SelectionRequest()
+FIVE = Folding(by="drive", count=5)
+
+
+@pytest.fixture(scope="module")
+def drives() -> list[Driven]:
+    return driven(1, STRONG_FIRST, drives=30)
+
+
+def squares(drives: list[Driven], inputs: tuple[str, ...]) -> float:
+    """Residual sum of squares from the rows."""
+    counts = rows_of(drives)
+    return dense_fit(counts[:, [*(INPUTS.index(name) for name in inputs), -1]])[1]
+
+
+def test_a_criterion_is_known_by_its_names() -> None:
+    assert require_criterion("cv") == require_criterion(CROSS_VALIDATION) == CROSS_VALIDATION
+    assert require_criterion("bic") == "bic"
+    with pytest.raises(QuestionError, match=r"unknown criterion 'best'\. Known criteria: cv, "):
+        require_criterion("best")
+
+
+@pytest.mark.parametrize("criterion", ["bic", CROSS_VALIDATION])
+@pytest.mark.parametrize("ranking", ["forward", "correlation"])
+def test_a_ranking_begins_with_what_says_most_and_ends_before_what_says_nothing(
+    drives: list[Driven], ranking: str, criterion: str
+) -> None:
+    found = select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ranking, criterion), USUAL)
+    assert found.choice.nested is not None
+    assert found.choice.nested.order[:2] == ("yaw_rate", "ay")
+    assert found.winner.model.signals == ("yaw_rate", "ay")
+    assert [len(model.signals) for model in found.models] == [1, 2, 3, 4]
+
+
+def test_each_nested_model_has_the_figures_of_its_own_cross_validation(
+    drives: list[Driven],
+) -> None:
+    cohort = cohort_of(drives)
+    found = select_inputs(cohort, INPUTS, FIVE, Rule("forward", "bic"), USUAL)
+    folds = cohort.folds("drive", 5).serving(INPUTS, LABEL)
+    for model in found.models:
+        procedure = least_squares(model.signals, LABEL)
+        alone = cross_validate("alone", folds, procedure, input_scales())
+        assert model.sums == alone.sums
+
+
+def test_the_honest_figures_are_of_the_choice_itself_and_need_three_folds() -> None:
+    rule, two = Rule("forward", "aic"), Folding(by="drive", count=2)
+    drives = driven(5, (0.3, 0.1, 0.1, 0.1), drives=9, rows=15, noise=300)
+    honest = select_inputs(
+        cohort_of(drives), INPUTS, FIVE, rule, SelectionRequest(cluster="drive")
+    ).choice.honest
+    fold = assign_folds([one.drive for one in drives], "drive", 5).fold
+    errors, choices = [], set()
+    for number in set(fold):
+        rest = [one for one, mine in zip(drives, fold, strict=True) if mine != number]
+        training = drive_folds(cohort_of(rest), INPUTS, two, cluster="drive").training
+        chosen = select_nested(training, INPUTS, LABEL, rule).signals
+        at = [INPUTS.index(name) for name in chosen]
+        b, _ = dense_fit(rows_of(rest)[:, [*at, -1]])
+        test = rows_of([one for one, mine in zip(drives, fold, strict=True) if mine == number])
+        errors.append(b[0] + test[:, at] @ b[1:] - test[:, -1])
+        choices.add(chosen)
+    assert len(choices) > 1
+    assert honest is not None
+    counts = honest.pooled.rmse / float(catalogue()[LABEL].scale)
+    assert counts == pytest.approx(np.sqrt(np.mean(np.concatenate(errors) ** 2)), rel=1e-9)
+    assert select_inputs(cohort_of(drives), INPUTS, two, rule, USUAL).choice.honest is None
+
+
+@pytest.mark.parametrize(
+    ("naive", "cluster", "kind"),
+    [(True, None, "rows"), (False, "drive", "drives"), (False, None, "vehicles")],
+)
+def test_what_counts_as_independent_is_what_was_asked_for(
+    drives: list[Driven], naive: bool, cluster: ClusterUnit | None, kind: str
+) -> None:
+    rule = Rule("forward", "bic")
+    cohort, asked = cohort_of(drives), SelectionRequest(naive=naive, cluster=cluster)
+    choice = select_inputs(cohort, INPUTS, FIVE, rule, asked).choice
+    assert choice.evidence.kind == kind
+    assert (choice.evidence.rows == 30 * 80) is naive
+    assert choice.as_dict()["evidence"] == choice.evidence.kind
+    subsets = select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"), asked).choice
+    assert subsets.evidence.kind == choice.evidence.kind
+
+
+@pytest.mark.parametrize("search", ["ranking", ALL_SUBSETS])
+def test_where_nothing_says_more_than_chance_there_is_no_winner(search: str) -> None:
+    cohort = cohort_of(driven(3, (0.0, 0.0, 0.0, 0.0), drives=20))
+    with pytest.raises(DataError, match="the criterion bic keeps no signal"):
+        if search == ALL_SUBSETS:
+            select_inputs(cohort, INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"), USUAL)
+        else:
+            select_inputs(cohort, INPUTS, FIVE, Rule("forward", "bic"), USUAL)
+
+
+def test_the_best_subset_of_every_size_is_that_of_the_rows(drives: list[Driven]) -> None:
+    found = select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"), USUAL)
+    assert found.choice.subsets is not None
+    assert found.choice.honest is None
+    for size, result in enumerate(found.choice.subsets):
+        best = min(combinations(INPUTS, size), key=lambda names: squares(drives, names))
+        assert set(result.best.model.signals) == set(best)
+        assert float(result.best.rss) == pytest.approx(squares(drives, best), rel=1e-9)
+    assert [set(model.signals) for model in found.models] == [
+        set(result.best.model.signals) for result in found.choice.subsets[1:]
+    ]
+    assert set(found.winner.model.signals) == {"ay", "yaw_rate"}
+    assert found.choice.picks is not None
+    assert found.choice.picks["bic"] == 2
+    assert found.winner.reason.startswith("bic keeps 2 of 4 signals of the best subsets")
+    document = found.choice.as_dict()
+    assert len(document["subsets"]) == 5
+    assert "honest" not in document
+
+
+def test_subsets_can_be_chosen_by_cross_validation(drives: list[Driven]) -> None:
+    found = select_inputs(
+        cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, CROSS_VALIDATION), USUAL
+    )
+    assert set(found.winner.model.signals) == {"ay", "yaw_rate"}
+    best = max(found.models, key=lambda model: model.correlation)
+    assert found.winner.best is best
+    shortfall = next(s for s in found.winner.shortfalls if s.model is found.winner.model)
+    assert shortfall.negligible
+
+
+@pytest.mark.parametrize("rule", ["best", "worth"])
+@pytest.mark.parametrize("around", ["0.00499deg", "0.005deg", "0.0051deg"])
+def test_a_worth_that_is_asked_for_decides_whatever_the_rule_of_the_list(
+    rule: Literal["best", "worth"], around: str
+) -> None:
+    """The usual worth asked for is asked for, too; the weak signals are 0.0029 deg each."""
+    cohort = cohort_of(driven(1, (0.00125, 0.4, 0.9, 0.00125), drives=30, noise=3))
+    search = Search(method="exchange", most=4, rule=rule)
+    models = search_models(cohort, INPUTS, FIVE, search).models
+    asked = {
+        text: len(choose_by(search, models, parse_worth(text)).model.signals)
+        for text in (around, "0.025deg", "0.0001deg")
+    }
+    assert asked == {around: 2, "0.025deg": 2, "0.0001deg": 4}
+    assert len(choose_by(search, models).model.signals) == (4 if rule == "best" else 2)
+
+
+def test_rows_can_be_the_folds() -> None:
+    """Ten Gram rows a drive, as the feature set `rows` makes them."""
+    parts = [
+        Driven(one.drive, one.counts[part::10], part=str(part + 1))
+        for one in driven(4, STRONG_FIRST, drives=6)
+        for part in range(10)
+    ]
+    cohort = cohort_of(parts, feature_set="rows")
+    rows = Folding(by="row", count=10)
+    ranked = select_inputs(cohort, INPUTS, rows, Rule("forward", "bic"), USUAL)
+    subsets = select_inputs(cohort, INPUTS, rows, Rule(ALL_SUBSETS, "bic"), USUAL)
+    assert set(ranked.winner.model.signals) == set(subsets.winner.model.signals)
+    assert ranked.choice.evidence.kind == subsets.choice.evidence.kind == "rows"
+    assert len(ranked.winner.model.folds) == 10
+    assert ranked.winner.model.pooled.rows == 6 * 80
+    with pytest.raises(QuestionError, match="whole drives"):
+        select_inputs(
+            cohort_of(driven(4, STRONG_FIRST)), INPUTS, rows, Rule("forward", "bic"), USUAL
+        )
+
+
+def test_a_signal_that_repeats_another_is_named() -> None:
+    drives = driven(6, STRONG_FIRST)
+    for one in drives:
+        one.counts[:, 3] = 2 * one.counts[:, 1]
+    with pytest.raises(DataError, match="steering_wheel"):
+        select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"), USUAL)
+    assert np.linalg.matrix_rank(rows_of(drives)[:, :4]) == 3

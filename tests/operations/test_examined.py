@@ -1,0 +1,248 @@
+"""What trains by hand is examined first, as a night does: wrong labels train no model."""
+
+import shutil
+from datetime import date
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import fleet_slip
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.catalogue.facts import TRAINING_DRIVES
+from fleet_slip.cli.app import app
+from fleet_slip.errors import DataError, RefusedError, UnexaminedError
+from fleet_slip.models import acceptance as champion_rules
+from fleet_slip.operations import examined, quality
+from fleet_slip.operations.quality import QualityReport
+from fleet_slip.storage.runs import hash_drive, with_all_drives, without_drives
+from fleet_slip.warehouse.condition import Condition
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.commands import RunCommand
+from tests.support.counted_rows import START_S, write_counted
+from tests.support.fleet_rows import rows_of_fleet
+from tests.support.landing import Landing
+from tests.support.once import made_once
+
+
+@pytest.fixture(scope="module")
+def landed(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
+    """A folder with logs of a car, two drives with ay stuck, and a root, `data`."""
+
+    def make(folder: Path) -> None:
+        landing = Landing(folder / "landing", smoke_root)
+        landing.prepare()
+        drives, fleet = landing.drives(), fleet_slip.open(folder / "data")
+        good = landing.land("good", drives[:4], date(2026, 10, 5))
+        bad = landing.land("bad", drives[4:6], date(2026, 10, 6), ay_mps2="1.0 + 0 * ay_mps2")
+        landing.land("late", drives[6:8], date(2026, 10, 7), yaw_rate_rad_s="0.1 + 0 * time_s")
+        fleet.ingest([good, bad], str(landing.mapping))
+        fleet.gram()
+
+    return made_once(tmp_path_factory, "examined", make)
+
+
+@pytest.fixture
+def fleet(landed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
+    shutil.copytree(landed / "data", tmp_path / "data")
+    return fleet_slip.open(tmp_path / "data")
+
+
+def test_drives_that_are_not_in_order_train_nothing_by_hand(
+    fleet: Fleet, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = fleet.cohort().examine()
+    assert (found.drives, found.faults) == (6, {"stuck ay": 2})
+
+    def examine_again(*_: object) -> None:
+        raise AssertionError("examined again")
+
+    monkeypatch.setattr(examined, "examine_drives", examine_again)
+    assert fleet.cohort().examine() == found
+    monkeypatch.undo()
+    told = run_command("select", "--models", "table1")
+    assert told.exit_code == 0
+    assert "2 drives of 6 left out, not in order: 2 stuck ay" in told.stderr
+    assert "4 drives" in told.stdout
+    assert "6 drives" in run_command("select", "--models", "table1", "--unexamined").stdout
+    assert run_command("publish", "m", "--models", "table1").exit_code == 0
+    assert fleet.model("m").manifest.trained_on.drives == 4
+    by_hand = fleet.cohort().select(models="table1")
+    assert by_hand.as_dict()["examined"] == str(found)
+    assert fleet.publish("m", by_hand).reason == "The champion is this very model."
+    scored = run_command("score", "m")
+    assert "2 drives of 6 left out, not in order: 2 stuck ay" in scored.stderr
+    assert (fleet.score("m").drives, fleet.score("m", unexamined=True).drives_left_out) == (4, 4)
+
+
+def test_a_kept_verdict_of_which_a_bit_flipped_is_found_again(fleet: Fleet, tmp_path: Path) -> None:
+    found = fleet.cohort().examine()
+    (kept,) = (tmp_path / "cache").glob("fleet-slip/examined/*.json")
+    whole = kept.read_bytes()
+    place = whole.index(b"[") + 2
+    kept.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+    assert fleet.cohort().examine() == found
+    assert kept.read_bytes() == whole
+
+
+def test_a_cohort_of_which_no_drive_is_in_order_says_so(fleet: Fleet) -> None:
+    with pytest.raises(DataError, match="none of 2 drives is in order: 2 stuck ay"):
+        fleet.cohort("day = DATE '2026-10-06'").select(models="table1")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ("-sideslip_rad", "reversed sideslip"),
+        ("2 * sideslip_rad", "scaled sideslip"),
+        ("sideslip_rad / 57.3", "scaled sideslip"),
+        ("sideslip_rad + 0.01745", "biased sideslip"),
+    ],
+)
+def test_a_first_champion_of_a_label_that_is_wrong_in_all_drives_is_refused(
+    tmp_path: Path, smoke_root: Path, wrong: str, told: str
+) -> None:
+    landing = Landing(tmp_path / "landing", smoke_root)
+    landing.prepare()
+    fleet = fleet_slip.open(tmp_path / "data")
+    bad = landing.land("bad", landing.drives()[:5], date(2026, 10, 5), sideslip_rad=wrong)
+    (report,) = fleet.ingest(bad, str(landing.mapping))
+    assert told in {f"{one.kind} {one.signals[0]}" for one in report.suspicions}
+    fleet.gram()
+    cohort = fleet.cohort()
+    with pytest.raises(RefusedError, match=rf"of 5 drives .* contradict .*{told}"):
+        fleet.publish("m", cohort)
+    assert fleet.publish("m", cohort, candidate=True).candidate
+    assert fleet.publish("m", cohort, force=True).new
+
+
+def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
+    tmp_path: Path, smoke_root: Path
+) -> None:
+    landing = Landing(tmp_path / "landing", smoke_root)
+    landing.prepare()
+    fleet, drives = fleet_slip.open(tmp_path / "data"), landing.drives()
+    late = "coalesce(lag(sideslip_rad, 60) OVER (PARTITION BY drive_id ORDER BY time_s), 0)"
+    for name, some, changes in (("a", drives[:4], {}), ("b", drives[4:], {"sideslip_rad": late})):
+        day = date(2026, 10, 5 + (name == "b"))
+        fleet.ingest(landing.land(name, some, day, **changes), str(landing.mapping))
+        fleet.gram()
+        if name == "a":
+            assert fleet.publish("m", fleet.cohort()).new
+    with pytest.raises(RefusedError, match=r"of 4 drives .* contradict .*late sideslip"):
+        fleet.publish("m", fleet.cohort())
+    assert fleet.publish("m", fleet.cohort(), candidate=True).candidate
+
+
+_FLOOR = champion_rules.floor
+
+
+def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_columns(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    choice = ("--nested", "ay,yaw_rate", "--worth", "0.0001deg")
+    command = ("--root", str(tmp_path / "data"), "publish", "m", *choice, "--dry-run")
+    asked = fleet.cohort("day = DATE '2026-10-05'").select(nested="ay,yaw_rate", worth="0.0001deg")
+    for name, bound, told in (
+        ("max_columns_per_drive", 0.1, r"columns? on 4 drives, more than 0\.1 a drive"),
+        ("min_rows_per_column", 10**6, r"rows, fewer than 1000000 for each of its \d columns?"),
+    ):
+        strict = champion_rules.floor().model_copy(update={name: bound})
+        monkeypatch.setattr(champion_rules, "floor", lambda strict=strict: strict)
+        with pytest.raises(RefusedError, match=told) as refused:
+            fleet.publish("m", asked)
+        dry = fleet.would_publish("m", asked)
+        assert (dry.refused, dry.publishes, dry.reason) == (True, False, str(refused.value))
+        assert fleet.would_publish("m", asked, candidate=True).candidate
+        said = CliRunner().invoke(app, command)
+        assert "winner: " in said.stdout and isinstance(said.exception, RefusedError)
+        monkeypatch.setattr(champion_rules, "floor", _FLOOR)
+    assert not fleet.models().num_rows
+    assert "m would be published. " in CliRunner().invoke(app, command).output
+    assert fleet.publish("m", asked).new
+
+
+def test_a_champion_of_more_columns_needs_drives_for_them_too(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cohort = fleet.cohort("day = DATE '2026-10-05'")
+    assert fleet.publish("m", cohort.select(model="ay, yaw_rate")).new
+    strict = champion_rules.floor().model_copy(update={"max_columns_per_drive": 0.6})
+    monkeypatch.setattr(champion_rules, "floor", lambda: strict)
+    with pytest.raises(RefusedError, match=r"3 columns on 4 drives, more than 0\.6 a drive"):
+        fleet.publish("m", cohort.select(model="ay, yaw_rate, steering_wheel"))
+    assert not fleet.would_publish("m", cohort.select(model="ay, steering_wheel")).refused
+
+
+def test_a_cohort_tells_what_it_was_before_drives_were_left_out() -> None:
+    asked = "day > '2026-01-01' AND (mass_kg < 1500)"
+    once = without_drives(asked, "drive", [hash_drive("drive", "a")])
+    twice = without_drives(once, "fleet", [hash_drive("fleet", "b")])
+    assert once != asked != twice
+    assert with_all_drives(twice) == with_all_drives(once) == with_all_drives(asked) == asked
+
+
+def test_many_drives_are_examined_in_pieces_of_days_and_each_piece_once(
+    landed: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    real = quality.examine_drives
+
+    def counted(warehouse: Warehouse, condition: Condition) -> QualityReport:
+        asked.append(condition.text)
+        return real(warehouse, condition)
+
+    monkeypatch.setattr(examined, "examine_drives", counted)
+    monkeypatch.setattr(examined, "PIECE", 4)
+    found = fleet.cohort().examine()
+    assert (found.drives, found.faults, len(asked)) == (6, {"stuck ay": 2}, 2)
+    landing = Landing(landed / "landing", landed)
+    fleet.ingest(sorted(landing.folder.glob("late*")), str(landing.mapping))
+    fleet.gram()
+    found = fleet.cohort().examine()
+    assert (found.drives, found.faults, len(asked)) == (8, {"stuck ay": 2, "stuck yaw_rate": 2}, 3)
+    assert "2026-10-06" in asked[-1] and "2026-10-05" not in asked[-1]
+
+
+def test_rows_of_whole_files_are_not_read_to_tell_that_they_are_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
+    monkeypatch.setattr(examined, "PIECE", 150)
+    fleet, asked = fleet_slip.open(tmp_path / "data"), list[str]()
+
+    def ask(warehouse: Warehouse, condition: Condition) -> QualityReport:
+        asked.append(condition.sql)
+        return QualityReport(0, 0, ())
+
+    monkeypatch.setattr(examined, "examine_drives", ask)
+    for day in range(3):
+        path = tmp_path / f"day-{day}"
+        write_counted(path, rows_of_fleet(150, START_S + 86_400 * day, seed=day))
+        fleet.ingest_counted(path)
+        fleet.cohort().examine()
+        assert len(asked) == day + 1
+        assert f"2024-05-0{day + 1}" in asked[-1]
+    fleet.cohort().examine()
+    assert len(asked) == 3
+
+
+def test_drives_without_gram_rows_are_reduced_and_examined_before_they_train(
+    fleet: Fleet, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after `gram --features`, where the rows that are examined may not be there."""
+    shutil.rmtree(Path(str(fleet.root)) / "grams")
+    fleet.gram("calibration")
+    told = str(examined.leave_out_faulty(fleet.warehouse, TRAINING_DRIVES))
+    assert told.startswith("6 measured drives not examined: ") and "Run: fleet-slip gram" in told
+    with monkeypatch.context() as patch:
+        patch.setattr(examined, "READ_ON_THE_WAY", 100)
+        with pytest.raises(UnexaminedError, match=r"6 measured drives .* unexamined"):
+            fleet.publish("m")
+    done = run_command("publish", "m", "--models", "table1")
+    assert done.exit_code == 0, done.stderr
+    assert "made the Gram rows of 6 measured drives" in done.stderr
+    assert fleet.model("m").manifest.trained_on.drives == 4

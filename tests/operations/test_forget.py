@@ -1,0 +1,248 @@
+"""Forgetting: nothing of the drives is left, and the models are those of a world without them."""
+
+import json
+import shutil
+from datetime import date
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import fleet_slip
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import QuestionError, RefusedError, StorageError
+from fleet_slip.grams import job
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.compute import compute_grams
+from fleet_slip.grams.job import update_grams
+from fleet_slip.operations.find_drives import Located, drives_by_file, find_unreferenced, locate
+from fleet_slip.operations.forget import forget
+from fleet_slip.operations.retention import Retention, retain
+from fleet_slip.operations.rewriting import compact
+from fleet_slip.regression.least_squares import fit
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.table import Change
+from fleet_slip.warehouse.forgotten import Audit, Forgettable
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.commands import RunCommand
+from tests.support.logs import land, log_rows, random_counts
+from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file
+
+CARS = ("alfa", "beta", "gamma")
+
+
+def drive(car: str, number: int, day: date = date(2024, 5, 1)) -> pa.Table:
+    rng = np.random.default_rng([CARS.index(car), number])
+    counts = {name: (values // 8) for name, values in random_counts(rng, 200).items()}
+    return log_rows(f"{car}-{number}", counts, day, vehicle_id=car)
+
+
+def fill(root: Path, *cars: str) -> Warehouse:
+    """A warehouse where some cars drove; files mix them."""
+    warehouse = Warehouse(LocalFolder(root))
+    for number in range(3):
+        land(warehouse, f"f{number}", *(drive(car, number) for car in cars))
+    update_grams(warehouse)
+    return warehouse
+
+
+def coefficients(warehouse: Warehouse) -> dict[str, Fraction]:
+    cohort = load_cohort(warehouse)
+    (table,) = cohort.tables
+    model = fit(table.total(), catalogue().inputs, catalogue().label).model
+    return {
+        "intercept": model.intercept,
+        **dict(zip(model.signals, model.coefficients, strict=True)),
+    }
+
+
+def mentions(root: Path, name: str) -> list[Path]:
+    return [
+        file for file in root.rglob("*") if file.is_file() and name.encode() in file.read_bytes()
+    ]
+
+
+def test_afterwards_every_coefficient_is_that_of_a_world_where_the_car_never_drove(
+    tmp_path: Path,
+) -> None:
+    warehouse = fill(tmp_path / "with", *CARS)
+    without = fill(tmp_path / "without", "alfa", "gamma")
+    with_all = coefficients(warehouse)
+    report = forget(warehouse, Forgettable("vehicle", "beta"))
+    assert (report.drives, report.rows, report.files_rewritten) == (3, 600, 3)
+    assert coefficients(warehouse) == coefficients(without)
+    assert with_all != coefficients(without)
+    query = "SELECT * EXCLUDE file FROM grams ORDER BY ALL"
+    with fleet_slip.connect(warehouse.root) as one, fleet_slip.connect(without.root) as two:
+        assert one.execute(query).fetchall() == two.execute(query).fetchall()
+        logs = "FROM log_counts ORDER BY ALL"
+        assert one.execute(logs).fetchall() == two.execute(logs).fetchall()
+
+
+def test_a_car_is_found_in_files_with_and_without_compute_grams_and_no_other_is_opened(
+    tmp_path: Path,
+) -> None:
+    warehouse = fill(tmp_path, "alfa", "beta")
+    land(warehouse, "other", drive("gamma", 7))
+    update_grams(warehouse)
+    land(warehouse, "later", drive("gamma", 8), drive("beta", 8))  # without Gram rows
+    (other,) = (path for path in warehouse.logs.snapshot().paths if "other" in path)
+    Path(other).write_bytes(b"no Parquet file")
+    subject = Forgettable("vehicle", "beta")
+    logs = warehouse.logs.snapshot()
+    found = drives_by_file(logs, subject, locate(warehouse.grams.snapshot(), subject))
+    assert sorted(found.values(), key=min) == [{f"beta-{number}"} for number in (0, 1, 2, 8)]
+    with pytest.raises(StorageError):
+        drives_by_file(logs, subject, Located(frozenset(), {}))
+
+
+def test_with_now_no_byte_below_the_root_names_the_car_not_even_in_older_versions(
+    tmp_path: Path,
+) -> None:
+    warehouse = fill(tmp_path, *CARS)
+    compact(warehouse)  # older versions now have the car in other files
+    report = forget(warehouse, Forgettable("vehicle", "beta"))
+    assert report.old_files_left > 0
+    assert mentions(tmp_path, "beta")
+    again = forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+    assert (again.drives, again.old_files_left) == (0, 0)
+    assert again.old_files_deleted == report.old_files_left
+    assert not mentions(tmp_path, "beta")
+    assert mentions(tmp_path, "gamma")
+
+
+def test_the_record_names_nobody_and_can_be_asked(tmp_path: Path) -> None:
+    warehouse = fill(tmp_path, *CARS)
+    audit = Audit(LocalFolder(tmp_path))
+    forget(warehouse, Forgettable("drive", "beta-1"))
+    assert [entry["event"] for entry in audit.entries()] == ["begun", "done"]
+    assert "beta" not in json.dumps(audit.entries())
+    assert audit.state(Forgettable("drive", "beta-1")) == "done"
+    assert audit.state(Forgettable("vehicle", "beta-1")) is None
+    assert not forget(warehouse, Forgettable("drive", "beta-1"), now=True).drives
+    with pytest.raises(QuestionError, match="no drive has vehicle_id 'delta'"):
+        forget(warehouse, Forgettable("vehicle", "delta"))
+
+
+def test_whoever_forgets_first_at_the_same_moment_is_found_in_the_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    audit = Audit(LocalFolder(tmp_path))
+    one, other = (Forgettable("vehicle", name) for name in ("alfa", "beta"))
+    audit.begin(one, 1, [])
+    with monkeypatch.context() as patch:
+        patch.setattr(Audit, "entries", lambda _: [])  # as they were a moment ago
+        audit.begin(other, 2, ["m@1"])
+    assert [audit.state(subject) for subject in (one, other)] == ["begun"] * 2
+    audit.end(other)
+    assert [audit.state(subject) for subject in (one, other)] == ["begun", "done"]
+    assert audit.models_of(other) == ["m@1"]
+
+
+def test_a_gram_job_under_way_does_not_bring_a_forgotten_drive_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its file is removed when no Gram row of it has landed, so that there is none to drop."""
+    warehouse = fill(tmp_path, "alfa")
+    land(warehouse, "new", drive("beta", 1))
+
+    def overtaken(*arguments: Any) -> list[pa.Table]:
+        rows = list(compute_grams(*arguments))
+        monkeypatch.undo()
+        forget(warehouse, Forgettable("vehicle", "beta"))
+        return rows
+
+    monkeypatch.setattr(job, "compute_grams", overtaken)
+    update_grams(warehouse)
+    with fleet_slip.connect(warehouse.root) as database:
+        cars = database.execute("SELECT DISTINCT vehicle_id FROM grams").fetchall()
+    assert cars == [("alfa",)]
+
+
+def test_a_file_of_forgotten_drives_only_is_removed(tmp_path: Path) -> None:
+    warehouse = fill(tmp_path, "alfa")
+    report = forget(warehouse, Forgettable("drive", "alfa-1"))
+    assert (report.files_removed, report.files_rewritten) == (1, 0)
+    assert warehouse.logs.snapshot().rows == 400
+
+
+def test_quarantined_rows_of_the_car_go_too(tmp_path: Path) -> None:
+    warehouse = fill(tmp_path, *CARS)
+    values: list[dict[str, Any]] = [
+        {"file": "x.csv", "row": row, "drive_id": name, "reason": "missing", "signal": None}
+        for row, name in enumerate(["beta-1", "alfa-1", None, "beta-10"])
+    ]
+    rows = pa.Table.from_pylist(values, schema=warehouse.quarantine.schema)
+    action = warehouse.quarantine.write_file("q", rows)
+    warehouse.quarantine.snapshot().commit(Change(add=[action]))
+    forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+    (path,) = warehouse.quarantine.snapshot().paths
+    assert pq.read_table(path)["drive_id"].to_pylist() == ["alfa-1", None, "beta-10"]
+    assert not find_unreferenced(warehouse.quarantine)
+
+
+@pytest.mark.parametrize("subject", ["vehicle", "drive"])
+def test_a_car_all_of_whose_rows_were_refused_goes_too(tmp_path: Path, subject: Any) -> None:
+    columns = {name: values * 2 for name, values in good_columns(50).items()}
+    columns["car"] = ["sound"] * 50 + ["secretive"] * 50
+    columns["ax"][50:] = ["777.125"] * 50
+    file = tmp_path / "x.csv"
+    file.write_text(csv_text(columns))
+    warehouse = Warehouse(LocalFolder(tmp_path / "data"))
+    mapping = a_mapping(drive={"vehicle_id": {"column": "car"}})
+    assert ingest_file(warehouse, file, mapping).counts.drives == 1
+    update_grams(warehouse)
+    (path,) = warehouse.quarantine.snapshot().paths
+    (name,) = pq.read_table(path)["drive_id"].unique().to_pylist()
+    chosen = Forgettable(subject, name if subject == "drive" else "secretive")
+    before = warehouse.logs.snapshot()
+    report = forget(warehouse, chosen, now=True)
+    assert (report.drives, report.rows) == (1, 0)
+    assert warehouse.logs.snapshot().files == before.files
+    assert not warehouse.quarantine.snapshot().files
+    left = mentions(tmp_path / "data", "secretive") + mentions(tmp_path / "data", "777.125")
+    assert not left
+    assert not forget(warehouse, chosen).changed
+
+
+def test_retention_forgets_by_age_and_refuses_to_leave_nothing(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    for month in (1, 2, 3):
+        day = date(2024, month, 1)
+        land(warehouse, f"m{month}", drive("alfa", month, day), day=day)
+    update_grams(warehouse)
+    retention = Retention(drives_days=45, replaced_files_hours=24)
+    with pytest.raises(RefusedError, match="Check the clock"):
+        retain(warehouse, retention, date(2034, 3, 2))
+    report = retain(warehouse, retention, date(2024, 3, 2))
+    assert (report.before, report.forgotten.drives) == (date(2024, 1, 17), 1)
+    assert not retain(warehouse, retention, date(2024, 3, 2)).forgotten.changed
+    with fleet_slip.connect(tmp_path) as database:
+        days = database.execute("SELECT DISTINCT day FROM grams ORDER BY ALL").fetchall()
+    assert days == [(date(2024, 2, 1),), (date(2024, 3, 1),)]
+
+
+def test_models_are_marked_and_run_trains_again_without_bringing_the_drive_back(
+    run_command: RunCommand, smoke_root: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(smoke_root, tmp_path / "data")
+    few = "day = '2024-05-02'"
+    run_command("publish", "other", "--cohort", few, "--force")  # fewer drives than columns
+    report = run_command("forget", "--drive", "smoke-2024-05-01-0001", "--now", "--json").json
+    assert report["models"] == ["smoke@1"]
+    marks = {
+        f"{row['name']}@{row['version']}": row["trained_on_forgotten"]
+        for row in run_command("models", "--json").json
+    }
+    assert marks == {"smoke@1": True, "other@1": False}
+    assert not run_command("simulate", "smoke", "--json").json["batches_written"]
+    again = run_command("run", "--campaign", "smoke", "--json").json
+    assert (again["publish"]["version"], again["publish"]["new"]) == (2, True)
+    query = "SELECT count(*) AS n FROM drives WHERE drive_id = 'smoke-2024-05-01-0001'"
+    assert run_command("sql", query, "--json").json == [{"n": 0}]
+    assert run_command("verify", "--full").exit_code == 0
+    assert run_command("forget").exit_code == 2

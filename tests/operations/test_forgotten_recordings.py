@@ -1,0 +1,186 @@
+"""A forgotten drive stays away when its recording comes again under other names."""
+
+import gzip
+import hashlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleet_slip.ingest import job, load
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.operations.forget import forget
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.forgotten import Audit, Forgettable
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.measured import a_mapping, csv_text, ingest_file
+
+ROWS = 3000
+
+
+def recording(seed: int = 1) -> dict[str, Any]:
+    """A drive of 30 s with noise, as sensors have it, and a row for the quarantine."""
+    noise = np.random.default_rng(seed).normal(size=(2, ROWS)).cumsum(axis=1) / 20
+    ax = [f"{x:.3f}" for x in np.clip(noise[0], -9, 9)]
+    ax[100] = "broken"
+    beta = [f"{x:.3f}" for x in np.clip(noise[1], -9, 9)]
+    return {"t": [f"{i / 100:.2f}" for i in range(ROWS)], "ax": ax, "beta": beta}
+
+
+def write(folder: Path, columns: dict[str, Any], name: str = "monday.csv") -> Path:
+    file = folder / name
+    file.write_text(csv_text(columns))
+    return file
+
+
+@pytest.fixture(scope="module")
+def after_it_was_forgotten(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data root where the drive of `recording` was forgotten, to copy."""
+    tmp_path = tmp_path_factory.mktemp("forgotten")
+    warehouse = Warehouse(LocalFolder(tmp_path / "data"))
+    ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
+    (file,) = warehouse.logs.snapshot().files
+    (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
+    assert forget(warehouse, Forgettable("drive", name), now=True).drives == 1
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def forgotten(after_it_was_forgotten: Path, tmp_path: Path) -> Warehouse:
+    """Such a root of one's own."""
+    return Warehouse(LocalFolder(shutil.copytree(after_it_was_forgotten, tmp_path / "data")))
+
+
+def is_empty(warehouse: Warehouse) -> bool:
+    return not warehouse.logs.snapshot().rows and not warehouse.quarantine.snapshot().rows
+
+
+Copy = tuple[dict[str, Any], Mapping]
+
+
+AGAIN: dict[str, Callable[[], Copy]] = {
+    "another mapping": lambda: (recording(), a_mapping(name="other")),
+    "another car": lambda: (recording(), a_mapping(drive={"vehicle_id": "pseudonym"})),
+    "another day": lambda: (recording(), a_mapping(drive={"day": "2020-01-01"})),
+    "another model": lambda: (recording(), a_mapping(drive={"vehicle_model": "coupe"})),
+    "a later clock": lambda: (
+        recording() | {"t": [f"{500 + i / 100:.2f}" for i in range(ROWS)]},
+        a_mapping(),
+    ),
+}
+
+
+@pytest.mark.parametrize("change", AGAIN)
+def test_the_recording_does_not_land_again(
+    change: str, forgotten: Warehouse, tmp_path: Path
+) -> None:
+    columns, mapping = AGAIN[change]()
+    report = ingest_file(forgotten, write(tmp_path, columns, "tuesday.csv"), mapping)
+    assert (report.drives_forgotten, report.counts.drives) == (1, 0)
+    assert is_empty(forgotten)
+
+
+@pytest.mark.parametrize("more", [b"\n", b"\r\n", b"# end\n"])
+def test_nor_does_its_file_with_some_bytes_more(
+    more: bytes, forgotten: Warehouse, tmp_path: Path
+) -> None:
+    file = write(tmp_path, recording())
+    file.write_bytes(file.read_bytes() + more)
+    assert ingest_file(forgotten, file, a_mapping()).drives_forgotten == 1
+    packed = tmp_path / "packed.csv.gz"
+    packed.write_bytes(gzip.compress(file.read_bytes()))
+    assert ingest_file(forgotten, packed, a_mapping()).drives_forgotten == 1
+
+
+def test_a_car_that_stands_is_known_by_its_name_and_day(
+    warehouse: Warehouse, tmp_path: Path
+) -> None:
+    standing = recording() | {"ax": ["0"] * ROWS, "beta": ["0"] * ROWS}
+    ingest_file(warehouse, write(tmp_path, standing), a_mapping())
+    (file,) = warehouse.logs.snapshot().files
+    (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
+    forget(warehouse, Forgettable("drive", name))
+    again = write(tmp_path, standing, "again.csv")
+    assert ingest_file(warehouse, again, a_mapping(name="other")).drives_forgotten == 1
+    other = a_mapping(drive={"vehicle_id": "other"})
+    assert ingest_file(warehouse, again, other).counts.drives == 1
+
+
+def test_other_recordings_of_the_car_land(forgotten: Warehouse, tmp_path: Path) -> None:
+    other = write(tmp_path, recording(2), "other.csv")
+    report = ingest_file(forgotten, other, a_mapping())
+    assert (report.drives_forgotten, report.counts.drives) == (0, 1)
+    again = write(tmp_path, recording(), "again.csv")
+    assert ingest_file(forgotten, again, a_mapping(name="b")).drives_forgotten == 1
+
+
+def test_a_forgotten_car_does_not_come_back_under_another_name(
+    warehouse: Warehouse, tmp_path: Path
+) -> None:
+    file = write(tmp_path, recording())
+    ingest_file(warehouse, file, a_mapping())
+    car = Forgettable("vehicle", "car")
+    forget(warehouse, car)
+    renamed = a_mapping(drive={"vehicle_id": "renamed"})
+    assert ingest_file(warehouse, file, renamed).drives_forgotten == 1
+    Audit(warehouse.root).allow(car)
+    again = a_mapping(name="again", drive={"vehicle_id": "renamed"})
+    assert ingest_file(warehouse, file, again).counts.drives == 1
+
+
+def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
+    warehouse: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
+    (file,) = warehouse.logs.snapshot().files
+    (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
+    land = load.land_batch
+
+    def overtaken(*written: Any) -> Any:
+        forget(warehouse, Forgettable("drive", name), now=True)
+        return land(*written)
+
+    monkeypatch.setattr(job, "land_batch", overtaken)
+    again, other = write(tmp_path, recording()), a_mapping(name="other")
+    (report,) = job.ingest_files(warehouse, [again], other, replace="all")
+    assert report.drives_forgotten == 1
+    assert is_empty(warehouse)
+
+
+def test_a_recording_without_every_50th_row_is_another_one(
+    forgotten: Warehouse, tmp_path: Path
+) -> None:
+    kept = [i for i in range(ROWS) if i % 50]
+    columns = {name: [values[i] for i in kept] for name, values in recording().items()}
+    report = ingest_file(forgotten, write(tmp_path, columns, "other.csv"), a_mapping())
+    assert (report.drives_forgotten, report.counts.drives) == (0, 1)
+
+
+def test_what_an_earlier_release_forgot_stays_away_by_name(
+    warehouse: Warehouse, tmp_path: Path
+) -> None:
+    """It kept salted scrypt hashes; this one of the vehicle "car", with this salt."""
+    hashed = hashlib.scrypt(b"vehicle:car", salt=bytes(16), n=2**14, r=8, p=1, dklen=32).hex()
+    old = {"kind": "vehicle", "subject": hashed, "salt": "00" * 16, "at": "2026-11-01T00:00:00"}
+    audit = Audit(warehouse.root)
+    for event in ({"event": "begun", "drives": 1, "models": []}, {"event": "done"}):
+        audit._folder.append({**old, **event})
+    file, car = write(tmp_path, recording()), Forgettable("vehicle", "car")
+    assert ingest_file(warehouse, file, a_mapping()).drives_forgotten == 1
+    assert audit.state(car) == "done"
+    audit.allow(car)
+    assert ingest_file(warehouse, file, a_mapping()).counts.drives == 1
+    forget(warehouse, car, now=True)
+    assert ingest_file(warehouse, file, a_mapping(name="again")).drives_forgotten == 1
+
+
+def test_names_of_other_cars_that_an_earlier_release_listed_go(
+    warehouse: Warehouse, tmp_path: Path
+) -> None:
+    ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
+    (warehouse.root / "cleared").create("1.txt", b"car")
+    forget(warehouse, Forgettable("vehicle", "car"), now=True)
+    assert (warehouse.root / "cleared").names() == []

@@ -1,0 +1,111 @@
+"""Labels that are wrong alike on one day: the other drives tell, whatever the day's own say."""
+
+import math
+from collections.abc import Callable
+from datetime import date, timedelta
+
+import numpy as np
+import pytest
+
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.operations.quality import examine_drives, find_wrong_labels
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.cars import Signals, counts, drive
+from tests.support.commands import RunCommand
+from tests.support.logs import DAY, land, log_rows
+
+CARS, DAYS = 12, 3
+NIGHT = DAY + timedelta(days=DAYS - 1)
+
+
+def land_days(warehouse: Warehouse, change: Callable[[Signals], None], every: int = 1) -> None:
+    """Land three days of drives of as many cars; on the last, labels of every n-th are wrong."""
+    rng = np.random.default_rng(1)
+    factors = 1 + 0.1 * rng.standard_normal(CARS)
+    for number in range(DAYS):
+        day, drives = DAY + timedelta(days=number), []
+        for car, factor in enumerate(factors):
+            signals = drive(rng, gentleness=2)
+            signals["sideslip"] = factor * signals["sideslip"]
+            if day == NIGHT and car % every == 0:
+                change(signals)
+            name, vehicle = f"{day}-{car:02d}", f"car-{car}"
+            drives.append(
+                log_rows(name, counts(signals), day, vehicle_id=vehicle, source="measured")
+            )
+        land(warehouse, str(day), *drives, day=day)
+    update_grams(warehouse)
+
+
+def multiplied(factor: float) -> Callable[[Signals], None]:
+    return lambda signals: signals.update(sideslip=factor * signals["sideslip"])
+
+
+def shifted(degrees: float) -> Callable[[Signals], None]:
+    return lambda signals: signals.update(sideslip=signals["sideslip"] + math.radians(degrees))
+
+
+def iced(signals: Signals) -> None:
+    """A tenth more, and as much less zero as ice brings: nothing is wrong."""
+    multiplied(1.12)(signals)
+    shifted(0.1)(signals)
+
+
+def found(warehouse: Warehouse) -> tuple[set[str], set[date], int]:
+    findings = examine_drives(warehouse).findings
+    return {one.fault.kind for one in findings}, {one.day for one in findings}, len(findings)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        (multiplied(2), "scaled"),
+        (multiplied(1.6), "scaled"),
+        (multiplied(1 / 57.3), "scaled"),
+        (multiplied(-1), "reversed"),
+        (shifted(1), "biased"),
+    ],
+)
+def test_a_day_on_which_all_labels_are_wrong_is_found(
+    warehouse: Warehouse, change: Callable[[Signals], None], kind: str
+) -> None:
+    land_days(warehouse, change)
+    assert found(warehouse) == ({kind}, {NIGHT}, CARS)
+
+
+@pytest.mark.parametrize("change", [multiplied(3), multiplied(1 / 57.3), shifted(2)])
+def test_a_third_of_a_days_labels_is_found(
+    warehouse: Warehouse, change: Callable[[Signals], None]
+) -> None:
+    land_days(warehouse, change, every=3)
+    assert found(warehouse)[1:] == ({NIGHT}, CARS / 3)
+
+
+def test_what_roads_and_loads_change_is_no_fault(warehouse: Warehouse) -> None:
+    land_days(warehouse, iced)
+    assert find_wrong_labels(load_cohort(warehouse)) == {}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        multiplied(1 / 57.3),
+        *(pytest.param(change, marks=pytest.mark.long) for change in (multiplied(2), shifted(1))),
+    ],
+)
+def test_publishing_by_hand_leaves_the_day_out(
+    warehouse: Warehouse, run_command: RunCommand, change: Callable[[Signals], None]
+) -> None:
+    land_days(warehouse, change)
+    asked = ("publish", "beta", "--nested", "ay,yaw_rate,steer_fl", "--json")
+    done = run_command(*asked)
+    assert done.exit_code == 0, done.stderr
+    assert f"{CARS} drives of {CARS * DAYS} left out, not in order" in done.stderr
+    with_all = run_command(*asked, "--unexamined", "--candidate")
+    assert with_all.exit_code == 0, with_all.stderr
+    few, many = (
+        run_command("show", f"beta@{number}", "--json").json["trained_on"]["drives"]
+        for number in (1, 2)
+    )
+    assert (few, many) == (CARS * (DAYS - 1), CARS * DAYS)

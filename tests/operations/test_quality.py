@@ -1,0 +1,273 @@
+"""Faulty sensors found from Gram rows: what was broken is what is named."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleet_slip.errors import DataError
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.operations.faults import Fault
+from fleet_slip.operations.peers import QualityThresholds, thresholds
+from fleet_slip.operations.quality import QualityReport, examine, examine_drives, find_wrong_labels
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.cars import TICKS, Signals, broken, counts, drive
+from tests.support.commands import RunCommand
+from tests.support.logs import land, log_rows, random_counts
+from tests.support.satellites import with_course
+
+DRIVES = 30
+
+
+def fleet(warehouse: Warehouse, change: Callable[[Signals], None], saturated: int = 0) -> None:
+    """Land drives of which the last has a fault."""
+    rng = np.random.default_rng(5)
+    signals = [drive(rng) for _ in range(DRIVES)]
+    signals[-1] = broken(signals[-1], change)
+    rows = [
+        log_rows(f"d{i:02d}", counts(one), saturated=saturated if i == DRIVES - 1 else 0)
+        for i, one in enumerate(signals)
+    ]
+    land(warehouse, "all", *rows)
+    update_grams(warehouse)
+
+
+def only_finding(report: QualityReport) -> Fault:
+    assert [finding.drive_id for finding in report.findings] == ["d29"]
+    return report.findings[0].fault
+
+
+def swap(a: str, b: str) -> Callable[[Signals], None]:
+    def change(signals: Signals) -> None:
+        signals[a], signals[b] = signals[b], signals[a]
+
+    return change
+
+
+def add(name: str, offset: float) -> Callable[[Signals], None]:
+    return lambda signals: signals.__setitem__(name, signals[name] + offset)
+
+
+def multiply(name: str, factor: float) -> Callable[[Signals], None]:
+    return lambda signals: signals.__setitem__(name, signals[name] * factor)
+
+
+def shake(name: str, std: float) -> Callable[[Signals], None]:
+    noise = std * np.random.default_rng(9).standard_normal(TICKS)
+    return lambda signals: signals.__setitem__(name, signals[name] + noise)
+
+
+FAULTS = [
+    (multiply("ay", -1), "reversed", ("ay",)),
+    (multiply("yaw_rate", -1), "reversed", ("yaw_rate",)),
+    (multiply("steering_wheel", -1), "reversed", ("steering_wheel",)),
+    (swap("ax", "ay"), "swapped", ("ax", "ay")),
+    (swap("wheel_fl", "wheel_fr"), "swapped", ("wheel_fl", "wheel_fr")),
+    (swap("wheel_rl", "wheel_rr"), "swapped", ("wheel_rl", "wheel_rr")),
+    (swap("steer_fl", "steer_fr"), "swapped", ("steer_fl", "steer_fr")),
+    (multiply("wheel_rl", 0), "stuck", ("wheel_rl",)),
+    (add("yaw_rate", 0.1), "biased", ("yaw_rate",)),
+    (add("steering_wheel", 0.1), "biased", ("steering_wheel",)),
+    (multiply("wheel_fr", 1.05), "scaled", ("wheel_fr",)),
+    (shake("steering_wheel", 0.1), "noisy", ("steering_wheel",)),
+    (shake("sideslip", 0.1), "noisy", ("sideslip",)),
+]
+
+
+@pytest.mark.parametrize(("change", "kind", "signals"), FAULTS)
+def test_what_is_broken_is_named(
+    warehouse: Warehouse,
+    change: Callable[[Signals], None],
+    kind: str,
+    signals: tuple[str, ...],
+) -> None:
+    fleet(warehouse, change)
+    fault = only_finding(examine(load_cohort(warehouse)))
+    assert (fault.kind, fault.signals) == (kind, signals)
+
+
+@pytest.mark.parametrize("turned", [1, 12, 30])
+def test_a_label_that_is_reversed_for_one_car_is_found(warehouse: Warehouse, turned: int) -> None:
+    rng = np.random.default_rng(5)
+    one = [log_rows(f"a{i:02d}", counts(drive(rng))) for i in range(DRIVES)]
+    other = [
+        log_rows(f"b{i:02d}", counts(broken(drive(rng), multiply("sideslip", -1))), vehicle_id="b")
+        for i in range(turned)
+    ]
+    land(warehouse, "all", *one, *other)
+    update_grams(warehouse)
+    findings = examine_drives(warehouse).findings
+    assert [(one.drive_id, one.vehicle_id) for one in findings] == [
+        (f"b{i:02d}", "b") for i in range(turned)
+    ]
+    assert {(one.fault.kind, one.fault.signals) for one in findings} == {
+        ("reversed", ("sideslip",))
+    }
+
+
+def two_kinds_of_cars(warehouse: Warehouse, often: Callable[[Signals], None]) -> QualityReport:
+    """Examine 60 drives of one car, whose sensors have no offsets, and one each of 30 others."""
+    rng = np.random.default_rng(6)
+    rows = []
+    for i in range(60):
+        one = broken(drive(rng), often)
+        rows.append(log_rows(f"often-{i:02d}", counts(one), vehicle_id="often"))
+    for i in range(30):
+        one = broken(drive(rng), add("ay", rng.normal(0, 0.3)))
+        one = broken(one, add("yaw_rate", rng.normal(0, 0.02)))
+        rows.append(log_rows(f"once-{i:02d}", counts(one), vehicle_id=f"car-{i:02d}"))
+    land(warehouse, "all", *rows)
+    update_grams(warehouse)
+    return examine(load_cohort(warehouse))
+
+
+def test_a_car_that_drives_every_day_does_not_say_what_is_usual(warehouse: Warehouse) -> None:
+    report = two_kinds_of_cars(warehouse, lambda _: None)
+    assert (report.drives, report.compared, report.findings) == (90, 90, ())
+
+
+def test_what_is_wrong_in_all_drives_of_a_car_shows_beside_other_cars(warehouse: Warehouse) -> None:
+    report = two_kinds_of_cars(warehouse, add("steering_wheel", 0.3))
+    (finding,) = report.findings
+    assert (finding.drive_id, finding.fault.kind) == ("often-00", "biased")
+    assert finding.fault.signals == ("steering_wheel",)
+
+
+def test_drives_in_order_raise_no_alarm(warehouse: Warehouse) -> None:
+    fleet(warehouse, lambda _: None)
+    report = examine(load_cohort(warehouse))
+    assert (report.drives, report.compared, report.findings) == (DRIVES, DRIVES, ())
+
+
+def test_vehicle_models_are_examined_one_after_the_other(warehouse: Warehouse) -> None:
+    rng = np.random.default_rng(3)
+    for file, model in enumerate(("beetle", "driver's", None)):
+        rows = [
+            log_rows(f"{model}-{i}", random_counts(rng, 200), vehicle_model=model)
+            for i in range(12)
+        ]
+        land(warehouse, str(file), *rows)
+    update_grams(warehouse)
+    for condition in ("true", "drive_id LIKE '%-1' -- and '%-11'", "vehicle_model IS NULL"):
+        cohort = load_cohort(warehouse, f"{condition}\n")
+        together = examine(cohort, few(), find_wrong_labels(cohort, few()))
+        assert examine_drives(warehouse, condition, few()) == together
+        assert together.drives > 0
+    with pytest.raises(DataError, match="no drive satisfies"):
+        examine_drives(warehouse, "mass_kg > 1e9")
+
+
+def few() -> QualityThresholds:
+    return thresholds().quality.model_copy(update={"min_rows": 100, "min_drives": 8})
+
+
+def test_values_at_the_end_of_their_range_are_told(warehouse: Warehouse) -> None:
+    fleet(warehouse, lambda _: None, saturated=TICKS // 10)
+    assert only_finding(examine(load_cohort(warehouse))).kind == "saturated"
+
+
+def test_signs_need_no_peers_and_offsets_do(warehouse: Warehouse) -> None:
+    fleet(warehouse, multiply("yaw_rate", -1))
+    alone = load_cohort(warehouse, "drive_id IN ('d28', 'd29')")
+    report = examine(alone)
+    assert report.compared == 0
+    assert only_finding(report).kind == "reversed"
+    limits = replace_min_rows(TICKS + 1)
+    assert examine(load_cohort(warehouse), limits).drives == 0
+
+
+def replace_min_rows(rows: int) -> QualityThresholds:
+    return thresholds().quality.model_copy(update={"min_rows": rows})
+
+
+def test_the_order_and_number_of_drives_do_not_matter_to_a_verdict(warehouse: Warehouse) -> None:
+    fleet(warehouse, multiply("wheel_fr", 1.05))
+    cohort = load_cohort(warehouse)
+    (table,) = cohort.tables
+    back = np.arange(len(table))[::-1]
+    turned = replace(cohort, tables=(table.take(back),), drives=cohort.drives.take(back))
+    assert examine(turned).findings == examine(cohort).findings
+
+
+def test_the_command_tells_by_its_exit_code(run_command: RunCommand, warehouse: Warehouse) -> None:
+    fleet(warehouse, multiply("ay", -1))
+    bad = run_command("quality", "--json")
+    assert bad.exit_code == 10
+    (finding,) = bad.json["findings"]
+    assert (finding["drive_id"], finding["kind"], finding["signals"]) == ("d29", "reversed", ["ay"])
+    assert "1 of 30 drives are not in order" in bad.stderr
+    good = run_command("quality", "--cohort", "drive_id <> 'd29'")
+    assert good.exit_code == 0
+    assert "29 drives examined" in good.stdout
+
+
+def test_a_heading_and_a_reversed_course_are_found(warehouse: Warehouse) -> None:
+    """From the Gram rows of changes of the course, where they are; before, both trained models."""
+    rng = np.random.default_rng(5)
+    drives = {}
+    for name in ("sound", "heading", "turned"):
+        signals = with_course(drive(rng, gentleness=4), rng, slip=name != "heading")
+        signals["course"] *= -1 if name == "turned" else 1
+        fixes = ~np.isnan(signals["course"])
+        whole: dict[str, Any] = {**counts({k: np.nan_to_num(v) for k, v in signals.items()})}
+        for extra in ("course", "satellite_speed"):
+            whole[extra] = [
+                v if fix else None for v, fix in zip(whole[extra].tolist(), fixes, strict=True)
+            ]
+        drives[name] = whole
+    land(warehouse, "all", *(log_rows(name, one) for name, one in drives.items()))
+    update_grams(warehouse)
+    assert examine_drives(warehouse).findings == ()
+    update_grams(warehouse, feature_set="course")
+    found = {one.drive_id: one.fault for one in examine_drives(warehouse).findings}
+    assert {name: (one.kind, one.signals) for name, one in found.items()} == {
+        "heading": ("no slip", ("course",)),
+        "turned": ("reversed", ("course",)),
+    }
+
+
+def test_steering_of_cars_with_biased_sensors_is_not_called_swapped(warehouse: Warehouse) -> None:
+    """The mean difference of the wheels is some hundredths of a degree; sensors are off by more."""
+    rng = np.random.default_rng(8)
+    rows = []
+    for number in range(DRIVES):
+        signals = drive(rng)
+        signals["steer_fl"] = 0.4 * signals["steer_fl"] + rng.normal(0, 0.005)
+        signals["steer_fr"] = 0.4 * signals["steer_fr"]
+        rows.append(log_rows(f"d{number}", counts(signals), vehicle_id=f"car-{number}"))
+    land(warehouse, "all", *rows)
+    update_grams(warehouse)
+    assert examine_drives(warehouse).findings == ()
+
+
+SIDES = {"fl", "fr", "rl", "rr"}
+
+
+def there_and_mirrored(signals: Signals) -> Signals:
+    """Return the first half of a drive, and once more with left for right."""
+    found = {}
+    for name, values in signals.items():
+        other = name[:-1] + {"l": "r", "r": "l"}[name[-1]] if name[-2:] in SIDES else name
+        sign = 1 if name == "ax" or name.startswith("wheel") else -1
+        half = values.size // 2
+        found[name] = np.concatenate([values[:half], sign * signals[other][: values.size - half]])
+    return found
+
+
+def test_a_yaw_rate_without_its_sign_is_found(warehouse: Warehouse) -> None:
+    rng = np.random.default_rng(9)
+    rows = []
+    for number in range(4):
+        signals = there_and_mirrored(drive(rng))
+        if number == 2:
+            signals["yaw_rate"] = np.abs(signals["yaw_rate"])
+        rows.append(log_rows(f"d{number}", counts(signals)))
+    land(warehouse, "all", *rows)
+    update_grams(warehouse)
+    found = {one.drive_id: one.fault for one in examine_drives(warehouse).findings}
+    assert {name: (one.kind, one.signals) for name, one in found.items()} == {
+        "d2": ("magnitude", ("yaw_rate",))
+    }

@@ -1,0 +1,238 @@
+"""Verification: whatever is damaged is found and named; what can be rebuilt is, and no more."""
+
+import json
+import os
+import random
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from fleet_slip.config import find_config
+from fleet_slip.errors import StorageError
+from fleet_slip.grams.job import update_grams
+from fleet_slip.operations.find_drives import vacuum
+from fleet_slip.operations.repair import repair
+from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.verify import verify
+from fleet_slip.simulation.campaign import load_campaign
+from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.storage.documents import DocumentFolder
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.table import Change
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.commands import RunCommand
+from tests.support.logs import DAY, land, log_rows, path_of, random_counts
+
+
+@pytest.fixture
+def filled(warehouse: Warehouse) -> Warehouse:
+    """Two log files, their Gram rows, and a document."""
+    rng = np.random.default_rng(0)
+    for name in "ab":
+        land(warehouse, name, log_rows(name, random_counts(rng, 300)))
+    update_grams(warehouse)
+    DocumentFolder(warehouse.root / "evaluations").append({"drive": "ä", "values": [1, 2.5]})
+    return warehouse
+
+
+def flip(file: Path, bit: int) -> None:
+    content = bytearray(file.read_bytes())
+    content[bit // 8] ^= 1 << bit % 8
+    file.write_bytes(content)
+
+
+def damaged(warehouse: Warehouse) -> set[tuple[str, str]]:
+    return {(finding.kind, finding.path) for finding in verify(warehouse, full=True).damage}
+
+
+def test_nothing_is_found_where_nothing_is_wrong(filled: Warehouse) -> None:
+    report = verify(filled, full=True)
+    assert report.findings == []
+    assert (report.files, report.log_files_recomputed, report.documents) == (3, 2, 1)
+
+
+def test_a_folder_without_a_warehouse_is_not_called_sound(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="nothing to verify"):
+        verify(Warehouse(LocalFolder(tmp_path)))
+    with pytest.raises(StorageError, match="no data root"):
+        verify(Warehouse(LocalFolder(tmp_path / "absent")))
+
+
+def test_logs_that_are_gone_are_found_and_nothing_follows_them(filled: Warehouse) -> None:
+    paths = [Path(path) for path in filled.logs.snapshot().paths]
+    rows = filled.grams.snapshot().rows
+    shutil.rmtree(path_of(filled.root) / "logs" / "_delta_log")
+    for path in paths:
+        os.utime(path, (0, 0))
+    assert ("log", "logs") in damaged(filled)
+    assert vacuum(filled).files == ()
+    assert all(path.exists() for path in paths)
+    with pytest.raises(StorageError, match="are gone"):
+        update_grams(filled)
+    assert filled.grams.snapshot().rows == rows
+
+
+def test_every_flipped_bit_is_found(filled: Warehouse) -> None:
+    rng = random.Random(0)  # noqa: S311
+    files = [Path(path) for table in filled.tables for path in table.snapshot().paths]
+    files += sorted(path_of(filled.root).glob("evaluations/*.json"))
+    for _ in range(12):
+        bits = {file: rng.randrange(file.stat().st_size * 8) for file in files}
+        for file, bit in bits.items():
+            flip(file, bit)
+        found = {finding.path for finding in verify(filled).damage}
+        assert found >= {str(file.relative_to(path_of(filled.root))) for file in files}, bits
+        for file, bit in bits.items():
+            flip(file, bit)
+    assert not verify(filled).damage
+
+
+@pytest.mark.parametrize(
+    ("harm", "problem"),
+    [
+        (lambda file: file.unlink(), "No such file"),
+        (lambda file: file.write_bytes(b""), "has 0 bytes instead of"),
+        (lambda file: file.write_bytes(file.read_bytes()[:-1]), "bytes instead of"),
+        (lambda file: file.write_bytes(b"x" * file.stat().st_size), "do not match the checksum"),
+    ],
+)
+def test_a_harmed_file_is_named_with_what_is_wrong(
+    filled: Warehouse, harm: Callable[[Path], object], problem: str
+) -> None:
+    file = Path(filled.logs.snapshot().paths[0])
+    harm(file)
+    (finding,) = verify(filled).damage
+    assert finding.path == str(file.relative_to(path_of(filled.root)))
+    assert problem in finding.problem
+
+
+def test_a_log_of_the_table_that_tells_other_counts_is_found(filled: Warehouse) -> None:
+    log = max(path_of(filled.root).glob("logs/_delta_log/*.json"))
+    log.write_text(log.read_text().replace('numRecords\\": 300', 'numRecords\\": 301'))
+    (in_log, in_file) = verify(filled).damage
+    assert "does not match the checksum" in in_log.problem
+    assert "has 300 rows, the Delta log says 301" in in_file.problem
+    log.write_text(log.read_text()[:-20])
+    assert ("log", "logs") in damaged(filled)
+
+
+def test_a_drive_in_two_files_or_without_a_beginning_is_found(filled: Warehouse) -> None:
+    rng = np.random.default_rng(1)
+    land(filled, "twice", log_rows("a", random_counts(rng, 5)))
+    land(filled, "headless", log_rows("c", random_counts(rng, 5)).slice(1))
+    assert {path for kind, path in damaged(filled) if kind == "drive"} == {"a", "c"}
+
+
+def test_a_wrong_gram_row_is_found_and_rebuilt(filled: Warehouse) -> None:
+    snapshot = filled.grams.snapshot()
+    rows = pa.parquet.read_table(snapshot.paths[0])
+    wrong = rows.set_column(rows.schema.get_field_index("n"), "n", pa.array([300, 299]))
+    action = filled.grams.write_file("signals-wrong", wrong)
+    snapshot.commit(Change(add=[action], remove=snapshot.files))
+    report = verify(filled, full=True)
+    assert [finding.kind for finding in report.damage] == ["gram"]
+    repair(filled, report)
+    assert {finding.kind for finding in verify(filled, full=True).findings} == {"unreferenced"}
+    assert not damaged(filled)
+
+
+def test_a_gram_row_that_stands_twice_is_found_and_rebuilt(filled: Warehouse) -> None:
+    rows = pa.parquet.read_table(filled.grams.snapshot().paths[0]).slice(0, 1)
+    action = filled.grams.write_file("signals-twice", rows)
+    filled.grams.snapshot().commit(Change(add=[action]))
+    report = verify(filled)
+    assert ["stands 2 times" in finding.problem for finding in report.damage] == [True]
+    repair(filled, report)
+    assert not damaged(filled)
+
+
+def test_an_unknown_log_file_is_told_and_never_deleted(filled: Warehouse) -> None:
+    file = Path(filled.logs.snapshot().paths[0])
+    flip(file, 99)
+    before = file.read_bytes()
+    assert repair(filled, verify(filled)) == []
+    assert file.read_bytes() == before
+    assert damaged(filled) == {("file", str(file.relative_to(path_of(filled.root))))}
+
+
+def test_a_log_file_lost_with_its_gram_rows_is_told_and_the_rest_rebuilt(
+    filled: Warehouse, run_command: RunCommand
+) -> None:
+    lost, *others = filled.logs.snapshot().paths
+    assert others
+    content = Path(lost).read_bytes()
+    Path(lost).unlink()
+    for gram in filled.grams.snapshot().paths:
+        Path(gram).unlink()
+    told = run_command("verify", "--repair", "--json")
+    assert told.exit_code == 9
+    (left,) = told.json["damage"]
+    assert left["path"] == str(Path(lost).relative_to(path_of(filled.root)))
+    assert left["problem"].endswith("rows)")
+    assert "under any name" in told.stderr
+    rows = [filled.grams.read(f.path, ["file"]) for f in filled.grams.snapshot().files]
+    assert {name for part in rows for name in part["file"].to_pylist()} == {
+        str(Path(other).relative_to(path_of(filled.logs.folder))) for other in others
+    }
+    (Path(lost).parent / "from-the-backup.parquet").write_bytes(content)
+    assert run_command("verify", "--repair").exit_code == 0
+    assert not damaged(filled)
+
+
+def test_a_document_is_checked_to_the_last_byte(filled: Warehouse) -> None:
+    folder = DocumentFolder(filled.root / "models" / "m" / "history")
+    for number in range(3):
+        folder.append({"number": number})
+    (path_of(folder.folder) / "2.json").unlink()
+    text = (path_of(folder.folder) / "3.json").read_text()
+    (path_of(folder.folder) / "3.json").write_text(json.dumps(json.loads(text)))
+    assert damaged(filled) == {
+        ("document", "models/m/history/2.json"),
+        ("document", "models/m/history/3.json"),
+    }
+
+
+def test_leftovers_and_a_backlog_are_remarks(filled: Warehouse) -> None:
+    filled.logs.write_file("left", log_rows("d", random_counts(np.random.default_rng(3), 5)), DAY)
+    land(filled, "new", log_rows("e", random_counts(np.random.default_rng(3), 5)))
+    report = verify(filled)
+    assert not report.damage
+    assert [finding.kind for finding in report.findings] == ["backlog", "unreferenced"]
+
+
+@pytest.mark.parametrize("compacted", [False, True])
+def test_simulated_logs_are_rebuilt_to_the_bit(
+    warehouse: Warehouse, tmp_path: Path, compacted: bool
+) -> None:
+    text = find_config("campaigns", "smoke").read_text().replace("laps = 0.5", "laps = 0.03")
+    (tmp_path / "short.toml").write_text(text.replace("15_000", "1_000"))
+    campaign = load_campaign(str(tmp_path / "short.toml"))
+    with ThreadPoolExecutor(1) as executor:
+        simulate_campaign(warehouse, campaign, campaign.days(), executor)
+    update_grams(warehouse)
+    if compacted:
+        compact(warehouse)
+    whole = {path: Path(path).read_bytes() for path in warehouse.logs.snapshot().paths}
+    first, *_, last = whole
+    flip(Path(first), 12345)
+    Path(last).unlink()
+    report = verify(warehouse)
+    assert len(report.damage) == 2
+    assert not repair(warehouse, report)  # the shipped campaign of this name is another one
+    assert len(repair(warehouse, report, [str(tmp_path / "short.toml")])) == 2
+    assert {path: Path(path).read_bytes() for path in whole} == whole
+    assert not verify(warehouse, full=True).damage
+
+
+def test_the_exit_code_tells_damage(run_command: RunCommand, filled: Warehouse) -> None:
+    assert run_command("verify").exit_code == 0
+    flip(Path(filled.logs.snapshot().paths[0]), 999)
+    told = run_command("verify", "--json")
+    assert told.exit_code == 9
+    assert told.json["damage"][0]["problem"].startswith("its bytes do not match the checksum")
+    assert run_command("verify", "--repair").exit_code == 9

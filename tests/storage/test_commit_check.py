@@ -1,0 +1,149 @@
+"""Flipped bits anywhere in a Delta log: found, or without consequence."""
+
+import json
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from deltalake import DeltaTable
+
+from fleet_slip.grams.job import update_grams
+from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.verify import verify
+from fleet_slip.storage.table import Change, Unit, find_commit_faults
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.logs import DAY, land, log_rows
+
+COUNTS = {"ax": np.arange(5), "sideslip": np.arange(5)}
+
+
+@pytest.fixture
+def root(warehouse: Warehouse) -> Warehouse:
+    """Logs that were made, appended to twice and compacted."""
+    for name in ("one", "two"):
+        land(warehouse, name, log_rows(name, COUNTS))
+    update_grams(warehouse)
+    compact(warehouse)
+    return warehouse
+
+
+def logs_of(warehouse: Warehouse) -> Path:
+    return Path(warehouse.logs.folder.uri)
+
+
+def commits(warehouse: Warehouse) -> list[Path]:
+    return sorted(logs_of(warehouse).glob("_delta_log/*.json"))
+
+
+def problems(warehouse: Warehouse) -> dict[str, str]:
+    return {f.path: f.problem for f in verify(warehouse).findings if f.kind == "log"}
+
+
+def consequences(content: bytes) -> Any:
+    """What a commit does: all of it but the Delta library's remarks on time, program and mode.
+
+    The note of the commit that only makes the table has nothing to tell but its own checksum.
+    """
+    actions = [json.loads(line) for line in content.splitlines()]
+    done = [action for action in actions if "commitInfo" not in action]
+    (info,) = (action["commitInfo"] for action in actions if "commitInfo" in action)
+    tidy = [{k: _without_nulls(v) for k, v in action.items()} for action in done]
+    sealed = any(not action.keys() <= {"metaData", "protocol"} for action in done)
+    return sorted(map(str, tidy)), json.loads(info["fleet_slip"]) if sealed else None
+
+
+def _without_nulls(content: dict[str, Any]) -> dict[str, Any]:
+    kept = {k: v for k, v in content.items() if v is not None}
+    return {k: v for k, v in sorted(kept.items()) if "xtendedFileMetadata" not in str(kept)}
+
+
+def test_sound_logs_have_no_problems(root: Warehouse) -> None:
+    assert [list(find_commit_faults(table.snapshot())) for table in root.tables] == [[], [], []]
+    assert all(b"sha256" in file.read_bytes() for file in commits(root))
+
+
+def test_every_bit_of_a_log_that_has_consequences_is_guarded(root: Warehouse) -> None:
+    rng = random.Random(0)  # noqa: S311
+    snapshot = root.logs.snapshot()
+    _ = snapshot.files
+    for file in commits(root):
+        content = file.read_bytes()
+        done = consequences(content)
+        for bit in rng.sample(range(8 * len(content)), 400):
+            damaged = bytearray(content)
+            damaged[bit // 8] ^= 1 << bit % 8
+            file.write_bytes(damaged)
+            if not any(name == file.name for name, _ in find_commit_faults(snapshot)):
+                assert consequences(bytes(damaged)) == done, damaged[bit // 8 - 40 : bit // 8 + 40]
+        file.write_bytes(content)
+
+
+def change(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("commit", "old", "new", "problem"),
+    [
+        (1, "test/one", "test/ome", "does not match the checksum"),
+        (1, '\\"sha256', '\\"sha255', "states no checksum"),
+        (1, '"fleet_slip"', '"fleet_slop"', "states no checksum"),
+        (1, '"txn"', '"uxn"', "never writes"),
+        (3, '"job', '"jbb', "does not match the checksum"),
+        (0, '"name":"logs"', '"name":"logr"', "in two ways"),
+    ],
+)
+def test_damage_that_no_other_check_sees_is_told(
+    root: Warehouse, commit: int, old: str, new: str, problem: str
+) -> None:
+    file = commits(root)[commit]
+    change(file, old, new)
+    DeltaTable(str(logs_of(root)))  # Delta reads it as if nothing had happened
+    assert problem in problems(root)[f"logs/_delta_log/{file.name}"]
+
+
+def test_tables_of_versions_that_wrote_no_checksums_are_sound(root: Warehouse) -> None:
+    for file in commits(root):
+        for line in (lines := file.read_text().splitlines()):
+            action = json.loads(line)
+            if "commitInfo" in action:
+                del action["commitInfo"]["fleet_slip"]
+                file.write_text("\n".join([json.dumps(action), *lines[1:]]))
+    assert not problems(root)
+    land(root, "three", log_rows("three", COUNTS))
+    assert not problems(root)
+
+
+def test_a_checkpoint_is_compared_with_the_commits_behind_it(root: Warehouse) -> None:
+    def checkpointed(damage: Callable[[Path], None]) -> dict[str, str]:
+        file = commits(root)[1]
+        content = file.read_bytes()
+        damage(file)
+        DeltaTable(str(logs_of(root))).create_checkpoint()
+        file.write_bytes(content)
+        found = problems(root)
+        for made in file.parent.glob("*checkpoint*"):
+            made.unlink()
+        return found
+
+    assert not checkpointed(lambda _file: None)
+    found = checkpointed(lambda file: change(file, '"appId":"test/one"', '"appId":"test/ome"'))
+    assert "has landed: test/one" in found["logs/_delta_log/_last_checkpoint"]
+
+
+def test_a_commit_that_is_gone_is_told(root: Warehouse) -> None:
+    DeltaTable(str(logs_of(root))).create_checkpoint()
+    commits(root)[2].unlink()
+    assert "logs/_delta_log/00000000000000000002.json" in problems(root)
+
+
+def test_units_and_notes_of_any_text_are_sealed_as_they_are(warehouse: Warehouse) -> None:
+    action = warehouse.logs.write_file("x", log_rows("x", COUNTS), DAY)
+    unit = Unit('"\\ é \u2028 1', 2**62)
+    warehouse.logs.snapshot().commit(Change(add=[action], units=[unit], note={"job": "ü\n"}))
+    assert not problems(warehouse)

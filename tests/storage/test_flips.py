@@ -1,0 +1,142 @@
+"""A flipped bit is told or makes no difference: nothing is computed from damaged bytes."""
+
+import random
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleet_slip.errors import FleetSlipError, StorageError
+from fleet_slip.grams.compute import aggregate
+from fleet_slip.grams.folding import Folding
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.sums import sum_cohort
+from fleet_slip.storage import folder
+from fleet_slip.storage.folder import check_local_files, checksum_in, checksum_of
+from fleet_slip.views import connect
+from fleet_slip.warehouse.database import reading_files
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.commands import RunCommand
+from tests.support.logs import land, log_rows, path_of, random_counts
+
+pytestmark = pytest.mark.long
+
+FLIPS = 30
+
+Answer = Callable[[Warehouse], Any]
+
+
+def sums(warehouse: Warehouse) -> Any:
+    found = sum_cohort(warehouse, Folding(count=2))
+    return found.sums.tables, found.drive_count
+
+
+def new_gram_rows(warehouse: Warehouse) -> Any:
+    return aggregate(warehouse, warehouse.logs.snapshot().files).to_pylist()
+
+
+def all_rows(warehouse: Warehouse) -> Any:
+    return [
+        table.read(file.path).to_pylist()
+        for table in (warehouse.logs, warehouse.grams)
+        for file in table.snapshot().files
+    ]
+
+
+def queried(warehouse: Warehouse) -> Any:
+    with connect(warehouse.root) as database, reading_files(database, "the query"):
+        statement = "SELECT drive_id, sum(ay_mps2), max(vx_mps) FROM log GROUP BY 1 ORDER BY 1"
+        return database.execute(statement).fetchall()
+
+
+@pytest.fixture
+def filled(warehouse: Warehouse) -> Warehouse:
+    """Three log files and their Gram rows."""
+    rng = np.random.default_rng(0)
+    for name in "abc":
+        drives = (log_rows(f"{name}{i}", random_counts(rng, 40)) for i in range(3))
+        land(warehouse, name, *drives)
+    update_grams(warehouse)
+    return warehouse
+
+
+@contextmanager
+def flipped(file: Path, bit: int) -> Iterator[None]:
+    """Flip a bit of a file for a while, its time of writing as it was: a disk tells nobody."""
+    sound, status = file.read_bytes(), file.stat()
+    content = bytearray(sound)
+    content[bit // 8] ^= 1 << bit % 8
+    file.write_bytes(content)
+    yield
+    file.write_bytes(sound)
+    assert file.stat().st_size == status.st_size
+
+
+LOGS, GRAMS, COMMITS = "logs/day=*/*", "grams/*.parquet", "*/_delta_log/*.json"
+
+
+@pytest.mark.parametrize(
+    ("answer", "pattern"),
+    [
+        (sums, GRAMS),
+        (sums, COMMITS),
+        (new_gram_rows, LOGS),
+        (new_gram_rows, COMMITS),
+        (all_rows, LOGS),
+        (all_rows, GRAMS),
+        (queried, LOGS),
+        (queried, COMMITS),
+    ],
+)
+def test_a_flipped_bit_is_told_or_makes_no_difference(
+    filled: Warehouse, answer: Answer, pattern: str
+) -> None:
+    rng = random.Random(0)  # noqa: S311
+    files = sorted(path_of(filled.root).glob(pattern))
+    usual = answer(filled)
+    told = 0
+    for _ in range(FLIPS):
+        file = rng.choice(files)
+        bit = rng.randrange(file.stat().st_size * 8)
+        with flipped(file, bit):
+            try:
+                assert answer(filled) == usual, (file, bit)
+            except FleetSlipError:
+                told += 1
+    assert answer(filled) == usual
+    assert told
+
+
+def test_a_file_of_an_earlier_name_is_compared_with_its_sha256(tmp_path: Path) -> None:
+    file = tmp_path / f"signals-6d052870401c74f0-{checksum_of(b'sound')}.parquet"
+    file.write_bytes(b"sound")
+    check_local_files([str(file)])
+    file.write_bytes(b"Sound")
+    with pytest.raises(StorageError, match="do not match the checksum in its name"):
+        check_local_files([str(file)])
+
+
+def test_a_file_is_read_once_while_it_stays_the_same(
+    filled: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = filled.logs.snapshot().paths
+    assert all(checksum_in(path) for path in paths)
+    check_local_files(paths)
+    monkeypatch.setattr(folder, "_require", lambda *_: pytest.fail("read again"))
+    check_local_files(paths)
+
+
+def test_queries_of_people_are_looked_at_too(filled: Warehouse, run_command: RunCommand) -> None:
+    file = Path(filled.logs.snapshot().paths[1])
+    good = run_command("sql", "SELECT sum(ay) FROM log_counts", "--json")
+    assert good.exit_code == 0
+    with flipped(file, file.stat().st_size * 4):
+        for output in ([], ["--json"], ["--csv"]):
+            bad = run_command("sql", "SELECT sum(ay) FROM log_counts", *output)
+            assert bad.exit_code == 6
+            assert "do not match the checksum in its name" in bad.stderr
+        # Files that are not opened need not be looked at.
+        assert run_command("sql", "SELECT count(*) FROM grams").exit_code == 0

@@ -1,0 +1,273 @@
+"""A folder of an object store keeps the promises of a local one, whatever the network does."""
+
+import pickle
+import socket
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import obstore
+import pytest
+
+import fleet_slip
+from fleet_slip.errors import StorageError
+from fleet_slip.grams.job import update_grams
+from fleet_slip.storage import objects
+from fleet_slip.storage.data_root import data_root
+from fleet_slip.storage.documents import DocumentFolder
+from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.table import Change, Unit, retry_conflicts
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.logs import DAY, land, log_rows, random_counts
+from tests.support.s3_server import ACCESS_KEY, SECRET_KEY, Server
+
+
+def rows(drive: str, count: int = 20) -> object:
+    return log_rows(drive, random_counts(np.random.default_rng(0), count))
+
+
+def test_what_is_put_is_read_listed_and_removed(root: Folder) -> None:
+    assert not root.exists()
+    assert (root.names(), root.files()) == ([], [])
+    folder = root / "models" / "m"
+    folder.put("versions/1.json", b"one")
+    data_root(f"{root}-2").put("other", b"not below data")
+    assert (root.names(), folder.names()) == (["models"], ["versions"])
+    assert folder.read("versions/1.json") == b"one"
+    assert folder.read("versions/1.json", longest=2) == b"on"
+    (file,) = root.files()
+    assert (file.path, file.size_bytes, file.age_hours < 1) == ("models/m/versions/1.json", 3, True)
+    folder.put("versions/1.json", b"two")
+    assert not root.remove(file)
+    (file,) = root.files()
+    assert root.remove(file)
+    assert not root.remove(file)
+    assert not root.exists()
+
+
+def test_a_file_is_known_again_where_listings_tell_its_state_otherwise(
+    root: Folder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root.put("one", b"1")
+    (file,) = root.files()
+    head = obstore.head
+
+    def as_others_do(store: Any, key: str) -> Any:
+        meta = head(store, key)
+        moment = meta["last_modified"] + timedelta(milliseconds=500)
+        return {**meta, "last_modified": moment, "e_tag": f'"{file.identity}"'}
+
+    monkeypatch.setattr(obstore, "head", as_others_do)
+    assert root.remove(file)
+
+
+def test_of_many_that_create_a_file_one_has_made_it(root: Folder) -> None:
+    with ThreadPoolExecutor(8) as executor:
+        made = list(
+            executor.map(
+                lambda n: (n % 5, root.create(f"{n % 5}.json", str(n).encode())), range(40)
+            )
+        )
+    assert Counter(name for name, won in made if won) == Counter(range(5))
+
+
+def test_no_document_is_lost_or_doubled_where_answers_are_lost(
+    root: Folder, server: Server
+) -> None:
+    folder = DocumentFolder(root / "evaluations")
+
+    def write(writer: int) -> list[int]:
+        return [folder.append({"writer": writer, "n": n}).number for n in range(8)]
+
+    with server.misbehaving(failing=0.2, slow_s=0.01), ThreadPoolExecutor(3) as executor:
+        taken = [number for numbers in executor.map(write, range(3)) for number in numbers]
+    assert sorted(taken) == folder.numbers() == list(range(1, 25))
+    found = Counter((d.content["writer"], d.content["n"]) for d in map(folder.read, taken))
+    assert found == Counter((writer, n) for writer in range(3) for n in range(8))
+
+
+def test_units_land_once_where_answers_are_lost(root: Folder, server: Server) -> None:
+    logs = Warehouse(root).logs
+
+    def bring(number: int) -> None:
+        action = logs.write_file(f"f{number}", rows(f"d{number}"), DAY)
+
+        def attempt() -> None:
+            snapshot = logs.snapshot()
+            if snapshot.landed(f"unit-{number}") is None:
+                snapshot.commit(Change(add=[action], units=[Unit(f"unit-{number}", 1)]))
+
+        retry_conflicts(attempt)
+
+    with server.misbehaving(failing=0.1), ThreadPoolExecutor(3) as executor:
+        list(executor.map(bring, [n // 2 for n in range(12)]))  # each is brought twice
+    assert logs.snapshot().rows == 6 * 20
+    with connect(root) as database:
+        found = database.execute("SELECT drive_id, count(*) FROM log GROUP BY 1").fetchall()
+    assert sorted(found) == [(f"d{n}", 20) for n in range(6)]
+
+
+def test_a_name_of_a_data_file_is_used_once(root: Folder) -> None:
+    logs = Warehouse(root).logs
+    first, second = (logs.write_file("one", rows("a"), DAY) for _ in range(2))
+    assert first.path != second.path
+    assert first.path[-40:] == second.path[-40:]  # the checksum
+    logs.snapshot().commit(Change(add=[second]))
+    (file,) = logs.snapshot().files
+    content = logs.folder.read(first.path)
+    logs.folder.put(second.path, b"damaged")
+    assert logs.restore_file(file, rows("a"))
+    assert logs.folder.read(second.path) == content
+    assert not logs.restore_file(file, rows("b"))
+
+
+def test_a_warehouse_is_sent_without_its_connections(root: Folder, tmp_path: Path) -> None:
+    for place in (root, LocalFolder(tmp_path / "data")):
+        warehouse = Warehouse(place)
+        assert not warehouse.logs.folder.exists()
+        sent = pickle.dumps((warehouse, warehouse.logs))
+        assert len(sent) < 20_000
+        assert pickle.loads(sent)[0] == warehouse  # noqa: S301
+        assert SECRET_KEY.encode() not in sent
+
+
+def test_a_locked_connection_reads_the_snapshot_and_nothing_else(root: Folder) -> None:
+    warehouse = Warehouse(root)
+    land(warehouse, "one", rows("a"))
+    update_grams(warehouse)
+    root.put("other.csv", b"a,b\n1,2\n")
+    with fleet_slip.connect(str(root)) as database:
+        assert database.execute("SELECT count(*) FROM log").fetchone() == (20,)
+        for query in (
+            f"FROM read_csv('{root}/other.csv')",
+            f"FROM glob('{root}/*')",
+            f"COPY (SELECT 1) TO '{root}/new.csv'",
+            "FROM read_csv('/etc/passwd')",
+        ):
+            with pytest.raises(duckdb.PermissionException):
+                database.execute(query).fetchall()
+    assert "new.csv" not in root.names()
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        f"s3://{ACCESS_KEY}:{SECRET_KEY}@bucket/data",
+        f"s3://bucket/data?secret={SECRET_KEY}",
+        "s3://",
+        "s3://Bucket/data",
+        "s3://bucket/../data",
+        "s3://bucket/a b",
+        "s3://bucket/a*",
+        "s3://bucket//data",
+        "http://bucket/data",
+        "file://host/data",
+    ],
+)
+def test_a_url_that_is_none_is_refused_and_not_repeated(url: str) -> None:
+    with pytest.raises(StorageError, match="is written as") as told:
+        data_root(url)
+    assert SECRET_KEY not in str(told.value)
+
+
+def test_a_file_url_is_a_folder(tmp_path: Path) -> None:
+    assert data_root(f"file://{tmp_path}/a%20b") == LocalFolder(tmp_path / "a b")
+    assert str(data_root("gs://bucket")) == "gs://bucket"
+    assert str(data_root("az://container/some/path/")) == "az://container/some/path"
+
+
+@pytest.fixture
+def silent() -> Iterator[socket.socket]:
+    """A port on which nobody listens, and that nobody else can take."""
+    with socket.socket() as bound:
+        bound.bind(("127.0.0.1", 0))
+        yield bound
+
+
+Fault = Callable[[Server, pytest.MonkeyPatch, socket.socket], None]
+
+
+def refuse_writes(server: Server, _patch: pytest.MonkeyPatch, _silent: socket.socket) -> None:
+    server.faults.refuse = ("PUT",)
+
+
+def fail_always(server: Server, _patch: pytest.MonkeyPatch, _silent: socket.socket) -> None:
+    server.faults.failing = 1.0
+
+
+def use_another_key(_server: Server, patch: pytest.MonkeyPatch, _silent: socket.socket) -> None:
+    patch.setenv("AWS_ACCESS_KEY_ID", "AKIDOFSOMEBODY")
+
+
+def use_no_encryption(_server: Server, patch: pytest.MonkeyPatch, _silent: socket.socket) -> None:
+    patch.delenv("AWS_ALLOW_HTTP")
+
+
+def close_the_port(_server: Server, patch: pytest.MonkeyPatch, silent: socket.socket) -> None:
+    patch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{silent.getsockname()[1]}")
+
+
+def never_answer(server: Server, patch: pytest.MonkeyPatch, silent: socket.socket) -> None:
+    silent.listen()
+    patch.setattr(objects, "TIMEOUT_S", 1)
+    close_the_port(server, patch, silent)
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        (refuse_writes, "the credentials do not permit this"),
+        (fail_always, "the store answers with errors"),
+        (use_another_key, "the store refuses the credentials"),
+        (use_no_encryption, "export AWS_ALLOW_HTTP=true"),
+        (close_the_port, "the store cannot be reached"),
+        (never_answer, "does not answer in time"),
+    ],
+)
+def test_a_fault_is_told_in_one_line_without_credentials(
+    root: Folder,
+    server: Server,
+    monkeypatch: pytest.MonkeyPatch,
+    silent: socket.socket,
+    fault: Fault,
+    told: str,
+) -> None:
+    monkeypatch.setattr(objects, "RETRY_S", 2)
+    logs = Warehouse(root).logs
+    action = logs.write_file("one", rows("a"), DAY)
+    with server.misbehaving():
+        objects.client.cache_clear()
+        fault(server, monkeypatch, silent)
+        attempts: tuple[Callable[[], None], ...] = (
+            lambda: root.put("runs/1", b"x"),
+            lambda: Warehouse(root).logs.snapshot().commit(Change(add=[action])),
+        )
+        for attempt in attempts:
+            with pytest.raises(StorageError, match=told) as error:
+                attempt()
+            assert "\n" not in str(error.value)
+            assert not {ACCESS_KEY, SECRET_KEY} & set(str(error.value).split())
+
+
+def test_a_bucket_that_is_not_there_is_told() -> None:
+    root = data_root("s3://no-such-bucket/data")
+    for attempt in (root.exists, root.files, Warehouse(root).logs.snapshot):
+        with pytest.raises(StorageError, match="there is no such bucket"):
+            attempt()
+
+
+def test_a_missing_object_is_told_by_a_query(root: Folder) -> None:
+    warehouse = Warehouse(root)
+    land(warehouse, "one", rows("a"))
+    (file,) = warehouse.logs.folder.files()[-1:]
+    assert warehouse.logs.folder.remove(file)
+    with pytest.raises(StorageError, match="there is no such object") as told:
+        update_grams(warehouse)
+    assert "Traceback" not in str(told.value)

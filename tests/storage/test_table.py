@@ -1,0 +1,232 @@
+"""Delta tables below a data root: whole commits or nothing, and units that land once."""
+
+import hashlib
+import threading
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import xxhash
+from deltalake import DeltaTable
+from deltalake.exceptions import DeltaError
+
+from fleet_slip.errors import ConflictError, StorageError
+from fleet_slip.storage.folder import TEMPORARY_PREFIX, checksum_in, checksum_of
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.table import Change, Unit, retry_conflicts
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.logs import DAY, land, log_rows, path_of, random_counts
+
+
+def rows(drive: str, count: int = 1000) -> object:
+    return log_rows(drive, random_counts(np.random.default_rng(0), count))
+
+
+def test_a_table_that_nobody_wrote_is_empty_and_touches_nothing(warehouse: Warehouse) -> None:
+    snapshot = warehouse.logs.snapshot()
+    assert (snapshot.version, snapshot.files, snapshot.rows) == (None, (), 0)
+    assert not warehouse.root.exists()
+
+
+def test_a_written_file_is_not_part_of_the_table_before_its_commit(warehouse: Warehouse) -> None:
+    action = warehouse.logs.write_file("one", rows("a"), DAY)
+    assert warehouse.logs.snapshot().files == ()
+    warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit("u", 7)], note={"job": "t"}))
+    snapshot = warehouse.logs.snapshot()
+    (file,) = snapshot.files
+    assert (file.rows, file.day, file.path) == (1000, DAY, action.path)
+    assert file.null_counts["ax"] == 0
+    assert (snapshot.landed("u"), snapshot.landed("other")) == (7, None)
+
+
+def test_counts_are_delta_packed_and_strings_are_dictionaries(warehouse: Warehouse) -> None:
+    action = warehouse.logs.write_file("one", rows("a"), DAY)
+    columns = pq.read_metadata(path_of(warehouse.logs.folder) / action.path).row_group(0)
+    encodings = {
+        columns.column(i).path_in_schema: columns.column(i).encodings
+        for i in range(columns.num_columns)
+    }
+    assert "DELTA_BINARY_PACKED" in encodings["ax"]
+    assert "RLE_DICTIONARY" in encodings["vehicle_id"]
+    assert "day" not in encodings
+
+
+def test_the_same_rows_make_the_same_bytes(warehouse: Warehouse) -> None:
+    action = warehouse.logs.write_file("one", rows("a"), DAY)
+    path = path_of(warehouse.logs.folder) / action.path
+    first = path.read_bytes()
+    again = warehouse.logs.write_file("one", rows("a"), DAY).path
+    assert checksum_in(again) == checksum_in(action.path)
+    assert (path_of(warehouse.logs.folder) / again).read_bytes() == first
+    assert again != action.path  # each name has one writer, who may delete it until its commit
+    assert not list(path.parent.glob(f"{TEMPORARY_PREFIX}*"))
+
+
+def test_a_file_is_named_by_its_checksum(warehouse: Warehouse) -> None:
+    action = warehouse.logs.write_file("one", rows("a"), DAY)
+    content = (path_of(warehouse.logs.folder) / action.path).read_bytes()
+    fast, checksum = xxhash.xxh3_64_hexdigest(content), hashlib.sha256(content).hexdigest()[:32]
+    assert action.path == f"day=2024-05-01/one-x{fast}-{checksum}.parquet"
+    assert checksum_in(action.path) == checksum_of(content)
+    assert checksum_in("day=2024-05-01/smoke-0000-0123456789ab.parquet") is None
+
+
+def test_a_unit_lands_once_however_many_try(warehouse: Warehouse) -> None:
+    action = warehouse.logs.write_file("one", rows("a"), DAY)
+    warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit("u", 1)]))
+    stale = [warehouse.logs.snapshot() for _ in range(6)]
+    outcomes: list[str] = []
+
+    def attempt(number: int) -> None:
+        extra = warehouse.logs.write_file(f"extra-{number}", rows(f"d{number}", 10), DAY)
+        try:
+            stale[number].commit(Change(add=[extra], units=[Unit("same", 3)]))
+        except ConflictError:
+            outcomes.append("conflict")
+        else:
+            outcomes.append("landed")
+
+    threads = [threading.Thread(target=attempt, args=(n,)) for n in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(outcomes) == ["conflict"] * 5 + ["landed"]
+    assert len(warehouse.logs.snapshot().files) == 2
+
+
+def test_a_unit_lands_once_in_a_table_that_was_not_there_a_moment_ago(
+    warehouse: Warehouse,
+) -> None:
+    action = warehouse.logs.write_file("one", rows("a"), DAY)
+    change = Change(add=[action], units=[Unit("u", 1)])
+    before, also_before = (warehouse.logs.snapshot() for _ in range(2))
+    before.commit(change)
+    with pytest.raises(ConflictError, match="Run the same command again"):
+        also_before.commit(change)
+    assert warehouse.logs.snapshot().rows == 1000
+
+
+def test_different_units_land_side_by_side(warehouse: Warehouse) -> None:
+    snapshots = [warehouse.logs.snapshot() for _ in range(4)]
+    for number, snapshot in enumerate(snapshots):
+        action = warehouse.logs.write_file(f"f{number}", rows(f"d{number}", 10), DAY)
+        snapshot.commit(Change(add=[action], units=[Unit(f"unit-{number}", 1)]))
+    assert warehouse.logs.snapshot().rows == 40
+
+
+def test_of_many_units_the_log_says_at_once_what_it_says_of_each(warehouse: Warehouse) -> None:
+    for number in range(4):
+        action = warehouse.logs.write_file(f"f{number}", rows(f"d{number}", 10), DAY)
+        units = [Unit(f"unit-{number}-{i}", 1) for i in range(3)]
+        warehouse.logs.snapshot().commit(Change(add=[action], units=units))
+        if number == 1:
+            DeltaTable(str(path_of(warehouse.logs.folder))).create_checkpoint()
+    names = [f"unit-{number}-{i}" for number in range(5) for i in range(4)]
+    commits = sorted((path_of(warehouse.root) / "logs/_delta_log").glob("*.json"))
+    commits[1].unlink()  # what the checkpoint sums up, Delta removes in time
+    earlier, now = warehouse.logs.snapshot(3), warehouse.logs.snapshot()
+    for snapshot, number in ((earlier, 9), (now, 12)):
+        landed = snapshot.landed_among(len(names))
+        assert [landed(n) for n in names] == [snapshot.landed(n) is not None for n in names]
+        assert sum(map(landed, names)) == number
+    assert not any(map(warehouse.quarantine.snapshot().landed_among(99), names))
+
+
+def test_a_snapshot_does_not_see_later_commits(warehouse: Warehouse) -> None:
+    first = warehouse.logs.write_file("one", rows("a"), DAY)
+    warehouse.logs.snapshot().commit(Change(add=[first], units=[Unit("1", 1)]))
+    before = warehouse.logs.snapshot()
+    second = warehouse.logs.write_file("two", rows("b"), DAY)
+    warehouse.logs.snapshot().commit(Change(add=[second], units=[Unit("2", 1)]))
+    assert (before.rows, warehouse.logs.snapshot().rows) == (1000, 2000)
+
+
+def test_a_root_that_is_a_file_is_told_with_a_next_step(tmp_path: Path) -> None:
+    (tmp_path / "data").write_text("not a folder")
+    with pytest.raises(
+        StorageError, match=r"Choose another data root|not a directory|Not a directory"
+    ):
+        Warehouse(LocalFolder(tmp_path / "data")).logs.write_file("one", rows("a"), DAY)
+
+
+def test_a_conflict_is_retried_and_the_last_one_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    waits: list[float] = []
+    monkeypatch.setattr("fleet_slip.storage.table.time.sleep", waits.append)
+    outcomes = [ConflictError("once"), ConflictError("twice"), "done"]
+
+    def attempt() -> object:
+        outcome = outcomes.pop(0) if outcomes else ConflictError("always")
+        if isinstance(outcome, ConflictError):
+            raise outcome
+        return outcome
+
+    assert retry_conflicts(attempt) == "done"
+    assert len(waits) == 2
+    waits.clear()
+    monkeypatch.setattr("fleet_slip.storage.table.random.uniform", lambda _, longest: longest)
+    with pytest.raises(ConflictError, match="always"):
+        retry_conflicts(attempt)
+    doubled = [0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 2.56]
+    assert waits == pytest.approx([*doubled, 5, 5, 5])
+
+
+def test_a_removal_conflicts_with_a_removal_of_the_same_file(warehouse: Warehouse) -> None:
+    for name in "ab":
+        action = warehouse.logs.write_file(name, rows(name, 10), DAY)
+        warehouse.logs.snapshot().commit(Change(add=[action]))
+    one, two = warehouse.logs.snapshot(), warehouse.logs.snapshot()
+    one.commit(Change(remove=one.files[:1]))
+    with pytest.raises(ConflictError, match="Run the same command again"):
+        two.commit(Change(remove=two.files[:1]))
+    assert len(warehouse.logs.snapshot().files) == 1
+
+
+def test_what_a_commit_adds_and_removes_stays(warehouse: Warehouse) -> None:
+    action = warehouse.logs.write_file("one", rows("a", 10), DAY)
+    warehouse.logs.snapshot().commit(Change(add=[action]))
+    snapshot = warehouse.logs.snapshot()
+    snapshot.commit(Change(add=[action], remove=snapshot.files))
+    assert [file.path for file in warehouse.logs.snapshot().files] == [action.path]
+
+
+@pytest.mark.parametrize(
+    ("number", "told"), [(28, "the disk is full"), (30, "read-only"), (13, "permission denied")]
+)
+def test_a_fault_during_a_commit_is_told_as_what_it_is(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, number: int, told: str
+) -> None:
+    action = warehouse.logs.write_file("one", rows("a", 10), DAY)
+    warehouse.logs.snapshot().commit(Change(add=[action]))
+
+    def fail(*_arguments: object, **_options: object) -> None:
+        raise OSError(f"Generic LocalFileSystem error\n Unable to copy (os error {number})")
+
+    snapshot = warehouse.logs.snapshot()
+    monkeypatch.setattr("deltalake.DeltaTable.create_write_transaction", fail)
+    with pytest.raises(StorageError, match=told):
+        snapshot.commit(Change(add=[action]))
+
+
+def test_a_damaged_log_is_told(warehouse: Warehouse) -> None:
+    action = warehouse.logs.write_file("one", rows("a"), DAY)
+    warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit("u", 1)]))
+    for entry in (path_of(warehouse.root) / "logs/_delta_log").glob("*.json"):
+        entry.write_text("{ damaged")
+    with pytest.raises(StorageError, match="the Delta log cannot be used"):
+        warehouse.logs.snapshot()
+
+
+def test_what_the_delta_library_cannot_tell_of_a_unit_is_a_storage_error(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    land(warehouse, "one", log_rows("d", random_counts(np.random.default_rng(1), 20)))
+    snapshot = warehouse.logs.snapshot()
+
+    def fail(_table: object, _unit: str) -> None:
+        raise DeltaError("Generic error: a commit is damaged")
+
+    monkeypatch.setattr(DeltaTable, "transaction_version", fail)
+    with pytest.raises(StorageError, match="a commit is damaged"):
+        snapshot.landed("test/one")

@@ -1,0 +1,150 @@
+"""Objects that come slowly, not as they are stored, or under names that are no paths."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import obstore
+import pytest
+from botocore.session import Session
+
+from fleet_slip.errors import InputError, StorageError
+from fleet_slip.ingest import log_files
+from fleet_slip.ingest.log_files import copy_object, find_below, find_object
+from fleet_slip.storage import objects
+from fleet_slip.storage import objects as object_files
+from fleet_slip.storage.objects import ObjectFolder, client
+from tests.ingest.test_folders import MAPPING, write_log
+from tests.support.commands import run_on
+from tests.support.s3_server import ACCESS_KEY, SECRET_KEY, Server, forget_clients
+
+CONTENT = bytes(range(256)) * 1200
+
+
+@pytest.fixture
+def bucket(server: Server) -> str:
+    return server.bucket()
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that gives a request a second, and asks for little at once."""
+    monkeypatch.setattr(objects, "TIMEOUT_S", 1)
+    monkeypatch.setattr(objects, "RETRIES", 0)
+    monkeypatch.setattr(object_files, "FIRST_BYTES", 2**16)
+    monkeypatch.setattr(object_files, "LEAST_BYTES", 2**12)
+    forget_clients()
+
+
+def amazon(server: Server) -> Any:
+    address = server.environment["AWS_ENDPOINT_URL"]
+    keys = {"aws_access_key_id": ACCESS_KEY, "aws_secret_access_key": SECRET_KEY}
+    return Session().create_client("s3", "us-east-1", endpoint_url=address, **keys)
+
+
+@pytest.mark.parametrize("bytes_per_s", [200_000, 60_000])
+def test_an_object_that_takes_longer_than_a_request_may_is_read_in_parts(
+    bytes_per_s: int, bucket: str, server: Server, hasty: None, tmp_path: Path
+) -> None:
+    content = CONTENT[: 2 * bytes_per_s]
+    obstore.put(client(bucket), "a/log.csv", content)
+    found = find_object(f"{bucket}/a/log.csv")
+    assert found is not None
+    with server.misbehaving(bytes_per_s=bytes_per_s) as faults:
+        copy_object(found, tmp_path / "log.csv")
+        assert ObjectFolder(bucket, "a").read("log.csv") == content
+    assert (tmp_path / "log.csv").read_bytes() == content
+    assert len([one for one in faults.seen if "log.csv" in one]) > 4
+
+
+def test_a_store_that_brings_nothing_is_given_up(
+    bucket: str, server: Server, hasty: None, tmp_path: Path
+) -> None:
+    obstore.put(client(bucket), "log.csv", CONTENT)
+    found = find_object(f"{bucket}/log.csv")
+    assert found is not None
+    with (
+        server.misbehaving(bytes_per_s=2000),
+        pytest.raises(StorageError, match="does not answer in time"),
+    ):
+        copy_object(found, tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+def test_a_flipped_bit_on_the_way_is_seen_and_fetched_again(
+    parts: int, bucket: str, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if parts == 1:
+        obstore.put(client(bucket), "log.csv", CONTENT)
+        content = CONTENT
+    else:
+        content = CONTENT * 40
+        store = client(bucket)
+        obstore.put(store, "log.csv", content, use_multipart=True, chunk_size=5 * 2**20)
+    found = find_object(f"{bucket}/log.csv")
+    assert found is not None
+    assert found.identity.endswith(f"-{parts}" if parts > 1 else hashlib.md5(content).hexdigest())  # noqa: S324
+    with server.misbehaving(flipping="log.csv"), pytest.raises(InputError, match="arrived 3 times"):
+        copy_object(found, tmp_path / "log.csv")
+    copy_once, attempts = log_files._copy_once, list[str]()
+
+    def flipped_first(*given: Any) -> str:
+        with server.misbehaving(flipping="(?!)" if attempts else "log.csv"):
+            attempts.append(copy_once(*given))
+        return attempts[-1]
+
+    monkeypatch.setattr(log_files, "_copy_once", flipped_first)
+    copy_object(found, tmp_path / "log.csv")
+    assert (tmp_path / "log.csv").read_bytes() == content
+    assert len(attempts) == 2
+
+
+def test_a_tag_that_is_no_checksum_costs_a_second_transfer(
+    bucket: str, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    obstore.put(client(bucket), "log.csv", CONTENT)
+    found = ObjectFolder.found
+    monkeypatch.setattr(
+        ObjectFolder,
+        "found",
+        lambda self, meta: found(self, {**meta, "e_tag": '"00112233445566778899aabbccddeeff"'}),
+    )
+    (one,) = find_below(f"{bucket}/")
+    with server.misbehaving() as faults:
+        copy_object(one, tmp_path / "log.csv")
+    assert len([get for get in faults.seen if "log.csv" in get]) == 2
+    assert (tmp_path / "log.csv").read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("day/..", "day/../x.csv", "day//x.csv", "day/./x.csv"),
+        *("day/a\tb.csv", "day/a\x1bb.csv", "day/a\rb.csv", f"day/{'x' * 256}.csv"),
+    ],
+)
+def test_a_name_that_is_no_path_holds_up_no_other(
+    name: str, bucket: str, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "car.toml").write_text(MAPPING.format(day="2024-05-31"))
+    for number in range(2):
+        write_log(tmp_path / f"{number}.csv", 20 + number)
+        obstore.put(client(bucket), f"day/{number}.csv", (tmp_path / f"{number}.csv").read_bytes())
+    amazon(server).put_object(Bucket=bucket[5:], Key=name, Body=b"x")
+    arguments = ("ingest", f"{bucket}/day", "--mapping", str(tmp_path / "car.toml"))
+    done = run_on(tmp_path / "root", *arguments)
+    refused = name.endswith(".csv")
+    assert done.exit_code == (4 if refused else 0), done.stderr
+    assert ("no file may have this name" in done.stderr) is refused
+    asked = run_on(tmp_path / "root", "sql", "--csv", "SELECT count(*) AS n FROM drives")
+    assert asked.stdout.split() == ['"n"', "2"]
+
+
+def test_an_object_that_is_gone_is_a_fault_of_its_own(bucket: str, tmp_path: Path) -> None:
+    obstore.put(client(bucket), "log.csv", CONTENT)
+    found = find_object(f"{bucket}/log.csv")
+    assert found is not None
+    obstore.delete(client(bucket), "log.csv")
+    with pytest.raises(InputError, match="no such object"):
+        copy_object(found, tmp_path / "log.csv")
