@@ -11,7 +11,7 @@ try:
     import llvmlite
     import numba
 except ModuleNotFoundError:  # of an extra: what is compiled says so when it is called
-    numba = None
+    numba = None  # type: ignore[assignment]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
