@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -103,7 +104,7 @@ class LogsAndGrams(Rooted):
         from fleet_slip.ingest.load import KnownFiles
         from fleet_slip.ingest.log_files import find_logs, find_whole_logs, names_several
         from fleet_slip.ingest.mapping import as_list
-        from fleet_slip.operations.rewriting import TakingOut
+        from fleet_slip.operations.rewriting import take_out
 
         plans = as_list(mapping)
         given = [files] if isinstance(files, Path | str) else list(files)
@@ -121,7 +122,7 @@ class LogsAndGrams(Rooted):
             shares, unclaimed = plans.share_out(paths, given)
             by_file = folders and not as_one
             threads = executor if by_file else elsewhere
-            taking_out = TakingOut(self.warehouse)
+            out = partial(take_out, self.warehouse)
             logs = [log for _, share in shares for log in share]
             read = no_progress if by_file or progress is None else _bytes_of(logs, told)
             for plan, share in shares:
@@ -133,7 +134,7 @@ class LogsAndGrams(Rooted):
                     told(landed, len(logs))
                 try:
                     for report in ingest_files(
-                        warehouse, wanted, plan, threads, known, read, replace, taking_out, failures
+                        warehouse, wanted, plan, threads, known, read, replace, out, failures
                     ):
                         reports[report.file] = report
                         figures.rows += report.counts.ticks if report.new else 0
@@ -143,7 +144,7 @@ class LogsAndGrams(Rooted):
                             told(1, len(logs))
                 finally:
                     if known is not None:
-                        known.save(warehouse)
+                        known.save()
             if failures or unclaimed:
                 raise joined(failures, unclaimed)
         return [reports[str(path)] for path in paths if str(path) in reports]

@@ -14,10 +14,10 @@ from fleet_slip.ingest.load import (
     FileOutcome,
     KnownFiles,
     Replace,
-    Superseding,
+    TakeOut,
     WrittenBatch,
     are_gone,
-    land_batch,
+    commit_batch,
     unit_of,
     write_batch,
 )
@@ -81,7 +81,7 @@ def ingest_files(
     known: KnownFiles | None = None,
     progress: Progress = no_progress,
     replace: Replace = "no",
-    superseding: Superseding | None = None,
+    take_out: TakeOut | None = None,
     failures: list[InputError] | None = None,
 ) -> Iterator[IngestReport]:
     """Ingest files, and yield a report of each as it is committed; small files land together.
@@ -89,7 +89,7 @@ def ingest_files(
     With an executor batches are read and written by its workers, in any order; threads of this
     process take those of small files only, since a large one keeps all cores and much of the
     memory busy by itself. `known` remembers what landed. A recording that is there is refused,
-    unless it is to be replaced: then `superseding` takes it out in the same commit.
+    unless it is to be replaced: then `take_out` takes it out in the same commit.
     `progress` counts bytes of each file as it is read, but for those that an executor's workers
     read.
 
@@ -106,7 +106,7 @@ def ingest_files(
     for batch, written in _written(executor, write, _batches(asked)):
         # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
         note = {"job": "ingest", "mapping": mapping.name, "digest": written.digest}
-        landed, new = land_batch(warehouse, written, partial(write, batch), note, superseding)
+        landed, new = commit_batch(warehouse, written, partial(write, batch), note, take_out)
         failed += landed.failures
         for outcome in landed.outcomes:
             yield _report(warehouse, outcome, new)
@@ -174,7 +174,7 @@ def _report(warehouse: Warehouse, outcome: FileOutcome, new: frozenset[str]) -> 
         look_alikes,
         outcome.left_out,
         suspicions,
-        outcome.found.drives if is_new else 0,
+        outcome.drives_replaced if is_new else 0,
     )
 
 

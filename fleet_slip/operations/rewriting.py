@@ -22,7 +22,7 @@ from fleet_slip.errors import ConflictError, FleetSlipError
 from fleet_slip.grams.gram_files import read_rows, write_rows
 from fleet_slip.grams.gram_rows import is_received
 from fleet_slip.grams.job import land_ahead, reconcile
-from fleet_slip.ingest.load import MEASURED, WITHDRAWALS, KnownMarks, Origin, TableName, is_from
+from fleet_slip.ingest.load import MEASURED, Fingerprints, Origin, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of
 from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, Unit, retry_conflicts
 from fleet_slip.warehouse.forgotten import Forgettable
@@ -195,37 +195,33 @@ def forget_received(warehouse: Warehouse, subject: Forgettable) -> int:
 # They may come again: their files' units are withdrawn. Their Gram rows go with the files.
 
 
-@dataclass(frozen=True)
-class TakingOut:
-    """Takes the drives of some origins out of the tables of a data root."""
+def take_out(
+    warehouse: Warehouse, name: TableName, snapshot: Snapshot, origins: Collection[Origin]
+) -> Change:
+    """Return the change that takes the drives, or the refused rows, of some origins out."""
+    if name == "quarantine":
+        return _without_refused(snapshot, origins)
+    drives = drives_in(warehouse, snapshot)
+    gone = {p: {one for one in there if is_from(one, origins)} for p, there in drives.items()}
+    left = {Origin.of_drive(one) for p, there in drives.items() for one in there - gone[p]}
+    files = {one.file for one in origins} - {one.file for one in left if one}
+    units = Fingerprints(snapshot.units).withdraw(origins, files)
+    concerned = [file for file in snapshot.files if gone.get(file.path)]
+    if concerned:
+        units += rewriting_units(snapshot, concerned)
+    kept = [Rewriting("kept", [file], gone[file.path]) for file in concerned]
+    return Change(write_again(warehouse, snapshot, kept), concerned, units)
 
-    warehouse: Warehouse
 
-    def without(self, name: TableName, snapshot: Snapshot, origins: Collection[Origin]) -> Change:
-        """Return the change that takes the drives, or refused rows, of origins out."""
-        if name == "quarantine":
-            return self._without_refused(snapshot, origins)
-        drives = drives_in(self.warehouse, snapshot)
-        gone = {p: {one for one in there if is_from(one, origins)} for p, there in drives.items()}
-        left = {Origin.of_drive(one) for p, there in drives.items() for one in there - gone[p]}
-        files = {one.file for one in origins} - {one.file for one in left if one}
-        units = KnownMarks(snapshot.units).withdraw(origins, files)
-        concerned = [file for file in snapshot.files if gone.get(file.path)]
-        if concerned:
-            units += rewriting_units(snapshot, concerned)
-            units.append(Unit(WITHDRAWALS, (snapshot.version or 0) + 1))
-        kept = [Rewriting("kept", [file], gone[file.path]) for file in concerned]
-        return Change(write_again(self.warehouse, snapshot, kept), concerned, units)
+def _without_refused(snapshot: Snapshot, origins: Collection[Origin]) -> Change:
+    def mine(rows: pa.Table) -> pa.ChunkedArray:
+        names = rows["drive_id"].cast(pa.string())
+        some = [n for n in names.unique().drop_null().to_pylist() if is_from(n, origins)]
+        return pc.fill_null(pc.is_in(names, pa.array(some, pa.string())), False)
 
-    def _without_refused(self, snapshot: Snapshot, origins: Collection[Origin]) -> Change:
-        def mine(rows: pa.Table) -> pa.ChunkedArray:
-            names = rows["drive_id"].cast(pa.string())
-            some = [n for n in names.unique().drop_null().to_pylist() if is_from(n, origins)]
-            return pc.fill_null(pc.is_in(names, pa.array(some, pa.string())), False)
-
-        add, remove = write_without(snapshot, mine)
-        files = {one for one in origins if one == one.file}
-        return Change(add, remove, KnownMarks(snapshot.units).withdraw((), files))
+    add, remove = write_without(snapshot, mine)
+    files = {one for one in origins if one == one.file}
+    return Change(add, remove, Fingerprints(snapshot.units).withdraw((), files))
 
 
 def drives_in(warehouse: Warehouse, logs: Snapshot) -> dict[str, set[str]]:
@@ -249,7 +245,6 @@ def take_back(warehouse: Warehouse, what: str) -> int:
     `what` names either, or begins the names of a file's drives. All of it goes that is there at the
     commit, whoever replaces it meanwhile.
     """
-    taking_out = TakingOut(warehouse)
 
     def attempt() -> int:
         logs = warehouse.logs.snapshot()
@@ -260,7 +255,7 @@ def take_back(warehouse: Warehouse, what: str) -> int:
         refused = warehouse.quarantine.snapshot()
         changes: dict[TableName, Snapshot] = {"quarantine": refused, "logs": logs}
         for name, snapshot in changes.items() if drives else ():
-            gone = taking_out.without(name, snapshot, origins)
+            gone = take_out(warehouse, name, snapshot, origins)
             if gone.remove or gone.units:
                 change = Change(gone.add, gone.remove, gone.units, {"job": "undo"})
                 snapshot.commit_or_discard(change)

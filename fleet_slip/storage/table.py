@@ -1,7 +1,6 @@
 """A Delta table of a data root: its files, and what it takes to open and make it."""
 
 import functools
-import hashlib
 import json
 import math
 import random
@@ -475,16 +474,6 @@ class Snapshot:
             return {}
         with storage_errors(self.table.folder):
             return read_landed_units(self.table.folder, self.version)
-
-    def moment(self, version: int) -> str | None:
-        """Return the digest of a version's commit, which also stands for all before it, or None."""
-        if self.version is None or version > self.version:
-            return None
-        try:
-            content = (self.table.folder / "_delta_log").read(f"{version:020}.json")
-        except StorageError:
-            return None
-        return hashlib.sha256(content).hexdigest()
 
     def commit_or_discard(self, change: Change) -> None:
         """Apply a change like `commit`; after a conflict delete the files that it was to add."""

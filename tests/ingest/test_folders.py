@@ -114,18 +114,6 @@ def test_a_cache_of_what_is_not_in_the_warehouse_is_not_believed(folder: Path) -
     assert [report["new"] for report in ingest(folder)] == [True] * 5
 
 
-def test_what_has_landed_is_not_asked_for_again(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ingest(folder)
-
-    def landed(*_: Any) -> None:
-        raise AssertionError("asked")
-
-    monkeypatch.setattr(Snapshot, "landed", landed)
-    assert ingest(folder) == []
-
-
 def test_a_root_that_was_restored_from_a_backup_is_asked_for_all(folder: Path) -> None:
     new = folder / "day 2" / "new.csv"
     ingest(folder)
@@ -146,13 +134,6 @@ def test_a_cache_that_is_none_costs_time_and_no_more(folder: Path, content: str)
     (cache,) = (folder.parent / "cache").rglob("*.json")
     cache.write_text(content)
     assert not any(report["new"] for report in ingest(folder))
-
-
-def test_the_cache_of_an_earlier_version_is_read(folder: Path) -> None:
-    ingest(folder)
-    (cache,) = (folder.parent / "cache").rglob("*.json")
-    cache.write_text(json.dumps(json.loads(cache.read_text())["files"]))
-    assert ingest(folder) == []
 
 
 def test_a_file_of_another_time_and_the_same_content_is_not_new(folder: Path) -> None:

@@ -137,13 +137,13 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
     ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
     (file,) = warehouse.logs.snapshot().files
     (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
-    land = load.land_batch
+    land = load.commit_batch
 
     def overtaken(*written: Any) -> Any:
         forget(warehouse, Forgettable("drive", name), now=True)
         return land(*written)
 
-    monkeypatch.setattr(job, "land_batch", overtaken)
+    monkeypatch.setattr(job, "commit_batch", overtaken)
     again, other = write(tmp_path, recording()), a_mapping(name="other")
     (report,) = job.ingest_files(warehouse, [again], other, replace="all")
     assert report.drives_forgotten == 1
