@@ -39,6 +39,7 @@ from fleet_slip.ingest.profile import FileProfile
 from fleet_slip.ingest.suspicion import WHEELS, Suspicion, find_suspicions
 from fleet_slip.ingest.vocabulary import parts_of
 
+_MOST_REFUSED = 20
 _STAND_IN: dict[str, Any] = {"vehicle_id": "car", "vehicle_model": "car", "day": date(2000, 1, 1)}
 
 
@@ -71,7 +72,7 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
         names = ", ".join(repr(p.channel.name) for p in profile.profiles[:30])
         raise InputError(
             f"{shown(file)}: none of its channels looks like a signal: {names}. Write the mapping "
-            "by hand: docs/mapping.md."
+            f"by hand: docs/mapping.md. {' '.join(_refused(profile))}".rstrip()
         )
     drive_keys, group = guess_cars(profile.profiles)
     bases = [guess.profile.channel.base for guess in guesses.values()]
@@ -98,7 +99,13 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     sure = {name: guess for name, guess in guesses.items() if name not in asked_for}
     left = {name: guess for name, guess in guesses.items() if name in asked_for}
     asked = () if COURSE in guesses else _ask_of_headings(profile, guesses)
-    notes = (*failures, *map(str, suspicions), *asked, *_notes(profile, guesses))
+    notes = (
+        *failures,
+        *map(str, suspicions),
+        *asked,
+        *_notes(profile, guesses),
+        *_refused(profile),
+    )
     return Draft(file, profile, time, sure, left, drive_keys, notes)
 
 
@@ -176,6 +183,15 @@ def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
             "sideslip: where is its sensor? If not at the centre of gravity: [label] sensor_x_m = "
             "... before it, sensor_y_m = ... to its left."
         )
+
+
+def _refused(profile: FileProfile) -> Iterator[str]:
+    """Yield what could not be read, and why."""
+    more = len(profile.refused) - _MOST_REFUSED
+    for reason in profile.refused[:_MOST_REFUSED]:
+        yield f"not read: {reason}"
+    if more > 0:
+        yield f"not read: {more:,} channels more."
 
 
 def _ask_of_headings(profile: FileProfile, guesses: dict[str, Guess]) -> tuple[str, ...]:

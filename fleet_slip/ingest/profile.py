@@ -236,6 +236,8 @@ class FileProfile:
     profiles: tuple[Profile, ...]
     absent: Absent = field(default_factory=Absent)
     """What means that there is no value."""
+    refused: tuple[str, ...] = ()
+    """What is wrong with channels that cannot be read."""
 
 
 def profile_file(file: Path, formats: FileFormats) -> FileProfile:
@@ -251,20 +253,27 @@ def profile_file(file: Path, formats: FileFormats) -> FileProfile:
         for channel in source.channels():
             told = replace(channel, unit=channel.unit or units.get(channel.name, ""))
             bases[channel.base].append(told)
-        found = tuple(p for of in bases.values() for p in _profile_base(source, of, formats.csv))
+        refused: list[str] = []
+        found = tuple(
+            p for of in bases.values() for p in _profile_base(source, of, formats.csv, refused)
+        )
         absent = find_absent([(p.channel.name, p.values, p.texts) for p in found if p.is_number])
         cleaned = (replace(p, values=without_absent(p.values, absent)) for p in found)
-        return FileProfile(source.has_clock, formats, tuple(cleaned), absent)
+        reasons = tuple(dict.fromkeys(refused))
+        return FileProfile(source.has_clock, formats, tuple(cleaned), absent, reasons)
 
 
-def _profile_base(source: Source, channels: list[Channel], csv: CsvFormat) -> Iterator[Profile]:
-    """Yield what can be read of one time base; a channel that cannot is passed over."""
+def _profile_base(
+    source: Source, channels: list[Channel], csv: CsvFormat, refused: list[str]
+) -> Iterator[Profile]:
+    """Yield what can be read of one time base; of a channel that cannot, note why."""
     try:
         table = _first_rows(source, channels)
-    except InputError:
-        if len(channels) > 1:
-            for channel in channels:
-                yield from _profile_base(source, [channel], csv)
+    except InputError as error:
+        for channel in channels if len(channels) > 1 else ():
+            yield from _profile_base(source, [channel], csv, refused)
+        if len(channels) == 1:
+            refused.append(str(error))
         return
     rate_hz = sample_rate_hz(table[OWN_TIME].to_numpy()) if OWN_TIME in table.columns else None
     for channel in channels:

@@ -3,6 +3,7 @@
 import inspect
 import re
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -154,14 +155,16 @@ def test_times_are_not_computed_by_a_formula(
 def test_no_command_runs_a_formula_where_sympy_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("sympy")
+    assert find_spec("sympy")
     monkeypatch.chdir(tmp_path)
     file = write_mdf(tmp_path, {"formula": EVIL})
     mapping = tmp_path / "mapping.toml"
     mapping.write_text(MAPPING)
     done = run_on(tmp_path / "root", "ingest", file, "--mapping", mapping)
     assert "__import__" in done.stderr, done
-    run([COMMAND, "mapping", "suggest", file])
+    told = run([COMMAND, "mapping", "suggest", file])
+    assert "not read: " in told.stdout + told.stderr
+    assert "channel 'ax': its formula" in " ".join((told.stdout + told.stderr).split())
     assert not list(tmp_path.rglob("pwned"))
 
 

@@ -286,14 +286,15 @@ def test_bus_logging_says_what_is_not_in_it(tmp_path: Path) -> None:
 def arxml(folder: Path) -> str:
     """Messages as canmatrix writes them, with the encodings that cantools asks for.
 
-    It writes factors as 0, so that the counts are what they are.
+    It rounds factors to tenths.
     """
-    counts = DBC.partition("BO_ 2566844672")[0].replace("(0.001,0)", "(1,0)")
-    counts = counts.replace("(0.01,0)", "(1,0)").replace("BU_: ECU", "BU_: A ECU")
-    (folder / "plain.dbc").write_text(counts.replace("Motion: 8 ECU", "Motion: 8 A"))
+    plain = DBC.partition("BO_ 2566844672")[0].replace("BU_: ECU", "BU_: A ECU")
+    (folder / "plain.dbc").write_text(plain.replace("Motion: 8 ECU", "Motion: 8 A"))
     matrix = canmatrix.formats.loadp_flat(str(folder / "plain.dbc"))
     canmatrix.formats.dumpp({"": matrix}, str(folder / "plain.arxml"))
     text = (folder / "plain.arxml").read_text()
+    for factor in ("0.001", "0.01"):
+        text = re.sub(r"(<V>0.0</V>\s*<V>)0.0<", rf"\g<1>{factor}<", text, count=1)
     for kind, encoding in (("sint", "2C"), ("uint", "NONE")):
         size = rf"(<SHORT-NAME>{kind}\d+<.*?)(</SW-BASE-TYPE>)"
         coded = rf"\1<BASE-TYPE-ENCODING>{encoding}</BASE-TYPE-ENCODING>\2"
@@ -301,13 +302,33 @@ def arxml(folder: Path) -> str:
     return text
 
 
+IN_ARXML = MAPPING.replace("car.dbc", "car.arxml").replace("Motion.", "FRAME_Motion.")
+
+
 def test_an_arxml_database_says_the_same(tmp_path: Path) -> None:
     file = write_trace(tmp_path, [motion(i) for i in range(50)])
-    text = MAPPING.replace("car.dbc", "car.arxml").replace("Motion.", "FRAME_Motion.")
-    text = text.replace('"m/s^2"', '"mm/s^2"').replace('"deg"', '"deg", gain = 0.01')
-    log = read(file, text, arxml(tmp_path), "car.arxml")
+    log = read(file, IN_ARXML, arxml(tmp_path), "car.arxml")
     assert log.drives["ax"].to_pylist() == AX_COUNTS
     assert log.drives["sideslip"].to_pylist() == BETA_COUNTS
+
+
+@pytest.mark.parametrize(
+    ("written", "instead"),
+    [
+        (">SCALE_LINEAR<", ">RAT_FUNC<"),
+        (">SCALE_LINEAR<", ">IDENTICAL<"),
+        ("(<COMPU-SCALE>.*?</COMPU-SCALE>)", r"\1\1"),
+        ("COMPU-INTERNAL-TO-PHYS", "COMPU-PHYS-TO-INTERNAL"),
+        ("COMPU-RATIONAL-COEFFS", "COMPU-RATIONAL"),
+        ("<V>0.001</V>", "<V>0</V>"),
+    ],
+)
+def test_what_cantools_does_not_apply_is_refused(
+    tmp_path: Path, written: str, instead: str
+) -> None:
+    text = re.sub(written, instead, arxml(tmp_path), flags=re.DOTALL)
+    told = failure(write_trace(tmp_path, [motion(0)]), IN_ARXML, text, "car.arxml")
+    assert "car.arxml: the conversion of 'FRAME_Motion.ax' is not applied" in told
 
 
 @given(

@@ -109,17 +109,26 @@ def test_json_has_the_times_at_which_it_was_published(tmp_path: Path) -> None:
     assert read_measured(tmp_path / "log.mcap", plain).drives["ax"].to_pylist() == AX_COUNTS
 
 
-def write_json(file: Path, messages: list[Any]) -> Path:
+def write_json(
+    file: Path, messages: list[Any], encodings: tuple[str, str] = ("json", "json")
+) -> Path:
     with file.open("wb") as stream:
         writer = PlainWriter(stream)
         writer.start()
         schema = writer.register_schema("imu", "jsonschema", b"{}")
-        channels = [writer.register_channel("imu", "json", schema) for _ in range(2)]
+        channels = [writer.register_channel("imu", one, schema) for one in encodings]
         for i, message in enumerate(messages):
             now = START_NS + i * 10**7
             writer.add_message(channels[i % 2], now, json.dumps(message).encode(), now)
         writer.finish()  # type: ignore[no-untyped-call]
     return file
+
+
+def test_a_topic_of_which_a_part_cannot_be_decoded_is_refused(tmp_path: Path) -> None:
+    file = write_json(tmp_path / "log.mcap", [{"a": 1.0}] * 4, ("json", "protobuf"))
+    with mcap_log.open_mcap(Budget.of(file)) as source, pytest.raises(InputError) as caught:
+        list(source.batches(["imu.a"]))
+    assert "topic 'imu' has a channel that nothing decodes ('protobuf')" in str(caught.value)
 
 
 @pytest.mark.parametrize("piece", [3, 10**6])

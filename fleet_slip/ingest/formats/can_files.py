@@ -5,6 +5,7 @@ passed over. A value that the database gives a name, such as `SNA`, is no number
 a signal that has no other values the name itself.
 """
 
+import math
 import os
 import re
 import struct
@@ -307,6 +308,11 @@ class CanSource(ClockSource):
             if signal not in found:
                 known = [f"{m}.{s.name}" for m, of in self._messages.items() for s in of.signals]
                 raise InputError(f"{shown(self._bus.database)}: {describe_missing(column, known)}")
+            if not math.isfinite(found[signal].scale) or not found[signal].scale:
+                raise InputError(
+                    f"{shown(self._bus.database)}: the conversion of {column!r} is not applied: it "
+                    "is not one line (factor and offset). Write it so, or map another signal."
+                )
             wanted[name][column] = found[signal]
         self._want({_key(self._messages[name]) for name in wanted})
         return [

@@ -487,9 +487,13 @@ class McapSource(ClockSource):
                 self._write(topic, pl.DataFrame(dict(columns)))
                 return rows
         for number, data, published_ns in block.one_by_one():
-            decode = channels[number][1]
+            channel, decode = channels[number]
             if decode is None:
-                continue
+                raise InputError(
+                    f"{shown(self._file)}: topic {topic!r} has a channel that nothing decodes "
+                    f"({channel.message_encoding!r}) beside one that is read. Record it in one "
+                    "encoding, or map another topic."
+                )
             message = decode(data)
             rows.times_s.append(stamp_s(message, published_ns))
             rows.values.append([field_of(message, name) for name in rows.fields.values()])
