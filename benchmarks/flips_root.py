@@ -16,7 +16,6 @@ import pyarrow.parquet as pq
 
 from benchmarks.flips_commands import Ended, command, in_a_child
 from fleet_slip.config import CONFIG_VARIABLE, find_config, folder
-from fleet_slip.storage.commits import keep_checksums
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
@@ -29,7 +28,6 @@ KINDS = {
     "commits": "*/_delta_log/*.json",
     "checkpoints": "*/_delta_log/*.checkpoint.parquet",
     "last checkpoint": "*/_delta_log/_last_checkpoint",
-    "checksums of checkpoints": "*/_checkpoints/*.json",
     "manifests": "models/*/versions/*.json",
     "trained drives": "models/*/versions/*.bin",
     "histories": "models/*/history/*.json",
@@ -149,7 +147,6 @@ def _add_what_is_rare(root: Path) -> None:
         delta = table.open_delta()
         assert delta is not None
         delta.create_checkpoint()
-        keep_checksums(table.folder)
 
 
 def digest(root: Path) -> str:
@@ -162,7 +159,7 @@ def digest(root: Path) -> str:
             names = [name for name in table.schema.names if name not in ("file", "day")]
             parts = [
                 pq.read_table(path, partitioning=None, columns=names)
-                for path in table.unchecked_snapshot().paths
+                for path in table.snapshot().paths
             ]
             rows = pa.concat_tables(parts).sort_by(
                 [("drive_id", "ascending"), (order, "ascending")]

@@ -5,7 +5,7 @@ checksum in the name that the Delta log knows, or are refused.
 """
 
 import contextlib
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -17,12 +17,7 @@ from fleet_slip.grams.job import reconcile
 from fleet_slip.operations.verify import Verification, read_whole
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
 from fleet_slip.simulation.job import file_name, simulate_batch
-from fleet_slip.storage.commits import (
-    checkpoint_faults,
-    keep_checksums,
-    list_dispensable,
-    remove_checkpoint,
-)
+from fleet_slip.storage.commits import LATEST, LOG, check_commits
 from fleet_slip.storage.folder import checksum_in, checksum_of, storage_errors
 from fleet_slip.storage.table import Change, TableFile, retry_conflicts
 from fleet_slip.warehouse.tables import Warehouse
@@ -32,7 +27,8 @@ def repair(
     warehouse: Warehouse, verification: Verification, campaigns: Sequence[str] = ()
 ) -> list[str]:
     """Rebuild what is damaged, also by files of `campaigns`; return what, below the root."""
-    rebuilt = _sum_up_again(warehouse)
+    logs = {finding.path for finding in verification.damage if finding.kind == "log"}
+    rebuilt = _sum_up_again(warehouse, logs)
     damaged = {finding.path for finding in verification.damage if finding.kind == "file"}
     wrong = {f.path.removeprefix("logs/") for f in verification.damage if f.kind == "gram"}
     found = _find_elsewhere(warehouse, damaged)
@@ -43,20 +39,23 @@ def repair(
     return rebuilt
 
 
-def _sum_up_again(warehouse: Warehouse) -> list[str]:
-    """Write damaged checkpoints again that can be spared: from what is before them in the log."""
+def _sum_up_again(warehouse: Warehouse, damaged: Set[str]) -> list[str]:
+    """Write the checkpoints of damaged logs again whose commits are all there, and sound."""
     rebuilt = []
     for table in warehouse.tables:
-        for name, _ in list(checkpoint_faults(table.folder)):
-            if not list_dispensable(table.folder, name):
-                continue
-            remove_checkpoint(table.folder, name)
-            delta = table.open_delta()
-            if delta is not None:
-                with storage_errors(table.folder):
-                    delta.create_checkpoint()
-                keep_checksums(table.folder, again=f"{delta.version():020}.checkpoint.parquet")
-            rebuilt.append(f"{table.folder.name}/_delta_log/{name}")
+        name, log = table.folder.name, table.folder / LOG
+        found = damaged & {name, f"{name}/{LOG}/{LATEST}"}
+        commits, faults = check_commits(log) if found else ([], {})
+        if not commits or commits[0].version or faults:
+            continue
+        for file in log.files():
+            if ".checkpoint." in file.name or file.name == LATEST:
+                log.remove(file)
+        delta = table.open_delta()
+        if delta is not None:
+            with storage_errors(table.folder):
+                delta.create_checkpoint()
+        rebuilt += sorted(found)
     return rebuilt
 
 
@@ -65,7 +64,7 @@ def _find_elsewhere(warehouse: Warehouse, damaged: Collection[str]) -> list[str]
     rebuilt = []
     for table in warehouse.tables:
         name = table.folder.name
-        files = table.unchecked_snapshot().files
+        files = table.snapshot().files
         lost = [file for file in files if f"{name}/{file.path}" in damaged]
         sizes = {file.size_bytes for file in lost}
         for other in table.folder.files() if lost else ():
@@ -84,9 +83,7 @@ def _find_elsewhere(warehouse: Warehouse, damaged: Collection[str]) -> list[str]
 def _simulate_again(
     warehouse: Warehouse, damaged: Collection[str], campaigns: Sequence[str]
 ) -> list[str]:
-    files = [
-        file for file in warehouse.logs.unchecked_snapshot().files if f"logs/{file.path}" in damaged
-    ]
+    files = [file for file in warehouse.logs.snapshot().files if f"logs/{file.path}" in damaged]
     if not files:
         return []
     known = [load_campaign(name) for name in (*campaigns, *config_names("campaigns"))]
@@ -135,7 +132,7 @@ def _aggregate_again(
 
     def attempt() -> None:
         removed.clear()
-        snapshot = warehouse.grams.unchecked_snapshot()
+        snapshot = warehouse.grams.snapshot()
         readable = _readable_grams(warehouse).items()
         named = {path: rows["file"].unique().to_pylist() for path, rows in readable}
         bad = [
@@ -156,7 +153,7 @@ def _aggregate_again(
 def _readable_grams(warehouse: Warehouse) -> dict[str, pa.Table]:
     """Return which drives and log files the Gram files name, of those that are whole."""
     found = {}
-    for file in warehouse.grams.unchecked_snapshot().files:
+    for file in warehouse.grams.snapshot().files:
         if read_whole(warehouse.grams, file).problem is None:
             with contextlib.suppress(FleetSlipError):
                 found[file.path] = warehouse.grams.read(file.path, ["file", "drive_id"])

@@ -34,8 +34,7 @@ from fleet_slip.grams.job import named_files
 from fleet_slip.grams.on_board import CountedSet, counted_by_identity, find_impossible
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import find_temporary_files, find_unreferenced
-from fleet_slip.storage.commits import FOLDER as CHECKSUMS
-from fleet_slip.storage.commits import checkpoint_faults, checkpoints_without_checksum
+from fleet_slip.storage.commits import LOG
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.encoding import Names, read_names
 from fleet_slip.storage.folder import Folder, StoredFile, checksum_in, checksum_of, storage_errors
@@ -462,34 +461,16 @@ def _verify(
 def _open_tables(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot]:
     found = {}
     for table in warehouse.tables:
-        _verify_checkpoints(table, report)
+        name = table.folder.name
         try:
-            snapshot = table.unchecked_snapshot()
+            snapshot = table.snapshot()
             _ = snapshot.files
-        except FleetSlipError as error:
-            report.note("log", table.folder.name, str(error))
-        else:
-            found[table.folder.name] = snapshot
+            found[name] = snapshot
             for file, problem in find_commit_faults(snapshot):
-                path = f"{table.folder.name}/_delta_log/{file}"
-                report.note("log", path, problem)
+                report.note("log", f"{name}/{LOG}/{file}", problem)
+        except FleetSlipError as error:
+            report.note("log", name, str(error))
     return found
-
-
-def _verify_checkpoints(table: Table, report: Verification) -> None:
-    name = table.folder.name
-    documents = DocumentFolder(table.folder / CHECKSUMS)
-    report.documents += len(documents.numbers())
-    if faults := documents.faults():
-        for file, problem in faults.items():
-            where = f"{name}/{CHECKSUMS}/{file.rpartition('/')[2]}"
-            report.note("document", where, problem)
-        return
-    for checkpoint, problem in checkpoint_faults(table.folder):
-        report.note("log", f"{name}/_delta_log/{checkpoint}", problem)
-    for checkpoint in checkpoints_without_checksum(table.folder):
-        problem = "no checksum was kept of this checkpoint; the next one comes with both"
-        report.note("backlog", f"{name}/_delta_log/{checkpoint}", problem)
 
 
 def _report_missing_logs(

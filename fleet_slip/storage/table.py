@@ -1,6 +1,5 @@
 """A Delta table of a data root: its files, and what it takes to open and make it."""
 
-import functools
 import json
 import math
 import random
@@ -22,22 +21,15 @@ from deltalake.transaction import AddAction, RemoveAction
 
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.storage.commits import (
-    CHECKSUM_KEY,
-    COMMIT_FILE,
+    LATEST,
     LOG,
     NOTE,
-    Commit,
+    check_commits,
     checked_note,
-    keep_checksum_of_new,
-    newest_checkpoint,
-    problem_of_commit,
-    read_commit,
     read_landed_units,
-    require_kept_checksum,
-    version_of,
 )
 from fleet_slip.storage.encoding import Encoded, Encoding, Names, read_names
-from fleet_slip.storage.folder import Folder, StoredFile, checksum_in, first_line, storage_errors
+from fleet_slip.storage.folder import Folder, checksum_in, first_line, storage_errors
 
 # The files of a table as the Delta log has them, and what one commit does to them.
 
@@ -504,85 +496,19 @@ class Snapshot:
             except CommitFailedError as error:
                 raise table.conflict_of(error) from None
             table.folder.settle_commits(self.version)
-            keep_checksum_of_new(table.folder, self.version)
-
-
-# Checks a table's Delta log against the checksums that it states and that are kept of it.
-#
-# A flipped bit loses a file, or brings one back. So on opening, the newest checkpoint and the
-# commits after it are compared; `verify` looks at all commits, and at what they add up to.
-
-REMEMBERED_COMMITS = 2**14
-
-
-def require_sound_log(table: Folder, version: int) -> None:
-    """Raise `StorageError` if what a version of a table is told from was damaged.
-
-    Each file is read once by a process; of an object store, `verify` alone looks.
-    """
-    if not table.is_local:
-        return
-    files = (table / LOG).files()
-    checkpoint = newest_checkpoint(files, version)
-    if checkpoint is not None:
-        require_kept_checksum(table, checkpoint.name)
-    after = version_of(checkpoint.name) if checkpoint else -1
-    commits = [file for file in files if COMMIT_FILE.fullmatch(file.name)]
-    checked = bool(commits) and _states_checksum(commits[0])
-    for file in commits:
-        if after < version_of(file.name) <= version and (problem := _problem(file, checked)):
-            raise StorageError(
-                f"{file}: {problem}. See what can be repaired with: fleet-slip verify --repair; or "
-                "restore the log from a backup."
-            )
-
-
-@functools.lru_cache(maxsize=REMEMBERED_COMMITS)
-def _problem(file: StoredFile, must_state_checksum: bool) -> str | None:
-    try:
-        return problem_of_commit(read_commit(file.folder, file.name), must_state_checksum)
-    except ValueError as error:
-        return str(error)
-
-
-@functools.lru_cache(maxsize=REMEMBERED_COMMITS)
-def _states_checksum(file: StoredFile) -> bool:
-    """Whether a commit states its checksum, after which all later ones do."""
-    try:
-        return CHECKSUM_KEY in read_commit(file.folder, file.name).note
-    except ValueError:
-        return False
 
 
 def find_commit_faults(snapshot: Snapshot) -> Iterator[tuple[str, str]]:
-    """Yield what is wrong with the log up to a snapshot: the commit's file below it, and what."""
+    """Yield what is wrong with the log up to a snapshot: the file's name, and what.
+
+    While all commits are there, their sum is compared with what Delta says, from a checkpoint.
+    """
     if snapshot.version is None:
         return
-    commits = []
-    must_state_checksum = False
-    log, last = snapshot.table.folder / LOG, f"{snapshot.version:020}.json"
-    there = {name for name in log.names() if COMMIT_FILE.fullmatch(name) and name <= last}
-    # Earlier ones were cleaned away.
-    first = min(map(version_of, there), default=snapshot.version)
-    for name in (f"{number:020}.json" for number in range(first, snapshot.version + 1)):
-        if name not in there:
-            yield name, "is missing"
-            continue
-        try:
-            commit = read_commit(log, name)
-        except ValueError as error:
-            yield name, str(error)
-            continue
-        must_state_checksum |= CHECKSUM_KEY in commit.note
-        if problem := problem_of_commit(commit, must_state_checksum):
-            yield name, problem
-        commits.append(commit)
-    if len(commits) == snapshot.version + 1:
-        yield from _state_problems(snapshot, commits)
-
-
-def _state_problems(snapshot: Snapshot, commits: Sequence[Commit]) -> Iterator[tuple[str, str]]:
-    """Compare what the commits add up to with what the Delta library says, from a checkpoint."""
+    commits, faults = check_commits(snapshot.table.folder / LOG, snapshot.version)
+    yield from faults.items()
+    if len(commits) <= snapshot.version:
+        return
     files: set[str] = set()
     units: dict[str, int] = {}
     for action in (action for commit in commits for action in commit.actions):
@@ -594,11 +520,9 @@ def _state_problems(snapshot: Snapshot, commits: Sequence[Commit]) -> Iterator[t
             case {"txn": {"appId": name, "version": number}}:
                 units[name] = number
     if files != {file.path for file in snapshot.files}:
-        yield "_last_checkpoint", "the active files are not those that the commits add up to"
-    known = snapshot.units
-    wrong = [name for name, number in units.items() if known.get(name) != number]
-    if wrong:
-        yield "_last_checkpoint", f"does not know what has landed: {', '.join(wrong[:3])}"
+        yield LATEST, "the active files are not those that the commits add up to"
+    if wrong := [name for name, number in units.items() if snapshot.units.get(name) != number]:
+        yield LATEST, f"does not know what has landed: {', '.join(wrong[:3])}"
 
 
 FENCE = "fleet_slip.fence"
@@ -628,16 +552,7 @@ class Table:
     def snapshot(self, version: int | None = None) -> Snapshot:
         """Return the table as it is, or at a version; empty if unwritten. Raises `StorageError`."""
         delta = self.open_delta(version)
-        if delta is not None:
-            require_sound_log(self.folder, delta.version())
         if delta is not None and version is None:
-            require_readable(self.folder, self.schema, delta)
-        return Snapshot(self, delta)
-
-    def unchecked_snapshot(self) -> Snapshot:
-        """Return the table as it is now, though its log may be damaged: to look for damage."""
-        delta = self.open_delta()
-        if delta is not None:
             require_readable(self.folder, self.schema, delta)
         return Snapshot(self, delta)
 

@@ -2,7 +2,6 @@
 
 import json
 import random
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -117,23 +116,6 @@ def test_tables_of_versions_that_wrote_no_checksums_are_sound(root: Warehouse) -
     assert not problems(root)
     land(root, "three", log_rows("three", COUNTS))
     assert not problems(root)
-
-
-def test_a_checkpoint_is_compared_with_the_commits_behind_it(root: Warehouse) -> None:
-    def checkpointed(damage: Callable[[Path], None]) -> dict[str, str]:
-        file = commits(root)[1]
-        content = file.read_bytes()
-        damage(file)
-        DeltaTable(str(logs_of(root))).create_checkpoint()
-        file.write_bytes(content)
-        found = problems(root)
-        for made in file.parent.glob("*checkpoint*"):
-            made.unlink()
-        return found
-
-    assert not checkpointed(lambda _file: None)
-    found = checkpointed(lambda file: change(file, '"appId":"test/one"', '"appId":"test/ome"'))
-    assert "has landed: test/one" in found["logs/_delta_log/_last_checkpoint"]
 
 
 def test_a_commit_that_is_gone_is_told(root: Warehouse) -> None:
