@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohort import load_cohort, sum_cohort
 from fleet_slip.grams.reader import GramReader
-from fleet_slip.grams.sums import sum_cohort
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import answer_request
 from fleet_slip.regression.least_squares import fit

@@ -201,7 +201,7 @@ def _say_left_out(selection: Selection[Any]) -> None:
     """Say which drives of the cohort the models were not made of, and what the label is worth."""
     if not isinstance(selection.cohort, TaughtCohort):
         say_without_information(selection.rows_without, selection.cohort.rows)
-    if without_log := selection.cohort.members.count_received:
+    if without_log := selection.cohort.members.count_received_with():
         say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
     say_without_log(selection.cohort.left_out, selection.cohort.feature_set)
     if isinstance(selection, RequestedSelection):

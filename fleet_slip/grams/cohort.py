@@ -1,22 +1,27 @@
-"""Cohorts: the Gram rows of the drives that satisfy an SQL condition."""
+"""Cohorts: the Gram rows of the drives that satisfy an SQL condition, and their sums over folds.
 
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+A cohort is Gram rows with a fold and a weight. What needs every drive reads them into memory; what
+compares given models needs the exact sum of each fold alone, of any number of rows.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import date
 from fractions import Fraction
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.base import BoolArray, IntArray, number_of
-from fleet_slip.catalogue.facts import SCENARIO, TRAINING_DRIVES
+from fleet_slip.catalogue.facts import RECEIVED, SCENARIO, TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN, features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, NotComputedError, QuestionError, RefusedError
-from fleet_slip.grams.cells import Hashed, Members, received_among
 from fleet_slip.grams.expansion import about_mean, expansion_of
 from fleet_slip.grams.folding import (
+    EACH,
     FOLD_KEYS,
     PARTS,
     ROW_FOLDS,
@@ -26,14 +31,61 @@ from fleet_slip.grams.folding import (
     assign_folds,
     require_divided,
 )
-from fleet_slip.grams.gram_rows import hash_numbers
-from fleet_slip.grams.reader import CohortOrigin, GramReader, OpenedGrams, open_grams
+from fleet_slip.grams.gram_rows import Hashes
+from fleet_slip.grams.reader import HASHES, CohortOrigin, GramReader, OpenedGrams, open_grams
 from fleet_slip.regression.choice import TrainingFolds
-from fleet_slip.regression.drives import ClusterUnit, DriveMoments, serving_drives
+from fleet_slip.regression.drives import (
+    ClusterUnit,
+    DriveMoments,
+    missing_signals_error,
+    serving_drives,
+)
 from fleet_slip.regression.folds import CohortFolds, Folds
-from fleet_slip.regression.gram import GramTable
-from fleet_slip.warehouse.condition import Condition, asking, parse_cohort
+from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.warehouse.condition import Condition, parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
+
+
+@dataclass(frozen=True)
+class Members:
+    """The drives that Gram rows are of, by the rows' signals.
+
+    Each row of an array has the hashes of a drive and of its car, 1 if it came without a log, and
+    its fold; shape (rows, 4).
+    """
+
+    rows: dict[str, Hashes] = field(default_factory=dict)
+
+    def __add__(self, other: "Members") -> "Members":
+        both = dict(self.rows)
+        for signals, rows in other.rows.items():
+            both[signals] = np.concatenate([both[signals], rows]) if signals in both else rows
+        return Members(both)
+
+    def having(self, signals: Collection[str]) -> Hashes:
+        """Return the rows that have all of some signals."""
+        some = [rows for kind, rows in self.rows.items() if set(signals) <= set(kind.split(","))]
+        return np.concatenate([np.empty((0, 4), dtype=np.uint64), *some])
+
+    def drives_with(self, signals: Collection[str]) -> Hashes:
+        """Return the hashes of the drives that have all of some signals, each once, sorted."""
+        return np.unique(self.having(signals)[:, 0])
+
+    def count_vehicles_with(self, signals: Collection[str]) -> int:
+        """Return the number of cars that have all of some signals."""
+        return len(np.unique(self.having(signals)[:, 1]))
+
+    def count_received_with(self, signals: Collection[str] = ()) -> int:
+        """Return the number of drives without a log that have all of some signals."""
+        rows = self.having(signals)
+        return len(np.unique(rows[rows[:, 2] == 1, 0]))
+
+
+def _member_rows(rows: pa.Table | pa.RecordBatch, folds: IntArray) -> Hashes:
+    drives, cars = (rows[name].to_numpy() for name in ("drive_hash", "vehicle_hash"))
+    came = pc.fill_null(pc.equal(rows["source"].cast(pa.string()), RECEIVED), False)
+    received = came.to_numpy(zero_copy_only=False)
+    return np.stack([one.astype(np.uint64) for one in (drives, cars, received, folds)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -73,18 +125,10 @@ class Cohort(CohortOrigin):
     @property
     def members(self) -> Members:
         """Which drives and cars the Gram rows are of."""
-        hashes, cars = (hash_numbers(self.drives[name]) for name in ("drive_id", "vehicle_id"))
+        rows = _member_rows(self.drives, np.zeros_like(self.drive_numbers))
         stops = np.cumsum([len(table) for table in self.tables])[:-1]
-        names = [",".join(table.signals) for table in self.tables]
-        drives, vehicles = np.split(hashes, stops), np.split(cars, stops)
-        came = np.split(received_among(self.drives), stops)
-        received = [some[mask] for some, mask in zip(drives, came, strict=True)]
-        return Members(
-            *(
-                {name: Hashed(some) for name, some in zip(names, parts, strict=True)}
-                for parts in (drives, vehicles, received)
-            )
-        )
+        names = (",".join(table.signals) for table in self.tables)
+        return Members(dict(zip(names, np.split(rows, stops), strict=True)))
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -142,16 +186,12 @@ def load_cohort(
     condition = parse_cohort(condition)
     with open_grams(warehouse, feature_set, condition) as opened:
         expansion = expansion_of(opened, feature_set)
-        statement = opened.statement("cohort.sql", condition)
-        with asking(opened.database, condition):
-            rows = opened.database.sql(statement).to_arrow_table()
-        origin = opened.origin(condition)
-        if not rows.num_rows:
+        rows = opened.rows(condition)
+        require_training(rows["source"].unique().to_pylist(), condition)
+        parts = list(expansion.tables(rows))
+        if not parts:  # no row, or none of changes
             raise empty_cohort_error(opened, condition)
-    require_training(rows["source"].unique().to_pylist(), condition)
-    parts = list(expansion.tables(rows))
-    if not parts:  # of changes, and there are none
-        raise empty_cohort(warehouse, condition, feature_set)
+        origin = opened.origin(condition)
     # Rows whose calibrated columns are not the same are apart now: their metadata follows them.
     order = np.concatenate([np.flatnonzero(here) for _, _, here in parts])
     return Cohort(
@@ -168,14 +208,6 @@ def require_training(sources: Iterable[str], condition: Condition) -> None:
             f"the cohort {condition.text!r} has drives of evaluation scenarios, which no model "
             f"may be trained on. Add to the condition: AND {TRAINING_DRIVES}"
         )
-
-
-def empty_cohort(
-    source: Warehouse | GramReader, condition: Condition, feature_set: str
-) -> DataError:
-    """Return the error that tells why a condition leaves no drive, from all Gram rows."""
-    with open_grams(source, feature_set, condition) as opened:  # all of them: it says what there is
-        return empty_cohort_error(opened, condition)
 
 
 def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
@@ -291,6 +323,183 @@ def taught_by(every: Cohort, changes: Cohort, by: FoldKey) -> TaughtCohort:
 
 def _cars(cohort: Cohort) -> int:
     return len(cohort.drives["vehicle_id"].unique())
+
+
+# The sums of a cohort over its folds, from Gram rows read batch by batch.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SummedCohort(CohortOrigin):
+    """What a selection from given models needs of a cohort.
+
+    Attributes:
+        folding, sums: how the cohort was divided, and the Gram of each fold.
+        rows, drive_count: number of rows of the logs, and of drives, behind the cohort.
+        members: which drives and cars the Gram rows are of.
+        source: where they were read, and can be read again over other folds.
+    """
+
+    folding: Folding
+    sums: CohortFolds
+    rows: int
+    drive_count: int
+    members: Members
+    source: Warehouse | GramReader
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Signals and features that any of the drives has, in the order of the feature set."""
+        return self.inputs_among(name for grams in self.sums.tables for name in grams[0].signals)
+
+    def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
+        """Return the folds; another division reads the Gram rows again, like `sum_cohort`."""
+        if (by, count) == (self.folding.by, self.folding.count):
+            return self.sums
+        folding = Folding(by=by, count=count)
+        return sum_cohort(self.source, folding, self.condition, self.feature_set).sums
+
+
+def sum_cohort(
+    warehouse: Warehouse | GramReader,
+    folding: Folding,
+    condition: str | Condition = TRAINING_DRIVES,
+    feature_set: str = PLAIN,
+) -> SummedCohort:
+    """Add up the Gram rows of a condition's drives over each fold.
+
+    Raises as `load_cohort`, and `DataError` for one fold.
+    """
+    condition = parse_cohort(condition)
+    require_divided(feature_set, folding.by, folding.count)
+    with open_grams(warehouse, feature_set, condition) as opened:
+        folds = _find_folds(opened, folding, condition)
+        grams, members = _add_up(opened, condition, *folds)
+        origin = opened.origin(condition)
+    sums = _used_folds(folds[0], grams, members)
+    return SummedCohort(
+        **vars(origin),
+        folding=folding,
+        sums=sums,
+        rows=sum(gram.n for of_folds in grams.values() for gram in of_folds),
+        drive_count=len(members.drives_with(())),
+        members=members,
+        source=warehouse,
+    )
+
+
+FoldOf = Callable[[pa.RecordBatch], IntArray]
+"""Returns the fold of each Gram row, by its metadata."""
+
+
+def _add_up(
+    opened: OpenedGrams, condition: Condition, names: Sequence[object], fold_of: FoldOf
+) -> tuple[dict[str, list[Gram]], Members]:
+    """Return the exact sums of Gram rows, by signals and fold, and which drives they are of."""
+    expansion = expansion_of(opened, features().name_of(opened.identity))
+    grams: dict[str, list[Gram]] = {}
+    rows: dict[str, list[Hashes]] = {}
+    for batch in opened.batches(condition, *HASHES):
+        require_training(batch["source"].unique().to_pylist(), condition)
+        folds = fold_of(batch)
+        some = _member_rows(batch, folds)
+        for signals, table, here in expansion.tables(batch):
+            totals, before = table.totals(folds[here], len(names)), grams.get(signals)
+            grams[signals] = list(map(Gram.__add__, before, totals)) if before else totals
+            rows.setdefault(signals, []).append(some[here])
+    if not grams:
+        raise empty_cohort_error(opened, condition)
+    return grams, Members({signals: np.concatenate(some) for signals, some in rows.items()})
+
+
+def _find_folds(
+    opened: OpenedGrams, folding: Folding, condition: Condition
+) -> tuple[Sequence[str], FoldOf]:
+    """Return the folds that there may be, and which a Gram row is in. Raises like `sum_cohort`."""
+    key = FOLD_KEYS[folding.by]
+    dealt = folding.by in ("drive", "vehicle") and folding.count != EACH
+    found = opened.values_of(key, condition, int(folding.count) + 1 if dealt else None)
+    if dealt and len(found) > (count := int(folding.count)):
+        hashed = key.removesuffix("_id") + "_hash"
+        names = [str(fold + 1) for fold in range(count)]
+        return names, lambda rows: (rows[hashed].to_numpy() % count).astype(np.int64)
+    if not len(found):
+        raise empty_cohort_error(opened, condition)
+    assignment = assign_folds(found.to_pylist(), folding.by, folding.count)
+    return assignment.names, lambda rows: assignment.fold[_places(rows[key], found)]
+
+
+def _places(values: pa.Array, known: pa.Array) -> IntArray:
+    places: IntArray = pc.index_in(values.cast(known.type), value_set=known).to_numpy()
+    return places
+
+
+def _used_folds(
+    names: Sequence[str], grams: dict[str, list[Gram]], members: Members
+) -> CohortFolds:
+    """Return the folds that have drives. Raises `DataError` if only one has."""
+    order = sorted(grams)
+    used = [fold for fold in range(len(names)) if any(grams[kind][fold].n for kind in order)]
+    if len(used) < 2:
+        raise DataError(
+            "cross-validation needs at least two folds, and the cohort has one: "
+            f"{names[used[0]]}. Widen the cohort, or fold by another key."
+        )
+
+    @cache
+    def count_drives(kinds: tuple[int, ...]) -> int:
+        return len(np.unique(np.concatenate([members.rows[order[i]][:, 0] for i in kinds])))
+
+    return CohortFolds(
+        tuple(names[fold] for fold in used),
+        tuple(tuple(grams[kind][fold] for fold in used) for kind in order),
+        lambda tables: count_drives(tuple(tables)),
+    )
+
+
+@dataclass(frozen=True)
+class DailySums:
+    """The Gram of each day, and the number of drives in it.
+
+    `left_out` drives of the condition have no such Gram rows: their cars sent no log.
+    """
+
+    days: tuple[date, ...]
+    grams: tuple[Gram, ...]
+    drives: tuple[int, ...]
+    left_out: int
+
+
+def sum_days(
+    source: Warehouse | GramReader,
+    inputs: Sequence[str],
+    condition: str | Condition = TRAINING_DRIVES,
+    feature_set: str = PLAIN,
+) -> DailySums:
+    """Add up a cohort's Gram rows with label and inputs, day by day. Raises like `load_cohort`."""
+    signals = (*inputs, catalogue().label)
+    condition = parse_cohort(condition)
+    with open_grams(source, feature_set, condition) as opened:
+        found = opened.values_of("day", condition).sort()
+        days: list[date] = found.to_pylist()
+        sums, members = _add_up(opened, condition, days, lambda rows: _places(rows["day"], found))
+        left_out = opened.count_left_out(condition)
+    serving = [one for kind, one in sums.items() if set(signals) <= set(kind.split(","))]
+    if not serving:
+        raise missing_signals_error(signals)
+    grams = [
+        sum((one[day].restrict(signals) for one in serving), Gram.zero(signals))
+        for day in range(len(days))
+    ]
+    rows = members.having(signals)
+    _, first = np.unique(rows[:, 0], return_index=True)  # a drive is of one day
+    drives = np.bincount(rows[first, 3].astype(np.int64), minlength=len(days)).tolist()
+    used = [day for day, gram in enumerate(grams) if gram.n]
+    return DailySums(
+        tuple(days[day] for day in used),
+        tuple(grams[day] for day in used),
+        tuple(drives[day] for day in used),
+        left_out,
+    )
 
 
 # A cohort made ready for one set of inputs: folds, and moments of each drive.

@@ -2,8 +2,9 @@
 
 import contextlib
 import shlex
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import date
 from functools import partial
 from typing import Any, Self
@@ -69,6 +70,15 @@ BATCH_NUMBERS = 2**20
 """Most sums and products of one batch: wide rows come in smaller ones."""
 
 
+SUMMED = (
+    *("drive_id", "vehicle_id", RECEIVER, "source", "track", "mass_kg", "adhesion"),
+    *("speed_factor", "day", "part", "trip", "signals", "n", "sums", "products"),
+)
+"""Columns of a cohort that its sums, and what its folds are made of, need."""
+
+HASHES = ("drive_hash", "vehicle_hash", "trip_hash")
+
+
 @dataclass(frozen=True)
 class OpenedGrams:
     """A connection to Gram rows."""
@@ -97,11 +107,27 @@ class OpenedGrams:
             left_out=self.count_left_out(condition),
         )
 
-    def batches(self, condition: Condition) -> Iterator[pa.RecordBatch]:
-        """Yield the Gram rows of a cohort, in any order, with the columns that tell their fold."""
-        statement = self.statement("cohort_sums.sql", condition)
+    def rows(self, condition: Condition) -> pa.Table:
+        """Return the Gram rows of a cohort with all that is known of them, sorted."""
+        text = self.statement("cohort.sql", condition)
         with asking(self.database, condition):
-            yield from self.database.sql(statement).to_arrow_reader(self._batch_rows)
+            return self.database.sql(
+                f"FROM ({text}) ORDER BY signals, drive_id, part"
+            ).to_arrow_table()
+
+    def batches(self, condition: Condition, *more: str) -> Iterator[pa.RecordBatch]:
+        """Yield the Gram rows of a cohort, in any order: `SUMMED` and `more` columns of them."""
+        columns = ", ".join([*SUMMED, *more])
+        text = f"SELECT {columns} FROM ({self.statement('cohort.sql', condition)})"
+        with asking(self.database, condition):
+            yield from self.database.sql(text).to_arrow_reader(self._batch_rows)
+
+    def values_of(self, column: str, condition: Condition, most: int | None = None) -> pa.Array:
+        """Return the distinct values of a cohort's column, at most so many."""
+        text = self.statement("cohort.sql", condition)
+        query = f"SELECT DISTINCT {column} FROM ({text}){f' LIMIT {most}' if most else ''}"
+        with asking(self.database, condition):
+            return self.database.sql(query).to_arrow_table()[column].combine_chunks()
 
     def count_left_out(self, condition: Condition) -> int:
         """Return how many drives of a cohort have no Gram rows, since their cars sent no log."""
@@ -272,45 +298,26 @@ class DriveSums:
         return found
 
 
-@dataclass
-class SumCollector:
-    """Adds up Gram rows, drive by drive, for several sets of columns at once."""
-
-    kinds: Mapping[str, tuple[str, ...]]
-    parts: dict[str, list[GramTable]] = field(default_factory=dict)
-    drives: dict[str, list[Drive]] = field(default_factory=dict)
-
-    def add(self, batch: pa.RecordBatch) -> None:
-        """Add a batch of Gram rows; those that do not say whose they are count for nobody."""
-        for names, rows, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
-            table = gram_table(names, rows) if len(rows) else None
-            drives = list(zip(*(rows[c].to_pylist() for c in _KEY), strict=True))
-            for kind, columns in self.kinds.items():
-                if table is not None and set(columns) <= set(names.split(",")):
-                    self.parts.setdefault(kind, []).append(table.restrict(columns))
-                    self.drives.setdefault(kind, []).extend(drives)
-
-    def sums(self) -> dict[str, DriveSums]:
-        """Return what was added, by kind."""
-        return {
-            kind: _sorted(parts, self.drives[kind])
-            for kind, parts in self.parts.items()
-            if self.drives[kind]
-        }
-
-
-_KEY = ("vehicle_id", "day", "drive_id")
-
-
 def collect_sums(
     batches: Iterable[pa.RecordBatch], kinds: Mapping[str, tuple[str, ...]]
 ) -> dict[str, DriveSums]:
-    """Return the sums of the columns of each kind over every drive."""
-    collector = SumCollector(kinds)
+    """Return the sums of the columns of each kind over every drive that says whose it is."""
+    parts: dict[str, list[GramTable]] = defaultdict(list)
+    drives: dict[str, list[Drive]] = defaultdict(list)
     for batch in batches:
-        if len(batch):
-            collector.add(batch)
-    return collector.sums()
+        for names, rows, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
+            if not len(rows):
+                continue
+            table = gram_table(names, rows)
+            of = list(zip(*(rows[key].to_pylist() for key in _KEY), strict=True))
+            for kind, columns in kinds.items():
+                if set(columns) <= set(names.split(",")):
+                    parts[kind].append(table.restrict(columns))
+                    drives[kind] += of
+    return {kind: _sorted(some, drives[kind]) for kind, some in parts.items()}
+
+
+_KEY = ("vehicle_id", "day", "drive_id")
 
 
 def _sorted(parts: Sequence[GramTable], rows: Sequence[Drive]) -> DriveSums:

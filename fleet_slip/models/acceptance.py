@@ -30,12 +30,11 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import Config, config_file, load_config
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
 from fleet_slip.grams.calibration import course_moments
-from fleet_slip.grams.cohort import Cohort, TaughtCohort, load_cohort
+from fleet_slip.grams.cohort import Cohort, SummedCohort, TaughtCohort, load_cohort
 from fleet_slip.grams.folding import FOLD_KEYS, FoldKey, assign_folds
 from fleet_slip.grams.gram_rows import hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
-from fleet_slip.grams.sums import SummedCohort
 from fleet_slip.ingest.drives import SOURCE
 from fleet_slip.ingest.suspicion import Suspicion, find_suspicions
 from fleet_slip.models.manifest import Manifest

@@ -14,9 +14,8 @@ from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, find_config, load_config
 from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.grams.cohort import Cohort
+from fleet_slip.grams.cohort import Cohort, SummedCohort
 from fleet_slip.grams.folding import Folding, FoldKey
-from fleet_slip.grams.sums import SummedCohort
 from fleet_slip.regression.choice import DEFAULT_WORTH, Worth
 from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.regression.orders import METHODS, RANKINGS

@@ -19,16 +19,17 @@ from fleet_slip.errors import ConfigError, DataError, NotComputedError, Question
 from fleet_slip.grams.cohort import (
     Cohort,
     Served,
+    SummedCohort,
     TaughtCohort,
     clustered_moments,
     drive_folds,
     load_cohort,
     load_taught,
+    sum_cohort,
 )
 from fleet_slip.grams.folding import EACH, PARTS, ROW_FOLDS, Folding, make_folding
 from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.reader import CohortOrigin, open_grams
-from fleet_slip.grams.sums import SummedCohort, sum_cohort
 from fleet_slip.models.request import (
     BOTH,
     COURSE,
@@ -392,7 +393,7 @@ class Selection(Generic[AnyCohort]):
             "drives": self.cohort.drive_count,
             "rows": self.cohort.rows,
             "rows_without": self.rows_without,
-            "drives_without_log": self.cohort.members.count_received,
+            "drives_without_log": self.cohort.members.count_received_with(),
             "drives_left_out": self.cohort.left_out,
             "intercept": self.intercept,
             "folds": {

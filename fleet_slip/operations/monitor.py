@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.features import PLAIN, features, input_scales
 from fleet_slip.errors import ConfigError, DataError, StorageError
-from fleet_slip.grams.sums import sum_days
+from fleet_slip.grams.cohort import sum_days
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import counts_model
 from fleet_slip.models.registry import ModelVersion

@@ -25,7 +25,7 @@ from fleet_slip.operations.faults import DriveBatches, Fault, find_implausible
 from fleet_slip.operations.labels import find_odd_days, find_repeated, find_reversed_labels
 from fleet_slip.operations.peers import QualityThresholds, settle, thresholds
 from fleet_slip.regression.gram import GramTable
-from fleet_slip.warehouse.condition import Condition, asking, parse_cohort, parse_condition
+from fleet_slip.warehouse.condition import Condition, parse_cohort, parse_condition
 from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -130,15 +130,11 @@ def _changed_delays(reader: GramReader, condition: Condition) -> dict[str, Fault
 def _vehicle_models(reader: GramReader, condition: Condition) -> list[Condition]:
     """Return, for each vehicle model of a cohort, the condition that a drive is of it."""
     opened = reader.opened(PLAIN, condition)
-    cohort = opened.statement("cohort.sql", condition)
-    with asking(opened.database, condition):
-        statement = f"SELECT DISTINCT vehicle_model, source FROM ({cohort}\n)"
-        rows = opened.database.sql(statement).fetchall()
-    if not rows:
+    sources = opened.values_of("source", condition).to_pylist()
+    if not sources:
         raise empty_cohort_error(opened, condition)
-    found = set(rows)
-    require_training({source for _, source in found}, condition)
-    models = sorted({model for model, _ in found}, key=str)
+    require_training(sources, condition)
+    models = sorted(opened.values_of("vehicle_model", condition).to_pylist(), key=str)
     return [
         parse_condition(f"vehicle_model IS NOT DISTINCT FROM {sql_text(model)}") for model in models
     ]

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import FleetSlipError, StorageError
+from fleet_slip.grams.cohort import sum_cohort
 from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.sums import sum_cohort
 from fleet_slip.storage import folder
 from fleet_slip.storage.folder import check_local_files, checksum_in, checksum_of
 from fleet_slip.views import connect

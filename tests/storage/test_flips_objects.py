@@ -7,10 +7,9 @@ from typing import Any
 import pytest
 
 from fleet_slip.errors import StorageError
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohort import load_cohort, sum_cohort
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.sums import sum_cohort
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.score import score
 from fleet_slip.operations.verify import verify

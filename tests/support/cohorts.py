@@ -10,6 +10,7 @@ import pyarrow as pa
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import Cohort
+from fleet_slip.grams.gram_rows import hash_numbers
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.condition import parse_condition
 from tests.support.counts import Matrix, table_of
@@ -68,6 +69,10 @@ def cohort_of(
         "mass_kg": [1200.0 + 100 * (i % 5) for i in range(len(drives))],
         "adhesion": [1.0 - 0.1 * (i % 3) for i in range(len(drives))],
         "part": pa.array([one.part for one in drives], pa.string()),
+    }
+    columns |= {
+        f"{name}_hash": pa.array(hash_numbers(pa.array(columns[f"{name}_id"])))
+        for name in ("drive", "vehicle")
     }
     return Cohort(
         condition=parse_condition(condition),

@@ -8,10 +8,9 @@ from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohort import load_cohort, sum_cohort, sum_days
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.sums import sum_cohort, sum_days
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.score import score_statement
 from fleet_slip.operations.monitor import monitor

@@ -13,11 +13,10 @@ from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, InputError, QuestionError
 from fleet_slip.grams.calibration import calibrate
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohort import load_cohort, sum_cohort
 from fleet_slip.grams.expansion import expand
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.sums import sum_cohort
 from fleet_slip.models.predict import predict
 from fleet_slip.models.score import score, score_statement
 from fleet_slip.regression.gram import Gram, GramTable

@@ -10,11 +10,10 @@ import pytest
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError
 from fleet_slip.grams import reader as gram_reader
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohort import load_cohort, sum_cohort, sum_days
 from fleet_slip.grams.folding import FoldCount, Folding, FoldKey
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import GramReader
-from fleet_slip.grams.sums import sum_cohort, sum_days
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import answer_request, select
 from fleet_slip.storage.local import LocalFolder

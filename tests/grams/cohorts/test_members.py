@@ -3,15 +3,14 @@
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.grams.cells import Hashed, Members
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohort import Members, load_cohort
 from fleet_slip.grams.gram_rows import hash_numbers
 from fleet_slip.grams.job import update_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 
 DRIVES = {"ax,ay": ["a", "b"], "ax,ay,yaw_rate": ["b", "c"]}
-"""Drive b has rows of both kinds."""
+"""Drive b has rows of both kinds; c came without a log."""
 
 
 def hashes(names: list[str]) -> list[int]:
@@ -19,9 +18,14 @@ def hashes(names: list[str]) -> list[int]:
 
 
 def members() -> Members:
-    drives = {signals: Hashed(hash_numbers(pa.array(names))) for signals, names in DRIVES.items()}
-    cars = {signals: Hashed(hash_numbers(pa.array(["car-1"]))) for signals in DRIVES}
-    return Members(drives, cars)
+    return Members(
+        {
+            signals: np.array(
+                [[*hashes([name]), 7, name == "c", 0] for name in names], dtype=np.uint64
+            )
+            for signals, names in DRIVES.items()
+        }
+    )
 
 
 def test_drives_with_signals_are_those_of_rows_that_have_them_all() -> None:
@@ -33,6 +37,17 @@ def test_drives_with_signals_are_those_of_rows_that_have_them_all() -> None:
 def test_a_car_counts_once() -> None:
     assert members().count_vehicles_with(["ax"]) == 1
     assert members().count_vehicles_with(["steering_wheel"]) == 0
+    assert members().count_received_with(["ax"]) == 1
+    assert (members() + members()).count_vehicles_with(["ax"]) == 1
+
+
+def test_the_statement_hashes_names_as_python_does(warehouse: Warehouse) -> None:
+    land(warehouse, "one", log_rows("dé", random_counts(np.random.default_rng(1), 40)))
+    update_grams(warehouse)
+    cohort = load_cohort(warehouse)
+    for name in ("drive", "vehicle"):
+        told = hash_numbers(cohort.drives[f"{name}_id"])
+        assert cohort.drives[f"{name}_hash"].to_pylist() == told.tolist()
 
 
 def test_a_part_of_a_cohort_has_the_tables_of_its_drives_alone(warehouse: Warehouse) -> None:

@@ -16,9 +16,8 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
 from fleet_slip.config import read_sql
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohort import load_cohort, sum_cohort
 from fleet_slip.grams.folding import EACH, Folding
-from fleet_slip.grams.sums import sum_cohort
 from fleet_slip.ingest.mapping import Mapping
 from tests.support.measured import csv_text
 
