@@ -9,6 +9,7 @@ later. Then this must be so:
 
 * no row that was committed is lost or doubled, and no reader sees half a change;
 * what `forget --now` has said to be gone is in no file, and the models trained on it are marked;
+* of a file that a command has taken out or forgotten no drive is there when it ends;
 * a version follows, in every bit, from the Gram rows that it names;
 * both commands, given again, end where they end if they never meet.
 
@@ -82,7 +83,7 @@ def run(options: argparse.Namespace, folder: Path, roots: Any) -> dict[str, list
             {k: len(v) for k, v in found.items() if k.startswith(f"{first} | {second}:")}
         )
         print(
-            f"{first:9s} {second:9s} {len(every):4d} schedules {worst.total():4d} findings",
+            f"{first:11s} {second:11s} {len(every):4d} schedules {worst.total():4d} findings",
             flush=True,
         )
     print(f"{done} schedules, {time.monotonic() - started:.0f} s")

@@ -17,7 +17,11 @@ FATES = ("goes on", "dies", "dies 1 later", "dies 2 later", "dies 3 later")
 ROUNDS = 3
 """So often both commands are given again until nothing fails."""
 PENDING = "pending"
-FORGETTING = ("retain", "forget")
+FORGETTING = ("retain", "forget", "forget_file", "forget_name")
+NOTHING_LEFT = {"forget_file": {0, 5}, "forget_name": {0, 5}}
+"""Exit codes of a command that was done before, where others than 0."""
+NAMING = ("undo", "forget_file", "forget_name")
+"""Commands that hold for what of `later.csv` is there when they commit."""
 UNHARMED = {0, 5, 6, 7, 8, 12}
 """Exit codes of a command that met another; 6 where a file is gone that it was about to read."""
 
@@ -73,12 +77,15 @@ class Pair:
             first.end()
             return []
         second = self._run(root, self.second)
+        named = self._look_for_named(root, self.second, second)
         migrated = self.second == "migrate"
         found = self._look(root, second, self.second, migrated, "while the first had stopped")
+        found += named
         first.go_on(schedule.die_after)
         ended = first.end()
         done = _done(self.second, second) + _done(self.first, ended)
         found += _harm(self.first, ended) + _harm(self.second, second)
+        found += self._look_for_named(root, self.first, ended)
         if "repair" not in self._both:
             migrated |= self.first == "migrate" and "migrate" in done
             if schedule.die_after != 0:  # else nothing has changed since
@@ -111,13 +118,21 @@ class Pair:
         if migrated:
             environments.reverse()
         committed = self._committed
-        forgotten = "all" if "forget" in done else "readable" if PENDING in done else ""
+        pending = PENDING in done and "forget" in self._both
+        forgotten = "all" if "forget" in done else "readable" if pending else ""
         return [
             str(one)
             for one in forked(
                 lambda: _findings(root, environments, committed, gone, forgotten)
             ).result
         ]
+
+    @staticmethod
+    def _look_for_named(root: str, name: str, outcome: Outcome) -> list[str]:
+        """Return what is left of `later.csv` just after a command has taken it out."""
+        if name not in NAMING or not _done(name, outcome):
+            return []
+        return list(forked(lambda: checks.named_findings(root, "later.csv")).result)
 
     def _settle(self, root: str) -> list[str]:
         """Give both commands again until both are done; return what keeps failing."""
@@ -137,7 +152,7 @@ def _repeat(
     let_temporary_files_age(root)
     for _ in range(ROUNDS):
         codes = {name: _give(root, arguments, environments) for name, arguments in given}
-        failed = {name: code for name, code in codes.items() if code}
+        failed = {n: code for n, code in codes.items() if code not in NOTHING_LEFT.get(n, {0})}
         if not failed:
             break
     return len(failed), ", ".join(f"{name} ends with {code}" for name, code in failed.items())

@@ -35,6 +35,10 @@ PUBLISH = ("publish", "sideslip", *TRAINING, "--nested", "ay", "--force")
 COMMANDS: Mapping[str, tuple[str, ...]] = {
     "simulate": ("simulate", "{campaign}", "--threads", "1"),
     "ingest": ("ingest", "{new}", "--mapping", "{mapping}"),
+    "replace": ("ingest", "{later}", "--mapping", "{fixed}", "--replace"),
+    "undo": ("ingest", "--undo", "later.csv"),
+    "forget_file": ("forget", "--source-file", "later.csv", "--now"),
+    "forget_name": ("forget", "--drive-name", "later", "--now"),
     "gram": ("gram",),
     "publish": PUBLISH,
     "promote": ("promote", "sideslip@1"),
@@ -48,7 +52,10 @@ COMMANDS: Mapping[str, tuple[str, ...]] = {
 LEFT_BY_KILLED = ("ingest", "simulate", "compact")
 """Commands that were killed before their first commit, where `vacuum` comes in."""
 
-SETTLING = ("repair", "migrate", "simulate", "ingest", "compact", "publish", "promote", "vacuum")
+SETTLING = (
+    *("repair", "migrate", "simulate", "ingest", "replace", "undo"),
+    *("compact", "publish", "promote", "vacuum"),
+)
 """In this order commands are given again; then `gram`, and what forgets comes last."""
 
 
@@ -91,6 +98,8 @@ def write_inputs(where: Path) -> Inputs:
     (where / "campaign.toml").write_text(text, encoding="utf-8")
     mapping = MAPPING.replace(str(FIRST_DAY), str(SECOND_DAY))
     (where / "mapping.toml").write_text(mapping, encoding="utf-8")
+    fixed = mapping.replace('column = "beta", unit = "rad"', 'column = "beta", unit = "deg"')
+    (where / "fixed.toml").write_text(fixed, encoding="utf-8")
     for name, cars in (("old", ("car-2", "car-3")), ("later", ("car-4",)), ("new", ("car-5",))):
         measure(where / f"{name}.csv", (CAR, *cars))
     days = (date.today() - SECOND_DAY).days
