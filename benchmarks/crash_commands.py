@@ -130,7 +130,7 @@ COMMANDS = (
     Command("forget a vehicle", MODEL, ("forget", "--vehicle", "car-1", "--now")),
     Command("forget a drive", MODEL, ("forget", "--drive", "smoke-2024-05-01-0001")),
     Command("compact", MODEL, ("compact",)),
-    Command("vacuum", (*MODEL, ("compact",)), ("vacuum",), let_time_pass),
+    Command("vacuum", (*MODEL, ("compact",)), ("compact",), let_time_pass),
     Command(
         "repair",
         MODEL,

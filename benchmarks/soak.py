@@ -127,7 +127,6 @@ def writers(inputs: Inputs) -> Mapping[str, Callable[[int], Arguments]]:
         "gram": lambda _: ("gram",),
         "publish": lambda _: PUBLISH,
         "compact": lambda _: ("compact",),
-        "vacuum": lambda _: ("vacuum",),
         "forget": lambda n: ("forget", "--vehicle", f"gone-{n // 3}", "--now"),
     }
 

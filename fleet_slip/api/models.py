@@ -153,33 +153,29 @@ class PublishedModels(Rooted):
         return cohort.select(**vars(recipe.request))
 
     @record_call
-    def promote(self, reference: str, alias: str = CHAMPION) -> ModelVersion:
-        """Point an alias at a version; return the version. Raises `UsageError`, and as `model`."""
+    def promote(
+        self, reference: str, alias: str = CHAMPION, *, previous: bool = False
+    ) -> ModelVersion:
+        """Point an alias at a version; return the version. Raises `UsageError`, and as `model`.
+
+        `previous` points it back at the version before, and pins it there; the reference is a name
+        alone then. Raises `RefusedError` if it never had another.
+        """
+        registry = self.registry()
+        if previous:
+            if "@" in reference:
+                raise UsageError(f"{reference}: with previous, give the name of the model alone.")
+            return registry.load(reference, registry.rollback(reference, alias))
         require_model_name(alias)
         version = self.model(reference)
-        self.registry().promote(version.manifest.name, version.version, alias)
+        registry.promote(version.manifest.name, version.version, alias)
         return version
 
     @record_call
-    def rollback(self, name: str, alias: str = CHAMPION) -> ModelVersion:
-        """Point an alias back at the version before; return it. It is held there as by `pin`.
-
-        Raises `RefusedError` if it never had another, and what `model` raises.
-        """
+    def pin(self, name: str, alias: str = CHAMPION, *, off: bool = False) -> ModelVersion:
+        """Keep an alias where it is until `promote` or `off`; return its version, as `model`."""
         registry = self.registry()
-        return registry.load(name, registry.rollback(name, alias))
-
-    @record_call
-    def pin(self, name: str, alias: str = CHAMPION) -> ModelVersion:
-        """Keep an alias where it is until `promote` or `unpin`; return its version, as `model`."""
-        registry = self.registry()
-        return registry.load(name, registry.hold(name, alias, "pin"))
-
-    @record_call
-    def unpin(self, name: str, alias: str = CHAMPION) -> ModelVersion:
-        """Let publications move an alias again; return its version. Raises as `model`."""
-        registry = self.registry()
-        return registry.load(name, registry.hold(name, alias, "unpin"))
+        return registry.load(name, registry.hold(name, alias, "unpin" if off else "pin"))
 
     def diff(self, one: str | ModelVersion, other: str | ModelVersion) -> "Difference":
         """Tell two versions apart: data, signals, coefficients, figures. Raises as `model`."""

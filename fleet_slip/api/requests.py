@@ -90,7 +90,7 @@ class ForgetRequest:
     source_file: Annotated[str | None, Doc("The source_file whose drives are to be forgotten.")] = (
         None
     )
-    now: Annotated[bool, Doc("Delete the old files at once, not when vacuum is due.")] = False
+    now: Annotated[bool, Doc("Delete the old files at once; compact would later.")] = False
     progress: ShowProgress | None = None
 
     @property

@@ -59,7 +59,6 @@ GROUPS = {
         "mapping": "data",
         "ingest": "data",
         "gram": "grams",
-        "check": "grams",
         "features": "grams",
         "init": "data",
     },
@@ -67,9 +66,7 @@ GROUPS = {
         "models": "models",
         "diff": "models",
         "promote": "models",
-        "rollback": "models",
         "pin": "models",
-        "unpin": "models",
         "export": "models",
     },
     "Accuracy": {
@@ -91,9 +88,7 @@ GROUPS = {
         "monitor": "operations",
         "verify": "upkeep",
         "compact": "upkeep",
-        "vacuum": "upkeep",
         "forget": "upkeep",
-        "retain": "upkeep",
         "migrate": "upkeep",
     },
 }

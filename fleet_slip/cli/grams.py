@@ -1,4 +1,4 @@
-"""Reducing logs to Gram rows: the commands gram and check."""
+"""Reducing logs to Gram rows, and what can be reduced: the commands gram and features."""
 
 from concurrent.futures import Executor
 from typing import TYPE_CHECKING, Annotated
@@ -101,36 +101,6 @@ def _say_gram(report: "GramReport") -> None:
             "in all are "
             "up to date"
         )
-
-
-def check(
-    context: typer.Context,
-    files: Annotated[
-        int, typer.Option(min=1, help="How many log files to check, evenly chosen.")
-    ] = 4,
-    json: Json = False,
-) -> None:
-    """Compute Gram rows three ways and compare them, bit for bit.
-
-    By the SQL statement, by float64 matrix products on blocks in which every partial sum is an
-    exact integer, and (for one drive of each file) by Python integers; and with the stored rows.
-
-    Example: **fleet-slip check**
-    """
-    with progress("check", "files") as show:
-        report = context.obj.check(files, progress=show)
-    if json:
-        print_json(report)
-    else:
-        ways = {
-            "SQL against stored Gram rows": report.drives,
-            "SQL against float64 blocks": report.drives,
-            "SQL against Python integers": report.drives_by_integers,
-        }
-        if report.wide_sets:
-            ways[f"SQL against the kernel: {', '.join(report.wide_sets)}"] = report.wide_drives
-        rows = [[way, f"{drives}", "yes"] for way, drives in ways.items()]
-        print_table("", ["way", "drives", "equal"], rows)
 
 
 # The command that lists features, feature sets and the config files that define them: features.

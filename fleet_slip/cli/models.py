@@ -1,4 +1,4 @@
-"""Commands that serve models: models, show, promote, rollback, pin, unpin."""
+"""Commands that serve models: models, show, promote, pin, diff, export."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -242,34 +242,30 @@ def promote(
     context: typer.Context,
     reference: Annotated[
         str,
-        typer.Argument(help="NAME@VERSION to point the alias at.", autocompletion=complete_model),
+        typer.Argument(
+            help="NAME@VERSION to point the alias at; with --previous NAME alone.",
+            autocompletion=complete_model,
+        ),
     ],
     alias: Alias = CHAMPION,
+    previous: Annotated[
+        bool,
+        typer.Option(
+            "--previous", help="Roll back to the version that the alias had before, and pin it."
+        ),
+    ] = False,
 ) -> None:
     """Point an alias, the champion unless told otherwise, at a version.
 
     Example: **fleet-slip promote waterford@2**
     """
-    version = context.obj.promote(reference, alias)
-    say(f"{version.manifest.name}@{alias} is now version {version.version}")
-
-
-@record_run
-def rollback(
-    context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
-    alias: Alias = CHAMPION,
-) -> None:
-    """Point an alias back at the version that it had before; no publication moves it from there.
-
-    Until promote or unpin.
-
-    Example: **fleet-slip rollback waterford**
-    """
-    version = context.obj.rollback(name, alias)
+    version = context.obj.promote(reference, alias, previous=previous)
+    name = version.manifest.name
     say(
         f"{name}@{alias} is version {version.version} again, and stays so until: fleet-slip "
-        f"promote, or fleet-slip unpin {name}"
+        f"promote NAME@VERSION, or fleet-slip pin {name} --off"
+        if previous
+        else f"{name}@{alias} is now version {version.version}"
     )
 
 
@@ -278,27 +274,18 @@ def pin(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
     alias: Alias = CHAMPION,
+    off: Annotated[
+        bool, typer.Option("--off", help="Let publications move the alias again.")
+    ] = False,
 ) -> None:
-    """Keep an alias where it is: publications become candidates, until promote or unpin.
+    """Keep an alias where it is: publications become candidates, until promote or pin --off.
 
     Example: **fleet-slip pin waterford**
     """
-    version = context.obj.pin(name, alias)
-    say(f"{name}@{alias} is pinned to version {version.version}")
-
-
-@record_run
-def unpin(
-    context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
-    alias: Alias = CHAMPION,
-) -> None:
-    """Let publications move an alias again, after pin or rollback.
-
-    Example: **fleet-slip unpin waterford**
-    """
-    version = context.obj.unpin(name, alias)
-    say(f"{name}@{alias} is version {version.version}; the next publication may move it")
+    version = context.obj.pin(name, alias, off=off)
+    told = "is" if off else "is pinned to"
+    more = "; the next publication may move it" if off else ""
+    say(f"{name}@{alias} {told} version {version.version}{more}")
 
 
 # Two model versions beside each other: the command diff, and score --against.

@@ -1,4 +1,4 @@
-"""Commands that look after the warehouse: verify, compact, vacuum, forget, retain."""
+"""Commands that look after the warehouse: verify, compact, forget, migrate."""
 
 import sys
 from concurrent.futures import Executor
@@ -16,6 +16,7 @@ from fleet_slip.cli.app import record_run
 from fleet_slip.cli.options import Cluster, request_options
 from fleet_slip.cli.output import Json, print_json, print_table, progress, say
 from fleet_slip.errors import DamageError, PendingError, UsageError
+from fleet_slip.grams.check import CheckReport
 from fleet_slip.operations.find_drives import RETENTION_HOURS, VacuumReport
 from fleet_slip.operations.forget import ForgetReport
 from fleet_slip.operations.rewriting import TARGET_ROWS
@@ -30,6 +31,13 @@ def verify(
     context: typer.Context,
     full: Annotated[
         bool, typer.Option("--full", help="Compute the Gram rows of all log files again.")
+    ] = False,
+    grams: Annotated[
+        bool,
+        typer.Option(
+            "--grams",
+            help="Compute the Gram rows of some log files in three ways, too; compare bit for bit.",
+        ),
     ] = False,
     repair: Annotated[
         bool,
@@ -59,10 +67,17 @@ def verify(
         if repair:
             rebuilt = fleet.repair(report, campaign or ())
             report = _verify(fleet, executor, full=full)
+    if grams and not report.damage:
+        with progress("verify Gram rows", "files") as show:
+            ways = fleet.check(progress=show)
+    else:
+        ways = None
     if json:
-        print_json(_verified(report, rebuilt))
+        print_json({**_verified(report, rebuilt), **({"grams": ways} if ways else {})})
     else:
         _print_verification(report, rebuilt)
+        if ways:
+            _print_ways(ways)
     if report.damage:
         advice = (
             "What is left cannot be rebuilt here: restore these files from a backup. Data files "
@@ -106,36 +121,24 @@ def _print_verification(report: Verification, rebuilt: list[str]) -> None:
     )
 
 
+def _print_ways(report: CheckReport) -> None:
+    ways = {
+        "SQL against stored Gram rows": report.drives,
+        "SQL against float64 blocks": report.drives,
+        "SQL against Python integers": report.drives_by_integers,
+    }
+    if report.wide_sets:
+        ways[f"SQL against the kernel: {', '.join(report.wide_sets)}"] = report.wide_drives
+    rows = [[way, f"{drives}", "yes"] for way, drives in ways.items()]
+    print_table("", ["way", "drives", "equal"], rows)
+
+
 @record_run
 def compact(
     context: typer.Context,
     target_rows: Annotated[
         int, typer.Option(min=1, help="Rows of a file after it, or fewer.")
     ] = TARGET_ROWS,
-    json: Json = False,
-) -> None:
-    """Turn the small log files of each day into large ones. Readers and jobs are not disturbed.
-
-    Example: **fleet-slip compact**
-    """
-    with progress("compact", "days") as show:
-        report = context.obj.compact(target_rows, progress=show)
-    if json:
-        print_json(report)
-    elif report.changed:
-        say(
-            f"{number_of(report.files_before, 'file')} became {report.files_after}; "
-            f"{report.rows_rewritten:,} "
-            f"rows were written again, {report.size_bytes_before:,} bytes became "
-            f"{report.size_bytes_after:,}"
-        )
-    else:
-        say(f"nothing to do: {number_of(report.files_after, 'file')}, large or alone in the day")
-
-
-@record_run
-def vacuum(
-    context: typer.Context,
     retention_hours: Annotated[
         int,
         typer.Option(
@@ -143,22 +146,40 @@ def vacuum(
         ),
     ] = RETENTION_HOURS,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="List the files and remove nothing.")
+        bool, typer.Option("--dry-run", help="List the files to be removed, and change nothing.")
     ] = False,
     json: Json = False,
 ) -> None:
-    """Remove replaced files and leftovers of killed jobs when they are old enough.
+    """Turn the small log files of each day into large ones, and remove files out of use.
 
-    Example: **fleet-slip vacuum --dry-run**
+    Replaced files and leftovers of killed jobs go when they are old enough. Readers and jobs are
+    not disturbed.
+
+    Example: **fleet-slip compact**
     """
     fleet: Fleet = context.obj
-    report = (fleet.preview_vacuum if dry_run else fleet.vacuum)(retention_hours)
+    if dry_run:
+        compacted, vacuumed = None, fleet.preview_vacuum(retention_hours)
+    else:
+        with progress("compact", "days") as show:
+            compacted = fleet.compact(target_rows, progress=show)
+        vacuumed = fleet.vacuum(retention_hours)
     if json:
-        print_json(report)
+        print_json({"compacted": compacted, "vacuumed": vacuumed})
         return
-    if dry_run and report.files:
-        print_table("", ["would be removed"], ([file] for file in report.files))
-    say(_vacuumed(report))
+    if compacted is None:
+        if vacuumed.files:
+            print_table("", ["would be removed"], ([file] for file in vacuumed.files))
+    elif compacted.changed:
+        say(
+            f"{number_of(compacted.files_before, 'file')} became {compacted.files_after}; "
+            f"{compacted.rows_rewritten:,} rows were written again, "
+            f"{compacted.size_bytes_before:,} bytes became {compacted.size_bytes_after:,}"
+        )
+    else:
+        files = number_of(compacted.files_after, "file")
+        say(f"nothing to compact: {files}, large or alone in the day")
+    say(_vacuumed(vacuumed))
 
 
 def _vacuumed(report: VacuumReport) -> str:
@@ -174,6 +195,17 @@ def forget(
     allow: Annotated[
         bool, typer.Option("--allow", help="Let it come back: land its new rows again from now on.")
     ] = False,
+    expired: Annotated[
+        bool,
+        typer.Option(
+            "--expired",
+            help="Forget drives older than the retention says, for a schedule.",
+        ),
+    ] = False,
+    retention: Annotated[
+        str | None,
+        typer.Option(help="With --expired: a TOML file. Default: retention.toml of the configs."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Forget a vehicle or drives: in logs, Gram rows and quarantine; mark the models they trained.
@@ -183,6 +215,11 @@ def forget(
 
     Example: **fleet-slip forget --vehicle car-7 --now**
     """
+    if expired or retention is not None:
+        if not expired or request != ForgetRequest() or allow:
+            raise UsageError("give --expired alone, or with --retention.")
+        _forget_expired(context.obj, retention, json)
+        return
     name, value = request.subject
     if allow and name == "drive_name":
         raise UsageError("give --allow with --vehicle, --drive or --source-file.")
@@ -226,28 +263,16 @@ def _say_forgotten(report: ForgetReport) -> None:
         say(f"{report.old_files_deleted} old files with them deleted")
     if report.old_files_left:
         say(
-            f"{report.old_files_left} old files still have them until fleet-slip vacuum is due; "
-            "repeat with --now to delete them at once"
+            f"{report.old_files_left} old files still have them until fleet-slip compact removes "
+            "them; repeat with --now to delete them at once"
         )
     if report.models:
         say(f"trained on them: {', '.join(report.models)}. Train again with: fleet-slip run")
 
 
-@record_run
-def retain(
-    context: typer.Context,
-    config: Annotated[
-        str | None,
-        typer.Option(help="A retention TOML file. Default: configs/retention.toml as it ships."),
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Forget drives that are older than the retention says, then vacuum. For a schedule.
-
-    Example: **fleet-slip retain**
-    """
+def _forget_expired(fleet: Fleet, retention: str | None, json: bool) -> None:
     with progress("retain", "files") as show:
-        report = context.obj.retain(config, progress=show)
+        report = fleet.retain(retention, progress=show)
     if json:
         print_json(report)
         return
@@ -255,7 +280,7 @@ def retain(
         _say_forgotten(report.forgotten)
         say(
             "their files do not land again; drives as old that come in other files do, until the "
-            "next retain"
+            "next forget --expired"
         )
     else:
         say(f"no drive is older than {report.before}")

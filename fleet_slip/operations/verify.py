@@ -496,7 +496,7 @@ def _list_unreferenced(
             continue
         for file in files:
             what = "replaced" if file.path in known else "never committed"
-            then = "fleet-slip vacuum removes it in time"
+            then = "fleet-slip compact removes it in time"
             if snapshot.version is None:
                 then = "if the table had a Delta log, restore that from a backup"
             _remark(warehouse, file, f"{what}; {then}", report)

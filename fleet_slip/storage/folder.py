@@ -170,7 +170,7 @@ _MEANINGS: tuple[tuple[str, str], ...] = (
     (
         r"AccessDenied|AuthorizationFailure|AuthorizationPermissionMismatch|403 Forbidden",
         "the credentials do not permit this. Reading needs the right to get and list objects, "
-        "writing to put them, and vacuum and forget to delete them.",
+        "writing to put them, and compact and forget to delete them.",
     ),
     (
         r"scheme is not allowed|BadScheme",

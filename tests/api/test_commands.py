@@ -151,7 +151,7 @@ def test_a_worse_model_is_refused_and_aliases_move(fleet: Fleet, tmp_path: Path)
         own.publish("slip", own.cohort().select(nested="ax"))
     forced = own.publish("slip", own.cohort().select(nested="ax"), force=True)
     assert own.model("slip") == forced.version
-    assert own.rollback("slip").version == 1
+    assert own.promote("slip", previous=True).version == 1
     assert own.promote("slip@2", "candidate").reference == "slip@2"
     assert own.model("slip@candidate").version == 2
     with pytest.raises(UsageError, match="cannot be the name"):

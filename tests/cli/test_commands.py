@@ -174,7 +174,7 @@ def test_publish_show_score_promote_and_roll_back(run_command: RunCommand, tmp_p
     forced = run_command("publish", "smoke", *alone, "--force", "--json").json
     assert (forced["version"], forced["new"]) == (2, True)
     assert run_command("show", "smoke", "--json").json["version"] == 2
-    assert run_command("rollback", "smoke").exit_code == 0
+    assert run_command("promote", "smoke", "--previous").exit_code == 0
     shown = run_command("show", "smoke@champion", "--json").json
     assert shown["version"] == 1
     score = run_command("score", "smoke", "--json").json
@@ -190,7 +190,7 @@ def test_publish_show_score_promote_and_roll_back(run_command: RunCommand, tmp_p
 
 @pytest.mark.long
 def test_the_grams_agree_however_computed(run_command: RunCommand, smoke_root: Path) -> None:
-    report = run_command("check", "--json", root=smoke_root).json
+    report = run_command("verify", "--grams", "--json", root=smoke_root).json["grams"]
     assert report["drives"] >= report["files"] == report["drives_by_integers"] > 0
 
 
@@ -260,7 +260,7 @@ def test_commands_on_an_empty_warehouse_say_how_to_begin(
     (tmp_path / "data").mkdir()
     assert run_command("select").exit_code == 5
     assert "fleet-slip simulate" in run_command("select").stderr
-    done = run_command("check")
+    done = run_command("verify", "--grams")
     assert (done.exit_code, "come with: fleet-slip run, or ingest" in done.stderr) == (5, True)
     assert run_command("sql", "FROM log", "--json").json == []
     assert run_command("sql", "FROM drives", "--json").json == []

@@ -35,12 +35,12 @@ def test_no_night_moves_a_champion_that_was_pinned_or_rolled_back(
 ) -> None:
     shutil.copytree(smoke_root, tmp_path / "data")
     assert run_command(*WORSE, "--force").exit_code == 0
-    for hold in ("pin", "rollback"):
-        assert run_command(hold, "smoke").exit_code == 0
+    for hold in (["pin", "smoke"], ["promote", "smoke", "--previous"]):
+        assert run_command(*hold).exit_code == 0
         before = run_command("show", "smoke", "--json").json["version"]
         night = run_command("publish", "smoke", "--nested", "ay,yaw_rate", "--force", "--json")
         assert night.json["candidate"]
         assert run_command("show", "smoke", "--json").json["version"] == before
-    assert run_command("unpin", "smoke").exit_code == 0
+    assert run_command("pin", "smoke", "--off").exit_code == 0
     night = run_command("publish", "smoke", "--nested", "ay,yaw_rate", "--force", "--json")
     assert not night.json["candidate"]
