@@ -7,11 +7,10 @@ import duckdb
 
 from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, DELAY, TRAINING_DRIVES
 from fleet_slip.catalogue.features import features
-from fleet_slip.config import read_sql
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.folder import Folder
-from fleet_slip.storage.runs import lend_runs, run_source
+from fleet_slip.storage.runs import add_runs
 from fleet_slip.warehouse.tables import (
     TABLE_VIEWS,
     Warehouse,
@@ -76,10 +75,7 @@ def _open_views(
     database = open_tables(warehouse, wanted, snapshots, threads=threads, of=of)
     paths = paths_of(snapshots, wanted)
     if "runs" in wanted:
-        runs = lend_runs(warehouse.root, database)
-        paths += runs
-        source = run_source(database, runs)
-        database.execute(read_sql("warehouse", "runs.sql").format(stored_runs=source))
+        add_runs(database, warehouse.root)
     if "models" in wanted:
         add_table(database, "models", Registry(warehouse.root / "models").as_table())
     if CALIBRATION in wanted:

@@ -1,5 +1,16 @@
--- The commands that changed the warehouse, one row a run. A run without an outcome is under way or was killed.
-CREATE VIEW runs AS
+-- The commands that changed the warehouse, one row a run, of its one or two lines. A run without an outcome is under way
+-- or was killed.
+CREATE TABLE runs AS
+WITH records AS (
+    SELECT
+        unnest(from_json(line, '{
+            "run_id": "VARCHAR", "command": "VARCHAR", "arguments": ["VARCHAR"], "started_at": "VARCHAR", "ended_at": "VARCHAR",
+            "outcome": "VARCHAR", "exit_code": "INTEGER", "error": "VARCHAR", "seconds": "DOUBLE",
+            "steps": [{"name": "VARCHAR", "seconds": "DOUBLE", "rows": "BIGINT", "size_bytes": "BIGINT"}],
+            "host": "VARCHAR", "process": "INTEGER", "process_began": "VARCHAR", "package_version": "VARCHAR"
+        }'))
+    FROM run_lines
+)
 SELECT
     run_id,
     any_value(command) AS command,
@@ -17,6 +28,6 @@ SELECT
     any_value(process) AS process,
     any_value(process_began) AS process_began,
     any_value(package_version) AS package_version
-FROM {stored_runs}
+FROM records
 WHERE run_id IS NOT NULL
 GROUP BY run_id

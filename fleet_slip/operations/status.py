@@ -17,10 +17,9 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, Folder, storage_errors
 from fleet_slip.storage.runs import (
+    add_runs,
     find_changed_lines,
     find_missing_documents,
-    lend_runs,
-    run_source,
     state_of,
 )
 from fleet_slip.storage.table import Snapshot
@@ -197,9 +196,7 @@ def _last_runs(root: Folder, since: str) -> list[dict[str, Any]]:
         open_database(reading=root) as database,
         database_errors(f"reading the history of runs in {root}"),
     ):
-        view = read_sql("warehouse", "runs.sql")
-        runs = lend_runs(root, database, since=since)
-        database.execute(view.format(stored_runs=run_source(database, runs)))
+        add_runs(database, root, since)
         rows = database.sql(read_sql("jobs", "last_runs.sql")).to_arrow_table().to_pylist()
     return [row | {"state": state_of(row)} for row in rows]
 

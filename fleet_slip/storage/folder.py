@@ -100,7 +100,7 @@ class Folder(Protocol):
         """Return the content of a file, or only its first bytes."""
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
-        """Return the content of files, None for one that is gone."""
+        """Return the content of files; None for one that is gone, nothing of a link."""
 
     def check(self, path: str) -> None:
         """Raise `StorageError` for a changed data file, if `open` would not."""
@@ -134,11 +134,6 @@ class Folder(Protocol):
 
     def let_read(self, database: "duckdb.DuckDBPyConnection") -> None:
         """Enable a connection to read files below this folder."""
-
-    def lend(
-        self, database: "duckdb.DuckDBPyConnection", wanted: Callable[[str], bool]
-    ) -> list[str]:
-        """Let a connection read small files that others may replace; return their URIs, sorted."""
 
 
 # Turns what fails below a data root into `StorageError`, with the next thing to do.

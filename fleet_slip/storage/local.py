@@ -85,7 +85,7 @@ class LocalFolder:
             return file.read(-1 if longest is None else longest)
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
-        return [self.read(path) if (self.path / path).is_file() else None for path in paths]
+        return [self._read_or_none(path) for path in paths]
 
     def check(self, path: str) -> None:
         check_local_files([str(self.path / path)])
@@ -184,14 +184,11 @@ class LocalFolder:
     def let_read(self, database: "duckdb.DuckDBPyConnection") -> None:
         """Enable a connection to read files below this folder, as every one is."""
 
-    def lend(
-        self,
-        database: "duckdb.DuckDBPyConnection",  # noqa: ARG002
-        wanted: Callable[[str], bool],
-    ) -> list[str]:
-        """Return the URIs of the wanted files but links, which may lead anywhere."""
-        paths = [self.path / file.path for file in self.files() if wanted(file.path)]
-        return [f"{self.uri}/{p.relative_to(self.path)}" for p in paths if not p.is_symlink()]
+    def _read_or_none(self, path: str) -> bytes | None:
+        file = self.path / path
+        if file.is_symlink():  # it may lead anywhere
+            return b""
+        return self.read(path) if file.is_file() else None
 
     def _judge(self, path: Path) -> StoredFile | None:
         try:

@@ -295,10 +295,19 @@ _fetched: dict[str, bytes] = {}
 _fetching = threading.Lock()
 
 
-class _ReadOnlyFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
-    """Files that never change, for DuckDB. fsspec makes text of all that one is made with."""
+class ObjectFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
+    """The objects of one bucket, which never change, for DuckDB.
+
+    fsspec makes text of all that one is made with.
+    """
 
     cachable = False
+
+    def __init__(self, bucket: str, store: "Callable[[], ObjectStore]") -> None:
+        super().__init__()
+        self.protocol, _, self._name = bucket.partition("://")
+        self._store = store()
+        self._sizes: dict[str, int] = {}
 
     def info(self, path: str, **_options: Any) -> dict[str, Any]:
         """Return the name, type and size of a file."""
@@ -320,18 +329,7 @@ class _ReadOnlyFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
         """Open a file for reading. Raises `PermissionError` for any other mode."""
         if mode != "rb":
             raise PermissionError(f"{path}: a warehouse is only read through SQL")
-        reader: io.RawIOBase | io.BytesIO = self._reader(path)
-        return reader
-
-
-class ObjectFilesystem(_ReadOnlyFilesystem):
-    """The objects of one bucket."""
-
-    def __init__(self, bucket: str, store: "Callable[[], ObjectStore]") -> None:
-        super().__init__()
-        self.protocol, _, self._name = bucket.partition("://")
-        self._store = store()
-        self._sizes: dict[str, int] = {}
+        return open_object(self._store, *self._key(path), self._size(path))
 
     def _key(self, path: str) -> tuple[str, str]:
         key = path.removeprefix(f"{self.protocol}://").removeprefix(f"{self._name}/")
@@ -344,30 +342,8 @@ class ObjectFilesystem(_ReadOnlyFilesystem):
                 self._sizes[key] = obstore.head(self._store, key)["size"]
         return self._sizes[key]
 
-    def _reader(self, path: str) -> io.RawIOBase | io.BytesIO:
-        return open_object(self._store, *self._key(path), self._size(path))
-
-
-class LentFile(_ReadOnlyFilesystem):
-    """A file in memory, for a connection that it is registered with."""
-
-    protocol = "lent"
-    uri = "lent://file"
-
-    def __init__(self, content: memoryview) -> None:
-        super().__init__()
-        self._content = content
-
-    def _size(self, _path: str) -> int:
-        return len(self._content)
-
-    def _reader(self, _path: str) -> io.BytesIO:
-        return io.BytesIO(self._content)
-
 
 READS_AT_ONCE = 32
-LISTINGS = 20
-"""So often files are listed again that were replaced before they were read."""
 
 
 @dataclass(frozen=True)
@@ -489,24 +465,6 @@ class ObjectFolder:
 
     def let_read(self, database: duckdb.DuckDBPyConnection) -> None:
         database.register_filesystem(ObjectFilesystem(self.bucket, lambda: self._store))
-
-    def lend(self, database: duckdb.DuckDBPyConnection, wanted: Callable[[str], bool]) -> list[str]:
-        """Read the files whose paths are wanted into memory, as one; return its URI.
-
-        DuckDB would ask one by one. Raises `StorageError` if they are replaced as fast as listed.
-        """
-        for _ in range(LISTINGS):
-            paths = [file.path for file in self.files() if wanted(file.path)]
-            contents = self.read_many(paths)
-            if None not in contents:
-                break
-        else:
-            raise StorageError(f"{self}: other processes keep changing it. Run the command again.")
-        if not paths:
-            return []
-        lent = LentFile(memoryview(b"".join(content for content in contents if content)))
-        database.register_filesystem(lent)
-        return [lent.uri]
 
     @property
     def _store(self) -> "ObjectStore":

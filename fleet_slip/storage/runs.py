@@ -1,9 +1,13 @@
-"""Lines of the history of runs, each with its own checksum, and what is wrong with a line.
+"""The history of runs and nights: which commands changed a data root, and what came of it.
 
-    {"run_id":…,"documents":…,"sha256":"0123456789abcdef0123456789abcdef"}
+    runs/2026-11.jsonl                        one line when a command starts, one when it ends
+    runs/2026-11.jsonl/TIME-RANDOM.jsonl      such lines, on an object store
+    runs/2026-11.jsonl/CHECKSUM.jsonl         lines of that month, gathered
+    nights/1.json, 2.json, ...                two of a night: its beginning and its end
 
-The checksum is of the bytes before it: a changed line differs from a torn one, which lacks its end,
-and an old one, which has none. Lines are no chain: processes add them without a lock.
+A line is one write, never changed, that ends in a checksum of the bytes before: no lock, and a
+killed run lacks its second line. A changed line differs from a torn one, which lacks its end and is
+skipped, and an old one, which has no checksum.
 
 Every run keeps number and checksum of the newest document of each folder, to tell that the last
 ones are gone; whoever deletes these and rewrites all records leaves no trace: docs/security.md.
@@ -28,6 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import duckdb
+import pyarrow as pa
 
 from fleet_slip.config import read_sql
 from fleet_slip.errors import HIDDEN, StorageError, hide_passwords
@@ -42,23 +47,14 @@ FOLDER = "runs"
 NEWEST_DOCUMENTS = "documents"
 """Name of the newest documents in the record of a run."""
 
-RECORD_COLUMNS = {
-    "run_id": "VARCHAR",
-    "command": "VARCHAR",
-    "arguments": "VARCHAR[]",
-    "started_at": "VARCHAR",
-    "ended_at": "VARCHAR",
-    "outcome": "VARCHAR",
-    "exit_code": "INTEGER",
-    "error": "VARCHAR",
-    "seconds": "DOUBLE",
-    "steps": "STRUCT(name VARCHAR, seconds DOUBLE, rows BIGINT, size_bytes BIGINT)[]",
-    "host": "VARCHAR",
-    "process": "INTEGER",
-    "process_began": "VARCHAR",
-    "package_version": "VARCHAR",
-}
-"""What a line of the history may say, with DuckDB's types."""
+_KEYS = frozenset(
+    {"run_id", "command", "arguments", "started_at", "ended_at", "outcome", "exit_code", "error"}
+    | {"seconds", "steps", "host", "process", "process_began", "package_version", NEWEST_DOCUMENTS}
+)
+"""What lines of earlier versions, which have no checksum, may say."""
+
+LISTINGS = 20
+"""So often records are listed again that were gathered before they were read."""
 
 _DOCUMENT_FOLDER = re.compile(r"forgotten|models/(?!\.\./)[^/]*/(?:versions|history)")
 
@@ -83,43 +79,41 @@ def write_line(record: Mapping[str, Any]) -> bytes:
     return body + b',"sha256":"' + _checksum(body) + b'"}'
 
 
-def is_intact(line: bytes) -> bool:
-    """Whether a line is what was written."""
-    return bool(line) and not _is_torn(line) and not _is_changed(line)
-
-
-def changed_lines(content: bytes) -> list[int]:
-    """Return the numbers of the lines, from 1, that are not what was written; torn ones are."""
-    lines = enumerate(content.split(b"\n"), 1)
-    return [n for n, line in lines if line and not _is_torn(line) and _is_changed(line)]
+def read_lines(content: bytes) -> tuple[list[bytes], list[int]]:
+    """Return the lines that are what was written, and the numbers, from 1, of changed ones."""
+    intact, changed = [], []
+    for number, line in enumerate(content.split(b"\n"), 1):
+        found = _WITH_CHECKSUM.fullmatch(line)
+        record = None if found else _parsed(line)
+        # An earlier version wrote no checksum, but no other keys either.
+        if _checksum(found[1]) == found[2] if found else record and record.keys() <= _KEYS:
+            intact.append(line)
+        elif found or record is not None or _ends(line) or _ends(line[:-1]):
+            changed.append(number)
+    return intact, changed
 
 
 def find_changed_lines(root: Folder, since: str = "") -> Iterator[tuple[str, str]]:
     """Yield the files, from a month YYYY-MM on, that have changed lines, and which."""
+    for path, content in _read_history(root, since):
+        for number in read_lines(content)[1]:
+            yield f"{FOLDER}/{path}", f"line {number} is not what a run has written"
+
+
+def _read_history(root: Folder, since: str = "") -> list[tuple[str, bytes]]:
+    """Return the files of the history from a month YYYY-MM on. Raises `StorageError`."""
     folder = root / FOLDER
-    for file in folder.files():
-        if not file.path.endswith(".jsonl") or file.path < since:
-            continue
-        try:
-            (content,) = folder.read_many([file.path])
-        except StorageError:
-            continue
-        for number in changed_lines(content or b""):
-            yield f"{FOLDER}/{file.path}", f"line {number} is not what a run has written"
+    for _ in range(LISTINGS):
+        paths = [f.path for f in folder.files() if _is_record(f.path) and f.path >= since]
+        contents = folder.read_many(paths)
+        if None not in contents:
+            return [(path, content or b"") for path, content in zip(paths, contents, strict=True)]
+    raise StorageError(f"{folder}: other processes keep changing it. Run the command again.")
 
 
-def require_unchanged(root: Folder, since: str = "") -> None:
-    """Raise `StorageError` if a line of the history was changed."""
-    for path, problem in find_changed_lines(root, since):
-        raise StorageError(
-            f"{root}/{path}: {problem}; it was changed or damaged. Restore the file from a backup, "
-            "or delete the line: the others stand for themselves."
-        )
-
-
-def _is_torn(line: bytes) -> bool:
-    """Whether a line lacks its end, as a write that did not finish leaves it."""
-    return not (_ends(line) or _ends(line[:-1]) or _parsed(line) is not None)
+def _intact_records(root: Folder, since: str) -> Iterator[dict[str, Any]]:
+    for _, content in _read_history(root, since):
+        yield from map(json.loads, read_lines(content)[0])
 
 
 def _ends(line: bytes) -> bool:
@@ -130,14 +124,6 @@ def _ends(line: bytes) -> bool:
     pairs = zip(there, _END, strict=True)
     hexadecimal = b"0123456789abcdef"
     return sum(a != b and not (b == 48 and a in hexadecimal) for a, b in pairs) <= 1
-
-
-def _is_changed(line: bytes) -> bool:
-    if found := _WITH_CHECKSUM.fullmatch(line):
-        return _checksum(found[1]) != found[2]
-    record = _parsed(line)
-    # An earlier version wrote no checksum, but no other keys either.
-    return record is None or not record.keys() <= {*RECORD_COLUMNS, NEWEST_DOCUMENTS}
 
 
 def _parsed(line: bytes) -> dict[str, Any] | None:
@@ -177,29 +163,13 @@ def find_missing_documents(root: Folder, since: str = "") -> Iterator[tuple[str,
 
 
 def _newest_seen(root: Folder, since: str) -> dict[str, tuple[int, str]]:
-    folder = root / FOLDER
-    paths = [f.path for f in folder.files() if f.path.endswith(".jsonl") and f.path >= since]
     kept: dict[str, tuple[int, str]] = {}
-    for content in folder.read_many(paths):
-        for line in (content or b"").splitlines():
-            for path, number, digest in _newest_in(line):
-                if number >= kept.get(path, (0, ""))[0]:
+    for record in _intact_records(root, since):
+        with contextlib.suppress(ValueError, TypeError, AttributeError):  # one without a checksum
+            for path, (number, digest) in record.get(NEWEST_DOCUMENTS, {}).items():
+                if _DOCUMENT_FOLDER.fullmatch(path) and number >= kept.get(path, (0, ""))[0]:
                     kept[path] = (number, digest)
     return kept
-
-
-def _newest_in(line: bytes) -> Iterator[tuple[str, int, str]]:
-    """Yield the newest documents that a line tells, none if it is torn, changed or without them."""
-    if not is_intact(line):
-        return
-    try:
-        record: Any = json.loads(line)
-        found = record.get(NEWEST_DOCUMENTS) or {}
-        for path, (number, sha256) in found.items():
-            if _DOCUMENT_FOLDER.fullmatch(str(path)):
-                yield str(path), int(number), str(sha256)
-    except (ValueError, TypeError, AttributeError, RecursionError):
-        return
 
 
 def _document_folders(root: Folder) -> list[str]:
@@ -209,14 +179,6 @@ def _document_folders(root: Folder) -> list[str]:
         *(f"{model}/{kind}" for model in models for kind in ("versions", "history")),
     ]
 
-
-# The history of runs: which commands changed a warehouse, when, and what came of it.
-#
-#     runs/2026-11.jsonl     one line when a command starts, one when it ends
-#
-# A line is one write, with a checksum (`fleet_slip.runs.records`), never changed: no lock, and a
-# killed run lacks its second line. Torn lines are skipped; each record begins a new line. What
-# cannot be written is not: nothing here fails or delays the command.
 
 LOGGER = logging.getLogger("fleet_slip")
 INTERRUPTED = 130
@@ -431,37 +393,38 @@ def _timestamp(moment: datetime) -> str:
     return moment.isoformat(timespec="microseconds")
 
 
-# Reading the history of runs, and keeping it short where every record is an object of its own.
-#
-#     runs/2026-11.jsonl                        the records of a month, in a folder
-#     runs/2026-11.jsonl/TIME-RANDOM.jsonl      a record, on an object store
-#     runs/2026-11.jsonl/CHECKSUM.jsonl         records of that month, gathered
-#
-# Gathering takes no lock: a record is deleted by who has written an object that has it, so that
-# each is there once or more; the view `runs` counts by name, and readers list again.
-
 REMOVALS_AT_ONCE = 16
 RUNNING = "running"
 KILLED = "killed"
 
 
-def lend_runs(root: Folder, database: duckdb.DuckDBPyConnection, since: str = "") -> list[str]:
-    """Let a connection read the history since a month; return its URIs. Raises `StorageError`."""
-    require_unchanged(root, since)
-    return (root / FOLDER).lend(database, lambda path: _is_record(path) and path >= since)
+def add_runs(database: duckdb.DuckDBPyConnection, root: Folder, since: str = "") -> None:
+    """Make the table `runs` of a connection, since a month YYYY-MM; `warehouse/runs.sql` says how.
+
+    Raises `StorageError` for a changed line.
+    """
+    found = []
+    for path, content in _read_history(root, since):
+        lines, changed = read_lines(content)
+        if changed:
+            raise StorageError(
+                f"{root}/{FOLDER}/{path}: line {changed[0]} is not what a run has written; it was "
+                "changed or damaged. Restore the file from a backup, or delete the line: the "
+                "others stand for themselves."
+            )
+        found.append(pa.array(lines, pa.binary()).cast(pa.string()))
+    rows = pa.chunked_array(found, pa.string())
+    database.register("run_lines", pa.table({"line": rows}))
+    database.execute(read_sql("warehouse", "runs.sql"))
+    database.unregister("run_lines")
 
 
 def runs_under_way(root: Folder) -> list[str]:
     """Return other runs of the last day that have no end, but for dead ones of this machine."""
     since = datetime.now(UTC) - timedelta(days=1)
-    begun: dict[str, Mapping[str, Any]] = {}
-    folder = root / FOLDER
-    paths = [f.path for f in folder.files() if _is_record(f.path) and f.path >= f"{since:%Y-%m}"]
-    for content in folder.read_many(paths):
-        for line in (content or b"").splitlines():
-            if is_intact(line):
-                record = json.loads(line)
-                begun[record["run_id"]] = {**begun.get(record["run_id"], {}), **record}
+    begun: dict[str, dict[str, Any]] = defaultdict(dict)
+    for record in _intact_records(root, f"{since:%Y-%m}"):
+        begun[record["run_id"]].update(record)
     return [
         run_id
         for run_id, run in sorted(begun.items())
@@ -520,23 +483,6 @@ def _gather(folder: Folder, month: str, files: list[StoredFile]) -> None:
 def _is_record(path: str) -> bool:
     return path.endswith(".jsonl")
 
-
-def run_source(database: duckdb.DuckDBPyConnection, files: list[str]) -> str:
-    """Return what stands after FROM for the history of runs, or some of its files."""
-    columns = ", ".join(f"{name} {kind}" for name, kind in RECORD_COLUMNS.items())
-    database.execute("SET VARIABLE run_files = $paths", {"paths": files})
-    if files:
-        return read_sql("warehouse", "stored_runs.sql").format(run_columns=RECORD_COLUMNS)
-    database.execute(f"CREATE TABLE empty_runs ({columns})")
-    return "empty_runs"
-
-
-# The record of nights: where each began, and how it ended.
-#
-#     nights/1.json, 2.json, ...    two of a night: its beginning and its end
-#
-# A killed night that is given again starts from its beginning, and tells the whole. Faulty drives
-# are hashes: the record outlives what is forgotten.
 
 NIGHTS_FOLDER = "nights"
 HASH_CHARACTERS = 16

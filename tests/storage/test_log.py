@@ -137,15 +137,6 @@ def test_secrets_and_names_of_cars_are_not_kept() -> None:
     assert publishable(["bad \udcff name"]) == ["bad ? name"]
 
 
-def test_the_history_is_read_when_it_is_asked_for_and_not_when_connecting(tmp_path: Path) -> None:
-    with recording(LocalFolder(tmp_path), "gram", []):
-        pass
-    with fleet_slip.connect(tmp_path) as database:
-        with recording(LocalFolder(tmp_path), "gram", []):
-            pass
-        assert database.execute("SELECT count(*) FROM runs").fetchone() == (2,)
-
-
 def test_commands_are_recorded_and_questions_are_not(run_command: RunCommand) -> None:
     run_command("run", "--campaign", "smoke", "--days", "1")
     run_command("gram", "--features", "unknown")

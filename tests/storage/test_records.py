@@ -10,10 +10,9 @@ from fleet_slip.errors import StorageError
 from fleet_slip.operations.verify import Verification, verify_documents
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import (
-    changed_lines,
     find_changed_lines,
     find_missing_documents,
-    is_intact,
+    read_lines,
     recording,
     runs_under_way,
     write_line,
@@ -36,12 +35,12 @@ def changed(file: Path) -> list[str]:
 
 def test_every_flipped_bit_is_found(history: Path) -> None:
     whole = history.read_bytes()
-    assert changed_lines(whole) == []
+    assert read_lines(whole)[1] == []
     missed = []
     for bit in range(len(whole) * 8):
         damaged = bytearray(whole)
         damaged[bit // 8] ^= 1 << bit % 8
-        if not changed_lines(bytes(damaged)):
+        if not read_lines(bytes(damaged))[1]:
             missed.append(bit)
     assert missed == []
 
@@ -89,6 +88,6 @@ def test_lines_of_earlier_versions_have_no_checksum(history: Path) -> None:
     record = json.loads(history.read_bytes().split(b"\n")[1])
     del record["sha256"]
     line = json.dumps(record).encode()
-    assert is_intact(line)
-    assert not is_intact(line.replace(b'"process"', b'"prozess"'))
-    assert is_intact(write_line(record))
+    assert read_lines(line) == ([line], [])
+    assert read_lines(line.replace(b'"process"', b'"prozess"')) == ([], [1])
+    assert read_lines(write_line(record))[0]
