@@ -46,16 +46,16 @@ def document_of(
 
     `drives` is the content of the file about the drives that trained it.
     """
-    told_by = version.manifest.trained_on.drives_sha256
+    drives_sha256 = version.manifest.trained_on.drives_sha256
     if drives is not None:
-        told_by = checksum_of_drives(drives)
+        drives_sha256 = checksum_of_drives(drives)
     content: dict[str, Any] = {
         "format": FORMAT,
         "schema": SCHEMA,
         "model": {
             "reference": version.reference,
             "sha256": version.sha256,
-            "drives_sha256": told_by,
+            "drives_sha256": drives_sha256,
             "drives": None if drives is None else base64.b64encode(drives).decode("ascii"),
             "manifest": version.manifest.model_dump(mode="json"),
         },

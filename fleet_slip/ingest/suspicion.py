@@ -299,6 +299,7 @@ RADIUS_M, TRACK_M = 0.31, 1.55
 """Of a passenger car: what is looked for is a factor of 3.6, 9.8 or 57."""
 LONGEST_M, LARGE_RAD = 8.0, 0.15
 """No car's rear axle is so far behind, and a car that slips so often slides."""
+LARGEST_COLLINEAR = 0.995
 LEAST_LEVER_M, LONGEST_LEVER_M, LONGEST_PART = 0.6, 2.6, 0.75
 """The rear axle is so far behind the centre of gravity, and by this part of the wheelbase."""
 WHEELBASE_M = (2.0, 4.5)
@@ -531,9 +532,13 @@ def _lever(
 
     Turning slowly it is the distance to the rear axle times the yaw rate over the speed, less what
     the rear tyres slip, and 0 on a straight (Milliken and Milliken, Race Car Vehicle Dynamics,
-    chapter 5). The same fit of the road wheels tells the wheelbase, which is longer.
+    chapter 5). The same fit of the road wheels tells the wheelbase, which is longer. At one speed
+    the two inputs are one, and nothing is said.
     """
     label = catalogue().label
+    ay, curvature = inputs[:, slow & np.isfinite(inputs).all(axis=0)]
+    if ay.size < FEWEST_TICKS or abs(np.corrcoef(ay, curvature)[0, 1]) > LARGEST_COLLINEAR:
+        return
     (_, lever), zero, explained = fit(signals[label], inputs, slow)
     figure = f"turning slowly it goes with the yaw rate by {lever:+.2f} m, should be +1 to +2"
     if explained <= LEAST_CORRELATION:

@@ -19,7 +19,7 @@ from fleet_slip.config import Config, parse_document
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.trained_drives import TrainedDrives, keep_drives, read_listed
-from fleet_slip.pages.page import notebook_table
+from fleet_slip.pages.notebook import notebook_table
 from fleet_slip.storage.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.storage.folder import Folder
 

@@ -56,7 +56,7 @@ from fleet_slip.models.search import (
     select_inputs,
     try_distances,
 )
-from fleet_slip.pages.page import notebook_table
+from fleet_slip.pages.notebook import notebook_table
 from fleet_slip.regression.choice import NestedDistances, Rule, Winner, Worth, fall_short
 from fleet_slip.regression.drives import (
     ClusterUnit,

@@ -148,8 +148,10 @@ def test_a_file_that_grows_while_it_is_read_is_refused(
 ) -> None:
     file = write(tmp_path, GOOD.encode())
 
+    read = log_rows.read_batches
+
     def grow(*arguments: Any) -> Any:
-        yield from log_rows.read_batches(*arguments)
+        yield from read(*arguments)
         file.write_bytes(GOOD.encode() + b"0.20,1,1\n")
 
     monkeypatch.setattr(checking, "read_batches", grow)

@@ -116,7 +116,7 @@ def test_a_car_that_an_earlier_version_forgot_is_found_by_verify_and_taken_away_
     with monkeypatch.context() as patch:
         patch.setattr("fleet_slip.operations.forget.drop_unused_names", lambda _: 0)
         patch.setattr(Audit, "names_are_exact", False)
-        patch.setattr("fleet_slip.delta.Table.has_unused_names", lambda *_: False)
+        patch.setattr("fleet_slip.storage.table.Table.has_unused_names", lambda *_: False)
         patch.setattr(encoding, "_only_used_values", lambda rows: rows)
         forget(old, Forgettable("vehicle", GONE[0]), now=True)
     assert named(tmp_path / "data", GONE) == set(GONE)

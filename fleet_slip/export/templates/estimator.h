@@ -11,7 +11,7 @@ extern "C" {
 
 #define ${upper}_MODEL "${version.reference}"
 #define ${upper}_SHA256 "${version.sha256}"
-#define ${upper}_DRIVES_SHA256 "${trained.told_by or ""}"
+#define ${upper}_DRIVES_SHA256 "${trained.drives_sha256 or ""}"
 
 /* Axes: ${axes}. */
 #define ${upper}_TICK_S ${tick_s}

@@ -1,6 +1,6 @@
 -- ${version.reference}: ${angle.column}, exported by fleet-slip. Do not edit.
 -- SHA-256 of the version: ${version.sha256}
--- Trained on ${trained.drives} drives, SHA-256 ${trained.told_by or "unknown"}
+-- Trained on ${trained.drives} drives, SHA-256 ${trained.drives_sha256 or "unknown"}
 -- angle: counts of ${angle.scale|decimal} ${angle.unit}, within ${"%.12f"|format(angle.error|float)} counts of the exact model
 //% if macro
 CREATE OR REPLACE MACRO ${macro}(source) AS TABLE
