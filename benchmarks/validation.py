@@ -1,6 +1,6 @@
 """The simulated cars in the manoeuvres of ISO 4138, 7401 and 3888, beside closed forms.
 
-    python -m benchmarks.validation [--plots docs/images] [--document docs/validation.md]
+    python -m benchmarks.validation [--plots docs/images] [--document docs/vehicle.md]
 
 Compact, sedan and SUV, each as its file has it and as a car with the imperfections of the scenario
 `imperfect`. The closed forms are those of the linear bicycle (Riekert and Schunck 1940; here as in

@@ -151,7 +151,7 @@ class LogsAndGrams(Rooted):
 
     @record_call
     def ingest_counted(self, file: Path | str) -> "CountedReport":
-        """Bring in Gram rows that cars counted: a Parquet or Arrow table (`docs/edge.md`).
+        """Bring in Gram rows that cars counted: a Parquet or Arrow table (`docs/export.md`).
 
         It lands whole and once. Raises `InputError` for a row that no drive can have or of what was
         forgotten, `RepeatedError` for a drive that is there, `StorageError` and `ConflictError`.
@@ -248,7 +248,7 @@ class LogsAndGrams(Rooted):
 
     @record_call
     def migrate(self, *, progress: ShowProgress | None = None) -> "MigrationReport":
-        """Bring the logs to the signal catalogue (`docs/schema.md`): add columns, convert scales.
+        """Bring the logs to the signal catalogue (`docs/configuration.md`): add columns, convert scales.
 
         Progress is in rows. Raises `RefusedError` if counts would not fit, and `ConflictError`.
         """

@@ -145,7 +145,7 @@ def ingest(
 ) -> None:
     """Bring measured logs into the warehouse through a mapping of columns, units and axes.
 
-    Without a mapping, files are tables of Gram rows that cars counted (docs/edge.md).
+    Without a mapping, files are tables of Gram rows that cars counted (docs/export.md).
 
     Rows that cannot be used go to the quarantine with a reason: fleet-slip sql "FROM quarantine"
 
@@ -192,7 +192,7 @@ def ingest(
 def _ingest_counted(fleet: Fleet, files: list[str], json: bool, *, alone: bool) -> None:
     """Bring in tables of Gram rows that cars counted."""
     if not alone:
-        raise UsageError("give --mapping: without it files are tables of Gram rows (docs/edge.md).")
+        raise UsageError("give --mapping: without it files are tables of Gram rows (docs/export.md).")
     with recording(fleet.root, "ingest", sys.argv[1:]):
         reports = [fleet.ingest_counted(file) for file in files]
     if json:

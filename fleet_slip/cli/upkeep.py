@@ -294,7 +294,7 @@ def _forget_expired(fleet: Fleet, retention: str | None, json: bool) -> None:
 def migrate(context: typer.Context, json: Json = False) -> None:
     """Bring the logs to the signal catalogue: add columns, convert counts to other scales.
 
-    See docs/schema.md before widening a scale. It can be repeated after any interruption.
+    See docs/configuration.md before widening a scale. It can be repeated after any interruption.
 
     Example: **fleet-slip migrate**
     """

@@ -1,6 +1,6 @@
 """Gram rows in C99: what a car counts at each tick of a drive, and the messages that tell it.
 
-`docs/edge.md` reads the messages in Python. All numbers are little-endian. A message is
+`docs/export.md` reads the messages in Python. All numbers are little-endian. A message is
 
     0   4   "FSGR"                          36  8  when the drive began, s since 1970 in UTC
     4   2   layout, 1                       44  4  which signals it is of, a bit for each

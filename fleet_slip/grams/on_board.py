@@ -279,7 +279,7 @@ COLUMNS = pa.schema(
         ("products", pa.list_(pa.int64())),
     ]
 )
-"""The table of Gram rows; `part` and `course_late` may be null or absent (`docs/edge.md`)."""
+"""The table of Gram rows; `part` and `course_late` may be null or absent (`docs/export.md`)."""
 
 _NUMBERS = ("sums", "products")
 OPTIONAL = ("part", COURSE_LATE)
@@ -364,7 +364,7 @@ def _read(file: Path, content: bytes) -> pa.Table:
 
 
 _NOTE = {"job": "receive"}
-_SEE = "docs/edge.md has its columns."
+_SEE = "docs/export.md has its columns."
 
 
 def _require_size(file: Path, rows: int, unpacked_bytes: int) -> None:

@@ -1,4 +1,4 @@
-"""What cars, sensors and roads have beyond the textbook's. Sources: `docs/imperfections.md`."""
+"""What cars, sensors and roads have beyond the textbook's. Sources: `docs/simulator.md`."""
 
 from typing import Annotated, TypeVar
 

@@ -1,7 +1,7 @@
 """Equations of motion of a car with imperfections, on a road that is not flat, even and calm.
 
 As `dynamics`, but steering gives way, wheels differ, tyres lag, weight and wind act along the road.
-Sources: `docs/imperfections.md`.
+Sources: `docs/simulator.md`.
 """
 
 import math
@@ -36,7 +36,7 @@ from fleet_slip.vehicle.parameters import (
 )
 from fleet_slip.vehicle.tyre import CREEP_SPEED_MPS, brush_force
 
-# What a real car has beyond the textbook's; zero is without. Sources: `docs/imperfections.md`.
+# What a real car has beyond the textbook's; zero is without. Sources: `docs/simulator.md`.
 
 Angle = Annotated[FiniteFloat, Field(ge=-5, le=5)]
 RadiusError = Annotated[FiniteFloat, Field(ge=-0.1, le=0.1)]

@@ -82,7 +82,7 @@ def gram_of(seed: int, rows: int = 500) -> Gram:
 
 
 class Message(NamedTuple):
-    """What a message says, read by what docs/edge.md says of its layout."""
+    """What a message says, read by what docs/export.md says of its layout."""
 
     definition: int
     vehicle: bytes
