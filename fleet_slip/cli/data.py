@@ -192,7 +192,9 @@ def ingest(
 def _ingest_counted(fleet: Fleet, files: list[str], json: bool, *, alone: bool) -> None:
     """Bring in tables of Gram rows that cars counted."""
     if not alone:
-        raise UsageError("give --mapping: without it files are tables of Gram rows (docs/export.md).")
+        raise UsageError(
+            "give --mapping: without it files are tables of Gram rows (docs/export.md)."
+        )
     with recording(fleet.root, "ingest", sys.argv[1:]):
         reports = [fleet.ingest_counted(file) for file in files]
     if json:
