@@ -248,7 +248,7 @@ class LogsAndGrams(Rooted):
 
     @record_call
     def migrate(self, *, progress: ShowProgress | None = None) -> "MigrationReport":
-        """Bring the logs to the signal catalogue (`docs/configuration.md`): new columns, other scales.
+        """Bring the logs to the catalogue (`docs/configuration.md`): new columns, other scales.
 
         Progress is in rows. Raises `RefusedError` if counts would not fit, and `ConflictError`.
         """
