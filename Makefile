@@ -2,7 +2,7 @@
 # `make test` adds what the checks need, and passes every check that needs Python alone.
 # `make test-all` installs outside programs, such as a browser, and passes the checks that need them or minutes.
 # `make report` does what `make run` does, then writes ./data/report/report.html.
-# `make report MODEL=gated` adds hard driving, slippery roads and a fleet before, and tells of the model with gates: ten minutes.
+# `make report MODEL=gated` adds hard driving and slippery roads before, and tells of the model with gates: ten minutes.
 # `make docs` builds the pages as a site, ./site/index.html; a warning is an error.
 PYTHON ?= python3
 VENV := .venv
@@ -27,11 +27,8 @@ report: run $(filter gated,$(MODEL))
 
 gated: run
 	$(BIN)/fleet-slip --root $(ROOT) simulate proving_ground
-	$(BIN)/fleet-slip --root $(ROOT) simulate fleet --days 7
 	$(BIN)/fleet-slip --root $(ROOT) gram
 	$(BIN)/fleet-slip --root $(ROOT) gram --features gated --cohort "campaign IN ('waterford', 'proving_ground')"
-	$(BIN)/fleet-slip --root $(ROOT) gram --features calibration --cohort "campaign = 'fleet'"
-	$(BIN)/fleet-slip --root $(ROOT) gram --features fleet --cohort "campaign = 'fleet'"
 	$(BIN)/fleet-slip --root $(ROOT) show gated > /dev/null 2>&1 || \
 	$(BIN)/fleet-slip --root $(ROOT) publish gated --models gated --cohort "lost_control_s IS NULL \
 	  AND (campaign = 'waterford' OR campaign = 'proving_ground' AND vehicle_model = 'd_class_sedan')"

@@ -1,410 +1,288 @@
 """The report: one static page without a request to anywhere, and its figures as files."""
 
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any
 
-from jinja2 import meta
-
 from fleet_slip.base import number_of
-from fleet_slip.evaluation.pictures import draw_pictures
-from fleet_slip.evaluation.report_data import (
-    BLOCK_S,
-    DRAWN_FILTERS,
-    ReportData,
-    blocks_won,
-    difference,
-    gather,
-)
-from fleet_slip.evaluation.report_tables import TEXTS, expression, read_toml, tables
-from fleet_slip.evaluation.scenarios import PAPER_TABLE_TWO, ErrorFigures
-from fleet_slip.export.costs import describe_costs
+from fleet_slip.evaluation.charts import draw_pictures
+from fleet_slip.evaluation.claims import Status, judge_claims
+from fleet_slip.evaluation.evaluate import LEAST_COVERAGE
+from fleet_slip.evaluation.kept import ReportData, gather
+from fleet_slip.evaluation.scenarios import FILTER_SCENARIOS, PAPER_TABLE_TWO
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.drawing import Picture, draw, png_file, svg_file
-from fleet_slip.pages.page import Tile, count, degrees, fill_in, listed
-from fleet_slip.regression.choice import Winner
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.pages.page import (
+    Cell,
+    ReportTable,
+    Tile,
+    count,
+    degrees,
+    fill_in,
+    number,
+    percent,
+    table,
+)
 from fleet_slip.storage.folder import Folder
 from fleet_slip.warehouse.tables import Warehouse
 
-# What claims are judged by, each under the name that it has in `claims.toml`.
-
-SLIPPERY = "adhesion_0_4"
-OUTAGES = {"gps_urban": "between high buildings", "gps_tunnel": "in the tunnel"}
+PAPER_TABLE_ONE = {"1": 0.9013, "2": 0.9534, "3": 0.9796, "4": 0.9911, "5": 0.9911}
+"""Cross-validated correlations, Table I."""
 
 
-class NotEvaluatedError(LookupError):
-    """The evaluation lacks what a claim needs; the message says what."""
+def _marked(text: str, good: bool, miss: bool = False) -> Cell:
+    return Cell(text, "good" if good else "miss" if miss else "")
 
 
-class Facts:
-    """The facts of one report, worked out when a claim asks for them."""
-
-    def __init__(self, data: ReportData) -> None:
-        """Take what the report knows."""
-        self.data = data
-        self._evaluated = data.evaluated
-
-    def __getitem__(self, name: str) -> Any:
-        """Return a fact, or a scenario's figures of the choice. Raises `NotEvaluatedError`."""
-        if name in self.data.shipped:
-            return self.figures(name, self.data.choice)
-        if name not in NAMES:
-            raise KeyError(f"claims.toml names {name!r}, which is neither a fact nor a scenario")
-        fact = getattr(self, name)
-        return fact if name in FUNCTIONS else fact()
-
-    def figures(self, scenario: str, estimator: str) -> Any:
-        """Return the error figures of an estimator over a whole drive, all of which are there."""
-        return _complete(self._evaluated.figures(scenario, estimator), f"{estimator} on {scenario}")
-
-    def unstable(self, scenario: str) -> list[str]:
-        """Return when the car is unstable in a drive."""
-        found = self._evaluated.stretches(scenario, "unstable")
-        return [f"{begin:.0f}\N{EN DASH}{end:.0f} s" for begin, end in found]
-
-    def scenarios(self) -> Mapping[str, Mapping[str, Any]]:
-        """Return what the evaluation says of each scenario."""
-        return self._evaluated.scenarios
-
-    def models(self) -> Mapping[str, str]:
-        """Return the estimator's name of each model of Table I."""
-        return self._evaluated.models
-
-    def ordering(self) -> Any:
-        """Return what the order of the variables is worth."""
-        return self.data.ordering
-
-    def block_s(self) -> str:
-        """Return the length of a block of a drive."""
-        return f"{BLOCK_S:g}"
-
-    def fleets(self) -> dict[str, Any]:
-        """Compare the models of a fleet with those of one car on cars of other classes."""
-        scenarios = self._evaluated.scenarios
-        if "nominal" not in scenarios:
-            raise NotEvaluatedError("nominal drive")
-        rows = [
-            row
-            for row in self._evaluated.rows("comparisons")
-            if scenarios[row["scenario"]]["vehicle_model"] != scenarios["nominal"]["vehicle_model"]
-        ]
-        if not rows:
-            raise NotEvaluatedError("fleet-trained model on cars of other classes")
-        change = sum(row["fleet_rmse_deg"] - row["one_car_rmse_deg"] for row in rows)
-        better = sum(row["better"] == row["fleet"] for row in rows)
-        return {"better": better, "cases": len(rows), "change_deg": change / len(rows)}
-
-    def board(self) -> dict[str, Any]:
-        """Return what an estimate costs on board."""
-        version = self.data.version
-        return {
-            "signals": len(self._evaluated.estimators[self.data.choice]["signals"]),
-            "drives": version.manifest.trained_on.drives,
-            "version": version.reference,
-            "costs": describe_costs(version.manifest),
-        }
-
-    def training(self) -> dict[str, Any]:
-        """Return the training rows, and how the models of Table I do on them."""
-        selection = self.data.trained.selection
-        return {
-            "rows": selection.cohort.rows,
-            "rate_hz": SAMPLE_RATE_HZ,
-            "ranked": sorted(selection.models, key=lambda one: one.correlation, reverse=True),
-            "correlation": {model.name: model.correlation for model in selection.models},
-            "smallest": _smallest(selection.winner),
-        }
-
-    def table_two(self) -> dict[str, Any]:
-        """Compare the models' errors on the nominal drive with Table II."""
-        models = self._evaluated.models.items()
-        errors = {name: self.figures("nominal", one).rmse_deg for name, one in models}
-        near = [error for name, error in errors.items() if name != "1"]
-        return {
-            "rmse_deg": errors,
-            "reached": all(e <= math.hypot(*PAPER_TABLE_TWO[name]) for name, e in errors.items()),
-            "spread_deg": max(near) - min(near),
-        }
-
-    def blocks_won(self) -> dict[str, int]:
-        """Return in how many blocks of the nominal drive each model is best."""
-        models = self._evaluated.models
-        for estimator in models.values():
-            self.figures("nominal", estimator)
-        won = blocks_won(self.data.runs["nominal"], list(models.values()))
-        return {name: won[estimator] for name, estimator in models.items()}
-
-    def unstable_section(self) -> dict[str, Any]:
-        """Return the figures within and without the unstable section of the slippery drive."""
-        what = "unstable section at an adhesion of 0.4"
-        choice, part = self.data.choice, self._evaluated.part
-        return {
-            "inside": _complete(part(SLIPPERY, choice, "inside", "unstable"), what),
-            "outside": _complete(part(SLIPPERY, choice, "outside", "unstable"), what),
-        }
-
-    def while_stable(self) -> Any:
-        """Return the figures of the slippery drive where the car is stable."""
-        outside = self._evaluated.part(SLIPPERY, self.data.choice, "outside", "unstable")
-        return self[SLIPPERY] if outside is None else _complete(outside, "stable section")
-
-    def further_drives(self) -> dict[str, float]:
-        """Return the RMSE over the angle's std in each drive beyond the paper without a failure."""
-        shares = {
-            one["description"]: self[name].rmse_deg / one["truth"]["sideslip_std_deg"]
-            for name, one in self._evaluated.scenarios.items()
-            if one["paper"] is None and not one["failures"]
-        }
-        if not shares:
-            raise NotEvaluatedError("drive beyond the paper")
-        return shares
-
-    def worst(self) -> dict[str, Any]:
-        """Return the largest error in the paper's drives, and where it is."""
-        errors = [
-            (self[name].error_max_deg, one["description"])
-            for name, one in self._evaluated.scenarios.items()
-            if one["paper"]
-        ]
-        if not errors:
-            raise NotEvaluatedError("drive of the paper")
-        largest, where = max(errors)
-        return {"error_deg": largest, "drive": where}
-
-    def against(self) -> dict[str, Any]:
-        """Test the difference of the squared errors of filters and regression, block by block."""
-        for name in (self.data.choice, *DRAWN_FILTERS):
-            self.figures("nominal", name)
-        run, choice = self.data.runs["nominal"], self.data.choice
-        return {name: difference(run, choice, name) for name in DRAWN_FILTERS}
-
-    def over_gps_noise(self) -> str:
-        """Tell at which noise of GPS the tuned filter is as accurate as the regression."""
-        sweep = self._evaluated.gps_noise
-        if sweep is None:
-            return ""
-        levels = [level["velocity_std_mps"] for level in sweep["levels"]]
-        span = f"noises of GPS velocity from {min(levels):g} to {max(levels):g} m/s"
-        equal = sweep["equal_at_mps"].get("kalman_tuned", {}).get(self.data.choice)
-        if equal is None:
-            return f"Among {span} there is none at which both are equal. "
-        return (
-            f"It hangs on GPS: of {span}, the tuned filter is better below {equal:.3f} and the "
-            "regression above. "
+def table_one(data: ReportData) -> ReportTable:
+    """Return Table I: the models with folds by drive and, where there are such, by speed."""
+    head = ["model", "signals", "paper", "ours", "standard error", "RMSE"]
+    rows: list[list[str | Cell]] = []
+    for one in data.trained.selection.models:
+        paper = PAPER_TABLE_ONE.get(one.name)
+        ours = _marked(number(one.correlation, 4), paper is not None and one.correlation >= paper)
+        error, rmse = f"± {number(one.standard_error, 4)}", degrees(one.pooled.rmse_deg)
+        rows.append([one.name, ", ".join(one.signals), number(paper, 4), ours, error, rmse])
+        if data.by_speed:
+            band = data.by_speed.get(one.name)
+            rows[-1] += [
+                number(band.correlation if band else None, 4),
+                degrees(band.pooled.rmse_deg if band else None),
+            ]
+    selection = data.trained.selection
+    noise = data.version.manifest.cross_validation.label_noise_deg
+    note = (
+        f"{selection.folds.count} folds by {selection.folds.by}, {count(selection.cohort.rows)} "
+        f"rows. {selection.winner.reason} "
+    )
+    if noise is None:
+        note += "How noisy the label is, is not known: every RMSE here has its noise in it."
+    else:
+        note += f"Every RMSE here has the label's own noise in it, {degrees(noise, 4)}."
+    if data.by_speed:
+        head += ["by speed", "RMSE by speed"]
+        note += (
+            " By speed: whole bands of the drives' speed are left out one after another, so that "
+            "no model has seen the speeds it is tested at. Folds by drive interpolate between "
+            "neighbours."
         )
-
-    def in_outages(self) -> list[str]:
-        """Tell the errors while satellite navigation is out."""
-        told = []
-        for name, place in OUTAGES.items():
-            ours, theirs = (
-                self._evaluated.part(name, estimator, "inside", "gps_outage")
-                for estimator in (self.data.choice, "kalman_tuned")
-            )
-            if ours and theirs:
-                told.append(f"{place} {degrees(theirs.rmse_deg)} against {degrees(ours.rmse_deg)}")
-        return told
+    caption = "Table I. Properties of the estimation models: cross-validated correlation"
+    return table("table-1", caption, head, rows, left=2, note=note)
 
 
-FUNCTIONS = ("figures", "unstable")
-"""Facts that a claim calls itself."""
+def table_two(data: ReportData) -> ReportTable:
+    """Return Table II: the errors on the nominal test drive."""
+    rows = []
+    for name, estimator in data.evaluated.models.items():
+        one = data.evaluated.figures("nominal", estimator)
+        if one is None or one.error_std_deg is None:
+            continue
+        mean, std = PAPER_TABLE_TWO[name]
+        rows.append(
+            [
+                name,
+                number(mean, 4, sign=True),
+                number(one.error_mean_deg, 4, sign=True),
+                number(std, 4),
+                _marked(number(one.error_std_deg, 4), one.error_std_deg <= std),
+                number(one.correlation, 4),
+            ]
+        )
+    head = ["model", "mean, paper", "mean, ours", "std, paper", "std, ours", "correlation, ours"]
+    caption = "Table II. Predictive accuracy on the nominal test drive: error in degrees"
+    return table("table-2", caption, head, rows)
 
-NAMES = frozenset(name for name in vars(Facts) if not name.startswith("_"))
+
+def distances(data: ReportData) -> list[ReportTable]:
+    """Return the paper's distance D of the nested models, if there are enough drives for it."""
+    found = data.distances
+    if isinstance(found, str):
+        return []
+    evidence = found.evidence
+    expected = [float(one) for one in evidence.distances()]
+    rows = [
+        [
+            str(size),
+            found.order[size - 1] if size else "none",
+            number(evidence.contributions[size - 1] if size else None, 1),
+            number(evidence.excess()[size], 1),
+            _marked(number(one, 1), one == min(expected)),
+        ]
+        for size, one in enumerate(expected)
+    ]
+    return [
+        table(
+            "distances",
+            "Distance D of equation (2) of the nested models, all signals in their declared order",
+            ["signals", "added", "contribution A", "D from the full model",
+             "expected D from the true"],
+            rows,
+            left=2,
+            note=f"In units of the noise, taking {evidence.kind} for independent: the rows are "
+            f"worth {count(round(evidence.rows))}. A is what a signal adds; without any effect it "
+            "is 1 on average. Green: the smallest expected distance, which is the smallest C_p. "
+            f"Without any signal the RMSE is {degrees(found.null.pooled.rmse_deg)}.",
+        )
+    ]  # fmt: skip
 
 
-def _smallest(winner: Winner) -> str:
-    if winner.model is winner.best:
-        return f"No model with fewer signals comes near model {winner.best.name}"
-    gain = next(s for s in winner.shortfalls if s.model is winner.model)
-    return (
-        f"Model {winner.model.name}, with {len(winner.model.signals)} signals, has an RMSE that is "
-        f"larger by {gain}: {'real' if gain.real else 'not real'}, and negligible"
+def targets(data: ReportData) -> list[ReportTable]:
+    """Return what the paper's scenarios ask of Table I, and of it against the Kalman filter."""
+    checks = data.evaluated.rows("checks")
+    against = [one for one in checks if "below that of" in one["requirement"]]
+    paper = [one for one in against if one["scenario"] not in FILTER_SCENARIOS[1:]]
+    plain = [one for one in checks if one not in against]
+    by_place = {(one["requirement"], one["estimator"]): one for one in plain}
+    tables = []
+    if plain:
+        rows: list[list[str | Cell]] = []
+        for requirement in dict.fromkeys(one["requirement"] for one in plain):
+            found = [by_place.get((requirement, one)) for one in data.evaluated.models.values()]
+            rows.append([requirement.replace("_", " ")])
+            rows[-1] += [
+                _marked(number(one["found"], 4), one["reached"], not one["reached"])
+                if one
+                else number(None)
+                for one in found
+            ]
+        head = ["requirement", *(f"model {name}" for name in data.evaluated.models)]
+        caption = "What the paper's scenarios ask for, by model of Table I"
+        tables.append(table("targets", caption, head, rows, note=_misses(plain)))
+    if paper:
+        rows = [
+            [
+                one["requirement"].removesuffix(", deg").replace("_", " "),
+                _marked(degrees(one["found"], 4), one["reached"], not one["reached"]),
+                degrees(one["limit"], 4),
+            ]
+            for one in paper
+        ]
+        caption = "What the comparison with the Kalman filter asks for"
+        head = ["requirement", "regression", "filter"]
+        tables.append(table("targets-filter", caption, head, rows, note=_misses(paper)))
+    return tables
+
+
+def _misses(checks: Sequence[Mapping[str, Any]]) -> str:
+    missed = [one for one in checks if not one["reached"]]
+    told = [f"Missed by {o['estimator']} ({o['requirement']}): {o['explanation']}" for o in missed]
+    return " ".join([f"{len(checks) - len(missed)} of {len(checks)} reached.", *told])
+
+
+def standings(data: ReportData) -> ReportTable:
+    """Return every estimator's error on every test drive; of Table I the paper's choice alone."""
+    evaluated = data.evaluated
+    left_out = set(evaluated.models.values()) - {data.choice}
+    names = [name for name in evaluated.estimators if name not in left_out]
+    rows: list[list[str | Cell]] = []
+    for scenario in evaluated.scenarios:
+        errors, texts = {}, {}
+        for name in names:
+            one = evaluated.figures(scenario, name)
+            rmse_deg = one.rmse_deg if one else None
+            texts[name] = number(rmse_deg)
+            if one and rmse_deg is not None and one.coverage >= LEAST_COVERAGE:
+                errors[name] = rmse_deg
+            elif one and rmse_deg is not None:
+                texts[name] += f" ({percent(one.coverage)})"
+        least = min(errors.values(), default=None)
+        marked = [_marked(texts[name], name in errors and errors[name] == least) for name in names]
+        rows.append([scenario, *marked])
+    found = evaluated.document.content.get("ranking")
+    won = (
+        f"Among all without satellite navigation {found['estimator']} wins {found['won']} of "
+        f"{found['drives']} drives, and comes within {found['close_ratio']} times the winner in "
+        f"{found['close']} more; drives that differ in satellite navigation alone are one. "
+        if found
+        else ""
+    )
+    return table(
+        "standings",
+        "Every estimator on every test drive: root mean square error in degrees",
+        ["test drive", *names],
+        rows,
+        note=f"Green: the smallest of the row. {won}A percentage: the share of the drive with an "
+        "estimate; such do not compete.",
     )
 
 
-def _complete(found: ErrorFigures | None, what: str) -> Any:
-    """Return figures that are all there. Raises `NotEvaluatedError` otherwise."""
-    if found is None or None in vars(found).values():
-        raise NotEvaluatedError(what)
-    return found
-
-
-# Judges the paper's claims, which `claims.toml` lists, by the report's data.
-
-
-class Status(StrEnum):
-    """What became of a claim."""
-
-    REPRODUCED = "reproduced"
-    NOT_REPRODUCED = "not reproduced"
-    NOT_TESTABLE = "not testable here"
-
-
-@dataclass(frozen=True)
-class Claim:
-    """One statement of the paper; the head of `claims.toml` says what the fields are."""
-
-    place: str
-    statement: str
-    criterion: str
-    why: str
-    holds: str | None = None
-    figure: str = ""
-
-
-@dataclass(frozen=True)
-class Judged:
-    """A claim with its criterion and how it turned out: what we found, and what it is due to."""
-
-    claim: Claim
-    criterion: str
-    status: Status
-    figure: str
-    why: str
-
-
-_TABLE = read_toml("claims.toml")
-LIMITS: Mapping[str, float] = _TABLE.pop("limits")
-CLAIMS: Mapping[str, Claim] = {name: Claim(**table) for name, table in _TABLE.items()}
-"""In the paper's order."""
-
-
-def judge_claims(data: ReportData) -> tuple[Judged, ...]:
-    """Judge all claims."""
-    facts = Facts(data)
-    return tuple(judge(claim, facts) for claim in CLAIMS.values())
-
-
-def judge(claim: Claim, facts: Facts) -> Judged:
-    """Judge a claim; it is not testable where the evaluation lacks what it needs."""
-
-    def not_testable(why: str) -> Judged:
-        return Judged(claim, criterion, Status.NOT_TESTABLE, "", why)
-
-    criterion = _filled(claim.criterion, facts)
-    evaluated = facts.data.evaluated
-    absent = [name for name in PAPER_TABLE_TWO if name not in evaluated.models]
-    if absent:
-        return not_testable(
-            "The drives that the model was trained on lack signals of model "
-            f"{listed(absent)} of Table I, which the paper's statements are about."
+def own_car(data: ReportData) -> list[ReportTable]:
+    """Return the errors on measured drives, if there were any."""
+    found = data.on_measured
+    if found is None:
+        return []
+    rows = [
+        [
+            name,
+            one["told"],
+            _marked(degrees(one["rmse_deg"]), place == 0),
+            degrees(one["error_mean_deg"], sign=True),
+            degrees(one["error_std_deg"]),
+            number(one["correlation"]),
+            percent(one["coverage"]),
+        ]
+        for place, (name, one) in enumerate(found["estimators"].items())
+    ]
+    return [
+        table(
+            "own-car",
+            "A car of one's own: measured drives with a label",
+            ["estimator", "knows", "RMSE", "mean", "error std", "correlation", "rows"],
+            rows,
+            left=2,
+            note=f"Each quarter of the {found['parts_of']} of {count(len(found['drives']))} drives "
+            f"left out in turn: {found['cohort']}. Green: the smallest.",
         )
-    try:
-        if claim.holds is None:
-            return not_testable(_filled(claim.why, facts))
-        held = expression(claim.holds)(_names(f"{{{{ {claim.holds} }}}}", facts))
-        figure, why = _filled(claim.figure, facts), _filled(claim.why, facts)
-    except NotEvaluatedError as lacking:
-        return not_testable(
-            f"The evaluation has no {lacking}. Run: fleet-slip evaluate "
-            f"{evaluated.group} --fleet NAME"
-        )
-    status = Status.REPRODUCED if held else Status.NOT_REPRODUCED
-    return Judged(claim, criterion, status, figure, why)
-
-
-def _filled(template: str, facts: Facts) -> str:
-    return TEXTS.from_string(template).render(_names(template, facts))
-
-
-def _names(template: str, facts: Facts) -> dict[str, Any]:
-    """Return all that a template names, looked up in the order in which it stands there."""
-    names = meta.find_undeclared_variables(TEXTS.parse(template))
-    return {
-        name: LIMITS[name] if name in LIMITS else facts[name]
-        for name in sorted(names, key=template.index)
-    }
-
-
-SECTIONS = {"paper": "figure-", "roads": "road-", "fleet": "fleet-"}
-"""What the keys of a section's pictures begin with."""
-
-TABLES_IN = {
-    "tables": ("table-1", "table-2", "distances", "targets", "targets-filter"),
-    "further": (
-        "without-label", "own-car", "scenarios", "standings", "limits", "fleets",
-    ),
-    "coefficients": ("coefficients",),
-}  # fmt: skip
-"""The tables of each section, by their names in `tables.toml`."""
+    ]
 
 
 def render(data: ReportData, shown: Sequence[Picture]) -> str:
     """Return the page."""
-    drawn = [draw(one) for one in shown]
     claims = judge_claims(data)
+    counted = Counter(one.status for one in claims)
     return fill_in(
         "report.html.j2",
         version=data.version,
         evaluation=data.evaluated.document,
-        **{
-            section: [one for one in drawn if one.picture.key.startswith(prefix)]
-            for section, prefix in SECTIONS.items()
-        },
-        beyond=[one for one in drawn if not one.picture.key.startswith((*SECTIONS.values(),))],
-        **{
-            section: [one for name in names for one in tables(data, name)]
-            for section, names in TABLES_IN.items()
-        },
-        tiles=_tiles(data, claims),
+        paper=[draw(one) for one in shown],
+        tables=[table_one(data), table_two(data), *distances(data), *targets(data)],
+        further=[*own_car(data), standings(data)],
+        tiles=_tiles(data, counted),
         claims=claims,
-        tally=_tally(claims),
-        statuses=list(Status),
+        tally={status: counted[status] for status in Status},
         missing=[one for one in data.shipped if one not in data.evaluated.scenarios],
         provenance=_provenance(data),
-        configs=data.configs,
         commands=_commands(data),
     )
 
 
-def _tally(claims: Sequence[Judged]) -> dict[Status, int]:
-    counted = Counter(one.status for one in claims)
-    return {status: counted[status] for status in Status}
-
-
-def _tiles(data: ReportData, claims: Sequence[Judged]) -> list[Tile]:
-    tally = _tally(claims)
-    cohort = data.trained.selection.cohort
+def _tiles(data: ReportData, tally: Mapping[Status, int]) -> list[Tile]:
+    drives = number_of(data.version.manifest.trained_on.drives, "drive")
     tiles = [
         Tile(
             f"{tally[Status.REPRODUCED]} of "
             f"{tally[Status.REPRODUCED] + tally[Status.NOT_REPRODUCED]}",
             f"testable claims reproduced; {tally[Status.NOT_TESTABLE]} cannot be tested here",
         ),
-        Tile(
-            count(cohort.rows),
-            f"training rows of {number_of(data.version.manifest.trained_on.drives, 'drive')}",
-        ),
+        Tile(count(data.trained.selection.cohort.rows), f"training rows of {drives}"),
     ]
-    reported, chosen = (
-        None if found is None else found.error_std_deg
-        for found in (
-            data.evaluated.figures("nominal", data.version.reference),
-            data.evaluated.figures("nominal", data.choice),
-        )
-    )
+    names = (data.version.reference, data.choice)
+    both = [data.evaluated.figures("nominal", name) for name in names]
+    reported, chosen = (one.error_std_deg if one else None for one in both)
     if reported is not None and chosen is not None:
-        number = data.choice_number
-        tiles.append(
-            Tile(
-                degrees(reported),
-                f"error std of {data.version.reference} on the nominal drive; "
-                f"of model {number} {degrees(chosen)}, in the paper "
-                f"{degrees(PAPER_TABLE_TWO[number][1])}",
-            )
+        label = (
+            f"error std of {data.version.reference} on the nominal drive; of model "
+            f"{data.choice_number} {degrees(chosen)}, in the paper "
+            f"{degrees(PAPER_TABLE_TWO[data.choice_number][1])}"
         )
+        tiles.append(Tile(degrees(reported), label))
     return tiles
 
 
 def _provenance(data: ReportData) -> list[tuple[str, str]]:
-    manifest = data.version.manifest
-    trained = manifest.trained_on
-    cohort = data.trained.selection.cohort
-    now = f"logs {cohort.logs_version}, grams {cohort.grams_version}"
+    manifest, document = data.version.manifest, data.evaluated.document
+    trained, cohort = manifest.trained_on, data.trained.selection.cohort
     return [
         ("model version", data.version.reference),
         ("its SHA-256", data.version.sha256),
@@ -414,24 +292,22 @@ def _provenance(data: ReportData) -> list[tuple[str, str]]:
         (
             "table versions",
             f"logs {trained.logs_version}, grams {trained.grams_version} when it was published; "
-            f"{now} now",
+            f"logs {cohort.logs_version}, grams {cohort.grams_version} now",
         ),
         ("model list", f"{manifest.selected_by.model_list}, {manifest.selected_by.config_sha256}"),
-        ("evaluation", f"evaluations/{data.evaluated.document.number}.json"),
-        ("its SHA-256", data.evaluated.document.sha256),
-        ("package", f"fleet-slip {data.evaluated.document.content['package_version']}"),
+        ("evaluation", f"evaluations/{document.number}.json"),
+        ("its SHA-256", document.sha256),
+        ("package", f"fleet-slip {document.content['package_version']}"),
     ]
 
 
 def _commands(data: ReportData) -> list[str]:
-    reference = data.version.reference
-    fleets = dict.fromkeys(
-        row["fleet"].rpartition("/")[0] for row in data.evaluated.rows("comparisons")
-    )
-    options = "".join(f" --fleet {name}" for name in fleets)
+    reference, campaigns = data.version.reference, data.trained.selection.cohort.drives["campaign"]
+    rows = data.evaluated.rows("comparisons")
+    fleets = dict.fromkeys(row["fleet"].rpartition("/")[0] for row in rows)
     return [
-        *(f"fleet-slip run --campaign {name}" for name in data.campaigns),
-        f"fleet-slip evaluate {reference}{options}",
+        *(f"fleet-slip run --campaign {name}" for name in sorted({*campaigns.to_pylist()})),
+        f"fleet-slip evaluate {reference}{''.join(f' --fleet {name}' for name in fleets)}",
         f"fleet-slip report {reference}",
     ]
 
@@ -457,7 +333,7 @@ class Written:
 def write_report(warehouse: Warehouse, version: ModelVersion, output: Folder) -> Written:
     """Write the report into a folder, the page last. Raises `DataError` if not evaluated."""
     data = gather(warehouse, version)
-    shown = draw_pictures(data)
+    shown = tuple(draw_pictures(data))
     page = render(data, shown).encode("utf-8")
     for picture in shown:
         output.put(f"{FIGURES}/{picture.key}.svg", svg_file(picture).encode("utf-8"))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.evaluation.report_data import ReportData, gather
+from fleet_slip.evaluation.kept import ReportData, gather
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
@@ -18,8 +18,6 @@ SCENARIOS = (
     "adhesion_0_4",
     "adhesion_0_7",
     "gps_tunnel",
-    "style_gentle",
-    "style_limit",
 )
 
 

@@ -72,8 +72,7 @@ def test_the_page_shows_its_figures_without_a_complaint(reported: Reported, tmp_
     assert tuple(shown.picture[0, 0]) == (255, 255, 255)
     for line in ("truth", "model_1", "model_2", "model_3", "model_4", "model_5", "kalman"):
         assert shown.pixels(line) > 300, line
-    for part in ("unstable", "below_3", "above_3", "near_0"):
-        assert shown.pixels(part) > 20, part
+    assert shown.pixels("unstable") > 20
 
 
 def test_a_request_to_outside_would_be_seen(reported: Reported, tmp_path: Path) -> None:

@@ -1,13 +1,11 @@
-"""Series with few points, and names beside lines."""
-
-from itertools import pairwise
+"""Series with few points."""
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from fleet_slip.evaluation.charts import apart, band, smooth
+from fleet_slip.evaluation.charts import band
 
 
 @given(
@@ -29,14 +27,3 @@ def test_a_band_has_a_gap_where_there_is_no_value() -> None:
     found = band(np.arange(5.0), values, 3)
     np.testing.assert_array_equal(found.mean, [1.5, np.nan, 5.0])
     np.testing.assert_array_equal(found.x, [0.5, 2.5, 4.0])
-
-
-def test_smoothing_keeps_a_constant() -> None:
-    np.testing.assert_allclose(smooth(np.full(7, 3.0), 4), 3.0)
-
-
-@given(st.lists(st.floats(0, 1), min_size=1, max_size=6))
-def test_labels_are_apart_and_in_order(places: list[float]) -> None:
-    moved = apart(sorted(places), 0.1)
-    assert all(b - a >= 0.1 - 1e-9 for a, b in pairwise(moved))
-    assert moved[-1] <= 1

@@ -9,33 +9,29 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from jinja2 import meta
 
-from fleet_slip.catalogue.features import features
 from fleet_slip.config import config_names
 from fleet_slip.errors import DataError
-from fleet_slip.evaluation.charts import opening
-from fleet_slip.evaluation.evaluate import LEAST_COVERAGE, evaluations_of, gates_of, keep
-from fleet_slip.evaluation.pictures import draw_pictures, road_pictures
-from fleet_slip.evaluation.report import (
+from fleet_slip.evaluation.charts import draw_pictures
+from fleet_slip.evaluation.claims import (
     CLAIMS,
     LIMITS,
     NAMES,
+    TEXTS,
     Facts,
     Status,
     judge,
     judge_claims,
-    render,
 )
-from fleet_slip.evaluation.report_data import ReportData, blocks_won, difference
-from fleet_slip.evaluation.report_tables import TEXTS, tables
+from fleet_slip.evaluation.evaluate import LEAST_COVERAGE, evaluations_of, keep
+from fleet_slip.evaluation.kept import ReportData, blocks_won, difference
+from fleet_slip.evaluation.report import distances, render, standings, table_one, table_two
 from fleet_slip.evaluation.scenarios import PAPER_TABLE_TWO
-from fleet_slip.models.manifest import LearnedFrom
 from fleet_slip.models.request import CandidateModel
 from fleet_slip.models.select import validate
-from fleet_slip.pages.drawing import DESK, PHONE, png_file, svg_file
+from fleet_slip.pages.drawing import png_file, svg_file
 from fleet_slip.pages.page import degrees, number
 from fleet_slip.storage.documents import Document
 from fleet_slip.storage.local import LocalFolder
@@ -104,17 +100,16 @@ def test_a_scenario_that_was_left_out_is_said(reported: Reported, page: Page) ->
 
 def test_the_same_data_give_the_same_bytes(reported: Reported, data: ReportData) -> None:
     """Gathered and drawn once more, in another process where tests run in several."""
-    shown = draw_pictures(data)
+    shown = tuple(draw_pictures(data))
     assert render(data, shown) == reported.page.read_text(encoding="utf-8")
-    points = next(picture for picture in shown if picture.key == "test-drives")
-    assert png_file(points) == (reported.figures / "test-drives.png").read_bytes()
-    assert svg_file(points) == (reported.figures / "test-drives.svg").read_text(encoding="utf-8")
+    assert png_file(shown[0]) == (reported.figures / "figure-1a.png").read_bytes()
+    assert svg_file(shown[0]) == (reported.figures / "figure-1a.svg").read_text(encoding="utf-8")
 
 
 def test_table_one_shows_folds_by_drive_and_by_whole_bands_of_speed(data: ReportData) -> None:
     selection = data.trained.selection
     bands = selection.cohort.folds("speed", selection.folds.count)
-    (table,) = tables(data, "table-1")
+    table = table_one(data)
     assert table.head[-2:] == ["by speed", "RMSE by speed"]
     for row, model in zip(table.rows, selection.models, strict=True):
         again = validate(CandidateModel(name="x", signals=model.signals), bands)
@@ -124,12 +119,12 @@ def test_table_one_shows_folds_by_drive_and_by_whole_bands_of_speed(data: Report
             degrees(again.pooled.rmse_deg),
         ]
         assert row[-1].text != row[-3].text
-    (bare,) = tables(replace(data, by_speed={}), "table-1")
+    bare = table_one(replace(data, by_speed={}))
     assert {len(row) for row in bare.rows} == {len(bare.head)} == {len(table.head) - 2}
 
 
 def test_the_distances_are_those_of_every_nested_model_and_the_null_one(data: ReportData) -> None:
-    (table,) = tables(data, "distances")
+    (table,) = distances(data)
     assert [row[0].text for row in table.rows] == [str(j) for j in range(len(table.rows))]
     assert len(table.rows) == 1 + len(data.trained.selection.models[-1].signals)
     assert table.rows[0][1].text == "none"
@@ -137,11 +132,11 @@ def test_the_distances_are_those_of_every_nested_model_and_the_null_one(data: Re
     expected = [float(row[4].text.replace(MINUS, "-")) for row in table.rows]
     (least,) = [j for j, row in enumerate(table.rows) if row[4].mark == "good"]
     assert expected[least] == min(expected)
-    assert not tables(replace(data, distances="too few drives"), "distances")
+    assert not distances(replace(data, distances="too few drives"))
 
 
 def test_table_two_has_the_evaluations_numbers(data: ReportData) -> None:
-    rows = tables(data, "table-2")[0].rows
+    rows = table_two(data).rows
     assert [row[0].text for row in rows] == ["1", "2", "3", "4", "5"]
     for row in rows:
         estimator = data.evaluated.models[row[0].text]
@@ -151,18 +146,6 @@ def test_table_two_has_the_evaluations_numbers(data: ReportData) -> None:
         assert (row[4].mark == "good") == (
             found["error_std_deg"] <= PAPER_TABLE_TWO[row[0].text][1]
         )
-
-
-def test_the_published_coefficients_are_in_the_table(data: ReportData) -> None:
-    manifest = data.version.manifest
-    published = data.coefficients[-1]
-    values = {row.estimate.name: row.estimate.value for row in published.rows}
-    assert published.model == data.version.reference
-    assert values.pop("intercept") == pytest.approx(manifest.intercept, rel=1e-12)
-    assert values == pytest.approx(
-        {term.signal: term.coefficient for term in manifest.terms}, rel=1e-12
-    )
-    assert all(row.estimate.standard_error > 0 for row in published.rows)
 
 
 def test_the_errors_of_blocks_add_up(data: ReportData) -> None:
@@ -248,7 +231,7 @@ def test_a_model_that_was_not_evaluated_is_told(
 
 
 def test_the_standings_mark_the_smallest_error_of_each_drive(data: ReportData) -> None:
-    (shown,) = tables(data, "standings")
+    shown = standings(data)
     names = shown.head[1:]
     for drive, *cells in shown.rows:
         found = {name: data.evaluated.figures(drive.text, name) for name in names}
@@ -260,84 +243,3 @@ def test_the_standings_mark_the_smallest_error_of_each_drive(data: ReportData) -
         marked = [name for name, cell in zip(names, cells, strict=True) if cell.mark == "good"]
         least = min(errors.values())
         assert marked == [name for name in names if errors.get(name) == least]
-
-
-def test_errors_stand_beside_the_bound_of_their_drive(data: ReportData) -> None:
-    (shown,) = tables(data, "limits")
-    assert shown.head[:3] == ["test drive", "bound, degrees", "told the car"]
-    nominal = next(cells for drive, *cells in shown.rows if drive.text == "nominal")
-    bound, told, *times = (float(cell.text) for cell in nominal)
-    assert told < bound < 0.02
-    for name, found in zip(shown.head[3:], times, strict=True):
-        one = data.evaluated.figures("nominal", name)
-        assert one is not None
-        assert one.rmse_deg is not None
-        assert found == pytest.approx(one.rmse_deg / bound, abs=0.06)
-
-
-def test_every_estimator_has_a_point_on_every_test_drive(data: ReportData) -> None:
-    (picture,) = [one for one in draw_pictures(data) if one.key == "test-drives"]
-    names = tables(data, "standings")[0].head[1:]
-    for size in (DESK, PHONE):
-        (axes,) = picture.draw(size).axes
-        drawn = [
-            (float(x), int(y))
-            for line in axes.get_lines()
-            for x, y in zip(*map(np.asarray, line.get_data()), strict=True)
-        ]
-        expected = [
-            (one.rmse_deg, place)
-            for place, drive in enumerate(data.evaluated.scenarios)
-            for name in names
-            if (one := data.evaluated.figures(drive, name))
-            and one.rmse_deg is not None
-            and one.coverage >= LEAST_COVERAGE
-        ]
-        assert sorted(drawn) == sorted(expected)
-        own = next(one for one in axes.get_lines() if one.get_label() == data.version.reference)
-        places = [np.asarray(own.get_xdata())[i] for i in range(len(data.evaluated.scenarios))]
-        for place, drive in zip(places, data.evaluated.scenarios, strict=True):
-            found = data.evaluated.figures(drive, data.version.reference)
-            assert found is not None
-            assert place == found.rmse_deg
-
-
-def test_gates_are_found_in_a_manifest_with_all_their_knots(data: ReportData) -> None:
-    """Weights at the knots of what opens a gate, on the slippery drive: closed, then open."""
-    known = features()
-    members = known.members("excess")
-    terms = tuple(
-        data.version.manifest.terms[0].model_copy(
-            update={"signal": name, "definition": known.definition(name)}
-        )
-        for name in members
-    )
-    manifest = data.version.manifest.model_copy(update={"terms": terms})
-    ((name, (by, knots)),) = gates_of(manifest).items()
-    assert name == "steering_excess over 32 ticks"
-    assert [float(count * known.of("steering_excess_mean_32").scale) for count in knots] == [
-        float(knot) for knot in known.gates["excess"].knots
-    ]
-    (share,) = opening(manifest, data.runs["adhesion_0_4"]).values()
-    assert by.ticks == 32
-    assert np.nanmin(share) == 0.0
-    assert np.nanmax(share) == 1.0
-    assert [one.key for one in road_pictures(data)] == []
-    gated = replace(data, version=replace(data.version, manifest=manifest))
-    (picture,) = road_pictures(gated)
-    assert picture.draw(DESK).axes[1].get_title() == f"gate by {name}"
-
-
-def test_what_no_label_taught_says_so(data: ReportData) -> None:
-    assert not tables(data, "without-label")
-    learned = LearnedFrom(
-        label="course",
-        change_s=(2.0, 4.0),
-        cars=7,
-        intercept_uncertainty_deg=0.012,
-        intercept_spread_deg=0.034,
-    )
-    manifest = data.version.manifest.model_copy(update={"learned_from": learned})
-    page = render(replace(data, version=replace(data.version, manifest=manifest)), [])
-    assert "Learned from the course" in page and "No reference sensor" in page and "2, 4" in page
-    assert degrees(0.012) in page and degrees(0.034) in page

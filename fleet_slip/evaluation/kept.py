@@ -1,6 +1,5 @@
-"""Everything that a report shows, gathered from warehouse, registry and evaluation."""
+"""A kept evaluation, read back, and all else that a report shows."""
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,9 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fleet_slip.base import FloatArray, canonical_json, sha256_of
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.config import config_file
+from fleet_slip.base import FloatArray
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.evaluate import evaluations_of
 from fleet_slip.evaluation.filters import (
@@ -19,11 +17,9 @@ from fleet_slip.evaluation.filters import (
     Estimate,
     LinearEstimate,
     TrainedModels,
-    published_estimate,
     rebuild,
     train_models,
 )
-from fleet_slip.evaluation.fleet_cars import Cars, weigh_cars
 from fleet_slip.evaluation.own_car import own_car_evaluations
 from fleet_slip.evaluation.scenarios import (
     THE_PAPERS_CHOICE,
@@ -31,30 +27,24 @@ from fleet_slip.evaluation.scenarios import (
     EvaluatedScenario,
     run_all,
 )
-from fleet_slip.evaluation.training_findings import (
-    Coefficients,
-    Ordering,
-    coefficient_table,
-    compare_orders,
-    lateral_reach_mps2,
-)
-from fleet_slip.grams.cohort import Cohort, load_cohort
+from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.folding import BANDS, Folding
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.search import try_distances
 from fleet_slip.models.select import Selection, select
-from fleet_slip.regression.choice import NestedDistances
+from fleet_slip.regression.choice import NestedDistances, nested_fits
 from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.folds import CrossValidation
-from fleet_slip.simulation.scenario import Scenario, load_scenario, shipped_scenarios
+from fleet_slip.regression.orders import RANKINGS, rank
+from fleet_slip.regression.subsets import best_subsets
+from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import Document
 from fleet_slip.warehouse.tables import Warehouse
 
-# A kept evaluation, read back, and its estimators compared stretch by stretch of a drive.
-
-Side = Literal["inside", "outside"]
+SAME = 1e-6
+"""Relative difference below which two figures of the same estimates are the same."""
 
 
 @dataclass(frozen=True)
@@ -80,12 +70,6 @@ class Evaluated:
         rows: Sequence[Mapping[str, Any]] = self.document.content[key]
         return rows
 
-    @property
-    def gps_noise(self) -> Mapping[str, Any] | None:
-        """The filters' errors over the noise of GPS; None in evaluations without it."""
-        sweep: Mapping[str, Any] | None = self.document.content.get("gps_noise")
-        return sweep
-
     @cached_property
     def models(self) -> Mapping[str, str]:
         """The estimator's name of each model of Table I that the cohort could serve."""
@@ -95,28 +79,25 @@ class Evaluated:
             if about["group"] == self.group and "table_one" in about
         }
 
-    def of_kind(self, kind: str) -> list[str]:
-        """Return the names of the estimators of a kind: regression or filter."""
-        return [name for name, about in self.estimators.items() if about["kind"] == kind]
-
     def figures(self, scenario: str, estimator: str) -> ErrorFigures | None:
         """Return the error figures over a whole drive; None if that was not evaluated."""
-        found = self._result(scenario, estimator)
-        return None if found is None else _figures(found)
+        return _figures(self._result(scenario, estimator))
 
-    def part(self, scenario: str, estimator: str, side: Side, section: str) -> ErrorFigures | None:
+    def part(
+        self, scenario: str, estimator: str, side: Literal["inside", "outside"], section: str
+    ) -> ErrorFigures | None:
         """Return the error figures inside or outside of a section; None if there is none."""
-        found = self._result(scenario, estimator)
-        if found is None or section not in found[side]:
-            return None
-        return _figures(found[side][section])
+        return _figures(self._result(scenario, estimator).get(side, {}).get(section, {}))
+
+    def _result(self, scenario: str, estimator: str) -> Mapping[str, Any]:
+        found: Mapping[str, Any] = self.scenarios.get(scenario, {"results": {}})["results"]
+        return found.get(estimator, {})
 
     def stretches(self, scenario: str, section: str) -> list[tuple[float, float]]:
         """Return begin and end in s of the stretches of a section; none if there is no such."""
-        sections = self.scenarios[scenario]["sections"] if scenario in self.scenarios else []
         return [
             (stretch["from_s"], stretch["until_s"])
-            for found in sections
+            for found in self.scenarios.get(scenario, {"sections": []})["sections"]
             if found["name"] == section
             for stretch in found["stretches"]
         ]
@@ -133,8 +114,11 @@ class Evaluated:
         """Raise `DataError` if an estimator is off by more or less on a drive of today."""
         for scenario, run in runs.items():
             for name, result in run.results.items():
-                kept = self.figures(scenario, name)
-                if kept is None or not _same(kept.rmse_deg, result.whole.rmse_deg):
+                kept, now = self.figures(scenario, name), result.whole.rmse_deg
+                before = kept.rmse_deg if kept else None
+                if (before is None) != (now is None) or not math.isclose(
+                    before or 0.0, now or 0.0, rel_tol=SAME
+                ):
                     raise self._changed(f"the drive of {scenario}, or {name},")
 
     def _changed(self, what: str) -> DataError:
@@ -143,24 +127,10 @@ class Evaluated:
             f"evaluate {self.group}"
         )
 
-    def _result(self, scenario: str, estimator: str) -> Mapping[str, Any] | None:
-        if scenario not in self.scenarios:
-            return None
-        result: Mapping[str, Any] | None = self.scenarios[scenario]["results"].get(estimator)
-        return result
 
-
-SAME = 1e-6
-"""Relative difference below which two figures of the same estimates are the same."""
-
-
-def _same(first: float | None, second: float | None) -> bool:
-    if first is None or second is None:
-        return first is second
-    return math.isclose(first, second, rel_tol=SAME)
-
-
-def _figures(found: Mapping[str, Any]) -> ErrorFigures:
+def _figures(found: Mapping[str, Any]) -> ErrorFigures | None:
+    if not found:
+        return None
     return ErrorFigures(**{name: found[name] for name in ErrorFigures.__dataclass_fields__})
 
 
@@ -177,12 +147,7 @@ def latest_of(warehouse: Warehouse, version: ModelVersion) -> Evaluated:
     )
 
 
-def latest_on_measured(warehouse: Warehouse, version: ModelVersion) -> Mapping[str, Any] | None:
-    """Return the latest evaluation of a version on measured drives; None if there is none."""
-    kept = own_car_evaluations(warehouse)
-    documents = (kept.read(number).content for number in reversed(kept.numbers()))
-    return next((one for one in documents if one["model"] == version.reference), None)
-
+# Estimators compared stretch by stretch of a drive.
 
 BLOCK_S = 5.0
 """Errors of neighbouring samples depend on each other; over this time they nearly do not."""
@@ -220,6 +185,38 @@ def blocks_won(run: EvaluatedScenario, estimators: Sequence[str]) -> dict[str, i
     return dict(zip(estimators, best.tolist(), strict=True))
 
 
+CLOSE = 0.001
+"""A model explains nearly all if it leaves no more than this of the variance to the full one."""
+
+
+@dataclass(frozen=True)
+class Ordering:
+    """How many signals each ranking, and the best of all subsets, needs to explain nearly all."""
+
+    signals: tuple[str, ...]
+    needed: dict[str, int]
+    best: int
+    subsets: int
+
+
+def compare_orders(cohort: Cohort, signals: Sequence[str]) -> Ordering:
+    """Rank signals in every way beside all subsets. Raises `DataError` if no drive has them all."""
+    label = catalogue().label
+    total = cohort.serving(signals).table.total()
+    best = best_subsets(total, signals, label, count=1)
+    enough = best[-1].best.r_squared - CLOSE
+    needed = {}
+    for ranking in RANKINGS:
+        fits = nested_fits(total, rank(ranking, total, signals, label), label)
+        needed[ranking] = next(fit.size for fit in fits if fit.r_squared >= enough)
+    return Ordering(
+        signals=tuple(signals),
+        needed=needed,
+        best=next(size.best.size for size in best if size.best.r_squared >= enough),
+        subsets=2 ** len(signals),
+    )
+
+
 DRAWN_FILTERS = ("kalman", "kalman_tuned")
 DRAWN_SCENARIOS = (
     "nominal",
@@ -230,15 +227,7 @@ DRAWN_SCENARIOS = (
     "adhesion_0_4",
     "melbourne",
     "gps_tunnel",
-    "style_gentle",
-    "style_brisk",
-    "style_sporty",
-    "style_limit",
 )
-TRAINED_SHARE = 0.999
-
-MOST_TERMS = 60
-"""Of a larger model no standard errors are shown: hundreds of rows tell nothing."""
 
 
 @dataclass(frozen=True)
@@ -250,18 +239,12 @@ class ReportData:
         evaluated: its latest evaluation.
         trained: its cohort, and the models of Table I on it.
         runs: drives of the evaluation's scenarios with the estimates that figures show.
-        coefficients: of the paper's choice, then of the published model if it is another and small.
-        trained_to_mps2: the lateral acceleration that `TRAINED_SHARE` of the training rows stay
-            below.
         ordering: what the order of the signals is worth.
         by_speed: the models of Table I with whole bands of speed left out, by name; empty where all
             drives are of one speed.
         distances: of the nested models of all signals in their declared order, or why there are
             none.
-        cars: what a car's own numbers are worth; None without a fleet in the data root.
         on_measured: its latest evaluation on measured drives; None if there is none.
-        campaigns: of the drives that the model was trained on.
-        configs: checksums of what determines the results, by file.
         shipped: names of all shipped scenarios, evaluated or not.
     """
 
@@ -269,15 +252,10 @@ class ReportData:
     evaluated: Evaluated
     trained: TrainedModels
     runs: Mapping[str, EvaluatedScenario]
-    coefficients: tuple[Coefficients, ...]
-    trained_to_mps2: float
     ordering: Ordering
     by_speed: Mapping[str, CrossValidation]
     distances: NestedDistances | str
-    cars: Cars | None
     on_measured: Mapping[str, Any] | None
-    campaigns: tuple[str, ...]
-    configs: Mapping[str, str]
     shipped: tuple[str, ...]
 
     @property
@@ -288,17 +266,8 @@ class ReportData:
     @property
     def choice_number(self) -> str:
         """Its number in Table I; of the last that the training drives have the signals for."""
-        return _choose(list(self.evaluated.models))
-
-
-def _choose(names: Sequence[str]) -> str:
-    """Return the paper's choice, or the last model where the drives lack signals of that."""
-    return THE_PAPERS_CHOICE if THE_PAPERS_CHOICE in names else names[-1]
-
-
-def _paper_choice(models: Sequence[CrossValidation]) -> CrossValidation:
-    chosen = _choose([model.name for model in models])
-    return next(model for model in models if model.name == chosen)
+        names = list(self.evaluated.models)
+        return THE_PAPERS_CHOICE if THE_PAPERS_CHOICE in names else names[-1]
 
 
 def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
@@ -311,50 +280,36 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     trained = train_models(warehouse, version)
     evaluated.require_models(trained)
     shipped = shipped_scenarios()
-    scenarios = [one for one in shipped if one.name in evaluated.scenarios]
-    drawn = [one for one in scenarios if one.name in DRAWN_SCENARIOS]
-    runs = {
-        run.scenario.name: run
-        for run in run_all(warehouse, drawn, drawn_estimators(evaluated, version))
-    }
+    drawn = [one for one in shipped if one.name in evaluated.scenarios]
+    drawn = [one for one in drawn if one.name in DRAWN_SCENARIOS]
+    runs = {run.scenario.name: run for run in run_all(warehouse, drawn, _drawn(evaluated))}
     evaluated.require_figures(runs)
     cohort, models = trained.selection.cohort, trained.selection.models
-    own = _own_cohort(warehouse, trained)
     signals = tuple(dict.fromkeys(models[-1].signals))
-    signals_toml = config_file("signals.toml").read_bytes()
+    measured = own_car_evaluations(warehouse)
+    documents = (measured.read(number).content for number in reversed(measured.numbers()))
     return ReportData(
         version=version,
         evaluated=evaluated,
         trained=trained,
         runs=runs,
-        coefficients=_coefficients(trained, own),
-        trained_to_mps2=lateral_reach_mps2(warehouse, cohort, TRAINED_SHARE),
         ordering=compare_orders(cohort, signals),
         by_speed=_by_speed(trained.selection),
         distances=try_distances(cohort, signals, trained.selection.folds, SelectionRequest()),
-        cars=weigh_cars(warehouse),
-        on_measured=latest_on_measured(warehouse, version),
-        campaigns=tuple(sorted(set(cohort.drives["campaign"].to_pylist()))),
-        configs={
-            "configs/signals.toml": hashlib.sha256(signals_toml).hexdigest(),
-            f"configs/models/{TABLE_ONE}.toml": load_model_list(TABLE_ONE).sha256,
-            **{f"configs/scenarios/{one.name}.toml": _checksum_of(one) for one in scenarios},
-        },
+        on_measured=next((one for one in documents if one["model"] == version.reference), None),
         shipped=tuple(one.name for one in shipped),
     )
 
 
-def drawn_estimators(evaluated: Evaluated, version: ModelVersion) -> dict[str, Estimate]:
+def _drawn(evaluated: Evaluated) -> dict[str, Estimate]:
     """Return the estimators that figures show, rebuilt from what the evaluation says of them."""
-    car = load_scenario("nominal").car
-    estimators: dict[str, Estimate] = {}
-    for name in evaluated.models.values():
-        about = evaluated.estimators[name]
-        estimators[name] = LinearEstimate(about["intercept"], about["coefficients"])
-    for name in DRAWN_FILTERS:
-        if name in evaluated.estimators:
-            estimators[name] = rebuild(name, evaluated.estimators[name], car)
-    return estimators | {version.reference: published_estimate(version.manifest)}
+    about, car = evaluated.estimators, load_scenario("nominal").car
+    models = {
+        name: LinearEstimate(about[name]["intercept"], about[name]["coefficients"])
+        for name in evaluated.models.values()
+    }
+    filters = {name: rebuild(name, about[name], car) for name in DRAWN_FILTERS if name in about}
+    return {**models, **filters}
 
 
 def _by_speed(selection: Selection) -> dict[str, CrossValidation]:
@@ -365,27 +320,3 @@ def _by_speed(selection: Selection) -> dict[str, CrossValidation]:
     except (DataError, QuestionError):
         return {}
     return {model.name: model for model in found.models}
-
-
-def _own_cohort(warehouse: Warehouse, trained: TrainedModels) -> Cohort:
-    """Return the cohort with the Gram rows that the published model was made of."""
-    cohort = trained.selection.cohort
-    name = features().name_of(trained.version.manifest.trained_on.feature_set)
-    return cohort if name == PLAIN else load_cohort(warehouse, cohort.condition, name)
-
-
-def _coefficients(trained: TrainedModels, own: Cohort) -> tuple[Coefficients, ...]:
-    cohort, published = trained.selection.cohort, trained.version
-    choice = _paper_choice(trained.selection.models)
-    tables = [coefficient_table(cohort, f"model {choice.name}", choice.signals)]
-    signals = published.manifest.signals
-    if set(signals) != set(choice.signals) and len(signals) <= MOST_TERMS:
-        intercept = not published.manifest.through_origin
-        tables.append(coefficient_table(own, published.reference, signals, intercept=intercept))
-    return tuple(tables)
-
-
-def _checksum_of(scenario: Scenario) -> str:
-    """Return the checksum of all that determines a scenario's drive, and of its failures."""
-    failures = [failure.model_dump(mode="json") for failure in scenario.failures]
-    return sha256_of(canonical_json({"drive": scenario.batch().digest, "failures": failures}))
