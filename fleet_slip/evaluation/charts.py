@@ -273,7 +273,8 @@ def draw_pictures(data: ReportData) -> Iterator[Picture]:
         if one.key in SPEEDS:
             yield _speed(one, *(runs[name].drive for name in one.drives))
             continue
-        lines, title, titles = (choice,), one.title, one.drives
+        lines: tuple[Line, ...] = (choice,)
+        title, titles = one.title, one.drives
         if one.models:
             lines = tuple(model_line(data, n) for n in one.models if n in data.evaluated.models)
             names = listed([line.label for line in lines])

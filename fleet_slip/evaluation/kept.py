@@ -90,8 +90,9 @@ class Evaluated:
         return _figures(self._result(scenario, estimator).get(side, {}).get(section, {}))
 
     def _result(self, scenario: str, estimator: str) -> Mapping[str, Any]:
-        found: Mapping[str, Any] = self.scenarios.get(scenario, {"results": {}})["results"]
-        return found.get(estimator, {})
+        results: Mapping[str, Mapping[str, Any]]
+        results = self.scenarios.get(scenario, {}).get("results", {})
+        return results.get(estimator, {})
 
     def stretches(self, scenario: str, section: str) -> list[tuple[float, float]]:
         """Return begin and end in s of the stretches of a section; none if there is no such."""

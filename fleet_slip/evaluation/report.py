@@ -73,7 +73,7 @@ def table_one(data: ReportData) -> ReportTable:
 
 def table_two(data: ReportData) -> ReportTable:
     """Return Table II: the errors on the nominal test drive."""
-    rows = []
+    rows: list[list[str | Cell]] = []
     for name, estimator in data.evaluated.models.items():
         one = data.evaluated.figures("nominal", estimator)
         if one is None or one.error_std_deg is None:
@@ -101,7 +101,7 @@ def distances(data: ReportData) -> list[ReportTable]:
         return []
     evidence = found.evidence
     expected = [float(one) for one in evidence.distances()]
-    rows = [
+    rows: list[list[str | Cell]] = [
         [
             str(size),
             found.order[size - 1] if size else "none",
