@@ -44,8 +44,6 @@ from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse
 
-# Compares data files with their checksums and the Delta log; looks for forgotten names in them.
-
 DamageKind: TypeAlias = Literal[
     "file",
     "drive",
@@ -122,7 +120,9 @@ def verify_files(
     with LocalThreads(os.cpu_count() or 1) as threads:
         groups = _groups(snapshot.files)
         task = partial(_read_files, table)
-        for group, found in run_tasks(executor or threads, task, groups, _group_name):
+        for group, found in run_tasks(
+            executor or threads, task, groups, lambda g: f"{len(g)} files from {g[0].path}"
+        ):
             read += found
             progress(sum(file.size_bytes for file in group), snapshot.size_bytes)
     read.sort(key=lambda one: one.file.path)
@@ -145,10 +145,6 @@ def _groups(files: Sequence[TableFile]) -> Iterator[tuple[TableFile, ...]]:
             group = ()
     if group:
         yield group
-
-
-def _group_name(group: Sequence[TableFile]) -> str:
-    return f"the bytes of {len(group)} files from {group[0].path}"
 
 
 def _read_files(table: Table, files: Sequence[TableFile]) -> list[ReadFile]:
@@ -236,8 +232,6 @@ def _used(files: Collection[ReadFile] | Iterator[ReadFile], column: str) -> froz
     return frozenset().union(*(one.names[column].used for one in files if column in one.names))
 
 
-# Looks for drives that are not whole, and for Gram rows that are not those of their logs.
-
 SAMPLE = 4
 """Log files whose Gram rows are computed again, evenly chosen, unless all are asked for."""
 
@@ -257,28 +251,26 @@ def verify_drives(warehouse: Warehouse, files: Sequence[TableFile], report: Veri
         report.note("drive", drive, problem)
 
 
-@dataclass(frozen=True)
-class SoundFiles:
-    """The files of a data root whose bytes are what they must be, and what the logs consist of."""
-
-    logs: Sequence[TableFile]
-    grams: Sequence[TableFile]
-    active: Collection[str]
-    """Paths of all active log files, sound or not."""
-
-
 def verify_grams(
     warehouse: Warehouse,
-    sound: SoundFiles,
+    logs: Sequence[TableFile],
+    grams: Sequence[TableFile],
+    active: Collection[str],
     report: Verification,
     full: bool,
     executor: Executor | None,
 ) -> None:
-    """Look for Gram rows that are doubled, missing, left over, or wrong (in a sample, or all)."""
-    _verify_unique(warehouse, sound.grams, report)
-    _verify_each(warehouse, sound.grams, report)
-    where = find_gram_files(warehouse, sound.grams)
-    covered = [file for file in sound.logs if file.path in where]
+    """Look for Gram rows that are doubled, missing, left over, or wrong (in a sample, or all).
+
+    `logs` and `grams` are files whose bytes are sound; `active` are the paths of all log files.
+    """
+    _verify_unique(warehouse, grams, report)
+    for file in grams:  # rows that cars counted, which no counts or drives can have
+        for drive, problem in _impossible(warehouse.grams.read(file.path)):
+            told = f"the Gram row that a car sent of drive {drive} {problem}"
+            report.note("gram", f"grams/{file.path}", told)
+    where = find_gram_files(warehouse, grams)
+    covered = [file for file in logs if file.path in where]
     step = 1 if full else max(1, len(covered) // SAMPLE)
     by_place: dict[tuple[str, ...], list[TableFile]] = {}
     for file in covered[::step]:
@@ -286,13 +278,15 @@ def verify_grams(
     for places, files in by_place.items():
         stored = stored_grams(warehouse, files, places)
         task = partial(_compute_grams, warehouse)
-        for file, computed in run_tasks(executor, task, files, _name_task):
+        for file, computed in run_tasks(
+            executor, task, files, lambda f: f"the Gram rows of {f.path}"
+        ):
             for drive in differing_drives(stored[file.path], computed):
                 problem = f"the stored Gram row of drive {drive} is not that of its rows"
                 report.note("gram", f"logs/{file.path}", problem)
             report.log_files_recomputed += 1
-    missing = len(sound.logs) - len(covered)
-    stale = where.keys() - set(sound.active)
+    missing = len(logs) - len(covered)
+    stale = where.keys() - set(active)
     if missing or stale:
         problem = (
             f"no Gram rows of {number_of(missing, 'log file')}, Gram rows of {len(stale)} that "
@@ -310,15 +304,6 @@ def _verify_unique(warehouse: Warehouse, grams: Sequence[TableFile], report: Ver
     for identity, file, drive, n in twice:
         problem = f"the Gram row {identity} of drive {drive} stands {n} times"
         report.note("gram", f"logs/{file}", problem)
-
-
-def _verify_each(warehouse: Warehouse, grams: Sequence[TableFile], report: Verification) -> None:
-    """Look for received Gram rows that no counts or drives can have."""
-    for file in grams:
-        rows = warehouse.grams.read(file.path)
-        for drive, problem in _impossible(rows):
-            told = f"the Gram row that a car sent of drive {drive} {problem}"
-            report.note("gram", f"grams/{file.path}", told)
 
 
 def _impossible(rows: pa.Table) -> Iterator[tuple[str, str]]:
@@ -348,10 +333,6 @@ def _impossible_among(
 
 def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:
     return grams_by_blocks(warehouse, read_counts(warehouse, file))
-
-
-def _name_task(file: TableFile) -> str:
-    return f"the Gram rows of {file.path}"
 
 
 def verify_documents(root: Folder, report: Verification) -> None:
@@ -445,7 +426,7 @@ def _verify(
     _report_missing_logs(snapshots, grams, report)
     if grams:
         active = {file.path for file in snapshots["logs"].files} if "logs" in snapshots else set()
-        verify_grams(warehouse, SoundFiles(logs, grams, active), report, full, executor)
+        verify_grams(warehouse, logs, grams, active, report, full, executor)
     verify_documents(warehouse.root, report)
     verify_models(warehouse, snapshots, report)
     _list_unreferenced(warehouse, snapshots, report)

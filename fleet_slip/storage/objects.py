@@ -238,25 +238,20 @@ class ObjectReader(io.RawIOBase):
         self._size = size
 
     def readable(self) -> bool:
-        """Return True."""
         return True
 
     def seekable(self) -> bool:
-        """Return True."""
         return True
 
     def tell(self) -> int:
-        """Return where the next read begins."""
         return self._position
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Move to where the next read begins."""
         begin = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._size}[whence]
         self._position = begin + offset
         return self._position
 
     def read(self, size: int = -1) -> bytes:
-        """Read so many bytes, or all that are left."""
         left = max(self._size - self._position, 0)
         length = left if size is None or size < 0 else min(size, left)
         if not length:
@@ -310,23 +305,18 @@ class ObjectFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
         self._sizes: dict[str, int] = {}
 
     def info(self, path: str, **_options: Any) -> dict[str, Any]:
-        """Return the name, type and size of a file."""
         return {"name": path, "type": "file", "size": self._size(path)}
 
     def modified(self, path: str) -> datetime:  # noqa: ARG002 - they never change
-        """Return one moment for all files."""
         return datetime.fromtimestamp(0, UTC)
 
     def glob(self, path: str, **_options: Any) -> list[str]:
-        """Return the path: names of data files are no patterns."""
-        return [path]
+        return [path]  # names of data files are no patterns
 
     def exists(self, path: str, **_options: Any) -> bool:
-        """Return True; that it is not there shows when it is read."""
-        return bool(path)
+        return bool(path)  # that it is not there shows when it is read
 
     def open(self, path: str, mode: str = "rb", **_options: Any) -> io.RawIOBase | io.BytesIO:
-        """Open a file for reading. Raises `PermissionError` for any other mode."""
         if mode != "rb":
             raise PermissionError(f"{path}: a warehouse is only read through SQL")
         return open_object(self._store, *self._key(path), self._size(path))
@@ -370,7 +360,6 @@ class ObjectFolder:
 
     @property
     def delta_options(self) -> dict[str, str] | None:
-        """Options of the Delta library; credentials it finds where we do."""
         return delta_options(self.bucket)
 
     @property
@@ -490,7 +479,6 @@ class ObjectFolder:
         return True
 
     def found(self, meta: Any) -> StoredFile:
-        """Return an object as the library tells of it."""
         # Of one object some stores list milliseconds, or a tag without quotes, and tell seconds
         # and quotes when they are asked for it alone.
         return StoredFile(

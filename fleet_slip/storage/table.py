@@ -31,8 +31,6 @@ from fleet_slip.storage.commits import (
 from fleet_slip.storage.encoding import Encoded, Encoding, Names, read_names
 from fleet_slip.storage.folder import Folder, checksum_in, first_line, storage_errors
 
-# The files of a table as the Delta log has them, and what one commit does to them.
-
 _DATA_FILE = re.compile(r"[\w.=-][\w.=/-]*\.parquet", re.ASCII)
 """Path of a data file below its table: relative, and without characters that could be a pattern."""
 
@@ -63,43 +61,6 @@ def absent_columns(files: Iterable[TableFile], names: Iterable[str]) -> tuple[st
     return tuple(absent)
 
 
-def read_actions(delta: DeltaTable | None) -> pa.Table:
-    """Return what the log says of each active file, a row a file; none without a table."""
-    if delta is None:
-        return pa.Table.from_pylist([])
-    # pa.table() would import pandas, which takes half a second.
-    stream = delta.get_add_actions(flatten=True)
-    return pa.RecordBatchReader.from_stream(stream).read_all().combine_chunks()
-
-
-def active_files(actions: pa.Table, where: object) -> tuple[TableFile, ...]:
-    """Return the active files, by path. Raises `StorageError` if the log names one wrongly."""
-    files = sorted(_table_files(actions), key=lambda file: file.path)
-    for file in files:
-        _require_sound(file, where)
-    return tuple(files)
-
-
-def have_same_columns(actions: pa.Table, names: Iterable[str]) -> bool:
-    """Whether each of the columns is in all active files or in none."""
-    counts = [actions[f"{_NULLS}{n}"] for n in names if f"{_NULLS}{n}" in actions.column_names]
-    return all(column.null_count in (0, len(column)) for column in counts)
-
-
-def _require_sound(file: TableFile, where: object) -> None:
-    parts = file.path.split("/")
-    if not _DATA_FILE.fullmatch(file.path) or ".." in parts or "." in parts:
-        raise StorageError(
-            f"{where}: the Delta log names the file {file.path[:200]!r}, which is "
-            "not one of this table. Restore the log from a backup."
-        )
-    if file.rows is None or file.rows < 0 or file.size_bytes is None or file.size_bytes < 0:
-        raise StorageError(
-            f"{where}: the Delta log does not say how large {file.path} is. "
-            "Another program wrote it, or it was damaged: restore the log from a backup."
-        )
-
-
 class _NullCounts(Mapping[str, int]):
     """Null counts of a file, looked up when asked for: of 100,000 files few jobs need many."""
 
@@ -124,7 +85,8 @@ class _NullCounts(Mapping[str, int]):
         return dict, (dict(self),)
 
 
-def _table_files(actions: pa.Table) -> Iterator[TableFile]:
+def _table_files(actions: pa.Table, where: object) -> Iterator[TableFile]:
+    """Yield the active files. Raises `StorageError` if the log names one wrongly."""
     nulls = {
         name.removeprefix(_NULLS): actions[name]
         for name in actions.column_names
@@ -136,6 +98,16 @@ def _table_files(actions: pa.Table) -> Iterator[TableFile]:
         for name in ("path", "num_records", "size_bytes", "partition.day", "min.day", "max.day")
     )
     for row, (path, rows, size_bytes, day, first, last) in enumerate(zip(*columns, strict=True)):
+        if not _DATA_FILE.fullmatch(path) or not {".", ".."}.isdisjoint(path.split("/")):
+            raise StorageError(
+                f"{where}: the Delta log names the file {path[:200]!r}, which is "
+                "not one of this table. Restore the log from a backup."
+            )
+        if rows is None or rows < 0 or size_bytes is None or size_bytes < 0:
+            raise StorageError(
+                f"{where}: the Delta log does not say how large {path} is. "
+                "Another program wrote it, or it was damaged: restore the log from a backup."
+            )
         days = (first, last) if first and last else None
         yield TableFile(path, rows, size_bytes, _NullCounts(nulls, row), day, days)
 
@@ -182,24 +154,11 @@ class Change:
 
 def rows_in(action: AddAction) -> int:
     """Return the number of rows of a file that an action adds."""
-    return int(json.loads(action.stats)["numRecords"])
+    return int(_statistic(action, "numRecords"))
 
 
-def columns_in(action: AddAction) -> frozenset[str]:
-    """Return the columns of a file that an action adds."""
-    return frozenset(json.loads(action.stats)["nullCount"])
-
-
-def addition(path: str, encoded: Encoded, day: date | None) -> AddAction:
-    """Return the action that adds a file to a table."""
-    return AddAction(
-        path=path,
-        size=len(encoded.content),
-        partition_values=_partition(day),
-        modification_time=_now_ms(),
-        data_change=True,
-        stats=encoded.statistics,
-    )
+def _statistic(action: AddAction, name: str) -> Any:
+    return json.loads(action.stats)[name]
 
 
 def _partition(day: date | None) -> dict[str, str | None]:
@@ -209,8 +168,6 @@ def _partition(day: date | None) -> dict[str, str | None]:
 def _now_ms() -> int:
     return int(time.time() * 1000)
 
-
-# Commits in conflict: how one is recognised, and how it is tried again.
 
 ATTEMPTS = 12
 FIRST_WAIT_S = 0.02
@@ -226,11 +183,6 @@ _CONFLICT = re.compile(
 """What the Delta library says when another commit was faster; anything else is a fault."""
 
 Result = TypeVar("Result")
-
-
-def is_conflict(error: CommitFailedError) -> bool:
-    """Whether a commit failed because another one was faster."""
-    return _CONFLICT.search(str(error)) is not None
 
 
 def on_newest(
@@ -276,10 +228,8 @@ def retry_conflicts(attempt: Callable[[], Result]) -> Result:
     return attempt()
 
 
-# Which signals and scales a stored table has, beside those of the catalogue.
-#
 # A count means nothing without its scale, so the schema in the Delta log records each. It changes
-# in the commit that exchanges the files (`fleet_slip.maintenance.migration`).
+# in the commit that exchanges the files (`fleet_slip.operations.migration`).
 
 SCALE = "scale"
 """Key of a field's metadata: the physical value of one count, as in the catalogue."""
@@ -370,8 +320,6 @@ def require_writable(
         )
 
 
-# One version of a Delta table: its files, what has landed in it, and committing on top of it.
-
 MANY_UNITS = 8
 """So many units of work are not asked for one by one."""
 
@@ -399,18 +347,25 @@ class Snapshot:
         if self.delta is None:
             return ()
         with storage_errors(self.table.folder):
-            every = active_files(self._actions, self.table.folder)
+            every = sorted(_table_files(self._actions, self.table.folder), key=lambda f: f.path)
         return tuple(file for file in every if file.path not in self.without)
 
     @property
     def has_same_columns(self) -> bool:
         """Whether all active files have the same ones of the table's columns."""
         with storage_errors(self.table.folder):
-            return have_same_columns(self._actions, self.table.schema.names)
+            names = {f"{_NULLS}{name}" for name in self.table.schema.names}
+            counts = [self._actions[name] for name in names & {*self._actions.column_names}]
+        return all(column.null_count in (0, len(column)) for column in counts)
 
     @cached_property
     def _actions(self) -> pa.Table:
-        return read_actions(self.delta)
+        """What the log says of each active file, a row a file."""
+        if self.delta is None:
+            return pa.Table.from_pylist([])
+        # pa.table() would import pandas, which takes half a second.
+        stream = self.delta.get_add_actions(flatten=True)
+        return pa.RecordBatchReader.from_stream(stream).read_all().combine_chunks()
 
     @property
     def paths(self) -> list[str]:
@@ -625,7 +580,14 @@ class Table:
         path = encoded.path(name, day)
         while not self.folder.create(path, encoded.content):
             path = encoded.path(f"{name}-{uuid.uuid4().hex[:8]}", day)
-        return addition(path, encoded, day)
+        return AddAction(
+            path=path,
+            size=len(encoded.content),
+            partition_values=_partition(day),
+            modification_time=_now_ms(),
+            data_change=True,
+            stats=encoded.statistics,
+        )
 
     def discard(self, actions: Iterable[AddAction]) -> None:
         """Delete files that this process wrote and its conflict left uncommitted.
@@ -658,7 +620,7 @@ class Table:
 
     def unneeded(self, added: Iterable[AddAction]) -> frozenset[str]:
         """Return the optional columns that none of some new files has."""
-        return frozenset(self.optional).difference(*map(columns_in, added))
+        return frozenset(self.optional).difference(*(_statistic(a, "nullCount") for a in added))
 
     def fence(self) -> None:
         """Make a conflict of every commit that began before now and has not landed.
@@ -683,7 +645,7 @@ class Table:
 
     def conflict_of(self, error: CommitFailedError) -> Exception:
         """Return what a failed commit is to be raised as: a conflict, or the fault that it is."""
-        if not is_conflict(error):
+        if not _CONFLICT.search(str(error)):
             return error
         return ConflictError(
             f"{self.folder}: another process changed the table at the same moment "
