@@ -19,6 +19,7 @@ from fleet_slip.cli.output import (
     cell,
     print_json,
     print_line,
+    print_records,
     print_table,
     print_text,
     progress,
@@ -117,23 +118,14 @@ def _rmse_cell(result: dict[str, Any]) -> str:
 def print_ranking(ranking: dict[str, Any]) -> None:
     """Print who wins each test drive."""
     least, ours = ranking["least_coverage"], ranking["estimator"]
-    print_table(
+    print_records(
         f"\n{ours} wins {ranking['won']} of {ranking['drives']} test drives by RMSE, and is within "
         f"{ranking['close_ratio']:g} of the winner on {ranking['close']} others.\nAll compete that "
         f"need no GPS and estimate {least:.0%} of the rows. Drives that differ in GPS alone are "
         f"one. {ours}/3 is model 3 of Table I, trained on what {ours} was trained on.",
-        ["scenario", "won by", "RMSE deg", f"{ours} deg", "ratio"],
-        [
-            [
-                one["scenario"],
-                one["winner"] or "",
-                cell(one["winner_rmse_deg"], ".3f"),
-                cell(one["rmse_deg"], ".3f"),
-                cell(one["ratio"], ".2f"),
-            ]
-            for one in ranking["standings"]
-            if one["same_as"] is None
-        ],
+        f"scenario|won by|RMSE deg|{ours} deg|ratio",
+        "{scenario}|{winner}|{winner_rmse_deg:.3f}|{rmse_deg:.3f}|{ratio:.2f}",
+        (one for one in ranking["standings"] if one["same_as"] is None),
         left=2,
     )
 
@@ -193,21 +185,10 @@ def _print_sections(content: dict[str, Any]) -> None:
 def _print_checks(checks: Sequence[dict[str, Any]]) -> None:
     if not checks:
         return
-    print_table(
-        "\nwhat the paper's scenarios ask for",
-        ["requirement", "estimator", "found", "limit", ""],
-        [
-            [
-                check["requirement"],
-                check["estimator"],
-                cell(check["found"], ".4f"),
-                cell(check["limit"], ".4f"),
-                "" if check["reached"] else "missed",
-            ]
-            for check in checks
-        ],
-        left=2,
-    )
+    header = "requirement|estimator|found|limit|"
+    row = "{requirement}|{estimator}|{found:.4f}|{limit:.4f}|{missed}"
+    rows = ({**check, "missed": None if check["reached"] else "missed"} for check in checks)
+    print_records("\nwhat the paper's scenarios ask for", header, row, rows, left=2)
     for check in checks:
         if not check["reached"]:
             print_line(
@@ -329,22 +310,13 @@ def _blind_cell(one: "ErrorFigures") -> str:
 def print_own_car(content: Mapping[str, Any], everything: bool) -> None:
     """Print figures on measured drives, the best estimator first; with all of them by drive."""
     estimators = content["estimators"]
-    print_table(
+    print_records(
         f"{content['cohort']}: each quarter of the {content['parts_of']} left out in turn, "
         f"{number_of(len(content['drives']), 'drive')}",
-        ["estimator", "knows", "RMSE deg", "mean", "std", "correlation", "rows"],
-        [
-            [
-                name,
-                one["told"],
-                cell(one["rmse_deg"], ".3f"),
-                cell(one["error_mean_deg"], "+.3f"),
-                cell(one["error_std_deg"], ".3f"),
-                cell(one["correlation"], ".3f"),
-                f"{one['coverage']:.0%}",
-            ]
-            for name, one in estimators.items()
-        ],
+        "estimator|knows|RMSE deg|mean|std|correlation|rows",
+        "{name}|{told}|{rmse_deg:.3f}|{error_mean_deg:+.3f}|{error_std_deg:.3f}|"
+        "{correlation:.3f}|{coverage:.0%}",
+        ({**one, "name": name} for name, one in estimators.items()),
         left=2,
     )
     if content["vehicle"] is None:

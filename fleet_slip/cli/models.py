@@ -11,7 +11,7 @@ from fleet_slip.base import number_of
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.cli.app import record_run
 from fleet_slip.cli.options import OnlyModel, complete_model
-from fleet_slip.cli.output import All, Json, print_json, print_table, print_text, say
+from fleet_slip.cli.output import All, Json, print_json, print_records, print_table, print_text, say
 from fleet_slip.errors import UsageError
 from fleet_slip.export.costs import costs_content, describe_costs
 from fleet_slip.export.files import Target
@@ -67,40 +67,29 @@ def models(
         if row["trained_on_forgotten"]:
             say(f"{row['name']}@{row['version']} was trained on drives that were forgotten since")
     if name:
-        print_table(
-            "\nhistory of aliases",
-            ["at", "command", "alias", "version"],
-            [
-                [f"{move.at:%Y-%m-%d %H:%M:%S}", move.command, move.alias, str(move.version)]
-                for move in fleet.registry().history(name).moves()
-            ],
-            left=3,
+        header = "at|command|alias|version"
+        row = "{at:%Y-%m-%d %H:%M:%S}|{command}|{alias}|{version}"
+        print_records(
+            "\nhistory of aliases", header, row, fleet.registry().history(name).moves(), 3
         )
 
 
 def _print_models(rows: Sequence[Mapping[str, Any]], everything: bool) -> None:
     """Print a line for each version; with the names of its signals if all is asked for."""
-    more = ["error std deg", "rows"] if everything else []
-    print_table(
-        "",
-        ["model", "aliases", "signals", "published", "correlation", "RMSE deg", "drives", *more],
-        [
-            [
-                f"{row['name']}@{row['version']}",
-                row["aliases"].replace(",", ", "),
-                row["signals"].replace(",", " ")
-                if everything
-                else str(len(row["signals"].split(","))),
-                f"{row['published_at']:%Y-%m-%d %H:%M}" if row["published_at"] else "",
-                f"{row['correlation']:.4f}",
-                f"{row['rmse_deg']:.4f}",
-                f"{row['drives']:,}",
-                *([f"{row['error_std_deg']:.4f}", f"{row['rows']:,}"] if everything else []),
-            ]
-            for row in rows
-        ],
-        left=4,
+    header = "model|aliases|signals|published|correlation|RMSE deg|drives"
+    row = (
+        "{name}@{version}|{aliases}|{signals}|{published_at:%Y-%m-%d %H:%M}|"
+        "{correlation:.4f}|{rmse_deg:.4f}|{drives:,}"
     )
+    if everything:
+        header += "|error std deg|rows"
+        row += "|{error_std_deg:.4f}|{rows:,}"
+    shown = []
+    for one in rows:
+        signals = one["signals"].split(",")
+        told = {"signals": signals if everything else len(signals)}
+        shown.append({**one, **told, "aliases": one["aliases"].replace(",", ", ")})
+    print_records("", header, row, shown, left=4)
 
 
 def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> None:

@@ -20,6 +20,7 @@ from fleet_slip.cli.output import (
     Json,
     cell,
     print_json,
+    print_records,
     print_table,
     print_text,
     progress_of_steps,
@@ -97,37 +98,16 @@ def _print_status(found: WarehouseStatus) -> None:
         facts["disk"] = free
     print_table("", ["", ""], facts.items(), left=2)
     if found.last_runs:
-        print_table(
-            "\nlast runs",
-            ["command", "started", "state", "seconds", "rows"],
-            [
-                [
-                    run["command"],
-                    f"{run['started_at']:%Y-%m-%d %H:%M:%S}",
-                    run["state"],
-                    cell(run["seconds"], ".1f"),
-                    cell(run["rows"], ","),
-                ]
-                for run in found.last_runs
-            ],
-            left=3,
-        )
+        header = "command|started|state|seconds|rows"
+        row = "{command}|{started_at:%Y-%m-%d %H:%M:%S}|{state}|{seconds:.1f}|{rows:,}"
+        print_records("\nlast runs", header, row, found.last_runs, left=3)
     if found.champions:
-        print_table(
-            "\nchampions",
-            ["model", "published", "age h", "logs behind", "grams behind"],
-            [
-                [
-                    f"{one.model}@{one.version}",
-                    cell(one.published_at, "%Y-%m-%d %H:%M"),
-                    cell(one.age_hours, ",.1f"),
-                    str(one.logs_behind),
-                    str(one.grams_behind),
-                ]
-                for one in found.champions
-            ],
-            left=2,
+        header = "model|published|age h|logs behind|grams behind"
+        row = (
+            "{model}@{version}|{published_at:%Y-%m-%d %H:%M}|{age_hours:,.1f}|"
+            "{logs_behind}|{grams_behind}"
         )
+        print_records("\nchampions", header, row, found.champions, left=2)
 
 
 # How the sensors of cars are off: the command calibrate.
@@ -229,41 +209,20 @@ def _print_fleet(found: Calibration) -> None:
     )
     if not any(one.uncertainty for cars in found.cars.values() for one in cars.values()):
         return say("no car has two drives: how sure the numbers are cannot be told")
-    print_table(
-        "\nhow sure after so many drives of a car; measured: by the next so many drives",
-        ["number", "drives", "cars", "known to +-", "measured"],
-        [
-            [
-                row.number,
-                str(row.drives),
-                f"{row.cars:,}",
-                f"{row.stated:.2g}",
-                cell(row.measured, ".2g"),
-            ]
-            for row in found.convergence()
-        ],
-    )
+    header = "number|drives|cars|known to +-|measured"
+    row = "{number}|{drives}|{cars:,}|{stated:.2g}|{measured:.2g}"
+    title = "\nhow sure after so many drives of a car; measured: by the next so many drives"
+    print_records(title, header, row, found.convergence())
 
 
 def _print_changed(changed: Sequence[ChangedNumber], since: date) -> None:
     if not changed:
         return say(f"no number of a car is another since {since}, as far as its drives tell")
-    print_table(
-        f"changed since {since}, by more than {SURE_ERRORS:g} standard errors",
-        ["car", "number", "unit", "before", "after", "+-"],
-        [
-            [
-                one.car,
-                one.number,
-                CAR_NUMBERS[one.number].unit,
-                f"{one.before:.5g}",
-                f"{one.after:.5g}",
-                f"{one.uncertainty:.2g}",
-            ]
-            for one in changed
-        ],
-        left=3,
-    )
+    header = "car|number|unit|before|after|+-"
+    row = "{car}|{number}|{unit}|{before:.5g}|{after:.5g}|{uncertainty:.2g}"
+    rows = ({**vars(one), "unit": CAR_NUMBERS[one.number].unit} for one in changed)
+    title = f"changed since {since}, by more than {SURE_ERRORS:g} standard errors"
+    print_records(title, header, row, rows, left=3)
 
 
 def _say_of_roads(roads: Roads) -> None:
@@ -447,18 +406,6 @@ def _print_quality(found: QualityReport) -> None:
         order = "all are in order" if found.drives else "none is long enough"
         print_text(f"{examined}: {order}")
         return
-    print_table(
-        examined,
-        ["drive", "car", "fault", "signals", "what shows it"],
-        [
-            [
-                finding.drive_id,
-                finding.vehicle_id,
-                finding.fault.kind,
-                " ".join(finding.fault.signals),
-                finding.fault.figure,
-            ]
-            for finding in found.findings
-        ],
-        left=5,
-    )
+    header = "drive|car|fault|signals|what shows it"
+    row = "{drive_id}|{vehicle_id}|{fault.kind}|{fault.signals}|{fault.figure}"
+    print_records(examined, header, row, found.findings, left=5)

@@ -4,9 +4,10 @@ import json
 import logging
 import math
 import os
+import string
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
@@ -135,6 +136,29 @@ def print_table(
     _print_lines("\n".join(line.rstrip() for line in captured.get().splitlines()))
 
 
+class _Cells(string.Formatter):
+    """Formats by the fields of a record or a mapping; None is nothing, and texts stand in a row."""
+
+    def __init__(self, row: Any) -> None:
+        self.row = row
+
+    def get_value(self, key: int | str, args: Any, kwargs: Any) -> Any:  # noqa: ARG002 - of the base
+        """Return a field."""
+        return self.row[key] if isinstance(self.row, Mapping) else getattr(self.row, str(key))
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        """Return a value as a table shows it."""
+        if isinstance(value, tuple | list):
+            return " ".join(map(str, value))
+        return cell(value, format_spec)
+
+
+def print_records(title: str, header: str, row: str, records: Iterable[Any], left: int = 1) -> None:
+    """Print records or mappings; `row` has formats of their fields, such as `{name}|{rmse:.4f}`."""
+    cells = ([_Cells(one).format(form) for form in row.split("|")] for one in records)
+    print_table(title, header.split("|"), cells, left)
+
+
 All = Annotated[bool, typer.Option("--all", help="Print all of it, not a screen alone.")]
 
 
@@ -145,12 +169,8 @@ def cell(value: Any, form: str = "") -> str:
 
 def figures_cells(figures: "Figures") -> list[str]:
     """Return correlation, RMSE, mean and standard deviation of an error as a table shows them."""
-    return [
-        f"{figures.correlation:.4f}",
-        f"{figures.rmse_deg:.4f}",
-        f"{figures.error_mean_deg:+.4f}",
-        f"{figures.error_std_deg:.4f}",
-    ]
+    row = "{correlation:.4f}|{rmse_deg:.4f}|{error_mean_deg:+.4f}|{error_std_deg:.4f}"
+    return _Cells(figures).format(row).split("|")
 
 
 GAPS = (2, 1)
