@@ -12,12 +12,3 @@ The way of a row, in the order of its stations:
 5. `load` leaves out what was forgotten and what is there already, and commits the files of a batch;
    `job` goes through all batches.
 """
-
-from fleet_slip.ingest.mapping import Mapping, load_mapping
-from fleet_slip.ingest.stream import IngestCounts
-
-__all__ = [
-    "IngestCounts",
-    "Mapping",
-    "load_mapping",
-]

@@ -11,6 +11,7 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -78,18 +79,17 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     bases = [guess.profile.channel.base for guess in guesses.values()]
     taken = {guess.profile.channel.name for guess in guesses.values()}
     time = guess_time(profile, taken, bases, group)
-    tried = _Tried(file, profile, time, drive_keys)
+    drive_of = partial(_drive_of, file, profile, time, drive_keys)
     failures: tuple[str, ...] = ()
     suspicions: list[Suspicion] = []
     try:
         if unnamed and set(WHEELS) <= set(guesses):
-            guesses |= _place_wheels(guesses, tried.drive(guesses))
-        guesses = choose_units(guesses, tried.drive(guesses))
-        drive = tried.drive(guesses)
+            guesses |= _place_wheels(guesses, drive_of(guesses))
+        guesses = choose_units(guesses, drive_of(guesses))
+        drive = drive_of(guesses)
         guesses = _road_wheels(guesses, drive)
-        corrected = _correct(guesses, find_suspicions(drive))
-        guesses = corrected
-        suspicions = find_suspicions(tried.drive(guesses))
+        guesses = _correct(guesses, find_suspicions(drive))
+        suspicions = find_suspicions(drive_of(guesses))
     except FleetSlipError as error:
         failures = (str(error),)
     guesses = _doubted(guesses, suspicions)
@@ -109,24 +109,20 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     return Draft(file, profile, time, sure, left, drive_keys, notes)
 
 
-@dataclass(frozen=True)
-class _Tried:
-    """What a draft makes of its file."""
-
-    file: Path
-    profile: FileProfile
-    time: TimeGuess
-    drive_keys: dict[str, dict[str, str]]
-
-    def drive(self, guesses: dict[str, Guess]) -> dict[str, FloatArray]:
-        """Return the signals of the longest drive, of all guesses that the catalogue can hold."""
-        usable = {name: guess for name, guess in guesses.items() if not guess.doubts}
-        if COURSE in usable and not {SPEED, "yaw_rate"} <= set(usable):
-            usable.pop(COURSE)
-        if not usable:
-            return {}
-        mapping = as_mapping(self.profile, self.time, usable, self.drive_keys)
-        return preview_log(self.file, mapping).longest
+def _drive_of(
+    file: Path,
+    profile: FileProfile,
+    time: TimeGuess,
+    drive_keys: dict[str, dict[str, str]],
+    guesses: dict[str, Guess],
+) -> dict[str, FloatArray]:
+    """Return the signals of the longest drive, of all guesses that the catalogue can hold."""
+    usable = {name: guess for name, guess in guesses.items() if not guess.doubts}
+    if COURSE in usable and not {SPEED, "yaw_rate"} <= set(usable):
+        usable.pop(COURSE)
+    if not usable:
+        return {}
+    return preview_log(file, as_mapping(profile, time, usable, drive_keys)).longest
 
 
 def _road_wheels(guesses: dict[str, Guess], drive: dict[str, FloatArray]) -> dict[str, Guess]:

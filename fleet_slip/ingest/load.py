@@ -28,7 +28,8 @@ from fleet_slip.caches import cache_folder
 from fleet_slip.catalogue.signals import as_arrow, catalogue
 from fleet_slip.errors import ConflictError, InputError, RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive, drive_id
-from fleet_slip.ingest.log_files import LocalCopies, Log, Spool, StoredParts
+from fleet_slip.ingest.formats.source import Spool
+from fleet_slip.ingest.log_files import LocalCopies, Log, StoredParts
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.preview import signals_of
 from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured

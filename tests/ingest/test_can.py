@@ -28,8 +28,7 @@ from fleet_slip.ingest.formats.can import (
     read_can_database,
 )
 from fleet_slip.ingest.formats.can_files import open_can_trace
-from fleet_slip.ingest.formats.source import Budget
-from fleet_slip.ingest.log_files import Spool
+from fleet_slip.ingest.formats.source import Budget, Spool
 from fleet_slip.ingest.mapping import load_mapping
 from tests.support.logs import without_names
 from tests.support.measured import MeasuredLog, read_measured, ticks
@@ -342,32 +341,21 @@ def test_frames_that_are_kept_are_those_that_came(
     came: list[tuple[float, str, bytes]], piece: int
 ) -> None:
     with closing(Spool()) as spool, mock.patch.object(can_frames, "PIECE_FRAMES", piece):
-        one_by_one, together = CanFrames(spool), CanFrames(spool)
-        for frame in came:
-            one_by_one.append(*frame)
-        times, buses, payloads = zip(*came, strict=True) if came else ((), (), ())
-        filled = np.array([list(data.ljust(9, b"x")) for data in payloads], dtype=np.uint8)
-        sizes = np.array([len(data) for data in payloads], dtype=np.int64)
-        numbers = np.zeros(len(came), dtype=np.int64)
-        data = filled.reshape(-1, 9)
-        together.extend(
-            FrameBlock(numbers, numbers > 0, np.array(times), np.array(buses), sizes, data)
-        )
-        require_the_frames(one_by_one, came)
-        require_the_frames(together, came)
-
-
-def require_the_frames(frames: CanFrames, came: list[tuple[float, str, bytes]]) -> None:
-    assert frames.buses == sorted({bus for _, bus, _ in came})
-    assert frames.sizes_on(None) == Counter(len(data) for _, _, data in came)
-    for bus in "ab":
-        assert frames.sizes_on(bus) == Counter(len(data) for _, on, data in came if on == bus)
-        found = [
-            (time, payload.tobytes())
-            for times, payloads in frames.take(bus, 2)
-            for time, payload in zip(times, payloads, strict=True)
-        ]
-        assert found == [(time, data[:2]) for time, on, data in came if on == bus]
+        frames = CanFrames(spool)
+        for time, on, data in came:
+            payload = np.frombuffer(data, dtype=np.uint8)[np.newaxis]
+            one, size = np.zeros(1, dtype=np.int64), np.array([len(data)])
+            frames.extend(FrameBlock(one, one > 0, np.array([time]), np.array([on]), size, payload))
+        assert frames.buses == sorted({bus for _, bus, _ in came})
+        for bus in ("a", "b", None):
+            mine = [(time, data) for time, on, data in came if bus in {None, on}]
+            assert frames.sizes_on(bus) == Counter(len(data) for _, data in mine)
+            found = [
+                (time, payload.tobytes())
+                for times, payloads in frames.take(bus, 2)
+                for time, payload in zip(times, payloads, strict=True)
+            ]
+            assert found == [(time, data[:2]) for time, data in mine]
 
 
 def test_a_trace_is_asked_for_one_message_after_the_other(tmp_path: Path) -> None:

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import log_files
-from fleet_slip.ingest.log_files import Spool
+from fleet_slip.ingest.formats import source
+from fleet_slip.ingest.formats.source import Spool
 
 
 @pytest.mark.parametrize("in_memory", [1, 2**20])
 def test_pieces_come_back_by_key_and_no_file_has_a_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_memory: int
 ) -> None:
-    monkeypatch.setattr(log_files, "IN_MEMORY_BYTES", in_memory)
+    monkeypatch.setattr(source, "IN_MEMORY_BYTES", in_memory)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with closing(Spool()) as kept:
         for number in range(10):

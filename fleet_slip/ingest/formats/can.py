@@ -6,11 +6,12 @@ it; its own decoder, one frame at a time, is what the tests compare with.
 
 import hashlib
 import importlib
+import pickle
 import re
-from array import array
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -22,8 +23,7 @@ from pydantic import Field
 from fleet_slip.base import FloatArray, IntArray, shown
 from fleet_slip.config import Config, Name, read_named_file
 from fleet_slip.errors import ConfigError, InputError
-from fleet_slip.ingest.formats.source import reading_with
-from fleet_slip.ingest.log_files import Spool
+from fleet_slip.ingest.formats.source import Spool, reading_with
 
 Bytes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
@@ -95,16 +95,6 @@ def _bits(signal: Any) -> list[tuple[int, int]]:
 
 
 @dataclass(frozen=True)
-class Frames:
-    """Some frames: times in s, numbers of buses, sizes in bytes, and all payloads in a row."""
-
-    times_s: FloatArray
-    buses: NDArray[np.uint16]
-    sizes: NDArray[np.uint16]
-    data: Bytes
-
-
-@dataclass(frozen=True)
 class FrameBlock:
     """Frames in the order of the file: numbers, whether they are of 29 bits, times in s, buses.
 
@@ -114,7 +104,7 @@ class FrameBlock:
     numbers: IntArray
     extended: Flags
     times_s: FloatArray
-    buses: IntArray
+    buses: NDArray[Any]
     sizes: IntArray
     data: Bytes
 
@@ -123,97 +113,53 @@ class FrameBlock:
         return FrameBlock(*(column[chosen] for column in vars(self).values()))
 
 
+def joined(blocks: Sequence[FrameBlock]) -> FrameBlock:
+    """Return several blocks as one."""
+    widest = max(block.data.shape[1] for block in blocks)
+    columns = list(zip(*(vars(block).values() for block in blocks), strict=True))
+    columns[-1] = tuple(np.pad(data, ((0, 0), (0, widest - data.shape[1]))) for data in columns[-1])
+    return FrameBlock(*map(np.concatenate, columns))
+
+
 class CanFrames:
     """The frames of one message, in the order in which they came."""
 
     def __init__(self, spool: Spool) -> None:
         """Begin without any; what is too much for the memory goes to `spool`."""
         self._spool = spool
-        self._numbers: dict[str, int] = {}
-        self._found: Counter[tuple[int, int]] = Counter()
-        self._clear()
-
-    def _clear(self) -> None:
-        self._times, self._buses, self._sizes = array("d"), array("H"), array("H")
-        self._data = bytearray()
-
-    def append(self, time_s: float, bus: str, payload: bytes) -> None:
-        """Keep a frame."""
-        number = self._numbers.setdefault(bus, len(self._numbers))
-        self._times.append(time_s)
-        self._buses.append(number)
-        self._sizes.append(len(payload))
-        self._data += payload
-        self._found[number, len(payload)] += 1
-        if len(self._times) >= PIECE_FRAMES:
-            self._put_aside()
+        self._waiting: list[FrameBlock] = []
+        self._found: Counter[tuple[str, int]] = Counter()
 
     def extend(self, block: FrameBlock) -> None:
         """Keep frames of the message."""
-        times_s, sizes, data = block.times_s, block.sizes, block.data
-        names, places = np.unique(block.buses, return_inverse=True)
-        known = [self._numbers.setdefault(str(bus), len(self._numbers)) for bus in names.tolist()]
-        numbers = np.array(known, dtype=np.uint16)[places]
-        for start in range(0, times_s.size, PIECE_FRAMES):
-            some = slice(start, start + PIECE_FRAMES)
-            kinds = numbers[some].astype(np.int64) << 16 | sizes[some]
-            for kind, frames in zip(*map(np.ndarray.tolist, np.unique_counts(kinds)), strict=True):
-                self._found[divmod(kind, 1 << 16)] += frames
-            self._times.frombytes(times_s[some].tobytes())
-            self._buses.frombytes(numbers[some].tobytes())
-            self._sizes.frombytes(sizes[some].astype(np.uint16).tobytes())
-            there = np.arange(data.shape[1]) < sizes[some, np.newaxis]
-            self._data += data[some][there].tobytes()
-            if len(self._times) >= PIECE_FRAMES:
-                self._put_aside()
-
-    def _put_aside(self) -> None:
-        for column in (self._times, self._buses, self._sizes, self._data):
-            self._spool.add(self, bytes(column))
-        self._clear()
+        buses = block.buses.astype(np.str_)
+        for bus in np.unique(buses).tolist():
+            for size, frames in zip(*np.unique_counts(block.sizes[buses == bus]), strict=True):
+                self._found[bus, int(size)] += int(frames)
+        self._waiting.append(replace(block, buses=buses))
+        if sum(len(one.sizes) for one in self._waiting) >= PIECE_FRAMES:
+            self._spool.add(self, pickle.dumps(joined(self._waiting)))
+            self._waiting = []
 
     @property
     def buses(self) -> list[str]:
         """The buses that the message is on, sorted."""
-        return sorted(self._numbers)
+        return sorted({bus for bus, _ in self._found})
 
     def sizes_on(self, bus: str | None) -> Counter[int]:
         """Return how many frames have how many bytes, on a bus or on all."""
-        number, sizes = self._numbers.get(bus or "", -1), Counter[int]()
+        sizes = Counter[int]()
         for (of, size), frames in self._found.items():
-            if bus is None or of == number:
-                sizes[size] += frames
-        return sizes
+            sizes[size] += frames if bus in {None, of} else 0
+        return +sizes
 
     def take(self, bus: str | None, size: int) -> Iterator[tuple[FloatArray, Bytes]]:
         """Yield times and first bytes of the payloads on a bus, or on all, piece by piece."""
-        for some in self._pieces():
-            sizes = some.sizes.astype(np.int64)
-            starts, times_s = np.cumsum(sizes) - sizes, some.times_s
-            if bus is not None:
-                chosen = some.buses == self._numbers.get(bus, -1)
-                starts, times_s = starts[chosen], times_s[chosen]
-            payloads = np.empty((starts.size, size), dtype=np.uint8)
-            for place in range(size):
-                payloads[:, place] = some.data[starts + place]
-            yield times_s, payloads
-
-    def _pieces(self) -> Iterator[Frames]:
-        aside = self._spool.read(self)
-        for times, buses, sizes, data in zip(aside, aside, aside, aside, strict=True):
-            yield _frames(times, buses, sizes, data)
-        yield _frames(
-            self._times.tobytes(), self._buses.tobytes(), self._sizes.tobytes(), bytes(self._data)
-        )
-
-
-def _frames(times: bytes, buses: bytes, sizes: bytes, data: bytes) -> Frames:
-    return Frames(
-        np.frombuffer(times),
-        np.frombuffer(buses, dtype=np.uint16),
-        np.frombuffer(sizes, dtype=np.uint16),
-        np.frombuffer(data, dtype=np.uint8),
-    )
+        pieces = map(pickle.loads, self._spool.read(self))
+        for block in chain(pieces, [joined(self._waiting)] if self._waiting else []):
+            some = block if bus is None else block.where(block.buses == bus)
+            if some.sizes.size:
+                yield some.times_s, some.data[:, :size]
 
 
 # What a mapping says of a CAN trace: the database of its messages, and the bus.

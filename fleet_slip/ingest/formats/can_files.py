@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
-from itertools import product
+from itertools import islice, product
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
@@ -32,6 +32,7 @@ from fleet_slip.ingest.formats.can import (
     FrameBlock,
     is_possible,
     is_sent,
+    joined,
     needed_bytes,
     parse_database,
     physical,
@@ -43,16 +44,13 @@ from fleet_slip.ingest.formats.source import (
     Budget,
     Channel,
     ClockSource,
+    Spool,
     describe_missing,
     reading_with,
 )
-from fleet_slip.ingest.log_files import Spool
 
-# The CAN frames of a BLF file, as arrays: some containers of objects at a time.
-#
-# Nobody published the format; it is as python-can reads it (after Toby Lorenz's Vector BLF), frame
-# by frame and a hundred times slower, which the tests compare with. A file may say what it likes:
-# sizes are looked at before anything is unfolded or read.
+# BLF, of which nobody published the format, is read as python-can does, as arrays: a hundred times
+# faster. Sizes are looked at before anything is unfolded or read.
 
 MAGIC = b"LOGG"
 _MARK, _OBJECT = b"LOBJ", struct.Struct("<4s4xII")
@@ -235,15 +233,7 @@ def _frames(content: bytes, begins: IntArray, start_s: float, budget: Budget) ->
         sent = found["how"] & kind.remote == 0
         blocks.append(block.where(sent))
         places.append(at[sent])
-    return _joined(blocks).where(np.argsort(np.concatenate(places), kind="stable"))
-
-
-def _joined(blocks: list[FrameBlock]) -> FrameBlock:
-    """Return several blocks as one."""
-    widest = max(block.data.shape[1] for block in blocks)
-    columns = list(zip(*(vars(block).values() for block in blocks), strict=True))
-    columns[-1] = tuple(np.pad(data, ((0, 0), (0, widest - data.shape[1]))) for data in columns[-1])
-    return FrameBlock(*map(np.concatenate, columns))
+    return joined(blocks).where(np.argsort(np.concatenate(places), kind="stable"))
 
 
 def _data_behind(data: Bytes, starts: IntArray, there: IntArray) -> Bytes:
@@ -268,8 +258,8 @@ def _read(
 
 
 SUFFIXES = {".blf", ".asc", ".log", ".trc"}
-TOLD_EVERY = 2**12
-"""Frames that are read one by one until it is told how far the file is read."""
+TOLD_EVERY = 2**14
+"""Frames of python-can until it is told how far the file is read."""
 
 
 _Key = tuple[int, bool]
@@ -422,15 +412,11 @@ class CanSource(ClockSource):
                 for block in read_blf_frames(self._budget, trace.start_timestamp):
                     self._keep(block)
                 return
-            for number, frame in enumerate(trace):
-                if not number % TOLD_EVERY:
+            sent = (one for one in trace if not (one.is_error_frame or one.is_remote_frame))
+            while some := list(islice(sent, TOLD_EVERY)):
+                self._keep(_block_of(some))
+                if not trace.file.closed:  # which it is at its end
                     self._budget.meter.pass_over(trace.file.buffer.tell(), self._budget.size)
-                if frame.is_error_frame or frame.is_remote_frame:
-                    continue
-                key = frame.arbitration_id, frame.is_extended_id
-                self._numbers.add(key)
-                if key in self._frames:
-                    self._frames[key].append(frame.timestamp, str(frame.channel), frame.data)
 
     def _require_whole(self, trace: Any) -> None:
         # A BLF file says how long it is; python-can reads what is there of one that was cut.
@@ -440,6 +426,19 @@ class CanSource(ClockSource):
                 f"{shown(self._file)}: {there:,} of {stated:,} bytes: it is truncated. Copy it "
                 "again."
             )
+
+
+def _block_of(frames: list[Any]) -> FrameBlock:
+    """Return frames of python-can."""
+    payloads = b"".join(bytes(one.data).ljust(MOST_BYTES, b"\0") for one in frames)
+    return FrameBlock(
+        np.array([one.arbitration_id for one in frames]),
+        np.array([one.is_extended_id for one in frames]),
+        np.array([one.timestamp for one in frames]),
+        np.array([str(one.channel) for one in frames]),
+        np.array([len(one.data) for one in frames]),
+        np.frombuffer(payloads, dtype=np.uint8).reshape(-1, MOST_BYTES),
+    )
 
 
 def _values(signal: Any, raw: NDArray[Any], sent: BoolArray, *, as_names: bool) -> pl.Series:

@@ -25,9 +25,9 @@ from fleet_slip.ingest.formats.source import (
     Channel,
     as_column,
     describe_missing,
+    needing_room,
     reading_with,
 )
-from fleet_slip.ingest.log_files import needing_room
 
 # Finds the numbers in a MATLAB 5 file without reading them; what is compressed is unfolded aside.
 #

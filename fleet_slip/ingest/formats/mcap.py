@@ -28,10 +28,10 @@ from fleet_slip.ingest.formats.source import (
     Budget,
     Channel,
     ClockSource,
+    Spool,
     describe_missing,
     reading_with,
 )
-from fleet_slip.ingest.log_files import Spool
 
 # The fields of MCAP messages: of one message, and of many that are alike at once.
 #

@@ -24,11 +24,11 @@ from fleet_slip.ingest.formats.source import (
     Budget,
     Channel,
     ClockSource,
+    Spool,
     as_column,
     describe_missing,
     reading_with,
 )
-from fleet_slip.ingest.log_files import Spool
 
 # Applies the conversions of an MDF file, of counts to physical values.
 #

@@ -8,9 +8,11 @@ time is a column like any other.
 import difflib
 import errno
 import logging
+import tempfile
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -192,9 +194,6 @@ def describe_missing(column: str, names: Sequence[str]) -> str:
     return f"no column {column!r}.{hint} Its columns are {there}{more}."
 
 
-# Tells how far a log is read, for whoever shows it.
-
-
 class Meter:
     """A share of a log's bytes: that of its rows which were read.
 
@@ -237,12 +236,8 @@ class Meter:
             self._told = done
 
 
-# What a measured file may become while it is decoded: so many bytes and rows, in so many seconds.
-#
-# A small file can stand for anything: a thousand times its size in zeros, a billion equal rows, a
-# view without end. How much is allowed follows from the file's size alone, so that it is known
-# before anything is decoded, and is the same for every format. A log that was measured is far
-# below: a row of it takes several bytes however well it is packed, since sensors are noisy.
+# A small file can stand for anything. What it may become while it is decoded follows from its size
+# alone; a log that was measured is far below, since noise cannot be packed.
 
 FREE_ROWS, ROWS_PER_BYTE = 10**6, 4
 """Rows that any file may have, and rows for each of its bytes if those are more."""
@@ -349,3 +344,58 @@ class Budget:
             rows += batch.height
             self.require_rows(rows)
             yield batch
+
+
+IN_MEMORY_BYTES = 2**24
+"""Up to this size all is in memory, and there is no file."""
+
+
+@contextmanager
+def needing_room(written: int) -> Iterator[None]:
+    """Raise `InputError` where a temporary file, so long already, cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno == errno.EFBIG:  # a limit of our own, on a file that unfolds
+            raise
+        raise InputError(
+            f"{tempfile.gettempdir()}: no room for a temporary copy of more than {written:,} bytes "
+            f"({error.strerror}). Free some, or name another folder in the environment variable "
+            "TMPDIR."
+        ) from None
+
+
+class Spool:
+    """Pieces of bytes by key, in their order, beyond 16 MiB in a temporary file without a name."""
+
+    def __init__(self) -> None:
+        """Begin without any."""
+        self._file = tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES)  # noqa: SIM115 - see close
+        self._pieces: dict[Hashable, list[tuple[int, int]]] = defaultdict(list)
+        self._end = 0
+
+    def add(self, key: Hashable, piece: bytes) -> None:
+        """Keep a piece. Raises `InputError` if the disk is full."""
+        with needing_room(self._end):
+            self._file.seek(self._end)
+            self._file.write(piece)
+            self._file.flush()
+        self._pieces[key].append((self._end, len(piece)))
+        self._end += len(piece)
+
+    def read(self, key: Hashable) -> Iterator[bytes]:
+        """Yield the pieces of a key."""
+        for start, size in self._pieces[key]:
+            self._file.seek(start)
+            yield self._file.read(size)
+
+    def clear(self) -> None:
+        """Forget all pieces."""
+        self._pieces.clear()
+        self._file.seek(0)
+        self._file.truncate()
+        self._end = 0
+
+    def close(self) -> None:
+        """Let go of all."""
+        self._file.close()
