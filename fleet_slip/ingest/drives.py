@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -61,30 +61,15 @@ _GROUP = np.dtype(
 )
 _UNSEEN = np.array((np.nan, np.nan, np.nan, np.nan, -1, -1), dtype=_GROUP)
 
-MOST_STRETCHES = 16
-"""Irregular steps up to which a block is taken apart at them; with more it is cut as a whole."""
-
-
-class _Stretch(NamedTuple):
-    """Rows, and whether they are of one group at times that ascend without a gap."""
-
-    rows: pl.DataFrame
-    is_steady: bool
-
 
 class DriveCutter:
     """Gives every row the number of its part, a stretch of one `group`, and refuses others.
 
-    Within the rows of one group, in the file's order:
-
-    * a step in time larger than `split_gap_s`, forward or back, begins a new part;
-    * `isolated`: a row whose neighbours are both that far; it goes before parts are made, so one
-      wild time stamp costs one row and does not cut a drive;
-    * `time_duplicate`, `time_backwards`: not later than all earlier rows of its stretch;
-    * a stretch is cut into parts of `longest_s` at most.
-
-    What becomes of a row does not depend on the blocks in which rows come: what the next row
-    decides waits for it.
+    Within a group, a step in time larger than `split_gap_s`, forward or back, begins a new part,
+    and so does `longest_s`. A row whose neighbours are both that far is `isolated`, so that one
+    wild time stamp does not cut a drive. `time_duplicate` and `time_backwards` are rows not later
+    than all before in their stretch. None of it depends on the blocks in which rows come: what the
+    next row decides waits for it.
     """
 
     def __init__(self, base: TimeBase, longest_s: float = LONGEST_DRIVE_S) -> None:
@@ -101,49 +86,6 @@ class DriveCutter:
     def cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
         """Return the rows of a block with their `part`, together; and the misplaced ones."""
         self.ended = []
-        stretches = _stretches(rows, self._gap_s)
-        found = [
-            self._go_on(stretch, last=last and i + 1 == len(stretches))
-            for i, stretch in enumerate(stretches)
-        ]
-        if len(found) == 1:
-            return found[0]
-        good, bad = zip(*found, strict=True)
-        return pl.concat(good), join_refused(bad)
-
-    def _go_on(self, stretch: "_Stretch", *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
-        """Cut a stretch; at once if nothing happens in it but that a part begins or goes on."""
-        rows = stretch.rows
-        if not stretch.is_steady or self._waiting is not None:
-            return self._cut(rows, last=last)
-        group, time = int(rows["group"][0]), rows["time"].to_numpy()
-        if group >= self._state.size or np.isnan(self._state[group]["last"]):
-            if time.size < 2 or time[-1] - time[0] >= self._longest_s:
-                return self._cut(rows, last=last)
-            self._grow(rows)
-            self._state[group] = (np.nan, np.nan, np.nan, time[0], self._parts, 0)
-            self._parts += 1
-            return self._with_part(rows, group, time[-1])
-        seen = self._state[group]
-        if seen["part"] < 0:
-            return self._cut(rows, last=last)
-        near = all(abs(time[0] - seen[at]) <= self._gap_s for at in ("last", "kept"))
-        piece = (time[-1] - seen["start"]) // self._longest_s
-        if not near or time[0] <= seen["latest"] or piece != seen["piece"]:
-            return self._cut(rows, last=last)
-        return self._with_part(rows, group, time[-1])
-
-    def _with_part(
-        self, rows: pl.DataFrame, group: int, last_s: float
-    ) -> tuple[pl.DataFrame, pl.DataFrame]:
-        """Return rows that are all of their group's open part."""
-        for at in ("last", "kept", "latest"):
-            self._state[at][group] = last_s
-        part = pl.lit(int(self._state["part"][group]), pl.Int64)
-        return rows.with_columns(part.alias("part")), no_rows()
-
-    def _cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
-        """Cut rows of any kind."""
         several = "base" in rows.columns
         if self._waiting is not None:
             rows = pl.concat([self._waiting, rows])
@@ -156,24 +98,21 @@ class DriveCutter:
         self._grow(rows)
         alone, waiting, known_at = self._isolated(rows, last=last)
         self._waiting = rows.filter(pl.Series(waiting)) if waiting.any() else None
-        isolated = _refuse(rows, alone, "isolated")
+        refused = [_refuse(rows, alone, "isolated")]
         unsettled = alone | waiting
         if unsettled.any():
-            settled = pl.Series(~unsettled)
-            rows, known_at = rows.filter(settled), known_at[~unsettled]
+            rows, known_at = rows.filter(pl.Series(~unsettled)), known_at[~unsettled]
         rows, before = self._number_parts(rows, known_at)
-        if several:
-            return rows, isolated
-        time = rows["time"].to_numpy()
-        twice, backwards = time == before, time < before
-        disordered = twice | backwards
-        if disordered.any():
-            refused = [
+        if not several:
+            time = rows["time"].to_numpy()
+            twice, backwards = time == before, time < before
+            refused += [
                 _refuse(rows, twice, "time_duplicate"),
                 _refuse(rows, backwards, "time_backwards"),
             ]
-            return rows.filter(pl.Series(~disordered)), pl.concat([isolated, *refused])
-        return rows, isolated
+            if (disordered := twice | backwards).any():
+                rows = rows.filter(pl.Series(~disordered))
+        return rows, join_refused(refused)
 
     def _grow(self, rows: pl.DataFrame) -> None:
         """Make room for groups that were not there before."""
@@ -265,26 +204,6 @@ def sample_intervals_s(rows: pl.DataFrame) -> dict[int, float]:
     return {number: sample_interval_s(base) or STEP_S for (number,), base in bases.items()}
 
 
-def _stretches(rows: pl.DataFrame, gap_s: float) -> list[_Stretch]:
-    """Take a block apart so that few rows are beside an irregular step, and most are steady.
-
-    Two rows stand alone at each such step: the one that is far from the last, and the one that
-    tells what it is.
-    """
-    if "base" in rows.columns or rows.height < 2:
-        return [_Stretch(rows, is_steady=False)]
-    step = np.diff(rows["time"].to_numpy())
-    irregular = ~((step > 0) & (step <= gap_s)) | (np.diff(rows["group"].to_numpy()) != 0)
-    heads = np.flatnonzero(irregular) + 1
-    if heads.size > MOST_STRETCHES:
-        return [_Stretch(rows, is_steady=False)]
-    ends = np.unique(np.clip([0, *heads, *(heads + 2), rows.height], 0, rows.height)).tolist()
-    return [
-        _Stretch(rows.slice(start, end - start), is_steady=start not in heads)
-        for start, end in itertools.pairwise(ends)
-    ]
-
-
 def _ends(group: IntArray) -> tuple[IntArray, IntArray]:
     """Return where each group's rows begin, and the last of them."""
     if not group.size:
@@ -309,12 +228,8 @@ def _refuse(rows: pl.DataFrame, which: BoolArray, reason: str) -> pl.DataFrame:
     return describe_refused(rows, which, reason) if which.any() else no_rows()
 
 
-# Keeps the rows of drives that have not ended yet.
-
 MAX_OPEN_ROWS = 20_000_000
 """Rows of drives that have not ended: 55 hours at 100 Hz of drives that alternate row by row."""
-MOST_RUNS = 8
-"""Runs of rows of one part, in a block, up to which they are sliced one by one."""
 
 
 @dataclass(frozen=True)
@@ -412,12 +327,10 @@ class OpenDrives:
         if rows.is_empty():
             return
         self.number_of_rows += rows.height
-        part = rows["part"].to_numpy()
-        heads = [0, *(np.flatnonzero(np.diff(part)) + 1).tolist(), rows.height]
-        if len(heads) > MOST_RUNS + 1:
-            runs = rows.partition_by("part", maintain_order=True)
+        if rows["part"][0] == rows["part"][-1]:
+            runs = [rows]
         else:
-            runs = [_run(rows, *ends) for ends in itertools.pairwise(heads)]
+            runs = rows.partition_by("part", maintain_order=True)
         for run in runs:
             pieces = _by_base(run) if "base" in run.columns else [run]
             self._rows.setdefault(int(run["part"][0]), []).extend(pieces)
@@ -432,14 +345,6 @@ class OpenDrives:
                 yield rows
 
 
-def _run(rows: pl.DataFrame, start: int, end: int) -> pl.DataFrame:
-    """Return some rows; a copy if they are few, or they would keep all others in memory."""
-    run = rows.slice(start, end - start)
-    if 2 * run.height >= rows.height:
-        return run
-    return run.select(pl.all().gather(pl.int_range(pl.len())))
-
-
 def _by_base(run: pl.DataFrame) -> list[pl.DataFrame]:
     """Return the rows of each time base, with those columns that have a value there."""
     bases = run.drop("part").partition_by("base", maintain_order=True)
@@ -448,8 +353,6 @@ def _by_base(run: pl.DataFrame) -> list[pl.DataFrame]:
         for rows in bases
     ]
 
-
-# Makes drives of checked rows: their names and trips, their ticks and counts; and counts them.
 
 SOURCE = "measured"
 _SECONDS_PER_DAY = 86_400

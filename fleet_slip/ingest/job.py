@@ -86,16 +86,14 @@ def ingest_files(
 ) -> Iterator[IngestReport]:
     """Ingest files, and yield a report of each as it is committed; small files land together.
 
-    With an executor batches are read and written by its workers, in any order; threads of this
-    process take those of small files only, since a large one keeps all cores and much of the
-    memory busy by itself. `known` remembers what landed. A recording that is there is refused,
-    unless it is to be replaced: then `take_out` takes it out in the same commit.
-    `progress` counts bytes of each file as it is read, but for those that an executor's workers
-    read.
+    An executor's workers read batches in any order, but its threads none of large files, each of
+    which keeps all cores busy. `known` remembers what is in. A recording that is there is refused,
+    unless it is to be replaced: then `take_out` takes it out in the same commit. `progress` counts
+    bytes of each file that this process reads.
 
-    A file that is not usable does not hold up the others: when they are done `InputError` tells
-    of it, or `RepeatedError` where all such files are there already, unless `failures` is given and
-    takes them. Raises `ClusterError` at the end for files that workers died of.
+    Errors of files come at the end: `failures` takes them, or `InputError` tells of all, or
+    `RepeatedError` where all are there already. Raises `ClusterError` for files that workers died
+    of.
     """
     write = partial(write_batch, warehouse, mapping, replace=replace)
     if executor is None:
@@ -106,9 +104,9 @@ def ingest_files(
     for batch, written in _written(executor, write, _batches(asked)):
         # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
         note = {"job": "ingest", "mapping": mapping.name, "digest": written.digest}
-        landed, new = commit_batch(warehouse, written, partial(write, batch), note, take_out)
-        failed += landed.failures
-        for outcome in landed.outcomes:
+        committed, new = commit_batch(warehouse, written, partial(write, batch), note, take_out)
+        failed += committed.failures
+        for outcome in committed.outcomes:
             yield _report(warehouse, outcome, new)
             new -= {unit_of(outcome.digest).name}  # the same content in another file is not new
             if known is not None:
@@ -195,11 +193,11 @@ def joined(failures: list[InputError], beside: InputError | None = None) -> Inpu
     """Return one error that tells of all, and of what is wrong beside them."""
     if len(failures) + bool(beside) == 1:
         return beside or failures[0]
-    told = " ".join(map(str, failures[:FAILURES_SHOWN]))
+    first = " ".join(map(str, failures[:FAILURES_SHOWN]))
     more = len(failures) - FAILURES_SHOWN
     kind = RepeatedError if all(isinstance(o, RepeatedError) for o in failures) else InputError
     return kind(
-        f"{number_of(len(failures), 'file')} cannot be used; all others are in. {told}"
+        f"{number_of(len(failures), 'file')} cannot be used; all others are in. {first}"
         + (f" And {more:,} more." if more > 0 else "")
         + (f" {beside}" if beside else "")
     )

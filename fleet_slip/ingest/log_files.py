@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from glob import glob
+from itertools import takewhile
 from os import environ
 from pathlib import Path, PosixPath
 from tempfile import TemporaryDirectory
@@ -48,6 +49,8 @@ SUFFIXES = (
 
 _HIDDEN = re.compile(r"/\.(?!\.?(/|$))")
 """A part of a path that begins with a point, and is not `.` or `..`: those are told as faults."""
+
+_WILDCARDS = frozenset("*?[")
 
 _NO_LOG = f"no file in this folder has the suffix of a log: {', '.join(SUFFIXES)}."
 
@@ -143,7 +146,7 @@ def is_url(place: Place) -> bool:
 
 def is_pattern(place: Place) -> bool:
     """Whether a path stands for those that match it."""
-    return any(c in str(place) for c in "*?[") and (is_url(place) or not Path(place).exists())
+    return bool(_WILDCARDS.intersection(str(place))) and (is_url(place) or not Path(place).exists())
 
 
 def parts_of(log: Path) -> list[Path]:
@@ -201,7 +204,7 @@ def _matching(pattern: Path) -> list[Path]:
     files = [path for path in map(Path, names) if path.is_file()]
     if not files:
         raise InputError(f"{shown(pattern)}: no file matches this pattern. Look at its folder.")
-    plain = [part for part in pattern.parents if not any(c in str(part) for c in "*?[")]
+    plain = [part for part in pattern.parents if not _WILDCARDS.intersection(str(part))]
     return _without_strays(files, plain[0])
 
 
@@ -294,6 +297,66 @@ def local_copy(log: Log) -> Iterator[Path]:
         yield file
 
 
+<<<<<<< HEAD
+=======
+# What comes in one order and is read in another, in a temporary file without a name if large.
+
+IN_MEMORY_BYTES = 2**24
+"""Up to this size all is in memory, and there is no file."""
+
+
+@contextmanager
+def needing_room(written: int) -> Iterator[None]:
+    """Raise `InputError` where a temporary file, so long already, cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno == errno.EFBIG:  # a limit of our own, on a file that unfolds
+            raise
+        raise InputError(
+            f"{tempfile.gettempdir()}: no room for a temporary copy of more than {written:,} bytes "
+            f"({error.strerror}). Free some, or name another folder in the environment variable "
+            "TMPDIR."
+        ) from None
+
+
+class Spool:
+    """Pieces of bytes by key, those of a key in the order in which they came."""
+
+    def __init__(self) -> None:
+        """Begin without any."""
+        self._file = tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES)  # noqa: SIM115 - see close
+        self._pieces: dict[Hashable, list[tuple[int, int]]] = defaultdict(list)
+        self._end = 0
+
+    def add(self, key: Hashable, piece: bytes) -> None:
+        """Keep a piece. Raises `InputError` if the disk is full."""
+        with needing_room(self._end):
+            self._file.seek(self._end)
+            self._file.write(piece)
+            self._file.flush()
+        self._pieces[key].append((self._end, len(piece)))
+        self._end += len(piece)
+
+    def read(self, key: Hashable) -> Iterator[bytes]:
+        """Yield the pieces of a key."""
+        for start, size in self._pieces[key]:
+            self._file.seek(start)
+            yield self._file.read(size)
+
+    def clear(self) -> None:
+        """Forget all pieces."""
+        self._pieces.clear()
+        self._file.seek(0)
+        self._file.truncate()
+        self._end = 0
+
+    def close(self) -> None:
+        """Let go of all."""
+        self._file.close()
+
+
+>>>>>>> a03f09bb (Cut drives in one way, judge suspicions with fewer functions, merge the classes of time bases)
 # Files that commands read from an object store: found by URL, and copied to be read.
 
 ATTEMPTS = 3
@@ -331,14 +394,9 @@ def list_any_names(bucket: ObjectFolder, path: str) -> Iterator[StoredFile]:
         )
         for page in pages:
             for one in page.get("Contents", ()):
-                yield bucket.found(
-                    {
-                        "path": one["Key"],
-                        "size": one["Size"],
-                        "last_modified": one["LastModified"],
-                        "e_tag": one["ETag"],
-                    }
-                )
+                meta = {"path": one["Key"], "size": one["Size"]}
+                changed = {"last_modified": one["LastModified"], "e_tag": one["ETag"]}
+                yield bucket.found({**meta, **changed})
     except (BotoCoreError, ClientError) as error:
         raise StorageError(f"{bucket}/{path}: {meaning_of(error)}") from None
 
@@ -375,18 +433,12 @@ def find_object(url: str) -> StoredFile | None:
 def find_below(url: str) -> list[StoredFile]:
     """Return objects below a folder, or that match a pattern with `*`, `?`, `**`, sorted."""
     bucket, path = parse_url(url)
-    whole = path.split("/")
-    plain = [part for part in whole if not has_wildcards(part)]
-    if len(plain) == len(whole):
+    folders = list(takewhile(lambda part: not _WILDCARDS.intersection(part), path.split("/")))
+    folder = "/".join(folders)
+    if folder == path:
         return _listed(bucket, path)
-    first = next(at for at, part in enumerate(whole) if has_wildcards(part))
     matches = re.compile(glob_translate(path)).match
-    return [file for file in _listed(bucket, "/".join(whole[:first])) if matches(file.path)]
-
-
-def has_wildcards(text: str) -> bool:
-    """Whether a text has characters that stand for others."""
-    return any(c in text for c in "*?[")
+    return [file for file in _listed(bucket, folder) if matches(file.path)]
 
 
 def copy_object(file: StoredFile, copy: Path) -> None:

@@ -47,7 +47,7 @@ _NO_CLOCK = "this file has no clock of its own: write column or rate_hz under [t
 
 @dataclass
 class _Opened:
-    """An open file, its time bases, and how many of them are being read."""
+    """An open file, its time bases, their columns, and how many of them are being read."""
 
     file: ExitStack
     bases: list[Base]
@@ -91,8 +91,7 @@ class PartBases:
                 opened.file.close()
 
 
-@dataclass(frozen=True)
-class _Stretch:
+class _Stretch(NamedTuple):
     """The rows of a time base in one file: which of its bases it is, and how many there are."""
 
     part: Path
@@ -251,7 +250,7 @@ def _read_with_times(
             yield batch.filter(pl.col(own).is_not_null()).rename({own: time})
 
 
-# Checks each row of a file by itself: values in SI units of good ones, the reason of bad ones.
+# Each row is checked by itself: values in SI units of good ones, the reason of bad ones.
 
 MAX_KEYS = 100_000
 """Combinations of drive metadata in one file, of whatever rows."""
@@ -295,7 +294,10 @@ class RowChecker:
 
     def _check(self, batch: pl.DataFrame) -> CheckedBlock:
         raw = batch.select(pl.all().name.prefix(RAW))
-        fields, meeting = self._understand(raw.schema)
+        try:
+            fields, meeting = _understand(self._mapping, tuple(raw.schema.items()))
+        except InputError as error:
+            raise InputError(f"{shown(self._file)}: {error}") from None
         if RAW + ROW in raw.columns:
             raw = raw.rename({RAW + ROW: "row"})
         else:
@@ -316,13 +318,6 @@ class RowChecker:
         if self._mapping.time.rate_hz is not None:
             rows = rows.with_columns((pl.col("row") / self._mapping.time.rate_hz).alias("time"))
         return CheckedBlock(rows, refused, self.rows)
-
-    def _understand(self, schema: pl.Schema) -> tuple[list[Field], pl.Expr | None]:
-        """Return the fields of batches with a schema, and the condition on their rows."""
-        try:
-            return _understand(self._mapping, tuple(schema.items()))
-        except InputError as error:
-            raise InputError(f"{shown(self._file)}: {error}") from None
 
 
 @lru_cache(maxsize=64)
@@ -373,12 +368,7 @@ class DriveKeys:
 
 
 def _split(batch: pl.DataFrame, fields: list[Field]) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Split a batch that has the fields' values and the columns `row` and `group`.
-
-    Returns the good rows, with `row`, `group`, `base` if there are several, the time and the
-    signals in SI units; and the bad ones, with `row`, `group`, `reason`, `signal` and `value`. The
-    first problem of a row counts.
-    """
+    """Split a batch into good rows, in SI units, and bad ones, by the first problem of each."""
     values = [field.name for field in fields if field.kind in {"time", "signal"}]
     kept = ["row", "group", *({"base"} & set(batch.columns)), *values]
     codes = [
@@ -441,10 +431,8 @@ def _explain(bad: pl.DataFrame, fields: list[Field]) -> pl.DataFrame:
     )
 
 
-# Brings the label from its sensor to the centre of gravity, on the ticks of a drive.
-#
-# With the yaw rate r, a sensor x before and y to the left of the centre of gravity has the
-# velocities (vx - r y, vy + r x). Of an angle alone the speed is needed beside it.
+# The label is brought to the centre of gravity: with the yaw rate r, a sensor x before it and y to
+# its left has the velocities (vx - r y, vy + r x). Of an angle alone the speed is needed beside it.
 
 RADIUS_M = 0.31
 """Of a wheel whose mapping names none; a tenth more moves the correction by a tenth."""

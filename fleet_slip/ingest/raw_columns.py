@@ -28,10 +28,8 @@ from fleet_slip.ingest.formats.csv import EXTRA_FIELDS
 from fleet_slip.ingest.formats.source import BASE, Base
 from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
 
-# Brings the time bases of a log into one table, in which every signal keeps its own samples.
-#
-# A row is a sample time of one of them, and has no value of the others. The table comes in windows
-# of time, so that only some rows of each base are in memory.
+# Time bases become one table: a row is a sample of one of them, and null in the columns of others.
+# It comes in windows of time, so that only some rows of each base are in memory.
 
 DISORDER = "\0disorder"
 """Column that says what is wrong with a row's time among those of its base, null if nothing."""
@@ -50,22 +48,20 @@ def merge_bases(
 ) -> Iterator[pl.DataFrame]:
     """Yield the rows of all bases, window by window in the order of time, with `BASE` as a number.
 
-    Times are in s. Within a base they must increase: what does not has its reason in `DISORDER`,
-    because once bases are mixed it could not be told, and its place is where the base's last right
-    time was. The `held` columns say of every row what was last known at its place, for
-    `split_gap_s` at most: conditions and names of drives hold for all signals. Rows of one time are
-    in one window. Where only one base has rows, they come as they are.
+    Times are in s. A row whose time does not increase within its base has the reason in
+    `DISORDER`, and stands where the base's last right time was. The `held` columns, conditions and
+    names of drives, say of every row what was last known there, for `split_gap_s` at most. Where
+    only one base has rows, they come as they are.
     """
-    opened = [_Opened(base) for base in bases]
+    opened = [_Coming(base, time, split_gap_s) for base in bases]
     columns = {name: kind for one in opened for name, kind in one.columns.items()}
     some = [one for one in opened if one.has_rows]
     if len(some) == 1:
         yield from (_completed(batch, columns) for batch in some[0].batches)
         return
-    coming, offset = [], 0
+    coming, offset = some, 0
     for number, one in enumerate(some):
-        judged = _Clock(time, split_gap_s, offset).judge_all(one.batches)
-        coming.append(_Coming(number, judged, max(WINDOW_ROWS // len(some), 1)))
+        one.begin(number, offset, max(WINDOW_ROWS // len(some), 1))
         if number + 1 < len(some):
             offset += one.base.count_rows()
     columns |= {BASE: pl.Int32(), DISORDER: pl.String(), ROW: pl.Int64(), _RIGHT: pl.Float64()}
@@ -78,35 +74,35 @@ def merge_bases(
         yield rows.with_columns(one.hold(rows) for one in lasting).drop(_RIGHT)
 
 
-class _Opened:
-    """A base of which the first rows were read, so that its columns are known."""
-
-    def __init__(self, base: Base) -> None:
-        self.base, batches = base, base.read()
-        first = next(batches)
-        while not first.height and (following := next(batches, None)) is not None:
-            first = following
-        self.columns, self.has_rows = dict(first.schema), first.height > 0
-        self.batches = chain([first], batches)
-
-
 def _completed(rows: pl.DataFrame, columns: dict[str, pl.DataType]) -> pl.DataFrame:
     """Return rows with all columns, null where they have none."""
     absent = [pl.lit(None, kind).alias(name) for name, kind in columns.items() if name not in rows]
     return rows.with_columns(absent).select(*columns)
 
 
-class _Clock:
-    """Judges the times of one base, row by row: what is wrong with each."""
+class _Coming:
+    """The rows of a base that are in no window yet; of the first ones its columns are known."""
 
-    def __init__(self, time: str, split_gap_s: float, offset: int) -> None:
-        self._time, self._gap_s, self._rows = time, split_gap_s, offset
+    def __init__(self, base: Base, time: str, split_gap_s: float) -> None:
+        self.base, self._time, self._gap_s = base, time, split_gap_s
+        batches = base.read()
+        first = next(batches)
+        while not first.height and (following := next(batches, None)) is not None:
+            first = following
+        self.columns, self.has_rows = dict(first.schema), first.height > 0
+        self.batches = chain([first], batches)
         self._before_s, self._right_s = np.nan, -np.inf
+        self._rows = pl.DataFrame()
 
-    def judge_all(self, batches: Iterator[pl.DataFrame]) -> Iterator[pl.DataFrame]:
+    def begin(self, number: int, offset: int, most: int) -> None:
+        """Take the base's number, that of its first row, and how many rows to read at once."""
+        self._number, self._offset = pl.lit(number, pl.Int32).alias(BASE), offset
+        self._slices = _resized(self._judged(), most)
+
+    def _judged(self) -> Iterator[pl.DataFrame]:
         """Yield the rows with `DISORDER`, `ROW` and `_RIGHT`; the last one waits for the next."""
         waiting: pl.DataFrame | None = None
-        for batch in batches:
+        for batch in self.batches:
             rows = batch if waiting is None else pl.concat([waiting, batch])
             if rows.height > 1:
                 yield self._judge(rows.head(rows.height - 1), rows[self._time][-1])
@@ -118,8 +114,7 @@ class _Clock:
         """Judge rows before a time. One far ahead is `isolated`, or all after it would be late."""
         time_s = rows[self._time].to_numpy()
         before_s = np.concatenate([[self._before_s], time_s[:-1]])
-        after_s = np.nan if after_s is None else after_s
-        next_s = np.concatenate([time_s[1:], [after_s]])
+        next_s = np.append(time_s[1:], np.nan if after_s is None else after_s)
         with np.errstate(invalid="ignore"):
             ahead = (time_s - before_s > self._gap_s) & (next_s < time_s)
         usable = np.where(ahead | ~np.isfinite(time_s), -np.inf, time_s)
@@ -132,33 +127,13 @@ class _Clock:
             )
             reasons = pl.Series(names.tolist()).replace("", None)
         self._before_s, self._right_s = time_s[-1], right_s[-1]
-        self._rows += rows.height
+        self._offset += rows.height
+        first = self._offset - rows.height + 1
         return rows.with_columns(
             reasons.alias(DISORDER),
-            pl.int_range(self._rows - rows.height + 1, self._rows + 1, dtype=pl.Int64).alias(ROW),
+            pl.int_range(first, self._offset + 1, dtype=pl.Int64).alias(ROW),
             pl.Series(_RIGHT, right_s[1:]),
         )
-
-
-def _resized(batches: Iterator[pl.DataFrame], most: int) -> Iterator[pl.DataFrame]:
-    """Yield the rows of batches with `most` at once: of large ones less, of small ones together."""
-    small: list[pl.DataFrame] = []
-    for batch in batches:
-        small.append(batch)
-        if sum(one.height for one in small) >= most:
-            yield from pl.concat(small).iter_slices(most)
-            small = []
-    if small:
-        yield from pl.concat(small).iter_slices(most)
-
-
-class _Coming:
-    """Rows of a base that were read and are in no window yet."""
-
-    def __init__(self, number: int, batches: Iterator[pl.DataFrame], most: int) -> None:
-        self._number = pl.lit(number, pl.Int32).alias(BASE)
-        self._slices = _resized(batches, most)
-        self._rows = pl.DataFrame()
 
     def fill(self) -> bool:
         """Read on if no rows wait; return whether some do now."""
@@ -176,6 +151,18 @@ class _Coming:
         number = int(self._rows[_RIGHT].search_sorted(until, side="right"))
         taken, self._rows = self._rows.head(number), self._rows.slice(number)
         return taken.with_columns(self._number)
+
+
+def _resized(batches: Iterator[pl.DataFrame], most: int) -> Iterator[pl.DataFrame]:
+    """Yield the rows of batches with `most` at once: of large ones less, of small ones together."""
+    small: list[pl.DataFrame] = []
+    for batch in batches:
+        small.append(batch)
+        if sum(one.height for one in small) >= most:
+            yield from pl.concat(small).iter_slices(most)
+            small = []
+    if small:
+        yield from pl.concat(small).iter_slices(most)
 
 
 class _Lasting:
@@ -295,8 +282,6 @@ def unfit_column(column: str, kind: pl.DataType, needed: str) -> InputError:
     return InputError(f"column {column!r} has the type {kind}; the mapping needs {needed}.")
 
 
-# Days and times of rows, as Polars expressions: numbers, timestamps, and dates beside times.
-
 _FIRST_DAY, _END_DAY = date(1970, 1, 1), date(2200, 1, 1)
 
 
@@ -377,10 +362,7 @@ def _dates(date: DateColumn, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
     return text.str.zfill(len(digits)) if digits.isdigit() else text
 
 
-# What a mapping takes from each row, as Polars expressions: values in SI units and their faults.
-#
-# A batch's columns carry the prefix `RAW`, so that no name in a file can meet one of ours, be taken
-# for a pattern, or be anything but a name.
+# What a mapping takes from each row: values in SI units and their faults.
 
 LONGEST_TEXT = 200
 """Characters of metadata that are accepted, and of offending values that are kept."""

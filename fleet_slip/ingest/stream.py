@@ -4,10 +4,10 @@ import os
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -47,8 +47,6 @@ from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.suspicion import Suspicion, assumed_rate, find_refusals
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 
-# What became of a file's rows, and when that says that the file or its mapping is not usable.
-
 MAX_DRIVES = 10_000
 """Short drives in one file. With more, time or the drive's column is not what the mapping says."""
 SHORT_ROWS = 1000
@@ -59,39 +57,41 @@ MOST_TICKS_A_ROW = 1000
 
 @dataclass(frozen=True)
 class IngestCounts:
-    """What became of a file's rows: read are left out, kept or quarantined."""
+    """What became of a file's rows: those read are left out, kept or quarantined.
+
+    Attributes:
+        rows_left_out: rows that do not meet the mapping's conditions.
+        quarantined: refused rows by reason.
+        ticks: rows of the result; equal to `rows_kept` where nothing was resampled.
+    """
 
     rows_read: int
     rows_left_out: int
-    """Rows that do not meet the mapping's conditions."""
     rows_kept: int
     quarantined: dict[str, int]
-    """Rejected rows by reason."""
     drives: int
     drives_resampled: int
     ticks: int
-    """Rows of the result; equal to `rows_kept` where nothing was resampled."""
 
     def without(self, drives: int, ticks: int) -> "IngestCounts":
         """Return the counts where some drives were left out, and so many ticks are left."""
         return replace(self, drives=self.drives - drives, ticks=ticks)
 
 
-@dataclass
 class Totals:
-    """What became of a file's rows so far."""
+    """What became of a file's rows so far.
 
-    rows_kept: int = 0
-    quarantined: Counter[str] = field(default_factory=Counter)
-    refused: Counter[tuple[str, str]] = field(default_factory=Counter)
-    """Rejected rows by what is wrong, where that is a signal, and by the reason."""
-    drives: int = 0
-    drives_resampled: int = 0
-    ticks: int = 0
-    samples: Counter[str] = field(default_factory=Counter)
-    """Values of each signal in the file's rows; `values` are those on ticks."""
-    values: Counter[str] = field(default_factory=Counter)
-    first_refused: dict[str, Any] | None = None
+    Attributes:
+        refused: rejected rows by signal and reason, where a signal is what is wrong.
+        samples: values of each signal in the file's rows; `values` are those on ticks.
+    """
+
+    def __init__(self) -> None:
+        """Begin at nothing."""
+        self.rows_kept = self.drives = self.drives_resampled = self.ticks = 0
+        self.quarantined, self.samples, self.values = Counter[str](), Counter[str](), Counter[str]()
+        self.refused = Counter[tuple[str, str]]()
+        self._first_refused: dict[str, Any] | None = None
 
     def add(self, rows: DriveRows, drive: MeasuredDrive) -> None:
         """Count a drive that was made of rows."""
@@ -110,19 +110,7 @@ class Totals:
             of_signals = refused.filter(pl.col("signal").is_in(list(signals)))
             self.refused.update(zip(of_signals["signal"], of_signals["reason"], strict=True))
             first = refused.row(refused["row"].arg_min() or 0, named=True)
-            self.first_refused = min(self.first_refused or first, first, key=lambda r: r["row"])
-
-    def counts(self, rows_read: int, rows_left_out: int) -> IngestCounts:
-        """Return what became of the rows, of which so many were read and left out."""
-        return IngestCounts(
-            rows_read=rows_read,
-            rows_left_out=rows_left_out,
-            rows_kept=self.rows_kept,
-            quarantined=dict(sorted(self.quarantined.items())),
-            drives=self.drives,
-            drives_resampled=self.drives_resampled,
-            ticks=self.ticks,
-        )
+            self._first_refused = min(self._first_refused or first, first, key=lambda r: r["row"])
 
     def require_sane_drives(self, file: Path, mapping: Mapping) -> None:
         """Raise `InputError` where drives are too many or too long for so few rows."""
@@ -141,9 +129,9 @@ class Totals:
 
     def require_usable(self, file: Path, mapping: Mapping) -> None:
         """Raise `InputError` where no row, no tick, or no value of a signal came of all rows."""
-        if not self.rows_kept and self.first_refused is not None:
+        if not self.rows_kept and self._first_refused is not None:
             reasons = ", ".join(f"{n:,} {reason}" for reason, n in self.quarantined.most_common())
-            first = self.first_refused
+            first = self._first_refused
             example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
             raise InputError(
                 f"{shown(file)}: none of its "
@@ -172,13 +160,11 @@ RATE_ROWS, MOST_RATE_ROWS = 2**17, 2**21
 FEWEST_STEPS = 1000
 
 
-@dataclass(frozen=True)
-class Piece:
+class Piece(NamedTuple):
     """Drives of a file that have ended, and rows that were refused meanwhile.
 
-    Attributes:
-        drives: in an order that depends on the file and the mapping only.
-        refused: `row`, `group`, `reason`, `signal` and `value`.
+    The order of drives depends on the file and the mapping only. `refused` has `row`, `group`,
+    `reason`, `signal` and `value`.
     """
 
     drives: list[MeasuredDrive]
@@ -272,10 +258,10 @@ class MeasuredStream:
         group = rows.group
         self._stretches[group] += 1
         name = drive_id(self.prefix, group, self._stretches[group])
-        told = self.checker.keys.metadata[group]
+        in_file = self.checker.keys.metadata[group]
         known = {
-            **told,
-            "drive_name": told.get("drive", self._stem),
+            **in_file,
+            "drive_name": in_file.get("drive", self._stem),
             "source_file": self.name,
             "trip_id": self._trips.name(name, group, rows.start_s, rows.end_s),
         }
@@ -317,7 +303,16 @@ class MeasuredStream:
 
     def counts(self) -> IngestCounts:
         """Return what became of the rows, once all pieces were taken."""
-        return self.totals.counts(self.checker.rows, self.checker.left_out)
+        found = self.totals
+        return IngestCounts(
+            rows_read=self.checker.rows,
+            rows_left_out=self.checker.left_out,
+            rows_kept=found.rows_kept,
+            quarantined=dict(sorted(found.quarantined.items())),
+            drives=found.drives,
+            drives_resampled=found.drives_resampled,
+            ticks=found.ticks,
+        )
 
     def suspicions(self) -> tuple[Suspicion, ...]:
         """Return the signals of which many values were refused, once all pieces were taken."""
@@ -355,10 +350,10 @@ def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
     content = digest.copy()
     used = {name for names in mapping.time_bases().values() for name in names}
     for part in parts_of(file):
-        told = partition_keys(part)
-        if keys := {key: text for key, text in told.items() if key in used}:
+        of_folders = partition_keys(part)
+        if keys := {key: text for key, text in of_folders.items() if key in used}:
             digest.update(canonical_ascii(keys).encode())
-        content.update(canonical_ascii(told).encode())
+        content.update(canonical_ascii(of_folders).encode())
     digest.update(mapping.canonical_json().encode())
     return digest.hexdigest(), content.hexdigest()
 

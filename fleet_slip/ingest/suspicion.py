@@ -7,24 +7,18 @@ with the figure that shows it, and what to try. Axes and signs are ISO 8855.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
 from fleet_slip.base import BoolArray, FloatArray
-from fleet_slip.catalogue.course import (
-    COURSE,
-    LARGEST_RAD,
-    WITNESSES,
-    CourseFault,
-    CourseRelation,
-    relate,
-)
+from fleet_slip.catalogue.course import COURSE, LARGEST_RAD, WITNESSES, CourseRelation, relate
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 
 # How signals of a drive go with one another: slopes, fits, a label's delay.
 
+SECOND = round(1 / float(SAMPLE_TIME_S))
 FEWEST_TICKS = 200
 MOVING_MPS = 2.0
 
@@ -161,9 +155,7 @@ def _mean(values: FloatArray) -> FloatArray:
 
 # What looks wrong in a course: it turns as the yaw rate does, and slips as a car does.
 
-SECOND = round(1 / float(SAMPLE_TIME_S))
 APART = 4 * SECOND
-COURSE_SUSPICION_LEAST_CORRELATION = 0.6
 SOUND = (0.8, 1.25)
 """Of the course's change to the yaw rate's integral, and of the receiver's speed to the wheels'."""
 LEAST_OF_THEIR_OWN = 0.9
@@ -172,9 +164,7 @@ LEAST_SPEED_MPS = 3.0
 SPEED = "satellite_speed"
 
 
-def course_fault(
-    signals: Mapping[str, FloatArray], speed: FloatArray | None = None
-) -> CourseFault | None:
+def course_fault(signals: "Signals", speed: FloatArray | None = None) -> "Suspicion | None":
     """Return what fault the course of a drive seems to have; `speed` is that of the wheels."""
     if not {"course", "yaw_rate"} <= set(signals):
         return None
@@ -185,53 +175,53 @@ def course_fault(
     )
     if (slope, correlation) != (1.0, 0.0):  # else it is too little to tell
         figure = f"over a second it changes by {slope:+.2f} times what the yaw rate adds up to"
-        if correlation < -COURSE_SUSPICION_LEAST_CORRELATION:
+        if correlation < -LEAST_CORRELATION:
             remedy = "Turn clockwise_from_north, or swap north and east."
-            return CourseFault("reversed", (COURSE,), figure, remedy)
-        if correlation < COURSE_SUSPICION_LEAST_CORRELATION:
+            return Suspicion("reversed", (COURSE,), figure, remedy)
+        if correlation < LEAST_CORRELATION:
             figure = f"over a second its change hardly goes with the yaw rate ({correlation:+.2f})"
             remedy = "Is it a course over ground, and of this car?"
-            return CourseFault("values", (COURSE,), figure, remedy)
+            return Suspicion("values", (COURSE,), figure, remedy)
         if not SOUND[0] <= slope <= SOUND[1]:
             remedy = "Check its unit, and that of the yaw rate."
-            return CourseFault("scaled", (COURSE,), figure, remedy)
+            return Suspicion("scaled", (COURSE,), figure, remedy)
     return _of_fixes(signals, speed) or _of_relation(_relation(signals, turned))
 
 
-def _of_fixes(signals: Mapping[str, FloatArray], speed: FloatArray | None) -> CourseFault | None:
+def _of_fixes(signals: "Signals", speed: FloatArray | None) -> "Suspicion | None":
     """Return what is wrong with the receiver's speed, or with how many fixes have a course."""
-    told = signals.get("satellite_speed")
-    if told is None:
+    own_speed = signals.get(SPEED)
+    if own_speed is None:
         return None
-    fast = told > LEAST_SPEED_MPS
+    fast = own_speed > LEAST_SPEED_MPS
     own = float(np.isfinite(signals["course"][fast]).mean()) if fast.any() else 1.0
     if own < LEAST_OF_THEIR_OWN:
         figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of backwards"
         remedy = "They are left out. Map it as the receiver tells it."
-        return CourseFault("values", (COURSE,), figure, remedy)
+        return Suspicion("values", (COURSE,), figure, remedy)
     both = fast & (speed > LEAST_SPEED_MPS) if speed is not None else fast
     if speed is not None and both.sum() >= SECOND:
-        ratio = float(np.median(told[both] / speed[both]))
+        ratio = float(np.median(own_speed[both] / speed[both]))
         if not SOUND[0] <= ratio <= SOUND[1]:
             figure = f"it is {ratio:.2f} times the speed of the wheels"
             remedy = "Check both units: the antenna's place is by it."
-            return CourseFault("scaled", (SPEED,), figure, remedy)
+            return Suspicion("scaled", (SPEED,), figure, remedy)
     return None
 
 
-def _of_relation(relation: CourseRelation | None) -> CourseFault | None:
+def _of_relation(relation: CourseRelation | None) -> "Suspicion | None":
     if relation is None:
         return None
-    if fault := relation.fault or relation.misplaced:
-        return replace(fault, signals=(COURSE,))
+    if found := relation.fault or relation.misplaced:
+        return Suspicion(found.kind, (COURSE,), found.figure, found.remedy)
     if abs(relation.scale - 1) > MOST_SCALE_ERROR:
         figure = f"it turns {relation.scale:.3f} times as the yaw rate adds up to"
         remedy = "The gyroscope's is off, which learning allows for."
-        return CourseFault("scale", (COURSE,), figure, remedy)
+        return Suspicion("scale", (COURSE,), figure, remedy)
     return None
 
 
-def _relation(signals: Mapping[str, FloatArray], turned: FloatArray) -> CourseRelation | None:
+def _relation(signals: "Signals", turned: FloatArray) -> CourseRelation | None:
     """Return what changes over some seconds come to, by the receiver's own speed."""
     if not {"ay", "satellite_speed"} <= set(signals):
         return None
@@ -354,17 +344,16 @@ def find_suspicions(signals: Signals) -> list[Suspicion]:
     sideslip = magnitudes.pop(catalogue().label, None)
     usual = {name: values for name, values in usual.items() if name not in magnitudes}
     found = [*still, *magnitudes.values(), *_turning(usual, speed)]
-    for check in (_axes_swapped, _wheels_differ, _rates_differ, _accelerates, _axles_swapped):
-        found += check(usual, speed)
     label: list[Suspicion] = []
-    if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
-        label = list(_label(usual, speed))  # which is judged by them
+    if speed is not None:
+        for check in (_axes_swapped, _scales_differ, _accelerates, _axles_swapped):
+            found += check(usual, speed)
+        if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
+            label = list(_label(usual, speed))  # which is judged by them
     if sideslip and all(one.kind != "biased" for one in label):  # else it is off to one side
         label = [sideslip]
-    found += label
-    if fault := course_fault(usual, speed):
-        found.append(Suspicion(**vars(fault)))
-    return found
+    fault = course_fault(usual, speed)
+    return [*found, *label, *([fault] if fault else [])]
 
 
 def speed_mps(signals: Signals) -> FloatArray | None:
@@ -427,9 +416,9 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
             yield Suspicion("reversed", concerned, figure, "Write negate = true.")
 
 
-def _axes_swapped(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+def _axes_swapped(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
     """Compare both accelerations with the turns."""
-    if speed is None or not {"ax", "ay", "yaw_rate"} <= set(signals):
+    if not {"ax", "ay", "yaw_rate"} <= set(signals):
         return
     expected, rows = signals["yaw_rate"] * speed, moving(speed)
     ax, ay = (abs(slope_of(signals[name], expected, rows)[1]) for name in ("ax", "ay"))
@@ -438,41 +427,39 @@ def _axes_swapped(signals: Signals, speed: FloatArray | None) -> Iterator[Suspic
         yield Suspicion("swapped", ("ax", "ay"), figure, "Swap their columns.")
 
 
-def _wheels_differ(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
-    if speed is None:
-        return
+def _scales_differ(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
+    """Compare the size of signals with that of others that tell the same."""
+    pairs: list[tuple[FloatArray, FloatArray, tuple[str, ...], str, tuple[float, float]]] = []
+    wide = (0.4, 2.5)
     for name in (*WHEELS, "vx", "vehicle_speed"):
         if name in signals:
             own = signals[name] * (RADIUS_M if name in WHEELS else 1.0)
-            yield from _of_scale(own, speed, (name,), "the speed of the wheels", (0.7, 1.4), speed)
+            pairs.append((own, speed, (name,), "the speed of the wheels", (0.7, 1.4)))
+    if "yaw_rate" in signals:
+        yaw_rate = signals["yaw_rate"]
+        if {"wheel_rl", "wheel_rr"} <= set(signals):
+            turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M
+            pairs.append((yaw_rate, turn, ("yaw_rate",), "what the rear wheels tell", wide))
+        if "ay" in signals:
+            both, of = ("ay", "yaw_rate"), "yaw rate times speed"
+            pairs.append((signals["ay"], yaw_rate * speed, both, of, wide))
+        angle = next((name for name in ROAD_WHEELS if name in signals), None)
+        if angle is not None and "steering_wheel" in signals:
+            both, of = ("steering_wheel", angle), "15 times the other"
+            pairs.append((signals["steering_wheel"], 15 * signals[angle], both, of, wide))
+    for values, expected, concerned, of, sound in pairs:
+        slope, correlation = slope_of(values, expected, moving(speed))
+        if abs(correlation) > LEAST_CORRELATION:
+            yield from _wrong_scale(abs(slope), concerned, of, sound)
 
 
-def _rates_differ(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
-    if speed is None or "yaw_rate" not in signals:
-        return
-    yaw_rate, wide = signals["yaw_rate"], (0.4, 2.5)
-    if {"wheel_rl", "wheel_rr"} <= set(signals):
-        turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M
-        of = "what the rear wheels tell"
-        yield from _of_scale(yaw_rate, turn, ("yaw_rate",), of, wide, speed)
-    if "ay" in signals:
-        both, of = ("ay", "yaw_rate"), "yaw rate times speed"
-        yield from _of_scale(signals["ay"], yaw_rate * speed, both, of, wide, speed)
-    angle = next((name for name in ROAD_WHEELS if name in signals), None)
-    if angle is not None and "steering_wheel" in signals:
-        both, of = ("steering_wheel", angle), "15 times the other"
-        wheel, road = signals["steering_wheel"], 15 * signals[angle]
-        yield from _of_scale(wheel, road, both, of, wide, speed)
-
-
-def _accelerates(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+def _accelerates(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
     """Compare `ax` with the change of speed over a second."""
-    if speed is None or "ax" not in signals or speed.size < 4 * FEWEST_TICKS:
+    if "ax" not in signals or speed.size < 4 * FEWEST_TICKS:
         return
-    second = round(1 / float(SAMPLE_TIME_S))
     change = np.full(speed.size, np.nan)
-    change[second // 2 : -second // 2] = speed[second:] - speed[:-second]
-    smooth = np.convolve(np.nan_to_num(signals["ax"]), np.ones(second) / second, "same")
+    change[SECOND // 2 : -SECOND // 2] = speed[SECOND:] - speed[:-SECOND]
+    smooth = np.convolve(np.nan_to_num(signals["ax"]), np.ones(SECOND) / SECOND, "same")
     slope, correlation = slope_of(smooth, change, moving(speed))
     if correlation < -LEAST_CORRELATION:
         figure = f"its correlation with the change of speed is {correlation:+.2f}"
@@ -481,9 +468,9 @@ def _accelerates(signals: Signals, speed: FloatArray | None) -> Iterator[Suspici
         yield from _wrong_scale(slope, ("ax",), "the change of speed", (0.4, 2.5))
 
 
-def _axles_swapped(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+def _axles_swapped(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
     """Compare axles in tight bends: the front one drives the longer way."""
-    if speed is None or not {"yaw_rate", *WHEELS} <= set(signals):
+    if not {"yaw_rate", *WHEELS} <= set(signals):
         return
     front, rear = (signals[f"wheel_{a}l"] + signals[f"wheel_{a}r"] for a in "fr")
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -497,10 +484,10 @@ def _axles_swapped(signals: Signals, speed: FloatArray | None) -> Iterator[Suspi
         yield Suspicion("swapped", WHEELS, figure, "Swap the front columns with the rear ones.")
 
 
-def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+def _label(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
     """Look for the label's delay behind its inputs, its sign, and its unit."""
     label = catalogue().label
-    if label not in signals or speed is None or not {"yaw_rate", "ay"} <= set(signals):
+    if not {label, "yaw_rate", "ay"} <= set(signals):
         return
     rows = moving(speed)
     angle = signals[label]
@@ -513,13 +500,14 @@ def _label(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
         inputs = [signals["ay"], signals["yaw_rate"] / speed, signals["yaw_rate"] * speed]
     steering = [signals[n] for n in ("steering_wheel", *ROAD_WHEELS) if n in signals]
     delay = find_delay(angle, signals["ay"], signals["yaw_rate"], speed, [*inputs, *steering])
-    told = "course" in signals and is_in_time(angle, signals["course"], signals["yaw_rate"])
-    if delay is not None and not told:
+    in_time = "course" in signals and is_in_time(angle, signals["course"], signals["yaw_rate"])
+    if delay is not None and not in_time:
         seconds, gain = delay
-        figure = f"its inputs explain it best {abs(seconds):.2f} s " + (
-            "earlier" if seconds > 0 else "later"
+        side = "earlier" if seconds > 0 else "later"
+        figure = (
+            f"its inputs explain it best {abs(seconds):.2f} s {side}, with {gain:.0%} less of its "
+            "variance left"
         )
-        figure += f", with {gain:.0%} less of its variance left"
         yield Suspicion("late", (label,), figure, f"Try delay_s = {seconds:.2f}.", seconds)
     many = large.size >= FEWEST_TICKS and np.quantile(large, 0.9) > LARGE_RAD
     yield from _lever(signals, np.array(inputs[:2]), rows & (speed < SLOW_MPS), many=bool(many))
@@ -563,19 +551,6 @@ def _lever(
     elif abs(zero) > LARGEST_ZERO_RAD:
         figure = f"on a straight it is {np.degrees(zero):+.2f} deg, should be 0"
         yield Suspicion("biased", (label,), figure, f"Write offset = {-zero:.4f} (rad).")
-
-
-def _of_scale(
-    values: FloatArray,
-    expected: FloatArray,
-    concerned: tuple[str, ...],
-    of: str,
-    sound: tuple[float, float],
-    speed: FloatArray,
-) -> Iterator[Suspicion]:
-    slope, correlation = slope_of(values, expected, moving(speed))
-    if abs(correlation) > LEAST_CORRELATION:
-        yield from _wrong_scale(abs(slope), concerned, of, sound)
 
 
 def _wrong_scale(
