@@ -2,13 +2,16 @@
 
 The way of a row, in the order of its stations:
 
-1. `formats.reading` opens the file. Its format yields batches of the columns that the mapping uses.
-2. `log_rows` joins the parts of a log, leaves out rows that do not meet the conditions, and takes
-   values in SI units, or the reason why a row is refused, by the expressions of `raw_columns`.
-3. `drives` checks the order of time, cuts rows into drives, and brings each to ticks by
+1. `log_files` finds the logs in folders and on object stores, and copies those that are elsewhere.
+2. `formats.reading` opens a file; its format yields batches of the columns that the mapping uses.
+3. `log_rows` joins the files and time bases of a log, and checks each row by itself: values in SI
+   units, or the reason why it is refused, by the expressions of `raw_columns`.
+4. `drives` checks the order of time, cuts rows into drives, and brings each to ticks by
    `resampling`, and to counts.
-4. `stream` goes through the steps above; it yields ended drives and refused rows, and refuses a
-   file that came to nothing.
-5. `load` leaves out what was forgotten and what is there already, and commits the files of a batch;
-   `job` goes through all batches.
+5. `stream` goes through 2 to 4 for one log: it yields ended drives and refused rows, and refuses a
+   log of which nothing is usable. `suspicion` says what looks wrong in what came out.
+6. `load` leaves out what was forgotten or is in the logs already, writes data files of a batch of
+   logs, and commits them; `job` goes through all batches.
+
+A mapping (`mapping`, of `columns`) says which column is which signal.
 """

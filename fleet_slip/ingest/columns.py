@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 from collections.abc import Mapping as Named
 from datetime import UTC, datetime
 from functools import cache, reduce
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 from zoneinfo import available_timezones
 
 import numpy as np
@@ -23,8 +23,6 @@ from fleet_slip.base import FloatArray
 from fleet_slip.catalogue.signals import HALF_TURN, Identifier, Signal, catalogue
 from fleet_slip.config import Config, Name, PositiveFloat, added
 from fleet_slip.ingest.formats.source import OWN_TIME
-
-# Factors from the units that people log in to the catalogue's SI units.
 
 _TERM = r"(?:°|[^\W\d]+\d?)(?:(?:\^|\*\*)-?\d)?"
 _UNITS_UNIT = re.compile(rf"(?:1/)?{_TERM}(?:[*/ ]{_TERM})*")
@@ -44,20 +42,13 @@ _NEEDS = {
 _NUMBERS = {"1": 1.0, "%": 0.01, "percent": 0.01}
 
 
-def require_unit(unit: str, si_unit: str, quantity: str = "it") -> None:
-    """Raise `ValueError` for a unit that has no `conversion_factor`."""
-    conversion_factor(unit, si_unit, quantity)
-
-
 @cache
 def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
     """Return f in `value in si_unit = f * value in unit`; `quantity` is what messages call it.
 
-    In an acceleration `g` is standard gravity, 9.80665 m/s² (elsewhere it would be the gram). The
-    radian counts as a dimension, so that neither a ratio passes for an angle nor Hz for rad/s:
-    what fits in dimension only is off by 2π or by 100 and would never be noticed.
-
-    Raises `ValueError`, with a message that ends in what is needed instead.
+    In an acceleration `g` is standard gravity, 9.80665 m/s². The radian counts as a dimension, so
+    that neither a ratio passes for an angle nor Hz for rad/s: that would be off by 2π or by 100.
+    Raises `ValueError`, with what is needed instead.
     """
     needs = f"{quantity} needs {_NEEDS.get(si_unit, f'a unit like {si_unit!r}')}"
     if si_unit == "1" and unit in _NUMBERS:
@@ -87,6 +78,7 @@ VELOCITY = "m/s"
 MAX_TABLE = 10_000
 
 COURSE, SPEED = "course", "satellite_speed"
+Component: TypeAlias = Literal["north", "east"]
 
 
 def _increasing(table: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
@@ -142,7 +134,7 @@ class SignalColumn(Config):
     time: Name | None = added(None)
     """The column of this signal's times, where the file has several, in the unit of the others."""
 
-    component: Literal["north", "east"] | None = added(None)
+    component: Component | None = added(None)
     """Of the velocity over ground, if it is one: set for `course = { north = …, east = … }`."""
     clockwise_from_north: bool | None = added(None)
     """Whether the course is told so; False: counterclockwise from east."""
@@ -173,7 +165,7 @@ class SignalColumn(Config):
                 f"is a velocity in {self.unit!r}; {signal} needs an angular velocity: add "
                 "radius_m, the rolling radius of the wheel"
             )
-        require_unit(self.unit, self._measured_in(si_unit), signal)
+        conversion_factor(self.unit, self._measured_in(si_unit), signal)
 
     def linear(self, si_unit: str) -> tuple[float, float]:
         """Return (gain, bias): `value in SI = gain * table(value in the file) + bias`."""
@@ -204,13 +196,10 @@ class SignalColumn(Config):
 
     def _is_velocity(self) -> bool:
         try:
-            require_unit(self.unit, VELOCITY)
+            conversion_factor(self.unit, VELOCITY)
         except ValueError:
             return False
         return True
-
-
-Component = Literal["north", "east"]
 
 
 def split_components(signals: Any) -> Any:
@@ -265,9 +254,6 @@ def count_range(name: str, column: SignalColumn) -> tuple[Signal, int, int]:
     if name == COURSE:
         return signal, -4 * HALF_TURN, 4 * HALF_TURN
     return signal, signal.min_count, signal.max_count
-
-
-# Where the times of a log are from.
 
 
 class DateColumn(Config):
@@ -343,7 +329,7 @@ class TimeBase(Config):
             raise ValueError("longest_gap_s cannot be larger than split_gap_s")
         if self.unit is not None:
             try:
-                require_unit(self.unit, "s")
+                conversion_factor(self.unit, "s")
             except ValueError as error:
                 raise ValueError(f"{self.column} {error}") from None
         return self
@@ -401,9 +387,7 @@ def reads_clock(timestamp_format: str) -> bool:
         return False
 
 
-# Which rows of a file count: conditions on its columns. Those of other rows are only counted.
-#
-# People write them as `vehicle_speed > 5 m/s and fix in (4, 5)`.
+# Conditions on rows; people write them as `vehicle_speed > 5 m/s and fix in (4, 5)`.
 
 Bound = Annotated[float, Field(allow_inf_nan=False)]
 _BOUNDS: dict[str, Callable[[pl.Expr, float], Any]] = {

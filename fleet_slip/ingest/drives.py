@@ -86,6 +86,9 @@ class DriveCutter:
     def cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
         """Return the rows of a block with their `part`, together; and the misplaced ones."""
         self.ended = []
+        if self._goes_on(rows):
+            part = pl.lit(int(self._state["part"][rows["group"][0]]), pl.Int64)
+            return rows.with_columns(part.alias("part")), no_rows()
         several = "base" in rows.columns
         if self._waiting is not None:
             rows = pl.concat([self._waiting, rows])
@@ -113,6 +116,25 @@ class DriveCutter:
             if (disordered := twice | backwards).any():
                 rows = rows.filter(pl.Series(~disordered))
         return rows, join_refused(refused)
+
+    def _goes_on(self, rows: pl.DataFrame) -> bool:
+        """Whether all rows are of one open part, as most blocks' are; then take note of them."""
+        if "base" in rows.columns or rows.is_empty() or self._waiting is not None:
+            return False
+        group, time = rows["group"].to_numpy(), rows["time"].to_numpy()
+        if group[0] >= self._state.size or not (group == group[0]).all():
+            return False
+        seen = self._state[group[0]]
+        step = np.diff(time, prepend=seen["latest"])
+        near = all(abs(time[0] - seen[at]) <= self._gap_s for at in ("last", "kept"))
+        piece = (time[-1] - seen["start"]) // self._longest_s
+        if not (near and step.min() > 0 and step[1:].max(initial=0) <= self._gap_s):
+            return False
+        if seen["part"] < 0 or piece != seen["piece"]:
+            return False
+        for at in ("last", "kept", "latest"):
+            self._state[at][group[0]] = time[-1]
+        return True
 
     def _grow(self, rows: pl.DataFrame) -> None:
         """Make room for groups that were not there before."""
@@ -521,7 +543,9 @@ def _on_the_circle(resample: Callable[[FloatArray], FloatArray], angle: FloatArr
     return np.asarray(resampled - 2 * np.pi * np.rint(resampled / (2 * np.pi)), dtype=np.float64)
 
 
-def _metadata(name: str, told: dict[str, Any], start_s: float, mapping: Mapping) -> dict[str, Any]:
+def _metadata(
+    name: str, of_drive: dict[str, Any], start_s: float, mapping: Mapping
+) -> dict[str, Any]:
     """Return what is known of a drive, by column of `logs`. Raises `InputError`."""
     given = {key: getattr(mapping.drive, key) for key in _FROM_MAPPING}
     known = {key: value for key, value in given.items() if not isinstance(value, FromColumn)}
@@ -529,7 +553,7 @@ def _metadata(name: str, told: dict[str, Any], start_s: float, mapping: Mapping)
         if mapping.time.own_clock and start_s < _EARLIEST_S:
             raise InputError("its clock does not tell the date. Give it in the mapping: drive.day.")
         known["day"] = date.fromordinal(_EPOCH.toordinal() + int(start_s // _SECONDS_PER_DAY))
-    known |= {key: value for key, value in told.items() if key in given or key in _FROM_FILE}
+    known |= {key: value for key, value in of_drive.items() if key in given or key in _FROM_FILE}
     dated = mapping.time.is_dated and start_s >= _EARLIEST_S
     return {
         **known,
@@ -554,10 +578,10 @@ def _facts_of(mapping: Mapping, known: dict[str, Any]) -> dict[str, Any]:
             f"the car {vehicle!r} is not in the table of vehicles of the mapping "
             f"{mapping.name!r}. Add a row for it."
         )
-    told = {name: fact for name, fact in facts.model_dump().items() if known.get(name) is None}
-    if told.get("vehicle_model", "") is None:
+    new = {name: fact for name, fact in facts.model_dump().items() if known.get(name) is None}
+    if new.get("vehicle_model", "") is None:
         raise InputError(f"nobody says the vehicle_model of the car {vehicle!r}. Add it.")
-    return told
+    return new
 
 
 class Trips:
@@ -576,11 +600,8 @@ class Trips:
         return trip_id
 
 
-# Finds rows of several cars or trips that a mapping takes for those of one.
-#
-# A log of several cars in turns becomes drives that no car drove: neighbouring rows differ by more
-# than a car can change between them. Where times are dated, one car cannot be under way twice. And
-# a column that is named as cars or trips are, and that no mapping uses, tells them apart.
+# Rows of several cars that a mapping takes for those of one: neighbouring rows differ by more than
+# a car can change, a car is under way twice, or a column named like cars is not mapped.
 
 _LIMITS = {
     **dict.fromkeys(WHEELS, (3 / RADIUS_M, 150 / RADIUS_M)),  # a wheel may lock within 0.15 s

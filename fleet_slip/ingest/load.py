@@ -29,7 +29,7 @@ from fleet_slip.catalogue.signals import as_arrow, catalogue
 from fleet_slip.errors import ConflictError, InputError, RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive, drive_id
 from fleet_slip.ingest.formats.source import Spool
-from fleet_slip.ingest.log_files import LocalCopies, Log, StoredParts
+from fleet_slip.ingest.log_files import Log, StoredParts, local_copies
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.preview import signals_of
 from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
@@ -606,13 +606,13 @@ def write_batch(
     outcomes: list[FileOutcome] = []
     failures: list[InputError] = []
     same = SameRecordings(warehouse, batch.logs, mapping.name, replace)
-    copies = LocalCopies(asked.file for asked in files)
-    with copies, ThreadPoolExecutor(WRITERS) as threads:
+    copies = local_copies(asked.file for asked in files)
+    with copies as open_copy, ThreadPoolExecutor(WRITERS) as threads:
         batch.files = {n: DataFiles(t, mapping, threads) for n, t in tables_of(warehouse).items()}
         for asked in files:
             try:
                 with (
-                    copies.of(asked.file) as file,
+                    open_copy(asked.file) as file,
                     open_measured(file, mapping, progress) as stream,
                 ):
                     first = drive_id(stream.prefix, 0)

@@ -7,9 +7,9 @@ mapped, so that a log on a store is copied as a whole to the temporary folder (`
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from glob import glob
@@ -17,8 +17,7 @@ from itertools import takewhile
 from os import environ
 from pathlib import Path, PosixPath
 from tempfile import TemporaryDirectory
-from types import TracebackType
-from typing import Self, TypeAlias
+from typing import TypeAlias
 
 import obstore
 from fsspec.utils import glob_translate
@@ -78,6 +77,8 @@ class StrayLink(PosixPath):
 
 Log: TypeAlias = Path | StoredFile | StoredParts
 """A measured log: a file, or a folder whose files are its parts, here or on an object store."""
+
+OpenCopy: TypeAlias = Callable[[Log], AbstractContextManager[Path]]
 
 Place: TypeAlias = Path | str
 """What a person gives: a path, a pattern, or the URL of an object store."""
@@ -228,55 +229,39 @@ def _logs_below(folder: Path) -> Iterator[Path]:
                 yield Path(parent, name)
 
 
-class LocalCopies:
-    """Copies of those logs that are on a store, fetched at once, as long as this is entered."""
-
-    def __init__(self, logs: Iterable[Log]) -> None:
-        """Take the logs."""
-        self._stored = [log for log in dict.fromkeys(logs) if not isinstance(log, Path)]
-        self._copies: dict[Log, Future[Path]] = {}
-
-    def __enter__(self) -> Self:
-        """Begin to fetch."""
-        if self._stored:
+@contextmanager
+def local_copies(logs: Iterable[Log]) -> Iterator[OpenCopy]:
+    """Fetch the logs that are on a store, at once; give what opens each of all."""
+    stored = [log for log in dict.fromkeys(logs) if not isinstance(log, Path)]
+    with ExitStack() as stack:
+        folders, copies = dict[Log, Path](), dict[Log, Future[Path]]()
+        if stored:
             with storage_errors("the temporary folder"):
-                self._folder = TemporaryDirectory(prefix="fleet-slip-copies-")
-            self._threads = ThreadPoolExecutor(AT_ONCE)
-            for number, log in enumerate(self._stored):
-                folder = Path(self._folder.name, str(number))
-                self._copies[log] = self._threads.submit(_copy, log, folder)
-        return self
+                top = stack.enter_context(TemporaryDirectory(prefix="fleet-slip-copies-"))
+            threads = ThreadPoolExecutor(AT_ONCE)
+            stack.callback(threads.shutdown, cancel_futures=True)
+            folders = {log: Path(top, str(number)) for number, log in enumerate(stored)}
+            copies = {log: threads.submit(_copy, log, folders[log]) for log in stored}
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Remove the copies."""
-        if self._stored:
-            self._threads.shutdown(cancel_futures=True)
-            self._folder.cleanup()
+        @contextmanager
+        def open_copy(log: Log) -> Iterator[Path]:
+            """Give the file to read a log from, whose errors name the log. Raises `InputError`."""
+            if isinstance(log, Path):
+                require_inside(log)
+                yield log
+                return
+            copy = copies[log].result()
+            try:
+                yield copy
+            except FleetSlipError as error:
+                bucket = "/".join(str(log).split("/")[:3])
+                raise type(error)(str(error).replace(str(folders[log]), bucket)) from None
 
-    @contextmanager
-    def of(self, log: Log) -> Iterator[Path]:
-        """Give the file to read a log from, whose errors name the log. Raises `InputError`."""
-        if isinstance(log, Path):
-            require_inside(log)
-            yield log
-            return
-        copy = self._copies[log].result()
-        folder = str(Path(self._folder.name, str(self._stored.index(log))))
-        try:
-            yield copy
-        except FleetSlipError as error:
-            bucket = "/".join(str(log).split("/")[:3])
-            raise type(error)(str(error).replace(folder, bucket)) from None
+        yield open_copy
 
 
 def _copy(log: StoredFile | StoredParts, folder: Path) -> Path:
     """Copy a log below a folder, under its path in the bucket: keys may be in its names."""
-
     for part in stored_parts(log):
         names = part.path.split("/")
         if not {"", ".", ".."}.isdisjoint(names) or not all(map(_can_be_copied, names)):
@@ -292,71 +277,11 @@ def _can_be_copied(name: str) -> bool:
 
 @contextmanager
 def local_copy(log: Log) -> Iterator[Path]:
-    """Give the file to read one log from. Raises what `LocalCopies.of` raises."""
-    with LocalCopies([log]) as copies, copies.of(log) as file:
+    """Give the file to read one log from. Raises what opening it raises."""
+    with local_copies([log]) as open_copy, open_copy(log) as file:
         yield file
 
 
-<<<<<<< HEAD
-=======
-# What comes in one order and is read in another, in a temporary file without a name if large.
-
-IN_MEMORY_BYTES = 2**24
-"""Up to this size all is in memory, and there is no file."""
-
-
-@contextmanager
-def needing_room(written: int) -> Iterator[None]:
-    """Raise `InputError` where a temporary file, so long already, cannot be written."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno == errno.EFBIG:  # a limit of our own, on a file that unfolds
-            raise
-        raise InputError(
-            f"{tempfile.gettempdir()}: no room for a temporary copy of more than {written:,} bytes "
-            f"({error.strerror}). Free some, or name another folder in the environment variable "
-            "TMPDIR."
-        ) from None
-
-
-class Spool:
-    """Pieces of bytes by key, those of a key in the order in which they came."""
-
-    def __init__(self) -> None:
-        """Begin without any."""
-        self._file = tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES)  # noqa: SIM115 - see close
-        self._pieces: dict[Hashable, list[tuple[int, int]]] = defaultdict(list)
-        self._end = 0
-
-    def add(self, key: Hashable, piece: bytes) -> None:
-        """Keep a piece. Raises `InputError` if the disk is full."""
-        with needing_room(self._end):
-            self._file.seek(self._end)
-            self._file.write(piece)
-            self._file.flush()
-        self._pieces[key].append((self._end, len(piece)))
-        self._end += len(piece)
-
-    def read(self, key: Hashable) -> Iterator[bytes]:
-        """Yield the pieces of a key."""
-        for start, size in self._pieces[key]:
-            self._file.seek(start)
-            yield self._file.read(size)
-
-    def clear(self) -> None:
-        """Forget all pieces."""
-        self._pieces.clear()
-        self._file.seek(0)
-        self._file.truncate()
-        self._end = 0
-
-    def close(self) -> None:
-        """Let go of all."""
-        self._file.close()
-
-
->>>>>>> a03f09bb (Cut drives in one way, judge suspicions with fewer functions, merge the classes of time bases)
 # Files that commands read from an object store: found by URL, and copied to be read.
 
 ATTEMPTS = 3

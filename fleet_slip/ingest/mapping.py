@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import date
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -52,8 +52,6 @@ from fleet_slip.ingest.formats.source import describe_unknown
 from fleet_slip.ingest.formats.tables import DuckdbRows
 from fleet_slip.ingest.log_files import Log, Place, is_pattern, is_url, names_several
 
-# Where the sensor of the label is, against the centre of gravity.
-
 SPEEDS = ("vx", "vehicle_speed")
 
 
@@ -93,17 +91,17 @@ class LabelSensor(Config):
 
 # What is known of each car, from a table beside the mapping.
 
-Told = TypeVar("Told")
+Fact = TypeVar("Fact")
 
 
-def require_drive_column(told: Told, info: ValidationInfo) -> Told:
-    """Return what is told of a drive. Raises `ValueError` if the catalogue has no such column."""
+def require_drive_column(fact: Fact, info: ValidationInfo) -> Fact:
+    """Return a fact of a drive. Raises `ValueError` if the catalogue has no such column."""
     if info.field_name not in catalogue().drive:
         raise ValueError(
             "the catalogue has no such drive column. Copy it from the shipped one: "
             "configs/signals.toml"
         )
-    return told
+    return fact
 
 
 OptionalColumn = Annotated[
@@ -134,20 +132,19 @@ def read_vehicle_facts(file: Path) -> tuple[VehicleFacts, ...]:
             f"{file}: vehicle_id is missing. A table of cars is CSV in UTF-8, whose first line "
             f"names its columns: {', '.join(VehicleFacts.model_fields)}."
         )
-    found = tuple(_facts(file, line, row) for line, row in enumerate(rows, 2))
+    found = []
+    for line, row in enumerate(rows, 2):
+        try:
+            facts = VehicleFacts.model_validate({key: text or None for key, text in row.items()})
+        except ValidationError as error:
+            raise ConfigError(f"{file}: line {line}: {faults_of(error)}") from None
+        found.append(facts)
     names = [facts.vehicle_id for facts in found]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise ConfigError(f"{file}: the car {twice!r} stands in it twice.")
     if not found:
         raise ConfigError(f"{file}: it has no row. It needs a header and one row for each car.")
-    return found
-
-
-def _facts(file: Path, line: int, row: dict[str, str]) -> VehicleFacts:
-    try:
-        return VehicleFacts.model_validate({key: text or None for key, text in row.items()})
-    except ValidationError as error:
-        raise ConfigError(f"{file}: line {line}: {faults_of(error)}") from None
+    return tuple(found)
 
 
 class FromColumn(Config):
@@ -340,8 +337,7 @@ class ListFile(Config):
     mappings: tuple[ListedMapping, ...] = Field(min_length=1)
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """Files, and the mapping that they go through, None if they are left alone."""
 
     files: str
@@ -349,8 +345,8 @@ class Entry:
 
     def takes(self, name: str) -> bool:
         """Whether a path below the folder is among the files."""
-        seen = name if "/" in self.files else name.rpartition("/")[2]
-        return fnmatchcase(seen, self.files) or name.startswith(f"{self.files.rstrip('/')}/")
+        subject = name if "/" in self.files else name.rpartition("/")[2]
+        return fnmatchcase(subject, self.files) or name.startswith(f"{self.files.rstrip('/')}/")
 
 
 @dataclass(frozen=True)
@@ -382,24 +378,18 @@ class MappingList:
             for one, share in zip(self.entries, shares, strict=True)
             if one.mapping is not None and share
         ]
-        left_out = [
-            f"{_told(n)} of {of}"
-            for n, of in ((none, "no mapping"), (several, "several mappings"))
-            if n
-        ]
-        if not left_out:
+        if not none and not several:
             return taken, None
-        return taken, UnclaimedError(
-            f"{self.name}: {' and '.join(left_out)} left out. Give each file one mapping in it, or "
-            "none, and it is left alone."
+        unclaimed = " and ".join(
+            f"{number_of(len(names), 'log')} ({', '.join(map(shown, names[:NAMES_SHOWN]))}"
+            f"{', …' if len(names) > NAMES_SHOWN else ''}) of {of}"
+            for names, of in ((none, "no mapping"), (several, "several mappings"))
+            if names
         )
-
-
-def _told(names: list[str]) -> str:
-    """Return how many logs they are, and the first of them."""
-    more = ", …" if len(names) > NAMES_SHOWN else ""
-    listed = ", ".join(map(shown, names[:NAMES_SHOWN]))
-    return f"{number_of(len(names), 'log')} ({listed}{more})"
+        return taken, UnclaimedError(
+            f"{self.name}: {unclaimed} left out. Give each file one mapping in it, or none, and "
+            "it is left alone."
+        )
 
 
 def as_list(mapping: str | Mapping | MappingList) -> MappingList:
@@ -415,19 +405,14 @@ def as_list(mapping: str | Mapping | MappingList) -> MappingList:
     if "mappings" not in load_toml(file):
         return as_list(load_mapping(mapping))
     folder = Path(str(file)).parent
-    return MappingList(
-        mapping,
-        tuple(
-            Entry(one.files, _listed(one.mapping, folder))
-            for one in load_config(file, ListFile).mappings
-        ),
-    )
 
+    def load(name: str | None) -> Mapping | None:
+        if name is None:
+            return None
+        return load_mapping(str(folder / name) if name.endswith(".toml") else name)
 
-def _listed(mapping: str | None, folder: Path) -> Mapping | None:
-    if mapping is None:
-        return None
-    return load_mapping(str(folder / mapping) if mapping.endswith(".toml") else mapping)
+    listed = load_config(file, ListFile).mappings
+    return MappingList(mapping, tuple(Entry(one.files, load(one.mapping)) for one in listed))
 
 
 def _folder_of(place: Place) -> str:

@@ -17,10 +17,7 @@ from fleet_slip.base import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.ingest.columns import SignalColumn
 
-# Which fixes of a satellite receiver tell where the car goes, and where they stand.
-#
-# Not all that have a course do, and changes over some seconds are of fixes that are exactly so far
-# apart.
+# Which fixes of a satellite receiver tell where the car goes, and at which ticks.
 
 STEP_S = float(SAMPLE_TIME_S)
 SAME_RAD = 1e-6
@@ -126,15 +123,15 @@ def _is_regular(fixes: IntArray) -> bool:
 def _between(ticks: IntArray, values: FloatArray, at: IntArray) -> FloatArray:
     """Return values at ticks, by straight lines between near samples, else beside a nearer one."""
     known = np.flatnonzero(~np.isnan(values))
-    times, told = ticks[known], values[known]
+    times, found = ticks[known], values[known]
     right = np.clip(np.searchsorted(times, at), 0, times.size - 1)
     left = np.maximum(right - 1, 0)
     bridged = (times[right] >= at) & (times[right] - times[left] <= LONGEST_BETWEEN)
     bridged &= times[left] <= at
     nearer = np.where(at - times[left] < times[right] - at, left, right)
     beside = np.abs(times[nearer] - at) <= LONGEST_BESIDE
-    line = np.where(bridged, np.interp(at, times, told), np.nan)
-    return np.where(bridged | ~beside, line, told[nearer])
+    line = np.where(bridged, np.interp(at, times, found), np.nan)
+    return np.where(bridged | ~beside, line, found[nearer])
 
 
 Method = Literal["snap", "interpolate", "average"]
@@ -317,15 +314,12 @@ def fixes_on_ticks(
     """Return course in rad and speed in m/s at the ticks nearest to the fixes, NaN elsewhere.
 
     `course` and `speed` are the antenna's, of the resampler's samples; `yaw_rate` in rad/s and
-    `ay` in m/s² are of the ticks. A sample that repeats the one before is no fix: the file holds
-    values in between. One of a course that `is_held`, or of a car that `is_backwards`, has none.
-    Fixes at irregular times are brought `on_grid`.
+    `ay` in m/s² are of the ticks. A sample that repeats the one before is no fix. There is no
+    course without a yaw rate, below `LEAST_SPEED_MPS`, where it `is_held` or `is_backwards`.
 
     In the car's axes the antenna moves by (-r y, r x) against the centre of gravity, with the yaw
-    rate r. Where the car does not slip, that tells how the axes lie to the antenna's course; what
-    slip β there is makes an error of r y β over speed. A fix that is measured a part of a tick
-    before its tick turns by r times that part. Without a yaw rate there is no course; nor is there
-    one below `LEAST_SPEED_MPS`.
+    rate r; a slip β makes an error of r y β over speed. A fix that is measured a part of a tick
+    before its tick turns by r times that part.
     """
     present = np.flatnonzero(_is_new(course, speed))
     nearest, late_s = _nearest(resampler, present, delay_s)

@@ -29,7 +29,7 @@ from typing import Any, Never
 
 import fleet_slip
 from fleet_slip.cli.main import main as fleet_slip_main
-from fleet_slip.ingest.columns import require_unit
+from fleet_slip.ingest.columns import conversion_factor
 
 READ_LATE = (
     *("AWS_", "FLEET_SLIP_", "XDG_CACHE_HOME", "CACHE_DIRECTORY", "TMPDIR"),
@@ -112,7 +112,7 @@ def main(address: str) -> None:
     """Serve until stdin closes. What a forked process is to do is done at the end of the module."""
     for module in _modules():
         importlib.import_module(module)
-    require_unit("km/h", "m/s")  # pint reads its definitions at the first use
+    conversion_factor("km/h", "m/s")  # pint reads its definitions at the first use
     gc.freeze()
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(address)
