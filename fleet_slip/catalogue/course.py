@@ -28,6 +28,7 @@ import numpy as np
 
 from fleet_slip.base import FloatArray
 from fleet_slip.catalogue.arithmetic import nearest_sql
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S, catalogue
 
 COURSE, YAW_RATE = "course", "yaw_rate"
@@ -226,16 +227,6 @@ def turned_scale() -> float:
 
 
 @dataclass(frozen=True)
-class CourseFault:
-    """What is wrong with a course: a kind of fault, the signals, what shows it, what to try."""
-
-    kind: str
-    signals: tuple[str, ...]
-    figure: str
-    remedy: str
-
-
-@dataclass(frozen=True)
 class CourseRelation:
     """What the changes of a course come to.
 
@@ -257,17 +248,17 @@ class CourseRelation:
     explained: float
 
     @property
-    def fault(self) -> CourseFault | None:
+    def fault(self) -> Fault | None:
         """What no course of a car does."""
         if self.scale < REVERSED:
-            return CourseFault(
+            return Fault(
                 "reversed",
                 (COURSE,),
                 f"it turns {self.scale:+.2f} times as the yaw rate does",
                 "Turn clockwise_from_north round, or swap north and east.",
             )
         if abs(self.scale) < STILL:
-            return CourseFault(
+            return Fault(
                 "stuck",
                 (COURSE,),
                 f"it turns {self.scale:+.2f} times as the yaw rate does",
@@ -275,21 +266,21 @@ class CourseRelation:
             )
         most = MOST_NOISE_MPS if self.explained < LEAST_EXPLAINED else HARDLY_A_COURSE_MPS
         if self.noise_mps > most:
-            return CourseFault(
+            return Fault(
                 "noisy",
                 (COURSE,),
                 f"a fix errs by {self.noise_mps:.2f} m/s across the car",
                 "Reflected signals? Leave out fixes that the receiver doubts, by where.",
             )
         if not SCALES[0] < self.scale < SCALES[1]:
-            return CourseFault(
+            return Fault(
                 "scaled",
                 (YAW_RATE, COURSE),
                 f"the course turns {self.scale:.2f} times as the yaw rate does",
                 "Check both units, and the gyroscope.",
             )
         if self.slip + 2 * self.slip_error < LEAST_SLIP:
-            return CourseFault(
+            return Fault(
                 "no slip",
                 (COURSE,),
                 f"beyond the yaw rate it changes by {self.slip:.2f} times what a car slips",
@@ -298,11 +289,11 @@ class CourseRelation:
         return None
 
     @property
-    def misplaced(self) -> CourseFault | None:
+    def misplaced(self) -> Fault | None:
         """Whether the course is that of a place where no car has its centre of gravity."""
         if LEVERS_M[0] <= self.lever_m <= LEVERS_M[1]:
             return None
-        return CourseFault(
+        return Fault(
             "place",
             (COURSE,),
             f"it is that of a place {self.lever_m:+.1f} m before the rear axle, "

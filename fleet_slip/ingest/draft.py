@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.base import FloatArray, shown
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
@@ -37,7 +38,7 @@ from fleet_slip.ingest.guess import (
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.preview import preview_log
 from fleet_slip.ingest.profile import FileProfile
-from fleet_slip.ingest.suspicion import WHEELS, Suspicion, find_suspicions
+from fleet_slip.ingest.suspicion import WHEELS, find_suspicions
 from fleet_slip.ingest.vocabulary import parts_of
 
 _MOST_REFUSED = 20
@@ -81,7 +82,7 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     time = guess_time(profile, taken, bases, group)
     drive_of = partial(_drive_of, file, profile, time, drive_keys)
     failures: tuple[str, ...] = ()
-    suspicions: list[Suspicion] = []
+    suspicions: list[Fault] = []
     try:
         if unnamed and set(WHEELS) <= set(guesses):
             guesses |= _place_wheels(guesses, drive_of(guesses))
@@ -139,7 +140,7 @@ def _road_wheels(guesses: dict[str, Guess], drive: dict[str, FloatArray]) -> dic
     return {**others, "steer": replace(guess.because(figure), signal="steer")}
 
 
-def _doubted(guesses: dict[str, Guess], suspicions: list[Suspicion]) -> dict[str, Guess]:
+def _doubted(guesses: dict[str, Guess], suspicions: list[Fault]) -> dict[str, Guess]:
     """Return the guesses with what the car's motion has against them.
 
     Of several signals that contradict one another, those are doubted of which the file does not
@@ -239,7 +240,7 @@ def signal_keys(guess: Guess) -> dict[str, Any]:
     return keys
 
 
-def _correct(guesses: dict[str, Guess], suspicions: list[Suspicion]) -> dict[str, Guess]:
+def _correct(guesses: dict[str, Guess], suspicions: list[Fault]) -> dict[str, Guess]:
     """Return the guesses with signs turned and pairs swapped, each with its figure."""
     corrected = dict(guesses)
     for one in suspicions:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.base import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import catalogue, digest_drive, round_chunks
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
@@ -42,7 +43,7 @@ from fleet_slip.ingest.resampling import (
     course_and_speed,
     fixes_on_ticks,
 )
-from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, Suspicion
+from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
 
 LONGEST_DRIVE_S = 2**19 * STEP_S
@@ -637,20 +638,20 @@ class SeveralCars:
             car = str(drive.metadata["vehicle_id"])
             self._under_way[car].append((rows.start_s, rows.end_s))
 
-    def suspicions(self) -> Iterator[Suspicion]:
+    def suspicions(self) -> Iterator[Fault]:
         """Yield what is seen of several cars, once all drives were looked at."""
         remedy = "Map the column that tells cars or trips apart."
         for name, jumps in self._jumps.most_common(1):
             if jumps:
                 figure = f"from row to row it jumps {jumps:,} times as that of no car does"
-                yield Suspicion("cars", (name,), figure, remedy)
+                yield Fault("cars", (name,), figure, remedy)
         twice = sum(_overlaps(under_way) for under_way in self._under_way.values())
         if twice:
             figure = f"one car is under way twice at a time, {twice:,} times"
-            yield Suspicion("repeated", ("time",), figure, remedy)
+            yield Fault("repeated", ("time",), figure, remedy)
 
 
-def unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Suspicion]:
+def unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]:
     """Yield columns named as cars or trips are that tell rows apart, and that a mapping passes by.
 
     `drives` is what the file fell into. Logs that have clocks of their own are those of one car.
@@ -677,7 +678,7 @@ def unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Suspici
                     told = json.dumps(name, ensure_ascii=False)
                     where = f"column = {told}"
                     where = f"{key} = {{ {where} }}" if key != "column" else where
-                    yield Suspicion("cars", (name,), figure, f"Write {where} under [drive].")
+                    yield Fault("cars", (name,), figure, f"Write {where} under [drive].")
 
 
 def _values_and_runs(column: pl.Series) -> tuple[int, int]:

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, TypeAlias
 
 from fleet_slip.base import Progress, no_progress, number_of
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.ingest.load import (
@@ -25,7 +26,6 @@ from fleet_slip.ingest.log_files import Log, StoredParts
 from fleet_slip.ingest.log_rows import find_look_alikes
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.stream import IngestCounts
-from fleet_slip.ingest.suspicion import Suspicion
 from fleet_slip.storage.folder import StoredFile
 from fleet_slip.warehouse.tables import Warehouse, connect_tables
 
@@ -48,7 +48,7 @@ class IngestReport:
     """Names that differ only in their Unicode form: in the file, or of cars in the logs."""
     drives_forgotten: int = 0
     """Drives that were left out: of cars that were forgotten, or forgotten themselves."""
-    suspicions: tuple[Suspicion, ...] = ()
+    suspicions: tuple[Fault, ...] = ()
     """What looks wrong in its longest drive; of small files that land together, in one of all."""
     drives_replaced: int = 0
     """Drives that gave way to it: its recording, from another file or through another mapping."""

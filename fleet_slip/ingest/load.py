@@ -25,6 +25,7 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.base import IntArray, Progress, no_progress, number_of, shown
 from fleet_slip.caches import cache_folder
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import as_arrow, catalogue
 from fleet_slip.errors import ConflictError, InputError, RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive, drive_id
@@ -33,7 +34,7 @@ from fleet_slip.ingest.log_files import Log, StoredParts, local_copies
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.preview import signals_of
 from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
-from fleet_slip.ingest.suspicion import Suspicion, find_suspicions
+from fleet_slip.ingest.suspicion import find_suspicions
 from fleet_slip.storage.folder import StoredFile
 from fleet_slip.storage.table import WITHDRAWN, Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
@@ -539,7 +540,7 @@ class FileOutcome:
     is_new: bool
     counts: IngestCounts
     look_alikes: tuple[tuple[str, ...], ...]
-    suspicions: tuple[Suspicion, ...] = ()
+    suspicions: tuple[Fault, ...] = ()
     vehicles: frozenset[str] = frozenset()
     left_out: int = 0
     fingerprints: dict[str, int] = field(default_factory=dict)

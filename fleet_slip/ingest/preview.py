@@ -11,13 +11,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.base import FloatArray, needed
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.log_files import Log, local_copy
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
-from fleet_slip.ingest.suspicion import Suspicion, find_suspicions
+from fleet_slip.ingest.suspicion import find_suspicions
 from fleet_slip.storage.folder import storage_errors
 
 MOST_TICKS = 200_000
@@ -43,7 +44,7 @@ class Preview:
     file: str
     counts: IngestCounts
     ranges: tuple[SignalRange, ...]
-    suspicions: tuple[Suspicion, ...]
+    suspicions: tuple[Fault, ...]
     longest: dict[str, FloatArray]
     """The signals of the longest drive, on consecutive ticks from its first."""
 

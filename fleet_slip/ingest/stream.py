@@ -14,6 +14,7 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.base import Progress, canonical_ascii, no_progress, number_of, shown
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives import (
@@ -44,7 +45,7 @@ from fleet_slip.ingest.log_rows import (
 )
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
-from fleet_slip.ingest.suspicion import Suspicion, assumed_rate, find_refusals
+from fleet_slip.ingest.suspicion import assumed_rate, find_refusals
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 
 MAX_DRIVES = 10_000
@@ -314,7 +315,7 @@ class MeasuredStream:
             ticks=found.ticks,
         )
 
-    def suspicions(self) -> tuple[Suspicion, ...]:
+    def suspicions(self) -> tuple[Fault, ...]:
         """Return the signals of which many values were refused, once all pieces were taken."""
         of_signals = Counter[str]()
         for (_, reason), count in self.totals.refused.items():

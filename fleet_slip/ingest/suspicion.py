@@ -7,13 +7,14 @@ with the figure that shows it, and what to try. Axes and signs are ISO 8855.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
 
 from fleet_slip.base import BoolArray, FloatArray
 from fleet_slip.catalogue.course import COURSE, LARGEST_RAD, WITNESSES, CourseRelation, relate
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 
 # How signals of a drive go with one another: slopes, fits, a label's delay.
@@ -164,7 +165,7 @@ LEAST_SPEED_MPS = 3.0
 SPEED = "satellite_speed"
 
 
-def course_fault(signals: "Signals", speed: FloatArray | None = None) -> "Suspicion | None":
+def course_fault(signals: "Signals", speed: FloatArray | None = None) -> Fault | None:
     """Return what fault the course of a drive seems to have; `speed` is that of the wheels."""
     if not {"course", "yaw_rate"} <= set(signals):
         return None
@@ -177,18 +178,18 @@ def course_fault(signals: "Signals", speed: FloatArray | None = None) -> "Suspic
         figure = f"over a second it changes by {slope:+.2f} times what the yaw rate adds up to"
         if correlation < -LEAST_CORRELATION:
             remedy = "Turn clockwise_from_north, or swap north and east."
-            return Suspicion("reversed", (COURSE,), figure, remedy)
+            return Fault("reversed", (COURSE,), figure, remedy)
         if correlation < LEAST_CORRELATION:
             figure = f"over a second its change hardly goes with the yaw rate ({correlation:+.2f})"
             remedy = "Is it a course over ground, and of this car?"
-            return Suspicion("values", (COURSE,), figure, remedy)
+            return Fault("values", (COURSE,), figure, remedy)
         if not SOUND[0] <= slope <= SOUND[1]:
             remedy = "Check its unit, and that of the yaw rate."
-            return Suspicion("scaled", (COURSE,), figure, remedy)
+            return Fault("scaled", (COURSE,), figure, remedy)
     return _of_fixes(signals, speed) or _of_relation(_relation(signals, turned))
 
 
-def _of_fixes(signals: "Signals", speed: FloatArray | None) -> "Suspicion | None":
+def _of_fixes(signals: "Signals", speed: FloatArray | None) -> Fault | None:
     """Return what is wrong with the receiver's speed, or with how many fixes have a course."""
     own_speed = signals.get(SPEED)
     if own_speed is None:
@@ -198,26 +199,26 @@ def _of_fixes(signals: "Signals", speed: FloatArray | None) -> "Suspicion | None
     if own < LEAST_OF_THEIR_OWN:
         figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of backwards"
         remedy = "They are left out. Map it as the receiver tells it."
-        return Suspicion("values", (COURSE,), figure, remedy)
+        return Fault("values", (COURSE,), figure, remedy)
     both = fast & (speed > LEAST_SPEED_MPS) if speed is not None else fast
     if speed is not None and both.sum() >= SECOND:
         ratio = float(np.median(own_speed[both] / speed[both]))
         if not SOUND[0] <= ratio <= SOUND[1]:
             figure = f"it is {ratio:.2f} times the speed of the wheels"
             remedy = "Check both units: the antenna's place is by it."
-            return Suspicion("scaled", (SPEED,), figure, remedy)
+            return Fault("scaled", (SPEED,), figure, remedy)
     return None
 
 
-def _of_relation(relation: CourseRelation | None) -> "Suspicion | None":
+def _of_relation(relation: CourseRelation | None) -> Fault | None:
     if relation is None:
         return None
     if found := relation.fault or relation.misplaced:
-        return Suspicion(found.kind, (COURSE,), found.figure, found.remedy)
+        return replace(found, signals=(COURSE,))
     if abs(relation.scale - 1) > MOST_SCALE_ERROR:
         figure = f"it turns {relation.scale:.3f} times as the yaw rate adds up to"
         remedy = "The gyroscope's is off, which learning allows for."
-        return Suspicion("scale", (COURSE,), figure, remedy)
+        return Fault("scale", (COURSE,), figure, remedy)
     return None
 
 
@@ -307,44 +308,20 @@ _GOES_WITH, _GOES_NOT = 0.8, 0.5
 _FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
 
 
-@dataclass(frozen=True)
-class Suspicion:
-    """What looks wrong.
-
-    Attributes:
-        kind: as `quality` calls it (stuck, magnitude, reversed, swapped, scaled, repeated, no slip,
-            noisy), or late, absent, values, time, cars, or scale, which does no harm.
-        signals: those concerned.
-        figure: what shows it.
-        remedy: what to try in the mapping.
-        value: how late, in seconds.
-    """
-
-    kind: str
-    signals: tuple[str, ...]
-    figure: str
-    remedy: str
-    value: float | None = None
-
-    def __str__(self) -> str:
-        """Return it as one line."""
-        return f"{self.kind} {', '.join(self.signals)}? {self.figure}. {self.remedy}"
-
-
-def find_suspicions(signals: Signals) -> list[Suspicion]:
+def find_suspicions(signals: Signals) -> list[Fault]:
     """Return what looks wrong in the signals of one drive; little data raises few suspicions."""
     still = list(_still(signals))
     usual = {name: v for name, v in signals.items() if name not in {s.signals[0] for s in still}}
     speed = speed_mps(usual)
     remedy = 'Where another column has its sign: sign = { column = "..." }.'
     magnitudes = {
-        name: Suspicion("magnitude", (name,), figure, remedy)
+        name: Fault("magnitude", (name,), figure, remedy)
         for name, figure in find_one_sided(usual, None if speed is None else moving(speed))
     }
     sideslip = magnitudes.pop(catalogue().label, None)
     usual = {name: values for name, values in usual.items() if name not in magnitudes}
     found = [*still, *magnitudes.values(), *_turning(usual, speed)]
-    label: list[Suspicion] = []
+    label: list[Fault] = []
     if speed is not None:
         for check in (_axes_swapped, _scales_differ, _accelerates, _axles_swapped):
             found += check(usual, speed)
@@ -364,17 +341,17 @@ def speed_mps(signals: Signals) -> FloatArray | None:
     return signals.get("vx", signals.get("vehicle_speed"))
 
 
-def _still(signals: Signals) -> Iterator[Suspicion]:
+def _still(signals: Signals) -> Iterator[Fault]:
     for name, values in signals.items():
         present = values[np.isfinite(values)]
         if not present.size:
-            yield Suspicion("absent", (name,), "it has no value at all", "Map another column.")
+            yield Fault("absent", (name,), "it has no value at all", "Map another column.")
         elif present.size >= FEWEST_TICKS and present.min() == present.max():
             figure = f"it is {present[0]:g} {catalogue()[name].unit} all the time"
-            yield Suspicion("stuck", (name,), figure, "Map another column.")
+            yield Fault("stuck", (name,), figure, "Map another column.")
 
 
-def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
+def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Fault]:
     """Compare the signs of all that tells left from right.
 
     The fewest faults that explain all count, as in `quality`: where up to two others are against
@@ -411,12 +388,12 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Suspicion]:
             remedy = "Swap their columns."
             if agree:
                 remedy += " If all others are positive to the right (SAE J670), negate these."
-            yield Suspicion("swapped", concerned, figure, remedy)
+            yield Fault("swapped", concerned, figure, remedy)
         else:
-            yield Suspicion("reversed", concerned, figure, "Write negate = true.")
+            yield Fault("reversed", concerned, figure, "Write negate = true.")
 
 
-def _axes_swapped(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
+def _axes_swapped(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
     """Compare both accelerations with the turns."""
     if not {"ax", "ay", "yaw_rate"} <= set(signals):
         return
@@ -424,10 +401,10 @@ def _axes_swapped(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
     ax, ay = (abs(slope_of(signals[name], expected, rows)[1]) for name in ("ax", "ay"))
     if ax > _GOES_WITH and ay < _GOES_NOT:
         figure = f"yaw rate times speed goes with ax by {ax:.2f}, with ay by {ay:.2f}"
-        yield Suspicion("swapped", ("ax", "ay"), figure, "Swap their columns.")
+        yield Fault("swapped", ("ax", "ay"), figure, "Swap their columns.")
 
 
-def _scales_differ(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
+def _scales_differ(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
     """Compare the size of signals with that of others that tell the same."""
     pairs: list[tuple[FloatArray, FloatArray, tuple[str, ...], str, tuple[float, float]]] = []
     wide = (0.4, 2.5)
@@ -453,7 +430,7 @@ def _scales_differ(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
             yield from _wrong_scale(abs(slope), concerned, of, sound)
 
 
-def _accelerates(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
+def _accelerates(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
     """Compare `ax` with the change of speed over a second."""
     if "ax" not in signals or speed.size < 4 * FEWEST_TICKS:
         return
@@ -463,12 +440,12 @@ def _accelerates(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
     slope, correlation = slope_of(smooth, change, moving(speed))
     if correlation < -LEAST_CORRELATION:
         figure = f"its correlation with the change of speed is {correlation:+.2f}"
-        yield Suspicion("reversed", ("ax",), figure, "Write negate = true.")
+        yield Fault("reversed", ("ax",), figure, "Write negate = true.")
     elif correlation > LEAST_CORRELATION:
         yield from _wrong_scale(slope, ("ax",), "the change of speed", (0.4, 2.5))
 
 
-def _axles_swapped(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
+def _axles_swapped(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
     """Compare axles in tight bends: the front one drives the longer way."""
     if not {"yaw_rate", *WHEELS} <= set(signals):
         return
@@ -481,10 +458,10 @@ def _axles_swapped(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
     slope, correlation = slope_of(longer, tightness, rows)
     if correlation < -LEAST_CORRELATION and slope < -1:
         figure = f"in tight bends the front wheels are slower (correlation {correlation:+.2f})"
-        yield Suspicion("swapped", WHEELS, figure, "Swap the front columns with the rear ones.")
+        yield Fault("swapped", WHEELS, figure, "Swap the front columns with the rear ones.")
 
 
-def _label(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
+def _label(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
     """Look for the label's delay behind its inputs, its sign, and its unit."""
     label = catalogue().label
     if not {label, "yaw_rate", "ay"} <= set(signals):
@@ -494,7 +471,7 @@ def _label(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
     large = np.abs(angle[rows & (speed > 8) & np.isfinite(angle)])
     if large.size >= FEWEST_TICKS and np.median(large) > 0.5:
         figure = f"half of the time it is above {np.degrees(np.median(large)):.0f} deg"
-        yield Suspicion("scaled", (label,), figure, "Check its unit: degrees or radians?")
+        yield Fault("scaled", (label,), figure, "Check its unit: degrees or radians?")
         return
     with np.errstate(divide="ignore", invalid="ignore"):
         inputs = [signals["ay"], signals["yaw_rate"] / speed, signals["yaw_rate"] * speed]
@@ -508,14 +485,12 @@ def _label(signals: Signals, speed: FloatArray) -> Iterator[Suspicion]:
             f"its inputs explain it best {abs(seconds):.2f} s {side}, with {gain:.0%} less of its "
             "variance left"
         )
-        yield Suspicion("late", (label,), figure, f"Try delay_s = {seconds:.2f}.", seconds)
+        yield Fault("late", (label,), figure, f"Try delay_s = {seconds:.2f}.", seconds)
     many = large.size >= FEWEST_TICKS and np.quantile(large, 0.9) > LARGE_RAD
     yield from _lever(signals, np.array(inputs[:2]), rows & (speed < SLOW_MPS), many=bool(many))
 
 
-def _lever(
-    signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool
-) -> Iterator[Suspicion]:
+def _lever(signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool) -> Iterator[Fault]:
     """Compare the label with what any car does: it needs no peers, where all are wrong alike.
 
     Turning slowly it is the distance to the rear axle times the yaw rate over the speed, less what
@@ -532,7 +507,7 @@ def _lever(
     if explained <= LEAST_CORRELATION:
         return
     if lever < -LEAST_LEVER_M / 2:
-        yield Suspicion("reversed", (label,), figure, "Write negate = true.")
+        yield Fault("reversed", (label,), figure, "Write negate = true.")
         return
     longest = LONGEST_LEVER_M
     for name in ROAD_WHEELS:
@@ -543,25 +518,25 @@ def _lever(
                 break
     unit = "Check its unit, degrees or radians, its factor, and where its sensor is: sensor_x_m."
     if lever > LONGEST_M and many:
-        yield Suspicion("scaled", (label,), figure, unit)
+        yield Fault("scaled", (label,), figure, unit)
     elif explained <= SURE_EXPLAINED:
         return
     elif not LEAST_LEVER_M < lever < longest:
-        yield Suspicion("scaled", (label,), figure, unit)
+        yield Fault("scaled", (label,), figure, unit)
     elif abs(zero) > LARGEST_ZERO_RAD:
         figure = f"on a straight it is {np.degrees(zero):+.2f} deg, should be 0"
-        yield Suspicion("biased", (label,), figure, f"Write offset = {-zero:.4f} (rad).")
+        yield Fault("biased", (label,), figure, f"Write offset = {-zero:.4f} (rad).")
 
 
 def _wrong_scale(
     slope: float, concerned: tuple[str, ...], of: str, sound: tuple[float, float]
-) -> Iterator[Suspicion]:
+) -> Iterator[Fault]:
     if sound[0] <= slope <= sound[1] or slope <= 0:
         return
     large = max(slope, 1 / slope)
     factor = min(_FACTORS, key=lambda f: abs(np.log(f / large)))
     near = f" ({factor:g} is between {_FACTORS[factor]})" if 0.6 < factor / large < 1.7 else ""
-    yield Suspicion("scaled", concerned, f"it is {slope:.3g} times {of}{near}", "Check the units.")
+    yield Fault("scaled", concerned, f"it is {slope:.3g} times {of}{near}", "Check the units.")
 
 
 # What looks wrong in a file as a whole: many rows refused, and times that are assumed.
@@ -577,7 +552,7 @@ _OF_TIME = ("time", "isolated", "too_short", "not_a_time")
 
 def find_refusals(
     refused: Mapping[tuple[str, str], int], rows: int, others: Mapping[str, int] | None = None
-) -> Iterator[Suspicion]:
+) -> Iterator[Fault]:
     """Yield the signals of which more than a tenth of a file's rows were refused, by reason.
 
     `others` are the rows refused for anything but a signal, by reason: together they are another.
@@ -586,7 +561,7 @@ def find_refusals(
         if count > max(rows * LARGEST_REFUSED, FEWEST_REFUSED):
             kind, remedy = _REFUSED.get(reason, ("values", "Look at the column."))
             figure = f"{count:,} of {rows:,} rows are refused for it, {reason}"
-            yield Suspicion(kind, (name,), figure, remedy)
+            yield Fault(kind, (name,), figure, remedy)
     total = sum((others or {}).values())
     if others and total > max(rows * LARGEST_REFUSED, FEWEST_REFUSED):
         reason = max(others, key=lambda one: others[one])
@@ -595,14 +570,14 @@ def find_refusals(
             remedy = "Check the column of times, its unit and its format"
             if reason in {"time_duplicate", "time_backwards"}:
                 remedy += ", and map the column that tells cars or trips apart if there are several"
-            yield Suspicion("values", ("time",), figure, f"{remedy}.")
+            yield Fault("values", ("time",), figure, f"{remedy}.")
         else:
-            yield Suspicion("values", ("rows",), figure, "Look at the view quarantine.")
+            yield Fault("values", ("rows",), figure, "Look at the view quarantine.")
 
 
-def assumed_rate(rate_hz: float | None) -> Iterator[Suspicion]:
+def assumed_rate(rate_hz: float | None) -> Iterator[Fault]:
     """Yield that a log has no times, and that its mapping assumes a rate; None: it does not."""
     if rate_hz is not None:
         figure = f"the log has no times, and {rate_hz:g} Hz are assumed"
         remedy = "Find out, correct rate_hz, and remove assumed = true."
-        yield Suspicion("time", ("rate_hz",), figure, remedy)
+        yield Fault("time", ("rate_hz",), figure, remedy)

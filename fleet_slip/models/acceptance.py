@@ -23,8 +23,9 @@ import pyarrow as pa
 from pydantic import Field
 
 from fleet_slip.base import BoolArray, FloatArray, number_of
-from fleet_slip.catalogue.course import CourseFault, relate
+from fleet_slip.catalogue.course import relate
 from fleet_slip.catalogue.facts import ALL_DRIVES, DELAY
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import Config, config_file, load_config
@@ -36,7 +37,7 @@ from fleet_slip.grams.gram_rows import hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
 from fleet_slip.ingest.drives import SOURCE
-from fleet_slip.ingest.suspicion import Suspicion, find_suspicions
+from fleet_slip.ingest.suspicion import find_suspicions
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import counts_model
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
@@ -345,9 +346,9 @@ def require_sound_drives(
 
 def _look(
     warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None
-) -> tuple[dict[tuple[str, tuple[str, ...]], list[Suspicion]], int, int]:
+) -> tuple[dict[tuple[str, tuple[str, ...]], list[Fault]], int, int]:
     """Return what looks wrong in some long drives, how many these are, and of how many."""
-    found: dict[tuple[str, tuple[str, ...]], list[Suspicion]] = {}
+    found: dict[tuple[str, tuple[str, ...]], list[Fault]] = {}
     condition = parse_condition(manifest.trained_on.cohort)
     query = _LONGEST.format(condition=condition.sql)
     with connect_tables(warehouse, query + "log_counts") as database, asking(database, condition):
@@ -646,7 +647,7 @@ def require_sound_course(
     condition = parse_cohort(manifest.trained_on.cohort)
     with GramReader(warehouse) as reader:
         cars = course_moments(reader, condition)
-    faults: dict[str, CourseFault] = {}
+    faults: dict[str, Fault] = {}
     for car, drives in sorted(cars.items()):
         relation = relate(np.sum(list(drives.values()), axis=0), delays_s.get(car, 0.0))
         if relation and (fault := relation.fault or relation.misplaced):

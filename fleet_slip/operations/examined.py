@@ -20,12 +20,12 @@ from typing import Any
 from fleet_slip.base import canonical_json, number_of, sha256_of
 from fleet_slip.caches import cache_folder
 from fleet_slip.catalogue.facts import RECEIVED
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, UnexaminedError
 from fleet_slip.grams.job import find_backlog, update_grams
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.ingest.drives import SOURCE
-from fleet_slip.operations.faults import Fault
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.operations.quality import SensorFault, examine_drives
 from fleet_slip.storage.runs import hash_drive, without_drives

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.base import BoolArray, FloatArray
 from fleet_slip.catalogue.course import WITNESSES
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.regression.gram import GramTable
 
@@ -120,23 +121,6 @@ the wheels differ by some 0.04 deg in the mean, and sensors by more."""
 AGREEING, LONE = 0.8, 0.5
 ONE_SIDED, TURNING_BOTH_WAYS = 0.5, 0.3
 """Mean over root mean square: a magnitude has about 0.8, a drive with bends to both sides 0.1."""
-
-
-@dataclass(frozen=True)
-class Fault:
-    """What is wrong with the sensors of a drive.
-
-    Attributes:
-        kind: stuck, magnitude, reversed, swapped, saturated, scaled, biased, noisy, unexplained, no
-            slip: a course that is a heading, or repeated: another drive of the car was under way,
-            so that its rows count twice.
-        signals: those concerned; of an unexplained fault, the one that is furthest off.
-        figure: the figure that shows it.
-    """
-
-    kind: str
-    signals: tuple[str, ...]
-    figure: str
 
 
 def find_implausible(table: GramTable, min_correlation: float) -> dict[int, Fault]:

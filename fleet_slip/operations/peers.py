@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fleet_slip.base import BoolArray, FloatArray
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.config import Config, config_file, load_config
-from fleet_slip.operations.faults import DriveBatches, Fault, MeanMoments
+from fleet_slip.operations.faults import DriveBatches, MeanMoments
 from fleet_slip.regression.gram import GramTable
 
 # The thresholds of `configs/monitor.toml`.

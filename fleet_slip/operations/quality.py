@@ -1,7 +1,7 @@
 """Faulty sensors, drive by drive, from Gram rows alone."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import date
 from math import ceil
 from operator import attrgetter
@@ -13,6 +13,7 @@ import pyarrow as pa
 from fleet_slip.base import BoolArray, IntArray
 from fleet_slip.catalogue.course import relate
 from fleet_slip.catalogue.facts import DELAY, TRAINING_DRIVES
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
@@ -21,7 +22,7 @@ from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, req
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.grams.receiver_delay import changed_delays
 from fleet_slip.ingest.load import Origin
-from fleet_slip.operations.faults import DriveBatches, Fault, find_implausible
+from fleet_slip.operations.faults import DriveBatches, find_implausible
 from fleet_slip.operations.labels import find_odd_days, find_repeated, find_reversed_labels
 from fleet_slip.operations.peers import QualityThresholds, settle, thresholds
 from fleet_slip.regression.gram import GramTable
@@ -42,7 +43,8 @@ class SensorFault:
     def as_dict(self) -> dict[str, Any]:
         """Return the finding for a JSON document."""
         named = {"drive_id": self.drive_id, "vehicle_id": self.vehicle_id, "day": self.day}
-        return named | asdict(self.fault)
+        fault = self.fault
+        return named | {"kind": fault.kind, "signals": fault.signals, "figure": fault.figure}
 
 
 BY_DAY = attrgetter("day", "drive_id")
@@ -100,7 +102,7 @@ def examine_drives(
 def _faulty_courses(reader: GramReader, condition: Condition) -> dict[str, Fault]:
     """Return the drives whose course is not one, if Gram rows of its changes are there."""
     return {
-        drive: Fault(fault.kind, fault.signals, fault.figure)
+        drive: fault
         for drives in course_moments(reader, condition).values()
         for drive, moments in drives.items()
         if (relation := relate(moments)) and (fault := relation.fault)

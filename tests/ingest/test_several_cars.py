@@ -9,9 +9,10 @@ import numpy as np
 import polars as pl
 import pytest
 
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.errors import AlarmError
 from fleet_slip.ingest.stream import open_measured
-from fleet_slip.ingest.suspicion import WHEELS, Suspicion
+from fleet_slip.ingest.suspicion import WHEELS
 from tests.ingest.test_strange_logs import a_mapping
 from tests.support.reported import call
 from tests.support.textbook_car import a_car
@@ -37,7 +38,7 @@ def cars(number: int) -> list[pl.DataFrame]:
     ]
 
 
-def said_of(rows: pl.DataFrame, folder: Path, mapping: Any) -> list[Suspicion]:
+def said_of(rows: pl.DataFrame, folder: Path, mapping: Any) -> list[Fault]:
     rows.write_parquet(folder / "log.parquet")
     with open_measured(folder / "log.parquet", mapping) as stream:
         list(stream.pieces())

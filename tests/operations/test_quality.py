@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
-from fleet_slip.operations.faults import Fault
 from fleet_slip.operations.peers import QualityThresholds, thresholds
 from fleet_slip.operations.quality import QualityReport, examine, examine_drives, find_wrong_labels
 from fleet_slip.warehouse.tables import Warehouse
