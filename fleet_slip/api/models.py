@@ -332,8 +332,7 @@ class JudgedModels(PublishedModels):
         with open_workers(self.root, threads) as executor:
             told = count_from_start(progress)
             simulate_scenarios(self.warehouse, chosen, executor, told)
-            found = evaluate(self.warehouse, chosen, first, rest, executor)
-        content = found.as_dict()
+            content = evaluate(self.warehouse, chosen, first, rest, executor)
         kept = keep(evaluations_of(self.warehouse), content)
         return Document(kept.number, content, kept.sha256)
 

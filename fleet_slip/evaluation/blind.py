@@ -23,6 +23,7 @@ from fleet_slip.evaluation.scenarios import (
     EvaluatedScenario,
     error_figures,
     evaluate_drive,
+    judge_together,
 )
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Range, Uniform
@@ -136,7 +137,7 @@ class BlindRow:
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs."""
-        return {**vars(self), "figures": {n: one.as_dict() for n, one in self.figures.items()}}
+        return asdict(self)
 
 
 def judge_blindly(sha256: str, estimators: Mapping[str, Estimate]) -> tuple[BlindRow, ...]:
@@ -159,18 +160,20 @@ def judge_blindly(sha256: str, estimators: Mapping[str, Estimate]) -> tuple[Blin
 
 
 def _row(name: str, runs: Sequence[EvaluatedScenario]) -> BlindRow:
-    truth = np.concatenate([run.drive.sideslip_rad for run in runs])
-    among = np.concatenate([run.drive.evaluated for run in runs])
+    truths = [run.drive.sideslip_rad for run in runs]
+    among = [run.drive.evaluated for run in runs]
+    truth = np.concatenate(truths)[np.concatenate(among)]
     speed = np.concatenate([run.drive.speed_mps for run in runs])
     return BlindRow(
         name=name,
         drives=len(runs),
         speed_mps=(float(speed.min()), float(speed.max())),
-        sideslip_std_deg=float(np.degrees(truth[among].std())),
-        figures={
-            one: error_figures(np.concatenate([run.estimates[one] for run in runs]), truth, among)
-            for one in runs[0].estimates
-        },
+        sideslip_std_deg=float(np.degrees(truth.std())),
+        figures=judge_together(
+            {name: [run.estimates[name] for run in runs] for name in runs[0].estimates},
+            truths,
+            among,
+        ),
     )
 
 

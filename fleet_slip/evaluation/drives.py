@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -193,10 +193,8 @@ def apply_failure(
 
 # Where a car is unstable on a drive, and how far its axles slip.
 #
-# It is unstable where the tyres of an axle slip beyond their peak. Past the slip at which its
-# lateral force is largest, an axle gives less force the more it slips: a front axle no longer
-# turns the car into its path, a rear axle no longer holds it from spinning (Pacejka 2012, section
-# 1.3). The slip angles follow from the true velocity, the yaw rate and the road wheel angles:
+# Past the slip at which its lateral force is largest, an axle gives less force the more it slips
+# (Pacejka 2012, section 1.3). Slip angles follow from velocity, yaw rate and road wheel angles:
 #
 #     tan(alpha_rear) = (vy - b r) / vx,    alpha_front = arctan((vy + a r) / vx) - delta.
 
@@ -214,8 +212,7 @@ CRITERION = (
 )
 
 
-@dataclass(frozen=True)
-class PeakSlip:
+class PeakSlip(NamedTuple):
     """Slip angles at which the axles' lateral forces are largest, in rad."""
 
     front_rad: float

@@ -1,6 +1,6 @@
 """An evaluation from end to end, and the JSON document that keeps it, `evaluations/1.json`."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version as package_version
@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.evaluation.blind import GpsSweep, sweep_gps_noise
+from fleet_slip.evaluation.blind import sweep_gps_noise
 from fleet_slip.evaluation.drives import EvaluatedDrive, find_stretches, rear_compliance
 from fleet_slip.evaluation.filters import (
     Estimate,
     FilterEstimate,
     TrainedModels,
+    TuningDrives,
     filter_bank,
     train_models,
 )
@@ -21,7 +22,6 @@ from fleet_slip.evaluation.own_car import NAME as IDENTIFIED
 from fleet_slip.evaluation.own_car import identified_estimate
 from fleet_slip.evaluation.scenarios import (
     EvaluatedScenario,
-    TargetCheck,
     check_filter_targets,
     check_targets,
     run_all,
@@ -157,59 +157,26 @@ def _without_gps(scenario: Scenario) -> tuple[str, tuple[Failure, ...]]:
     return drive.digest, failures
 
 
-@dataclass(frozen=True)
-class FleetComparison:
-    """RMSE of the same set of signals, trained on one car and on a fleet, on one scenario."""
-
-    scenario: str
-    model: str
-    one_car: str
-    fleet: str
-    one_car_rmse_deg: float
-    fleet_rmse_deg: float
-
-    @property
-    def better(self) -> str:
-        """Which estimator has the smaller error."""
-        return self.one_car if self.one_car_rmse_deg <= self.fleet_rmse_deg else self.fleet
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
-        return {**asdict(self), "better": self.better}
-
-
 def compare_fleets(
     runs: Sequence[EvaluatedScenario], one_car: TrainedModels, fleet: TrainedModels
-) -> tuple[FleetComparison, ...]:
+) -> Iterator[dict[str, Any]]:
     """Compare the models of Table I that both cohorts can serve, wherever both have estimates."""
-    found = []
     for run in runs:
         for number, one in one_car.table_one.items():
             other = fleet.table_one.get(number)
             if other is None:
                 continue
-            errors = [run.results[name].whole.rmse_deg for name in (one, other)]
-            if errors[0] is not None and errors[1] is not None:
-                found.append(
-                    FleetComparison(run.scenario.name, number, one, other, errors[0], errors[1])
-                )
-    return tuple(found)
-
-
-FORMAT = 1
-
-
-def document(
-    runs: Sequence[EvaluatedScenario], estimators: Mapping[str, Mapping[str, Any]], **further: Any
-) -> dict[str, Any]:
-    """Return an evaluation's document: of logs, models and program alone, `further` keys beside."""
-    return {
-        "format": FORMAT,
-        "package_version": package_version("fleet-slip"),
-        "estimators": {name: dict(about) for name, about in estimators.items()},
-        "scenarios": [_run(one) for one in runs],
-        **further,
-    }
+            ours, theirs = (run.results[name].whole.rmse_deg for name in (one, other))
+            if ours is not None and theirs is not None:
+                yield {
+                    "scenario": run.scenario.name,
+                    "model": number,
+                    "one_car": one,
+                    "fleet": other,
+                    "one_car_rmse_deg": ours,
+                    "fleet_rmse_deg": theirs,
+                    "better": one if ours <= theirs else other,
+                }
 
 
 def _run(one: EvaluatedScenario) -> dict[str, Any]:
@@ -236,9 +203,9 @@ def _run(one: EvaluatedScenario) -> dict[str, Any]:
         ],
         "results": {
             name: {
-                **result.whole.as_dict(),
-                "inside": {part: figures.as_dict() for part, figures in result.inside.items()},
-                "outside": {part: figures.as_dict() for part, figures in result.outside.items()},
+                **asdict(result.whole),
+                "inside": {part: asdict(figures) for part, figures in result.inside.items()},
+                "outside": {part: asdict(figures) for part, figures in result.outside.items()},
             }
             for name, result in one.results.items()
         },
@@ -287,43 +254,6 @@ class Competitors:
     estimators: Mapping[str, Estimate]
     descriptions: Mapping[str, Mapping[str, Any]]
 
-    @property
-    def using_gps(self) -> frozenset[str]:
-        """Names of the estimators that need satellite navigation."""
-        return frozenset(name for name, one in self.descriptions.items() if one.get("gps"))
-
-    @property
-    def gps_filters(self) -> dict[str, FilterEstimate]:
-        """The filters that need satellite navigation, by name."""
-        filters = {n: one for n, one in self.estimators.items() if isinstance(one, FilterEstimate)}
-        return {name: one for name, one in filters.items() if one.filter.gps}
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Everything that an evaluation found, with the drives and estimates behind it."""
-
-    competitors: Competitors
-    runs: tuple[EvaluatedScenario, ...]
-    checks: tuple[TargetCheck, ...]
-    comparisons: tuple[FleetComparison, ...]
-    ranking: Ranking
-    gps_noise: GpsSweep | None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the evaluation's document."""
-        cohort = self.competitors.one_car.selection.cohort
-        return document(
-            self.runs,
-            self.competitors.descriptions,
-            logs_version=cohort.logs_version,
-            grams_version=cohort.grams_version,
-            checks=[check.as_dict() for check in self.checks],
-            comparisons=[comparison.as_dict() for comparison in self.comparisons],
-            ranking=self.ranking.as_dict(),
-            gps_noise=self.gps_noise.as_dict() if self.gps_noise else None,
-        )
-
 
 def train_competitors(
     warehouse: Warehouse,
@@ -332,27 +262,23 @@ def train_competitors(
     executor: Executor,
 ) -> Competitors:
     """Fit and tune all that compete; filters get the one-car model's drives."""
-    first = train_models(warehouse, one_car)
-    others = tuple(train_models(warehouse, version) for version in fleets)
+    first, *others = (train_models(warehouse, version) for version in (one_car, *fleets))
     estimators: dict[str, Estimate] = {}
     descriptions: dict[str, Mapping[str, Any]] = {}
     for trained in (first, *others):
         estimators |= trained.estimators()
         descriptions |= trained.descriptions()
-    cohort = first.selection.cohort
     weighed = "mass_kg" in Predictor.of(one_car.manifest).plan.facts
-    nominal = load_scenario("nominal").car
-    bank = filter_bank(warehouse, cohort, nominal, executor, weighed=weighed)
-    identified = identified_estimate(warehouse, bank.drives, executor)
+    drives = TuningDrives.of(warehouse, first.selection.cohort, weighed=weighed)
+    bank, tuned_on = filter_bank(
+        warehouse, drives, load_scenario("nominal").car, executor, weighed=weighed
+    )
+    identified = identified_estimate(warehouse, drives, executor)
     if identified is not None:
         estimators[IDENTIFIED] = identified
         descriptions[IDENTIFIED] = identified.description()
-    return Competitors(
-        one_car=first,
-        fleets=others,
-        estimators=estimators | bank.estimators,
-        descriptions=descriptions | bank.descriptions,
-    )
+    filters = {name: {**one.description(), **tuned_on.get(name, {})} for name, one in bank.items()}
+    return Competitors(first, tuple(others), estimators | bank, descriptions | filters)
 
 
 def evaluate(
@@ -361,21 +287,37 @@ def evaluate(
     one_car: ModelVersion,
     fleets: Sequence[ModelVersion],
     executor: Executor,
-) -> Evaluation:
-    """Evaluate a model and all that competes with it on scenarios that are in the logs."""
+) -> dict[str, Any]:
+    """Evaluate a model and all that competes with it on scenarios that are in the logs.
+
+    Returns the evaluation's document: of logs, models and program alone.
+    """
     competitors = train_competitors(warehouse, one_car, fleets, executor)
-    runs = run_all(warehouse, scenarios, competitors.estimators)
+    estimators, about = competitors.estimators, competitors.descriptions
+    runs = run_all(warehouse, scenarios, estimators)
     first = competitors.one_car
-    return Evaluation(
-        competitors=competitors,
-        runs=runs,
-        checks=(
-            *check_targets(runs, first.table_one, first.linear_estimators()),
-            *check_filter_targets(runs, first.table_one),
-        ),
-        comparisons=tuple(
-            row for fleet in competitors.fleets for row in compare_fleets(runs, first, fleet)
-        ),
-        ranking=rank(runs, first.version.reference, competitors.using_gps),
-        gps_noise=sweep_gps_noise(runs, competitors.gps_filters, list(first.estimators())),
+    gps = {name for name, one in about.items() if one.get("gps")}
+    filters = {
+        name: one
+        for name, one in estimators.items()
+        if name in gps and isinstance(one, FilterEstimate)
+    }
+    sweep = sweep_gps_noise(runs, filters, list(first.estimators()))
+    checks = (
+        *check_targets(runs, first.table_one, first.linear_estimators()),
+        *check_filter_targets(runs, first.table_one),
     )
+    comparisons = [row for one in competitors.fleets for row in compare_fleets(runs, first, one)]
+    cohort = first.selection.cohort
+    return {
+        "format": 1,
+        "package_version": package_version("fleet-slip"),
+        "estimators": {name: dict(one) for name, one in about.items()},
+        "scenarios": [_run(one) for one in runs],
+        "logs_version": cohort.logs_version,
+        "grams_version": cohort.grams_version,
+        "checks": [asdict(check) for check in checks],
+        "comparisons": comparisons,
+        "ranking": rank(runs, first.version.reference, gps).as_dict(),
+        "gps_noise": sweep.as_dict() if sweep else None,
+    }

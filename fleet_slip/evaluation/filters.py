@@ -285,31 +285,24 @@ def rebuild(name: str, about: Mapping[str, Any], car: VehicleParameters) -> Filt
     return FilterEstimate(one, parameters, car, about.get("weighed", False))
 
 
-@dataclass(frozen=True)
-class Bank:
-    """All filters with the parameters that they have, by name, and the drives they are tuned on."""
-
-    drives: "TuningDrives"
-    estimators: dict[str, FilterEstimate]
-    descriptions: dict[str, dict[str, Any]]
-
-
 def filter_bank(
     warehouse: Warehouse,
-    cohort: Cohort,
+    drives: "TuningDrives",
     car: VehicleParameters,
     executor: Executor,
     *,
     weighed: bool = False,
-) -> Bank:
-    """Return each filter as it is and tuned on drives of a cohort, each in the car that made it.
+) -> tuple[dict[str, FilterEstimate], dict[str, dict[str, list[str]]]]:
+    """Return each filter as it is and tuned on drives, each in the car that made it.
+
+    Beside them stands what each tuned one was `tuned_on`.
 
     A filter that the drives lack something for is tuned on none, and a remark says so. Tuned
     parameters are kept below `tuned/` in the data root, and sought again only for other
     drives, another car or another program. The best that any start leads to is taken.
     """
-    drives = TuningDrives.of(warehouse, cohort, weighed=weighed)
-    bank = Bank(drives, {}, {})
+    bank: dict[str, FilterEstimate] = {}
+    tuned_on: dict[str, dict[str, list[str]]] = {}
     before: dict[str, Config] = {}
     for one in FILTERS:
         key = _key(one, drives, car)
@@ -328,16 +321,13 @@ def filter_bank(
                 kept.append(found)
             except DataError as error:  # its drives have no fix, no wheel speeds, no steering
                 LOGGER.warning("%s competes as it is, for it cannot be tuned: %s", one.name, error)
-        on = drives.names if found else []
         if found:
             before[one.module] = type(one.parameters).model_validate(found["parameters"])
         tuned = before.get(one.module, one.parameters)
-        both = {one.name: one.parameters, f"{one.name}_tuned": tuned}
-        for name, parameters in both.items():
-            bank.estimators[name] = FilterEstimate(one, parameters, car, weighed)
-            bank.descriptions[name] = bank.estimators[name].description()
-        bank.descriptions[f"{one.name}_tuned"]["tuned_on"] = on
-    return bank
+        bank[one.name] = FilterEstimate(one, one.parameters, car, weighed)
+        bank[f"{one.name}_tuned"] = FilterEstimate(one, tuned, car, weighed)
+        tuned_on[f"{one.name}_tuned"] = {"tuned_on": drives.names if found else []}
+    return bank, tuned_on
 
 
 def _key(one: Filter, drives: "TuningDrives", car: VehicleParameters) -> dict[str, Any]:

@@ -7,7 +7,7 @@ not seen. A part is a quarter of the drives, or of each drive's time where there
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version as package_version
 from typing import Any
 
@@ -44,7 +44,7 @@ from fleet_slip.evaluation.identify import (
     checksum_of_sources,
     identify,
 )
-from fleet_slip.evaluation.scenarios import ErrorFigures, error_figures
+from fleet_slip.evaluation.scenarios import ErrorFigures, error_figures, judge_together
 from fleet_slip.evaluation.single_track import (
     STEP_S,
     DriveSignals,
@@ -67,8 +67,6 @@ from fleet_slip.storage.runs import LOGGER
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-
-# The columns of models on measured drives with a label, and which part of them is left out.
 
 
 @dataclass(frozen=True)
@@ -188,8 +186,7 @@ class OwnCarEvaluation:
             "package_version": package_version("fleet-slip"),
             **{name: getattr(self, name) for name in ("model", "cohort", "vehicle", "parts_of")},
             "estimators": {
-                name: {"told": self.told[name], **one.as_dict()}
-                for name, one in self.figures.items()
+                name: {"told": self.told[name], **asdict(one)} for name, one in self.figures.items()
             },
             "drives": {name: dict(found) for name, found in self.by_drive.items()},
         }
@@ -230,10 +227,7 @@ def evaluate_own_car(
             estimates[name], told[name] = found, knows
     among = [_judged(one, vehicle) for one in drives]
     truth = [one.drive.sideslip_rad for one in drives]
-    together = {
-        name: error_figures(np.concatenate(found), np.concatenate(truth), np.concatenate(among))
-        for name, found in estimates.items()
-    }
+    together = judge_together(estimates, truth, among)
     kept = {name: one for name, one in together.items() if one.rmse_deg is not None}
     return OwnCarEvaluation(
         model=versions[0].reference,
@@ -385,10 +379,8 @@ def _rolling(signals: DriveSignals, vehicle: VehicleParameters) -> FloatArray:
     return np.arctan2(vehicle.body.rear_axle_m * turning, measured_speed_mps(signals, vehicle))
 
 
-# The extended Kalman filter in a car that was identified from the drives a model learned from.
-#
-# It is what a department would build that has scales and a tape measure, labelled drives, and no
-# tyre measured: of the simulator's parameters it is given none that these do not tell.
+# The extended Kalman filter in a car that was identified from the drives a model learned from, as a
+# department would build it that has scales, a tape measure and labelled drives.
 
 NAME = "ekf_identified"
 

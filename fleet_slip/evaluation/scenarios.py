@@ -3,8 +3,8 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -51,10 +51,6 @@ class ErrorFigures:
     error_p99_deg: float | None = None
     error_max_deg: float | None = None
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures for a JSON document."""
-        return asdict(self)
-
 
 def error_figures(
     estimate_rad: FloatArray, truth_rad: FloatArray, among: BoolArray
@@ -67,11 +63,13 @@ def error_figures(
         return ErrorFigures(rows, len(truth) / rows if rows else 0.0)
     error = np.degrees(estimate - truth)
     size = np.abs(error)
+    constant = np.ptp(estimate) == 0 or np.ptp(truth) == 0
+    correlation = None if constant else float(np.corrcoef(estimate, truth)[0, 1])
     median, p95, p99 = np.quantile(size, [0.5, 0.95, 0.99]).tolist()
     return ErrorFigures(
         rows=rows,
         coverage=len(truth) / rows,
-        correlation=pearson_correlation(estimate, truth),
+        correlation=correlation,
         error_mean_deg=float(error.mean()),
         error_std_deg=float(error.std(ddof=1)),
         rmse_deg=float(np.sqrt(np.mean(error**2))),
@@ -82,11 +80,16 @@ def error_figures(
     )
 
 
-def pearson_correlation(first: FloatArray, second: FloatArray) -> float | None:
-    """Return Pearson's correlation of two arrays of shape (rows,); None if one is constant."""
-    if np.ptp(first) == 0 or np.ptp(second) == 0:
-        return None
-    return float(np.corrcoef(first, second)[0, 1])
+def judge_together(
+    estimates: Mapping[str, Sequence[FloatArray]],
+    truths: Sequence[FloatArray],
+    among: Sequence[BoolArray],
+) -> dict[str, ErrorFigures]:
+    """Return each estimator's figures over the rows of several drives together."""
+    truth, rows = np.concatenate(truths), np.concatenate(among)
+    return {
+        name: error_figures(np.concatenate(found), truth, rows) for name, found in estimates.items()
+    }
 
 
 GPS_OUTAGE_S = 1.0
@@ -217,17 +220,16 @@ NOISE = "noise_doubled"
 
 
 class Reached(NamedTuple):
-    """Figures of an estimator; NaN where it has no estimates, which reaches nothing."""
+    """Figures that requirements are about; NaN without estimates, which reaches nothing."""
 
     mean: float
     std: float
     correlation: float
 
-    @classmethod
-    def of(cls, figures: ErrorFigures) -> "Reached":
-        """Return the figures that requirements are about."""
-        found = (figures.error_mean_deg, figures.error_std_deg, figures.correlation)
-        return cls(*(math.nan if figure is None else figure for figure in found))
+
+def _reached(figures: ErrorFigures) -> Reached:
+    found = (figures.error_mean_deg, figures.error_std_deg, figures.correlation)
+    return Reached(*(math.nan if figure is None else figure for figure in found))
 
 
 class Requirement(NamedTuple):
@@ -282,62 +284,45 @@ REQUIREMENTS = (
 
 @dataclass(frozen=True)
 class TargetCheck:
-    """A requirement on an estimator; NaN without estimates, a miss has an `explanation`."""
+    """A requirement on an estimator; None without estimates, a miss has an `explanation`."""
 
     requirement: str
     scenario: str
     estimator: str
-    found: float
-    limit: float
+    found: float | None
+    limit: float | None
     reached: bool
     explanation: str = ""
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
-        content = dict(vars(self))
-        for key in ("found", "limit"):
-            content[key] = content[key] if math.isfinite(content[key]) else None
-        return content
+
+def _target(
+    text: str, scenario: str, name: str, found: float, limit: float, reached: bool, why: str
+) -> TargetCheck:
+    kept, most = (one if math.isfinite(one) else None for one in (found, limit))
+    return TargetCheck(text, scenario, name, kept, most, reached, "" if reached else why)
 
 
 def check_targets(
     runs: Sequence[EvaluatedScenario],
     models: Mapping[str, str],
     estimators: Mapping[str, LinearEstimate],
-) -> tuple[TargetCheck, ...]:
+) -> Iterator[TargetCheck]:
     """Check each model of Table I, named by its estimator, on the scenarios that were run."""
     by_name = {run.scenario.name: run for run in runs}
-    if "nominal" not in by_name:
-        return ()
-    return tuple(
-        _check(one, by_name["nominal"], by_name[one.scenario], models, number, estimators)
-        for one in REQUIREMENTS
-        if one.scenario in by_name
-        for number in models
-    )
-
-
-def _check(
-    requirement: Requirement,
-    nominal: EvaluatedScenario,
-    run: EvaluatedScenario,
-    models: Mapping[str, str],
-    number: str,
-    estimators: Mapping[str, LinearEstimate],
-) -> TargetCheck:
-    name = models[number]
-    here = run.results[name]
-    figures = (nominal.results[name].whole, here.outside.get("unstable", here.whole))
-    found = requirement.found(*(Reached.of(one) for one in figures))
-    limit = PAPER_TABLE_TWO[number][1] if requirement.limit is None else requirement.limit
-    reached = found >= limit if requirement.least else found <= limit
-    explanation = ""
-    if not reached:
-        noisy = run.scenario.name == NOISE
-        explanation = _noise(estimators[name], nominal, run) if noisy else _compliance(run, nominal)
-    return TargetCheck(
-        requirement.text, run.scenario.name, name, found, limit, reached, explanation
-    )
+    nominal = by_name.get("nominal")
+    for one in REQUIREMENTS:
+        run = by_name.get(one.scenario)
+        if nominal is None or run is None:
+            continue
+        for number, name in models.items():
+            here = run.results[name]
+            outside = here.outside.get("unstable", here.whole)
+            found = one.found(_reached(nominal.results[name].whole), _reached(outside))
+            limit = PAPER_TABLE_TWO[number][1] if one.limit is None else one.limit
+            reached = found >= limit if one.least else found <= limit
+            noisy = one.scenario == NOISE
+            why = _noise(estimators[name], nominal, run) if noisy else _compliance(run, nominal)
+            yield _target(one.text, one.scenario, name, found, limit, reached, why)
 
 
 FILTER_SCENARIOS = ("nominal", "gps_clear", "gps_urban", "gps_tunnel")
@@ -347,39 +332,23 @@ THE_PAPERS_CHOICE = "4"
 
 def check_filter_targets(
     runs: Sequence[EvaluatedScenario], models: Mapping[str, str]
-) -> tuple[TargetCheck, ...]:
+) -> Iterator[TargetCheck]:
     """Check that the regression beats the paper's Kalman filter, as it is and tuned."""
     name = models.get(THE_PAPERS_CHOICE)
-    if name is None:
-        return ()
-    return tuple(
-        check
-        for run in runs
-        if run.scenario.name in FILTER_SCENARIOS
-        for rival in ("kalman", "kalman_tuned")
-        if rival in run.results
-        for check in _check_filters(run, name, rival)
-    )
-
-
-def _check_filters(run: EvaluatedScenario, name: str, rival: str) -> Iterator[TargetCheck]:
-    ours, theirs = run.results[name], run.results[rival]
-    parts = [("error std", ours.whole, theirs.whole, _CORRECTED)]
-    if "gps_outage" in ours.inside:
-        inside, outside = ours.inside["gps_outage"], theirs.inside["gps_outage"]
-        parts.append(("error std in outages", inside, outside, _drift(run)))
-    for figure, our, their, why in parts:
-        found, limit = Reached.of(our).std, Reached.of(their).std
-        reached = found < limit
-        yield TargetCheck(
-            f"{run.scenario.name}: {figure} below that of {rival}, deg",
-            run.scenario.name,
-            name,
-            found,
-            limit,
-            reached,
-            "" if reached else why,
-        )
+    for run in runs:
+        scenario = run.scenario.name
+        for rival in ("kalman", "kalman_tuned"):
+            if name is None or scenario not in FILTER_SCENARIOS or rival not in run.results:
+                continue
+            ours, theirs = run.results[name], run.results[rival]
+            parts = [("error std", ours.whole, theirs.whole, _CORRECTED)]
+            if "gps_outage" in ours.inside:
+                inside, outside = ours.inside["gps_outage"], theirs.inside["gps_outage"]
+                parts.append(("error std in outages", inside, outside, _drift(run)))
+            for figure, our, their, why in parts:
+                found, limit = _reached(our).std, _reached(their).std
+                text = f"{scenario}: {figure} below that of {rival}, deg"
+                yield _target(text, scenario, name, found, limit, found < limit, why)
 
 
 _CORRECTED = (
