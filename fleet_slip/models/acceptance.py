@@ -474,9 +474,6 @@ def _folds(cohort: Cohort, asked: Contest, wanted: BoolArray) -> Folds:
     return folds.serving(asked.signals, catalogue().label, sparse=True)
 
 
-# What the rules for champions, and the drives that made this one, say of a challenger.
-
-
 @dataclass(frozen=True)
 class Judgement:
     """What the rules say of a challenger.
@@ -598,7 +595,8 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
 
 
 def _unsure(delays: Mapping[str, ReceiverDelay], cars: Iterable[str]) -> Iterator[str]:
-    unsure = {car: delays[car] for car in cars if car in delays and not _sure(delays[car])}
+    known = {car: delays[car] for car in cars if car in delays}
+    unsure = {c: d for c, d in known.items() if d.uncertainty is None or d.uncertainty > SURE_S}
     if unsure:
         yield f"delays are not known to {1000 * SURE_S:g} ms ({_named(unsure)})"
     if untold := sum(car not in delays for car in cars):
@@ -630,10 +628,6 @@ def _named(delays: Mapping[str, ReceiverDelay]) -> str:
     return f"{shown}, and {len(delays) - NAMED} more" if len(delays) > NAMED else shown
 
 
-def _sure(one: ReceiverDelay) -> bool:
-    return one.uncertainty is not None and one.uncertainty <= SURE_S
-
-
 def _said(one: ReceiverDelay) -> str:
     if one.uncertainty is None:
         return f"{1000 * one.value:.0f} ms, of too few drives to be sure"
@@ -655,7 +649,7 @@ def require_sound_course(
     if not faults:
         return
     first = next(iter(faults.values()))
-    named = "; ".join(f"{car}: {fault.figure}" for car, fault in list(faults.items())[:SHOWN])
+    named = "; ".join(f"{car}: {one.figure}" for car, one in list(faults.items())[:SHOWN])
     more = f", and {len(faults) - SHOWN} more" if len(faults) > SHOWN else ""
     raise RefusedError(
         f"{manifest.name} was not published: the course of {len(faults)} of "

@@ -78,8 +78,8 @@ def _drives(registry: Registry, one: ModelVersion, other: ModelVersion) -> Commo
 
 def _facts(one: ModelVersion, other: ModelVersion) -> dict[str, tuple[Any, Any]]:
     a, b = (_flat(version.manifest) for version in (one, other))
-    pairs = {name: (a.get(name), b.get(name)) for name in dict.fromkeys([*a, *b])}
-    return {name: (first, second) for name, (first, second) in pairs.items() if first != second}
+    names = dict.fromkeys([*a, *b])
+    return {name: (a.get(name), b.get(name)) for name in names if a.get(name) != b.get(name)}
 
 
 def _flat(manifest: Manifest) -> dict[str, Any]:

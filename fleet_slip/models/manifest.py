@@ -26,8 +26,6 @@ from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.grams.gram_rows import Hashes
 
-# Fractions in the documents of models, exact however long they are.
-
 MOST_DIGITS = 4000
 """Most decimal digits of a number that stands in decimal; Python refuses longer ones as text."""
 

@@ -150,9 +150,6 @@ def is_up_to_date(
     )
 
 
-# What a selection's winner is, as the manifest of a model version.
-
-
 def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
     """Describe the winner of a selection as a manifest."""
     signals = catalogue()

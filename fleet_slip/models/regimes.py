@@ -171,16 +171,9 @@ def compare_regimes(
         if not mine:
             continue
         one, own = _total([s[0] for s in mine]), _total([s[1] for s in mine])
-        found.append(
-            RegimeFigures(
-                name,
-                one.n,
-                one.n / grid.total.n,
-                one.figures(unit),
-                own.figures(unit),
-                all(s[2] for s in mine),
-            )
-        )
+        share, alone = one.n / grid.total.n, all(s[2] for s in mine)
+        figures = one.figures(unit), own.figures(unit)
+        found.append(RegimeFigures(name, one.n, share, *figures, alone))
     by_fold = [[s for (_, f), s in sums.items() if f == fold] for fold in range(grid.folds)]
     pooled_folds = [_total([s[0] for s in fold]) for fold in by_fold]
     split_folds = [_total([s[1] for s in fold]) for fold in by_fold]

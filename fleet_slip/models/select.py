@@ -82,16 +82,6 @@ from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.tables import Warehouse
 
-# How far to trust a winner's figures: drawing the drives again, and dealing the folds again.
-#
-# The cars of a cohort whose influence no honest car has, by name, and a cohort without them.
-#
-# The noise of the label, below which no error that is measured against it can be.
-#
-# A cross-validated mean square error is that of the model plus the variance of the label's white
-# noise, since a model cannot know the noise of drives that it has not seen. Only simulated drives
-# state it, in the `[sensors]` of their campaign.
-
 SEED = 1
 """Resampling is reproducible: the same command prints the same figures."""
 
@@ -165,8 +155,8 @@ def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Conditi
 def label_noise_deg(warehouse: Warehouse, cohort: CohortOrigin) -> float | None:
     """Return the standard deviation of the label's noise, of all rows of a cohort together.
 
-    The step of its counts is part of it, as the standard deviation of a uniform error. None where
-    no campaign states it.
+    A cross-validated error has it in it, as no model knows the noise of other drives. So has it the
+    step of its counts, as a uniform error. None where no campaign states it in its `[sensors]`.
     """
     if not warehouse.logs.snapshot().rows:  # all rows are of messages: none is read for this
         return None
@@ -363,7 +353,7 @@ class Selection(Generic[AnyCohort]):
         rows = [
             [
                 one.name,
-                str(len(one.signals)),
+                f"{len(one.signals)}",
                 f"{one.correlation:.4f}",
                 f"{one.pooled.rmse_deg:.4f}",
             ]
@@ -585,11 +575,10 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
             sum_cohort(warehouse, folds, condition, feature_set), request, model_list, folds
         )
     cohort = load_cohort(warehouse, condition, feature_set)
-    answer = (
-        _search(cohort, request, folds)
-        if request.ordered
-        else _compare_listed(cohort, request, model_list, folds)
-    )
+    if request.ordered:
+        answer = _search(cohort, request, folds)
+    else:
+        answer = _compare_listed(cohort, request, model_list, folds)
     if distances:
         inputs = inputs_of(cohort, request.nested or WHOLE_SET)
         answer = replace(answer, distances=try_distances(cohort, inputs, folds, request))
@@ -760,14 +749,9 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Reques
     )
     content = {"inputs": described.sha256, "ranking": rule.ranking, "criterion": rule.criterion}
     content |= {"evidence": found.choice.evidence.kind}
+    chosen, intercept = found.choice, request.intercept
     selection = Selection(
-        cohort,
-        folds,
-        found.models,
-        found.winner,
-        {},
-        choice=found.choice,
-        intercept=request.intercept,
+        cohort, folds, found.models, found.winner, {}, choice=chosen, intercept=intercept
     )
     label = f"nested:{nested} {rule.ranking} {rule.criterion}"
     checksum = _checksum(sha256_of(canonical_json(content)), request.worth, request.intercept)

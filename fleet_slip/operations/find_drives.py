@@ -42,8 +42,7 @@ class VacuumReport:
 def vacuum(warehouse: Warehouse, retention_hours: float = RETENTION_HOURS) -> VacuumReport:
     """Remove what nothing has referred to for some hours; gather the records of runs."""
     warehouse.require()
-    expired = find_expired(warehouse, retention_hours)
-    removed = [file for file in expired if file.folder.remove(file)]
+    removed = [one for one in find_expired(warehouse, retention_hours) if one.folder.remove(one)]
     gather_runs(warehouse.root)
     return _report(warehouse, removed, dry_run=False)
 

@@ -7,10 +7,10 @@ that have not seen it conflict. Then Gram rows are fenced, against those that ha
 logs. What such jobs have written is deleted by them or here.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import cache, cached_property
+from dataclasses import dataclass
+from functools import cache
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -44,6 +44,7 @@ from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import runs_under_way
 from fleet_slip.storage.table import Change, retry_conflicts, rows_in
 from fleet_slip.views import connect
+from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -69,44 +70,31 @@ def marked_models(root: Folder) -> frozenset[str]:
     warehouse = Warehouse(root)
     registry = Registry.of(warehouse)
     versions = [(n, number) for n in registry.names() if judged for number in registry.versions(n)]
-    drives = _PresentDrives(warehouse)
+    hashes = cache(lambda: _hashes_of_present(warehouse))
+    present = cache(lambda name: hash_drives(name, hashes()))
     for subject, numbers in judged.items():
         found |= {
             f"{name}@{number}"
             for name, number in versions
             if number > numbers.get(name, 0)
-            and _may_have_seen(registry, name, number, without[subject], drives)
+            and _may_have_seen(registry, name, number, without[subject], present)
         }
     return frozenset(found)
 
 
-def newest_versions(root: Folder) -> dict[str, int]:
-    """Return the number of the newest version of each model."""
-    registry = Registry(root / "models")
-    return {name: max(registry.versions(name), default=0) for name in registry.names()}
-
-
-@dataclass(frozen=True)
-class _PresentDrives:
-    warehouse: Warehouse
-    hashed: dict[str, Hashes] = field(default_factory=dict)
-
-    def hashed_for(self, name: str) -> Hashes:
-        """Return them as the versions of a model keep them."""
-        if name not in self.hashed:
-            self.hashed[name] = hash_drives(name, self._hashes)
-        return self.hashed[name]
-
-    @cached_property
-    def _hashes(self) -> Hashes:
-        grams = self.warehouse.grams.snapshot()
-        drives = (grams.table.read(file.path, ["drive_id"])["drive_id"] for file in grams.files)
-        found = [hash_numbers(some.unique()) for some in drives]
-        return np.unique(np.concatenate(found)) if found else np.array([], dtype=np.uint64)
+def _hashes_of_present(warehouse: Warehouse) -> Hashes:
+    grams = warehouse.grams.snapshot()
+    drives = (grams.table.read(file.path, ["drive_id"])["drive_id"] for file in grams.files)
+    found = [hash_numbers(some.unique()) for some in drives]
+    return np.unique(np.concatenate(found)) if found else np.array([], dtype=np.uint64)
 
 
 def _may_have_seen(
-    registry: Registry, name: str, number: int, without: int | None, present: _PresentDrives
+    registry: Registry,
+    name: str,
+    number: int,
+    without: int | None,
+    present: Callable[[str], Hashes],
 ) -> bool:
     """Whether a version was, or may have been, trained on drives that Gram rows lack since then."""
     if without is None:
@@ -117,7 +105,7 @@ def _may_have_seen(
         if here and manifest.trained_on.grams_version >= without:
             return False
         made = registry.trained_drives(manifest)
-        return made is None or not bool(np.isin(made.salted, present.hashed_for(name)).all())
+        return made is None or not bool(np.isin(made.salted, present(name)).all())
     except FleetSlipError:
         return True
 
@@ -179,10 +167,6 @@ def _in_cohorts(
     warehouse: Warehouse, cohorts: Collection[str], drives: Collection[str]
 ) -> dict[str, frozenset[str]]:
     """Return which of some drives each cohort has; all, of a cohort that cannot be asked for."""
-    # Who lists models need not wait for a database.
-    from fleet_slip.views import connect  # noqa: PLC0415
-    from fleet_slip.warehouse.condition import asking, parse_condition  # noqa: PLC0415
-
     found = {}
     with connect(warehouse.root, query="grams", scenarios=True) as database:
         database.register(
@@ -294,7 +278,8 @@ def _begin(
     located: Located,
     source_file: str | None,
 ) -> list[str]:
-    judged = newest_versions(warehouse.root)
+    registry = Registry.of(warehouse)
+    judged = {name: max(registry.versions(name), default=0) for name in registry.names()}
     models = models_trained_on(warehouse, drives)
     known = () if subject.kind == "before" else digests_of(warehouse, subject, located)
     audit.begin(subject, len(drives), models, judged, set(known), source_file)

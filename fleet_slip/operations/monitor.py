@@ -146,15 +146,7 @@ def monitor(
     mean = Limits.of([day.error_mean_deg for day in usual], limits.false_alarms_per_day)
     std = Limits.above([day.error_std_deg for day in usual], limits.false_alarms_per_day)
     judged = tuple(day if day.training else _judged(day, mean, std) for day in found)
-    return Chart(
-        version.reference,
-        condition.text,
-        judged,
-        mean,
-        std,
-        feature_set,
-        sums.left_out,
-    )
+    return Chart(version.reference, condition.text, judged, mean, std, feature_set, sums.left_out)
 
 
 def _models(
@@ -178,8 +170,8 @@ def _day(day: date, gram: Gram, drives: int, model: LinearModel, training: bool)
 
 
 def _judged(day: Day, mean: Limits, std: Limits) -> Day:
-    beyond = {"mean": mean.beyond(day.error_mean_deg), "std": std.beyond(day.error_std_deg)}
-    return replace(day, alarms=tuple(name for name, yes in beyond.items() if yes))
+    checked = (("mean", mean, day.error_mean_deg), ("std", std, day.error_std_deg))
+    return replace(day, alarms=tuple(name for name, one, value in checked if one.beyond(value)))
 
 
 _SINCE = "fleet-slip monitor {name} --since DAY"

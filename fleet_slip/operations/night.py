@@ -132,7 +132,7 @@ class NightReport:
         lines = [
             f"{self.model}, night of {self.night}: {self.verdict} (exit code {self.exit_code})",
             f"new: {self.gained}; champion: {self.champion or 'none'}"
-            + (f", was {self.before.champion}" if self._moved else ""),
+            + (f", was {self.before.champion}" if self.moved else ""),
             *(f"  {one.name:<{wide}}  {mark[one.state]:<6}  {one.told}" for one in self.steps),
             *(
                 f"  {one.drive_id}: {one.fault.kind} {' '.join(one.fault.signals)}"
@@ -142,7 +142,8 @@ class NightReport:
         return "\n".join(printable(line).rstrip() for line in lines)
 
     @property
-    def _moved(self) -> bool:
+    def moved(self) -> bool:
+        """Whether the night replaced a champion."""
         return self.before.champion not in (None, self.champion)
 
     def as_dict(self) -> dict[str, Any]:
@@ -201,8 +202,7 @@ def render_night(report: NightReport) -> str:
 
 
 def _tiles(report: NightReport) -> list[Tile]:
-    before = report.before.champion
-    was = f", was {before}" if before not in (None, report.champion) else ""
+    was = f", was {report.before.champion}" if report.moved else ""
     tiles = [
         Tile(f"{report.exit_code}", "exit code"),
         Tile(f"{report.drives:,}", f"drives, {count(report.rows)} rows"),
@@ -219,27 +219,16 @@ def _steps(report: NightReport) -> ReportTable:
         [one.name, Cell(one.state, MARKS[one.state]), one.told, f"{one.seconds:.1f}"]
         for one in report.steps
     ]
-    return table(
-        "night-steps",
-        "What was done",
-        ["step", "state", "what came of it", "seconds"],
-        rows,
-        left=3,
-    )
+    head = ["step", "state", "what came of it", "seconds"]
+    return table("night-steps", "What was done", head, rows, left=3)
 
 
 def _faults(report: NightReport) -> ReportTable | None:
     if not report.new_faults:
         return None
     rows: list[list[str | Cell]] = [
-        [
-            one.drive_id,
-            one.vehicle_id,
-            one.fault.kind,
-            " ".join(one.fault.signals),
-            one.fault.figure,
-        ]
-        for one in report.new_faults
+        [one.drive_id, one.vehicle_id, fault.kind, " ".join(fault.signals), fault.figure]
+        for one, fault in ((one, one.fault) for one in report.new_faults)
     ]
     head = ["drive", "car", "fault", "signals", "what shows it"]
     return table("night-faults", "Sensors not in order since this night", head, rows, left=5)
@@ -260,16 +249,10 @@ def _past(report: NightReport) -> ReportTable | None:
 
 def _picture(chart: Chart) -> Picture:
     new = [day for day in chart.days if not day.training]
-    title = f"{chart.model}: error on each day"
     caption = (
         f"Mean and standard deviation of the error on {number_of(len(chart.days), 'day')}, "
         f"{len(new)} of them new; dashed: the limits that the training days set. "
         f"Beyond a limit: {number_of(len(chart.alarms), 'day')}."
     )
-    return Picture(
-        "control-chart",
-        title,
-        caption,
-        "Points over the days, beside their limits.",
-        lambda size: control_chart(chart, size),
-    )
+    title, shown = f"{chart.model}: error on each day", "Points over the days, beside their limits."
+    return Picture("control-chart", title, caption, shown, lambda size: control_chart(chart, size))
