@@ -205,6 +205,8 @@ def read_landed_units(table: Folder, version: int) -> dict[str, int]:
                 commit = read_commit(log, int(name[:20]))
             except ValueError as error:
                 raise StorageError(f"{log}/{name}: {error}") from None
-            stated = (action["txn"] for action in commit.actions if "txn" in action)
+            stated = [action["txn"] for action in commit.actions if "txn" in action]
+            if not all({"appId", "version"} <= one.keys() for one in stated):
+                raise StorageError(f"{log}/{name}: was damaged: a unit of work has no name.")
             numbers.update((one["appId"], one["version"]) for one in stated)
     return numbers

@@ -456,13 +456,13 @@ class Snapshot:
 def find_commit_faults(snapshot: Snapshot) -> Iterator[tuple[str, str]]:
     """Yield what is wrong with the log up to a snapshot: the file's name, and what.
 
-    While all commits are there, their sum is compared with what Delta says, from a checkpoint.
+    While all commits are there and sound, their sum is compared with what Delta says.
     """
     if snapshot.version is None:
         return
     commits, faults = check_commits(snapshot.table.folder / LOG, snapshot.version)
     yield from faults.items()
-    if len(commits) <= snapshot.version:
+    if faults or len(commits) <= snapshot.version:
         return
     files: set[str] = set()
     units: dict[str, int] = {}

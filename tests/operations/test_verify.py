@@ -121,6 +121,12 @@ def test_a_log_of_the_table_that_tells_other_counts_is_found(filled: Warehouse) 
     assert ("log", "logs") in damaged(filled)
 
 
+def test_a_flipped_bit_in_the_key_of_a_unit_of_work_is_damage_not_a_bug(filled: Warehouse) -> None:
+    log = max(path_of(filled.root).glob("logs/_delta_log/*.json"))
+    flip(log, 8 * (log.read_bytes().index(b'"appId"') + 1))
+    assert "log" in {kind for kind, _ in damaged(filled)}
+
+
 def test_a_drive_in_two_files_or_without_a_beginning_is_found(filled: Warehouse) -> None:
     rng = np.random.default_rng(1)
     land(filled, "twice", log_rows("a", random_counts(rng, 5)))
