@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet_slip.config import find_config
+from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 
 SHIPPED = "fleet"

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fleet_slip.config import find_config
+from fleet_slip.resources import find_config
 from fleet_slip.storage.commits import CHECKSUM_KEY, NOTE, checksum_of_actions
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder

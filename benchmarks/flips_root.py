@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchmarks.flips_commands import Ended, command, in_a_child
-from fleet_slip.config import CONFIG_VARIABLE, find_config, folder
+from fleet_slip.resources import CONFIG_VARIABLE, find_config, folder
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change

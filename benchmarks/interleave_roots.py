@@ -14,7 +14,7 @@ from pathlib import Path
 from benchmarks.crash_commands import MAPPING, let_time_pass
 from benchmarks.interleave_stops import Environment, Running
 from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE
-from fleet_slip.config import find_config, folder
+from fleet_slip.resources import find_config, folder
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 
 CAR = "mini-0000"

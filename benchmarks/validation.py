@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 
 from benchmarks.documents import insert
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.vehicle.batch import LaneDrive, Road
 from fleet_slip.vehicle.driver import handling

@@ -1,4 +1,4 @@
-"""What every module may use: types of arrays, canonical JSON, days, optional packages, words."""
+"""What every module may use: canonical JSON, days, optional packages, words."""
 
 import hashlib
 import json
@@ -7,34 +7,10 @@ from contextlib import contextmanager
 from datetime import date, datetime
 from typing import TYPE_CHECKING, Any, overload
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fleet_slip.errors import ExtraError, UsageError
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
-
-# Types of numpy arrays, by what they hold.
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
-ObjectArray = NDArray[np.object_]
-"""Python objects, such as integers that never overflow."""
-
-
-def is_finite(values: FloatArray) -> bool:
-    """Whether neither NaN nor infinity is among values, nor their sum, by which it is told."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return bool(np.isfinite(values.sum()))
-
-
-def float_column(rows: "pa.Table", name: str) -> FloatArray:
-    """Return a column of rows in float64, NaN where null."""
-    values: FloatArray = rows[name].to_numpy().astype(np.float64)
-    return values
+    pass
 
 
 # The one text of JSON content, whatever its order and layout, and the checksum of a text.

@@ -18,7 +18,7 @@ import numpy as np
 from sklearn.cluster import KMeans
 
 from benchmarks.rivals.learners import SEED, FittedLearner, Names, Scaling, hold_back
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 
 RULES = 9
 PREMISES = 3

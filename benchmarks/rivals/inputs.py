@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.rivals.learners import Fit, FittedLearner, Names, one_thread
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts, as_counts

@@ -18,7 +18,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.evaluation import belief

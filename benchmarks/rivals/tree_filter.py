@@ -17,7 +17,7 @@ from pydantic import Field, FiniteFloat
 from sklearn.tree import DecisionTreeRegressor
 
 from benchmarks.rivals.learners import SEED
-from fleet_slip.base import FloatArray, IntArray
+from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.evaluation import ekf

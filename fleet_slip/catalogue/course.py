@@ -26,7 +26,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.arithmetic import nearest_sql
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S, catalogue

@@ -27,8 +27,9 @@ from fleet_slip.catalogue.time_columns import (
     gated_columns,
     window_column,
 )
-from fleet_slip.config import Config, config_file, faults_of, folder, load_config, load_toml
+from fleet_slip.config import Config, faults_of, load_config, load_toml
 from fleet_slip.errors import ConfigError, QuestionError
+from fleet_slip.resources import config_file, folder
 
 # Feature sets and regimes of `configs/features.toml` as types.
 #

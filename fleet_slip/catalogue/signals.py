@@ -15,9 +15,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pydantic import Field, StringConstraints, model_validator
 
-from fleet_slip.base import BoolArray, FloatArray
-from fleet_slip.config import Config, config_file, load_config
+from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError
+from fleet_slip.resources import config_file
 
 CATALOGUE_VARIABLE = "FLEET_SLIP_SIGNALS"
 """Names a signal catalogue to use instead of the shipped one: another fleet, other signals."""

@@ -22,15 +22,15 @@ from fleet_slip.cli.output import (
     print_records,
     print_table,
     print_text,
-    progress,
     say,
     stdout,
 )
+from fleet_slip.cli.progress import progress
 from fleet_slip.cli.selection import say_examined, say_without_information
-from fleet_slip.config import folder
 from fleet_slip.errors import UsageError
 from fleet_slip.models.score import Score, score_statement
-from fleet_slip.storage.folder import storage_errors
+from fleet_slip.resources import folder
+from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
     from fleet_slip.evaluation.blind import BlindRow

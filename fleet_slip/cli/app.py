@@ -23,7 +23,6 @@ import fleet_slip
 from fleet_slip.cli.early_exit import LOG_VARIABLE, leave
 from fleet_slip.cli.output import say
 from fleet_slip.cli.streams import LogFormat, Streams, configure_logs
-from fleet_slip.config import CONFIG_VARIABLE, own_configs
 from fleet_slip.errors import (
     INTERRUPTED,
     FleetSlipError,
@@ -32,6 +31,7 @@ from fleet_slip.errors import (
     is_lack_of_memory,
 )
 from fleet_slip.limits import memory_bytes
+from fleet_slip.resources import CONFIG_VARIABLE, own_configs
 from fleet_slip.storage.data_root import ROOT_VARIABLE
 from fleet_slip.storage.runs import recording
 

@@ -26,7 +26,8 @@ from fleet_slip.cli.options import (
     complete_model,
     request_options,
 )
-from fleet_slip.cli.output import All, Json, print_json, progress_of_steps, say
+from fleet_slip.cli.output import All, Json, print_json, say
+from fleet_slip.cli.progress import progress_of_steps
 from fleet_slip.cli.selection import print_selection, say_examined
 from fleet_slip.errors import FleetSlipError, RefusedError
 from fleet_slip.models.manifest import require_model_name

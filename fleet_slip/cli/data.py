@@ -19,11 +19,12 @@ from fleet_slip.api.requests import RunRequest
 from fleet_slip.base import last_day, number_of
 from fleet_slip.cli.app import record_run
 from fleet_slip.cli.options import Cluster, Threads, complete_config, option
-from fleet_slip.cli.output import Json, print_json, print_table, print_text, progress, say
-from fleet_slip.config import folder as shipped
+from fleet_slip.cli.output import Json, print_json, print_table, print_text, say
+from fleet_slip.cli.progress import progress
 from fleet_slip.errors import AlarmError, UsageError
-from fleet_slip.storage.folder import storage_errors
+from fleet_slip.resources import folder as shipped
 from fleet_slip.storage.runs import recording
+from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
     from fleet_slip.ingest.draft import Draft

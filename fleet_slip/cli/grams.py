@@ -13,10 +13,12 @@ from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.app import record_run
 from fleet_slip.cli.options import Cluster, complete_feature_set
-from fleet_slip.cli.output import All, Json, print_json, print_table, progress, say
+from fleet_slip.cli.output import All, Json, print_json, print_table, say
+from fleet_slip.cli.progress import progress
 from fleet_slip.columns.sql import column_query
-from fleet_slip.config import config_files, folder, own_configs, read_named_file
+from fleet_slip.config import read_named_file
 from fleet_slip.grams.compute import gram_statement
+from fleet_slip.resources import config_files, folder, own_configs
 
 if TYPE_CHECKING:
     from fleet_slip.grams.job import GramReport

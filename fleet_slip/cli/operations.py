@@ -23,9 +23,9 @@ from fleet_slip.cli.output import (
     print_records,
     print_table,
     print_text,
-    progress_of_steps,
     say,
 )
+from fleet_slip.cli.progress import progress_of_steps
 from fleet_slip.cli.selection import say_without_log
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.grams.calibration import SURE_ERRORS, Calibration, ChangedNumber

@@ -13,8 +13,8 @@ import typer
 
 from fleet_slip.api.calls import documented, type_of
 from fleet_slip.base import date_of, last_day
-from fleet_slip.config import CONFIG_VARIABLE, config_names
 from fleet_slip.errors import FleetSlipError, UsageError
+from fleet_slip.resources import CONFIG_VARIABLE, config_names
 
 # What Tab completes in a shell of the system: names of models, campaigns, lists and feature sets.
 #

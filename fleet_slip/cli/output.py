@@ -3,35 +3,18 @@
 import json
 import logging
 import math
-import os
 import string
 import sys
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from decimal import Decimal
-from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.progress import (
-    BarColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from rich.text import Text
 
-from fleet_slip.base import number_of
-from fleet_slip.cli.streams import drawing_on, for_people, stderr, wrapped
+from fleet_slip.cli.streams import wrapped
 from fleet_slip.errors import printable
-from fleet_slip.storage.runs import LOGGER, log_event
+from fleet_slip.storage.runs import LOGGER
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -209,104 +192,3 @@ def _paragraphs(header: Sequence[str], rows: Sequence[Sequence[str]]) -> "Table"
             table.add_row(Text(name, style="bold"), Text(cell))
         table.add_row("", "")
     return table
-
-
-# How commands show the progress of long work: bars for people, events for machines.
-
-TOLD_EVERY_S = 30.0
-"""How often the log tells the progress of a job."""
-
-
-class _Rate(ProgressColumn):
-    """Speed of a task in its unit."""
-
-    def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        unit = task.fields.get("unit", "")
-        return Text(f"{_short(speed)} {unit}/s" if speed else "")
-
-
-class _Workers(ProgressColumn):
-    """How many workers a cluster has at the moment."""
-
-    def render(self, task: Task) -> Text:
-        number = getattr(task.fields.get("executor"), "workers", None)
-        return Text("" if number is None else f"{number_of(number, 'worker')}")
-
-
-def _short(value: float) -> str:
-    for limit, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if value >= limit:
-            return f"{value / limit:.1f}{suffix}"
-    return f"{value:.0f}"
-
-
-@contextmanager
-def progress(
-    doing: str, unit: str, executor: Executor | None = None
-) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar while one thing is done; see `progress_of_steps`."""
-    with progress_of_steps(unit, executor, doing) as show:
-        yield partial(show, doing)
-
-
-@contextmanager
-def progress_of_steps(
-    unit: str, executor: Executor | None = None, first: str | None = None
-) -> Iterator[Callable[[str, int, int], None]]:
-    """Show bars with rate and time left on stderr while steps are done, if a person watches.
-
-    And the number of workers, if the executor is of a cluster. Machines are told by an event now
-    and then. Yields the callback: what is being done, how much is done, and how much there is. The
-    bar of the first step is there before it is called. At Ctrl-C a line says how much of each step
-    was done.
-    """
-    console = stderr()
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f}%"),
-        _Rate(),
-        _Workers(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not (console.is_terminal and for_people()) or bool(os.environ.get("CI")),
-    )
-    begun: dict[str, tuple[TaskID, float]] = {}
-    reached: dict[str, tuple[int, int]] = {}
-    told = time.monotonic()
-
-    def begin(doing: str) -> tuple[TaskID, float]:
-        task = bar.add_task(doing, total=None, unit=unit, executor=executor)
-        return task, time.monotonic()
-
-    def show(doing: str, done: int, total: int) -> None:
-        nonlocal told
-        if doing not in begun:
-            begun[doing] = begin(doing)
-        task, since = begun[doing]
-        reached[doing] = done, total
-        bar.update(task, completed=done, total=total)
-        if (now := time.monotonic()) - told > TOLD_EVERY_S:
-            told = now
-            rate = {f"{unit}_per_s": round(done / (now - since))}
-            workers = getattr(executor, "workers", None)
-            log_event("progress", doing=doing, done=done, total=total, workers=workers, **rate)
-
-    try:
-        with drawing_on(console), bar:
-            if first is not None:
-                begun[first] = begin(first)
-            yield show
-    except KeyboardInterrupt:
-        for doing, (done, total) in reached.items():
-            say(f"{doing}: {_how_far(done, total, unit)}.", logging.WARNING)
-        raise
-
-
-def _how_far(done: int, total: int, unit: str) -> str:
-    if done >= total:
-        return f"all {total:,} {unit} were done"
-    return f"{done:,} of {total:,} {unit} were done, {total - done:,} were not"

@@ -14,7 +14,8 @@ from fleet_slip.api.requests import ForgetRequest
 from fleet_slip.base import number_of
 from fleet_slip.cli.app import record_run
 from fleet_slip.cli.options import Cluster, request_options
-from fleet_slip.cli.output import Json, print_json, print_table, progress, say
+from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.cli.progress import progress
 from fleet_slip.errors import DamageError, PendingError, UsageError
 from fleet_slip.grams.check import CheckReport
 from fleet_slip.operations.find_drives import RETENTION_HOURS, VacuumReport

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.base import BoolArray, FloatArray, IntArray
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.definitions import Definition, limit_of
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.kernel import GAPS, run

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.course import COURSE, YAW_RATE
 from fleet_slip.catalogue.definitions import Definition, limit_of, plain_column
 from fleet_slip.catalogue.features import FeatureCatalogue

@@ -17,8 +17,8 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from fleet_slip.config import folder, own_configs
 from fleet_slip.errors import FleetSlipError, RefusedError, StorageError
+from fleet_slip.resources import folder, own_configs
 from fleet_slip.storage.folder import Folder
 
 PACKAGES = (

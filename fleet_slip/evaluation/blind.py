@@ -13,9 +13,9 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import Identifier
-from fleet_slip.config import Config, config_file, load_config
+from fleet_slip.config import Config, load_config
 from fleet_slip.evaluation.drives import EvaluatedDrive, simulate_drives
 from fleet_slip.evaluation.filters import Estimate, FilterEstimate
 from fleet_slip.evaluation.scenarios import (
@@ -25,6 +25,7 @@ from fleet_slip.evaluation.scenarios import (
     evaluate_drive,
     judge_together,
 )
+from fleet_slip.resources import config_file
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Range, Uniform
 from fleet_slip.simulation.plan import Drivers, FleetPlan, load_by_name

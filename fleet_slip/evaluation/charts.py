@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.drives import EvaluatedDrive, find_stretches
 from fleet_slip.evaluation.kept import DRAWN_FILTERS, ReportData
 from fleet_slip.evaluation.scenarios import EvaluatedScenario

@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.base import BoolArray, FloatArray, float_column
+from fleet_slip.arrays import BoolArray, FloatArray, float_column
 from fleet_slip.catalogue.facts import SCENARIO
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.config import read_sql
 from fleet_slip.errors import DataError, QuestionError, RefusedError
+from fleet_slip.resources import read_sql
 from fleet_slip.simulation.job import MOTION, DriveLog, exact_motion, simulate_logs
 from fleet_slip.simulation.scenario import Failure, Scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ

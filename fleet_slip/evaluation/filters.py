@@ -12,7 +12,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from fleet_slip.base import FloatArray, number_of
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import number_of
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import as_counts
 from fleet_slip.config import Config

@@ -18,7 +18,8 @@ from typing import Any, Generic, Self, TypeVar
 import numpy as np
 from pydantic import Field, FiniteFloat
 
-from fleet_slip.base import FloatArray, sha256_of
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import sha256_of
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError

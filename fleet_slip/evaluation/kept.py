@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.evaluate import evaluations_of

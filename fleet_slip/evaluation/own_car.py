@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.base import BoolArray, FloatArray, IntArray
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns
 from fleet_slip.columns.plan import ColumnPlan

@@ -8,7 +8,8 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from fleet_slip.base import BoolArray, FloatArray, Progress, no_progress
+from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.drives import (

@@ -12,7 +12,7 @@ from typing import NamedTuple, cast
 import duckdb
 import numpy as np
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError, QuestionError

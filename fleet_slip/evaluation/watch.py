@@ -11,18 +11,18 @@ import numpy as np
 import pyarrow as pa
 from markupsafe import Markup
 
-from fleet_slip.base import FloatArray, float_column
+from fleet_slip.arrays import FloatArray, float_column
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, as_counts
 from fleet_slip.columns.plan import ColumnPlan
-from fleet_slip.config import config_names
 from fleet_slip.errors import DataError, QuestionError, UsageError
 from fleet_slip.evaluation.drives import load_drives
 from fleet_slip.evaluation.scenarios import simulate_scenarios
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import fill_in
+from fleet_slip.resources import config_names
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.storage.local import LocalFolder

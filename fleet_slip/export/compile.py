@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.base import BoolArray, FloatArray, IntArray
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.arithmetic import parse
 from fleet_slip.catalogue.definitions import plain_column
 from fleet_slip.catalogue.facts import round_number

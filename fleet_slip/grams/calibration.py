@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.base import FloatArray, date_of
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import date_of
 from fleet_slip.catalogue.course import COLUMNS, turned_scale
 from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, CAR_NUMBERS, NumberName
 from fleet_slip.catalogue.features import features, input_scales

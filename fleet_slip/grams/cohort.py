@@ -14,7 +14,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.base import BoolArray, IntArray, number_of
+from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.base import number_of
 from fleet_slip.catalogue.facts import RECEIVED, SCENARIO, TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN, features, input_scales
 from fleet_slip.catalogue.signals import catalogue

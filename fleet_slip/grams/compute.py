@@ -19,7 +19,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from fleet_slip.base import BoolArray, FloatArray, IntArray, Progress, no_progress, number_of
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
+from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.catalogue.course import (
     COARSER,
     COURSE,
@@ -36,8 +37,8 @@ from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
 from fleet_slip.columns.sql import with_absent, with_columns
 from fleet_slip.compute.tasks import LocalThreads, in_flight, run_tasks
-from fleet_slip.config import read_sql
 from fleet_slip.errors import DataError, StorageError
+from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import TableFile, absent_columns
 from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.tables import Warehouse

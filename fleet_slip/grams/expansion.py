@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fleet_slip.base import BoolArray
+from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.course import BESIDE, TURNED
 from fleet_slip.catalogue.definitions import Number
 from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from fleet_slip.base import BoolArray, IntArray
+from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalogue.facts import RECEIVED_FILES
 from fleet_slip.regression.gram import GramTable, packed_size
 

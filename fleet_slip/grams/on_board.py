@@ -19,7 +19,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from fleet_slip.base import BoolArray, IntArray, canonical_json, sha256_of, shown
+from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.base import canonical_json, sha256_of, shown
 from fleet_slip.catalogue.course import (
     BESIDE,
     COARSER,

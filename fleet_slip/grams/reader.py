@@ -13,17 +13,17 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.course import TURNED
 from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, LONGEST_PAUSE_S, TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.config import read_sql
 from fleet_slip.errors import DataError, NotComputedError
 from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.job import find_backlog
 from fleet_slip.grams.receiver_delay import RECEIVER
 from fleet_slip.regression.gram import GramTable, packed_position, packed_size
+from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.condition import Condition, asking
 from fleet_slip.warehouse.tables import Warehouse, gram_snapshots, lock, open_tables

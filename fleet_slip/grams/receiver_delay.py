@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.course import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOST_LATE
 from fleet_slip.catalogue.facts import DELAY, RECEIVED_FILES
 from fleet_slip.catalogue.features import features

@@ -19,7 +19,7 @@ import pint
 import polars as pl
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import HALF_TURN, Identifier, Signal, catalogue
 from fleet_slip.config import Config, Name, PositiveFloat, added
 from fleet_slip.ingest.formats.source import OWN_TIME

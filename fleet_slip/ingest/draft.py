@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.base import FloatArray, shown
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import shown
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import FleetSlipError, InputError

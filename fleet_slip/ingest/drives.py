@@ -15,7 +15,7 @@ import polars as pl
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fleet_slip.base import BoolArray, FloatArray, IntArray
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import catalogue, digest_drive, round_chunks

@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.ingest.columns import COURSE, SPEED, Component, conversion_factor, reads_clock
 from fleet_slip.ingest.profile import FileProfile, Profile, sample_rate_hz

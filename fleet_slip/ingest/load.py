@@ -23,7 +23,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
-from fleet_slip.base import IntArray, Progress, no_progress, number_of, shown
+from fleet_slip.arrays import IntArray
+from fleet_slip.base import Progress, no_progress, number_of, shown
 from fleet_slip.caches import cache_folder
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import as_arrow, catalogue

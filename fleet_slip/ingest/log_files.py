@@ -25,13 +25,7 @@ from obstore.exceptions import InvalidPathError
 
 from fleet_slip.base import needed, shown
 from fleet_slip.errors import FleetSlipError, InputError, StorageError, UsageError
-from fleet_slip.storage.folder import (
-    NoSuchObjectError,
-    StoredFile,
-    meaning_of,
-    object_errors,
-    storage_errors,
-)
+from fleet_slip.storage.folder import StoredFile
 from fleet_slip.storage.objects import (
     CONNECT_TIMEOUT_S,
     TIMEOUT_S,
@@ -39,6 +33,12 @@ from fleet_slip.storage.objects import (
     client,
     fetch_parts,
     profile_of,
+)
+from fleet_slip.storage.storage_errors import (
+    NoSuchObjectError,
+    meaning_of,
+    object_errors,
+    storage_errors,
 )
 
 SUFFIXES = (

@@ -19,7 +19,8 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from fleet_slip.base import BoolArray, FloatArray, shown
+from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.base import shown
 from fleet_slip.catalogue.signals import catalogue, round_chunks
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import describe

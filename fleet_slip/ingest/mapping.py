@@ -29,7 +29,6 @@ from fleet_slip.config import (
     PositiveFloat,
     added,
     faults_of,
-    find_config,
     load_config,
     load_toml,
     read_named_file,
@@ -51,6 +50,7 @@ from fleet_slip.ingest.formats.reading import FileFormats
 from fleet_slip.ingest.formats.source import describe_unknown
 from fleet_slip.ingest.formats.tables import DuckdbRows
 from fleet_slip.ingest.log_files import Log, Place, is_pattern, is_url, names_several
+from fleet_slip.resources import find_config
 
 SPEEDS = ("vx", "vehicle_speed")
 

@@ -10,7 +10,8 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.base import FloatArray, needed
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import needed
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import ConfigError
@@ -19,7 +20,7 @@ from fleet_slip.ingest.log_files import Log, local_copy
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.ingest.suspicion import find_suspicions
-from fleet_slip.storage.folder import storage_errors
+from fleet_slip.storage.storage_errors import storage_errors
 
 MOST_TICKS = 200_000
 """Ticks of the longest drive that are looked at: half an hour."""

@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.csv import CsvFormat, Encoding, decompressed, first_lines
 from fleet_slip.ingest.formats.reading import (

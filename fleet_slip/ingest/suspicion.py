@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fleet_slip.base import BoolArray, FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.course import COURSE, LARGEST_RAD, WITNESSES, CourseRelation, relate
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue

@@ -22,13 +22,14 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
-from fleet_slip.base import BoolArray, FloatArray, number_of
+from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.base import number_of
 from fleet_slip.catalogue.course import relate
 from fleet_slip.catalogue.facts import ALL_DRIVES, DELAY
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.config import Config, config_file, load_config
+from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
 from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.cohort import Cohort, SummedCohort, TaughtCohort, load_cohort
@@ -58,6 +59,7 @@ from fleet_slip.regression.folds import (
     least_squares,
 )
 from fleet_slip.regression.least_squares import LinearModel
+from fleet_slip.resources import config_file
 from fleet_slip.storage.runs import LOGGER
 from fleet_slip.warehouse.condition import asking, parse_cohort, parse_condition
 from fleet_slip.warehouse.tables import Warehouse, connect_tables

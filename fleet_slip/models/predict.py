@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.base import FloatArray, IntArray
+from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.definitions import plain_column
 from fleet_slip.catalogue.facts import round_number
 from fleet_slip.catalogue.features import features, input_scales

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.base import IntArray
+from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError

@@ -12,7 +12,7 @@ from typing_extensions import Doc
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import Identifier
-from fleet_slip.config import Config, find_config, load_config
+from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.cohort import Cohort, SummedCohort
 from fleet_slip.grams.folding import Folding, FoldKey
@@ -20,6 +20,7 @@ from fleet_slip.regression.choice import DEFAULT_WORTH, Worth
 from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.regression.orders import METHODS, RANKINGS
 from fleet_slip.regression.subsets import CRITERIA
+from fleet_slip.resources import find_config
 
 DEFAULT_MODELS = "estimator"
 """The model list that is compared unless another is named, by `run` and every night too."""

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.definitions import limit_of
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, catalogue
 from fleet_slip.columns.sql import with_columns
-from fleet_slip.config import read_sql
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.compute import counts_of, drives_of_stream
 from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
+from fleet_slip.resources import read_sql
 from fleet_slip.storage.runs import log_event
 from fleet_slip.warehouse.condition import Condition, asking, parse_cohort, row_columns
 from fleet_slip.warehouse.tables import Warehouse, connect_tables

@@ -9,12 +9,13 @@ from typing import Any, Generic
 import numpy as np
 from typing_extensions import TypeVar
 
-from fleet_slip.base import FloatArray, canonical_json, sha256_of
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalogue.course import STRAIGHT, STRAIGHT_COURSE, TURNED, YAW_RATE
 from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN, features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.config import find_config, load_toml
+from fleet_slip.config import load_toml
 from fleet_slip.errors import ConfigError, DataError, NotComputedError, QuestionError, UsageError
 from fleet_slip.grams.cohort import (
     Cohort,
@@ -78,6 +79,7 @@ from fleet_slip.regression.folds import (
 )
 from fleet_slip.regression.gram import GramTable, packed_position
 from fleet_slip.regression.orders import METHODS
+from fleet_slip.resources import find_config
 from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.tables import Warehouse

@@ -15,7 +15,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.facts import NumberName
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue

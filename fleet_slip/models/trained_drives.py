@@ -11,7 +11,7 @@ from hashlib import sha256
 
 import numpy as np
 
-from fleet_slip.base import BoolArray
+from fleet_slip.arrays import BoolArray
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.gram_rows import Hashes
 from fleet_slip.models.manifest import Manifest, salt_drives

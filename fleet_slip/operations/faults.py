@@ -13,7 +13,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.base import BoolArray, FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.course import WITNESSES
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import catalogue

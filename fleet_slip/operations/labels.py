@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.base import BoolArray, FloatArray, IntArray
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.facts import RECEIVED
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue

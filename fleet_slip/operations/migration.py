@@ -24,13 +24,14 @@ from deltalake.schema import Schema
 from deltalake.transaction import AddAction
 from numpy.typing import NDArray
 
-from fleet_slip.base import IntArray, Progress, no_progress
+from fleet_slip.arrays import IntArray
+from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.grams.job import land_ahead
 from fleet_slip.operations.rewriting import drop_unused_names, read_kept_drives
 from fleet_slip.storage.commits import NOTE, checked_note
-from fleet_slip.storage.folder import storage_errors
+from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import (
     ALL_STATISTICS,
     SCALE,

@@ -34,7 +34,7 @@ from fleet_slip.regression.figures import error_sums, student_t_quantile
 from fleet_slip.regression.folds import least_squares
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import LinearModel
-from fleet_slip.storage.folder import storage_errors
+from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.warehouse.condition import Condition, parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -19,11 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from fleet_slip.base import BoolArray, FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.faults import Fault
-from fleet_slip.config import Config, config_file, load_config
+from fleet_slip.config import Config, load_config
 from fleet_slip.operations.faults import DriveBatches, MeanMoments
 from fleet_slip.regression.gram import GramTable
+from fleet_slip.resources import config_file
 
 # The thresholds of `configs/monitor.toml`.
 

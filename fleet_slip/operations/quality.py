@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.base import BoolArray, IntArray
+from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalogue.course import relate
 from fleet_slip.catalogue.facts import DELAY, TRAINING_DRIVES
 from fleet_slip.catalogue.faults import Fault

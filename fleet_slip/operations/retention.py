@@ -7,11 +7,12 @@ import pyarrow.compute as pc
 from pydantic import Field
 
 from fleet_slip.base import Progress, no_progress
-from fleet_slip.config import Config, config_file, find_config, load_config
+from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.grams.gram_files import is_of_received
 from fleet_slip.operations.find_drives import RETENTION_HOURS, VacuumReport, vacuum
 from fleet_slip.operations.forget import ForgetReport, forget
+from fleet_slip.resources import config_file, find_config
 from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 

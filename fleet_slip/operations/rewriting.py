@@ -16,7 +16,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
-from fleet_slip.base import IntArray, Progress, no_progress
+from fleet_slip.arrays import IntArray
+from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.errors import ConflictError, FleetSlipError
 from fleet_slip.grams.gram_files import read_rows, write_rows

@@ -19,7 +19,6 @@ import pyarrow.parquet as pq
 from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
-from fleet_slip.config import read_sql
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
 from fleet_slip.grams.check import (
     DriveGrams,
@@ -34,11 +33,13 @@ from fleet_slip.grams.job import named_files
 from fleet_slip.grams.on_board import CountedSet, counted_by_identity, find_impossible
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import find_temporary_files, find_unreferenced
+from fleet_slip.resources import read_sql
 from fleet_slip.storage.commits import LOG
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.encoding import Names, read_names
-from fleet_slip.storage.folder import Folder, StoredFile, checksum_in, checksum_of, storage_errors
+from fleet_slip.storage.folder import Folder, StoredFile, checksum_in, checksum_of
 from fleet_slip.storage.runs import find_changed_lines, find_missing_documents
+from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Snapshot, Table, TableFile, find_commit_faults, on_newest
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.forgotten import Audit

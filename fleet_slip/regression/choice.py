@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.base import IntArray
+from fleet_slip.arrays import IntArray
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import eliminate

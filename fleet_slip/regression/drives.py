@@ -13,7 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.base import BoolArray, FloatArray, IntArray, number_of
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
+from fleet_slip.base import number_of
 from fleet_slip.errors import DataError
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram, GramTable, packed_position, packed_size

@@ -22,7 +22,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.base import FloatArray, ObjectArray
+from fleet_slip.arrays import FloatArray, ObjectArray
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.regression import exact
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import LinearModel

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.base import IntArray, number_of
+from fleet_slip.arrays import IntArray
+from fleet_slip.base import number_of
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.figures import ErrorSums, Figures, error_sums
 from fleet_slip.regression.gram import Gram, GramTable, require_signals

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.base import IntArray, ObjectArray
+from fleet_slip.arrays import IntArray, ObjectArray
 from fleet_slip.errors import DataError
 
 SomeSize = TypeVar("SomeSize", int, IntArray)

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fleet_slip.base import FloatArray, IntArray
+from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression import exact
 from fleet_slip.regression.drives import DriveMoments

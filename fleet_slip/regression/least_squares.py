@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.base import FloatArray, number_of
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import number_of
 from fleet_slip.errors import DataError
 from fleet_slip.regression import exact
 from fleet_slip.regression.exact import (

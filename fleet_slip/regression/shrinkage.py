@@ -15,7 +15,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.exact import eliminate
 from fleet_slip.regression.figures import ErrorSums

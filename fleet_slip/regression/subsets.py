@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.base import FloatArray, IntArray
+from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.figures import normal_cdf, normal_density

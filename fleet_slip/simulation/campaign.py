@@ -15,10 +15,12 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
 
-from fleet_slip.base import FloatArray, canonical_ascii, sha256_of
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import canonical_ascii, sha256_of
 from fleet_slip.catalogue.signals import Identifier
-from fleet_slip.config import Config, find_config, load_config, load_toml
+from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
+from fleet_slip.resources import find_config
 from fleet_slip.simulation.imperfections import NONE, Imperfections
 from fleet_slip.simulation.plan import FleetPlan, GridPlan, TrialPlan
 from fleet_slip.simulation.receivers import Receiver, Receivers

@@ -17,7 +17,8 @@ import numpy as np
 import pyarrow as pa
 from deltalake.transaction import AddAction
 
-from fleet_slip.base import FloatArray, Progress, no_progress
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import RefusedError

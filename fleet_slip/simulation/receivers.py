@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat
 
-from fleet_slip.base import BoolArray, FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import HALF_TURN, catalogue
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.config import Config, Name

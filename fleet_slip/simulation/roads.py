@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, FiniteFloat, model_validator
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.compiling import kernel
-from fleet_slip.config import Config, find_config, load_config
+from fleet_slip.config import Config, load_config
+from fleet_slip.resources import find_config
 from fleet_slip.simulation.imperfections import RoadImperfections
 from fleet_slip.vehicle.batch import Road, Surface
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2

@@ -16,8 +16,9 @@ from pydantic import Field, FiniteFloat, model_validator
 from fleet_slip.base import sha256_of
 from fleet_slip.catalogue.facts import SCENARIO
 from fleet_slip.catalogue.signals import Identifier, catalogue
-from fleet_slip.config import Config, config_names, find_config, load_config, load_toml
+from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError
+from fleet_slip.resources import config_names, find_config
 from fleet_slip.simulation.campaign import Batch, DriveSpec, merged
 from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative, Positive
 from fleet_slip.simulation.plan import NamedTrack, NamedVehicle

@@ -4,14 +4,12 @@ Files are written whole, once: no locks, no directories. `fleet_slip.files.local
 file system, `fleet_slip.files.object_folder` one of an object store.
 """
 
-import contextlib
-import errno
 import functools
 import hashlib
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -20,12 +18,12 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, TypeAlias
 
 import pyarrow as pa
 import xxhash
-from deltalake.exceptions import DeltaError
 
 from fleet_slip.errors import StorageError
 
 if TYPE_CHECKING:
     import duckdb
+from fleet_slip.storage.storage_errors import storage_errors
 
 TEMPORARY_PREFIX = ".tmp-"
 """Beginning of the name of a file that is not whole yet."""
@@ -134,151 +132,6 @@ class Folder(Protocol):
 
     def let_read(self, database: "duckdb.DuckDBPyConnection") -> None:
         """Enable a connection to read files below this folder."""
-
-
-# Turns what fails below a data root into `StorageError`, with the next thing to do.
-#
-# Of the libraries' text, which has the server's whole answer and names of keys, none is shown.
-
-_CREDENTIALS = (
-    "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY or AWS_PROFILE, "
-    "GOOGLE_APPLICATION_CREDENTIALS, or AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY"
-)
-
-_TIMEOUT = r"timed out|TimedOut|kind: Timeout"
-
-_MEANINGS: tuple[tuple[str, str], ...] = (
-    (
-        r"169\.254\.169\.254|computeMetadata|metadata\.google|Account must be specified|"
-        r"CredentialsNotLoaded|no providers in chain|no credentials found in chain",
-        f"there are no credentials. Set {_CREDENTIALS}.",
-    ),
-    (
-        r"NoSuchBucket|ContainerNotFound|[Tt]he specified bucket does not exist",
-        "there is no such bucket. Make it, or choose another data root.",
-    ),
-    (
-        r"InvalidAccessKeyId|SignatureDoesNotMatch|ExpiredToken|InvalidToken|InvalidSecurity|"
-        r"AuthenticationFailed|RequestTimeTooSkewed|InvalidClientTokenId|401 Unauthorized",
-        f"the store refuses the credentials. Check {_CREDENTIALS}, and the clock.",
-    ),
-    (
-        r"AccessDenied|AuthorizationFailure|AuthorizationPermissionMismatch|403 Forbidden",
-        "the credentials do not permit this. Reading needs the right to get and list objects, "
-        "writing to put them, and compact and forget to delete them.",
-    ),
-    (
-        r"scheme is not allowed|BadScheme",
-        "the endpoint is http, not https. Where that is meant: export AWS_ALLOW_HTTP=true",
-    ),
-    (
-        r"501 Not Implemented|NotImplemented",
-        "the store does not know conditional writes (If-None-Match), without which several "
-        "writers are not safe. Use a store that does.",
-    ),
-    (
-        r"(?:429|50[0-9]) [A-Z]|SlowDown|InternalError",
-        "the store answers with errors, after several attempts. Run the same command again.",
-    ),
-    (
-        r"InvalidPath",
-        "the name of an object there is no path: a part of it is empty, `.` or `..`. Rename it.",
-    ),
-    (
-        _TIMEOUT,
-        "the store does not answer in time, after several attempts. Check the network, and run "
-        "the same command again.",
-    ),
-    (
-        r"dns error|error sending request|[Cc]onnection|connect error|HTTP error",
-        "the store cannot be reached. Check the network and the endpoint (AWS_ENDPOINT_URL).",
-    ),
-    (r"NoSuchKey|BlobNotFound|404 Not Found|not found", "there is no such object."),
-)
-
-_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-
-
-def known_meaning(error: BaseException) -> str | None:
-    """Return what a failure of an object store means, in one line; None if it is not known."""
-    text = str(error)
-    return next((meaning for pattern, meaning in _MEANINGS if re.search(pattern, text)), None)
-
-
-def is_timeout(error: BaseException) -> bool:
-    """Whether a request was given up because an answer did not come in time."""
-    return re.search(_TIMEOUT, str(error)) is not None
-
-
-def meaning_of(error: BaseException) -> str:
-    """Return what a failure of an object store means, in one line."""
-    unknown = f"the store cannot be used ({type(error).__name__}). Run the same command again."
-    return known_meaning(error) or unknown
-
-
-class NoSuchObjectError(StorageError):
-    """An object is not there, or is gone."""
-
-
-@contextlib.contextmanager
-def object_errors(where: str) -> Iterator[None]:
-    """Turn the failures of an object store into `StorageError`."""
-    from obstore.exceptions import BaseError  # noqa: PLC0415 - the library is optional
-
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise NoSuchObjectError(f"{where}: {meaning_of(error)}") from None
-    except (BaseError, OSError, ValueError) as error:
-        raise StorageError(f"{where}: {meaning_of(error)}") from None
-
-
-@contextlib.contextmanager
-def storage_errors(path: object) -> Iterator[None]:
-    """Turn failures of files, object stores and Delta into `StorageError`; `path` says where."""
-    try:
-        yield
-    except OSError as error:
-        reason = meaning_of(error) if "://" in str(path) else _reason(error)
-        raise StorageError(f"{path}: {reason}") from None
-    except DeltaError as error:
-        known = known_meaning(error) if "://" in str(path) else None
-        reason = known or f"the Delta log cannot be used: {first_line(error)}"
-        raise StorageError(f"{path}: {reason}") from None
-    except pa.ArrowException as error:
-        raise StorageError(f"{path}: not readable as Parquet: {first_line(error)}") from None
-
-
-def _reason(error: OSError) -> str:
-    advice = {
-        errno.ENOSPC: "the disk is full. Free some space and run the same command again.",
-        errno.EDQUOT: "the disk quota is used up. Free some space and run the command again.",
-        errno.EACCES: "permission denied. Check the owner of the data root, or choose another.",
-        errno.EPERM: "not permitted. Check the owner of the data root, or choose another.",
-        errno.EROFS: "the file system is read-only. Choose a writable data root.",
-        errno.ENOTDIR: "a part of the path is a file, not a folder. Choose another data root.",
-        errno.EMFILE: "this process may have no more files open. Raise the limit: ulimit -n 1024",
-        errno.EEXIST: "a file, or a link to nothing, is where a folder must be. Choose another "
-        "data root.",
-        errno.ELOOP: "the path is a loop of links. Choose another data root.",
-        errno.ENAMETOOLONG: "the path is too long. Choose another data root.",
-        errno.EIO: "the disk cannot be read or written (I/O error). Have it examined, then restore "
-        "what is damaged from a backup: fleet-slip verify",
-    }
-    # The Delta library tells the number in its text only.
-    stated = re.search(r"\(os error (\d+)\)", str(error))
-    number = error.errno or (int(stated[1]) if stated else 0)
-    return advice.get(number, _on_one_line(error))
-
-
-def first_line(error: BaseException) -> str:
-    """Return the first line of an error's message."""
-    return str(error).strip().partition("\n")[0]
-
-
-def _on_one_line(error: BaseException) -> str:
-    text = _COLOUR.sub("", str(error)).replace("\N{DOWNWARDS ARROW WITH TIP RIGHTWARDS}", ":")
-    return " ".join(text.split()).replace(" : ", ": ")
 
 
 # Checksums in the names of data files, and whether a file is still what its name says.

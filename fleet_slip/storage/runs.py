@@ -29,15 +29,15 @@ from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, date, datetime, timedelta
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import duckdb
-import pyarrow as pa
-
-from fleet_slip.config import read_sql
 from fleet_slip.errors import HIDDEN, StorageError, hide_passwords
+from fleet_slip.resources import read_sql
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder, StoredFile
+
+if TYPE_CHECKING:
+    import duckdb
 
 PROC = Path("/proc")
 START = 19
@@ -398,11 +398,13 @@ RUNNING = "running"
 KILLED = "killed"
 
 
-def add_runs(database: duckdb.DuckDBPyConnection, root: Folder, since: str = "") -> None:
+def add_runs(database: "duckdb.DuckDBPyConnection", root: Folder, since: str = "") -> None:
     """Make the table `runs` of a connection, since a month YYYY-MM; `warehouse/runs.sql` says how.
 
     Raises `StorageError` for a changed line.
     """
+    import pyarrow as pa  # noqa: PLC0415 - help and version wait for no table
+
     found = []
     for path, content in _read_history(root, since):
         lines, changed = read_lines(content)

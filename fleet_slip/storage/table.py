@@ -29,7 +29,8 @@ from fleet_slip.storage.commits import (
     read_landed_units,
 )
 from fleet_slip.storage.encoding import Encoded, Encoding, Names, read_names
-from fleet_slip.storage.folder import Folder, checksum_in, first_line, storage_errors
+from fleet_slip.storage.folder import Folder, checksum_in
+from fleet_slip.storage.storage_errors import first_line, storage_errors
 
 _DATA_FILE = re.compile(r"[\w.=-][\w.=/-]*\.parquet", re.ASCII)
 """Path of a data file below its table: relative, and without characters that could be a pattern."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import ConfigError
 from fleet_slip.vehicle import batch_kernel
 from fleet_slip.vehicle.batch_kernel import (

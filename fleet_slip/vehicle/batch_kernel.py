@@ -13,7 +13,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from fleet_slip.base import FloatArray, IntArray, needed
+from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.base import needed
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.vehicle.driver import (
     SAMPLE_S,

@@ -14,7 +14,8 @@ import numpy as np
 from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
-from fleet_slip.base import FloatArray, needed
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import needed
 from fleet_slip.compiling import equation
 from fleet_slip.vehicle.dynamics import NO_EXTENSIONS, Extensions, build_derivative
 from fleet_slip.vehicle.integration import (

@@ -8,8 +8,9 @@ from typing import NamedTuple, Self
 from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
 from fleet_slip.catalogue.signals import Identifier
-from fleet_slip.config import Config, ConfigT, find_config, load_config
+from fleet_slip.config import Config, ConfigT, load_config
 from fleet_slip.errors import ConfigError
+from fleet_slip.resources import find_config
 
 GRAVITY_MPS2 = 9.80665
 STIFFEST_TYRE = 30.0

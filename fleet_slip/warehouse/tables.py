@@ -14,8 +14,9 @@ from fleet_slip.catalogue.course import COURSE_LATE
 from fleet_slip.catalogue.facts import ALL_DRIVES
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue, catalogue
 from fleet_slip.columns.sql import with_absent
-from fleet_slip.config import Config, folder, load_toml, read_sql
+from fleet_slip.config import Config, load_toml
 from fleet_slip.errors import ConflictError, StorageError
+from fleet_slip.resources import folder, read_sql
 from fleet_slip.storage.encoding import Encoding
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.table import SCALE, Snapshot, Table, absent_columns

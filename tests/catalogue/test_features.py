@@ -18,7 +18,6 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.columns.sql import with_columns
-from fleet_slip.config import folder
 from fleet_slip.errors import ConfigError, DataError, QuestionError
 from fleet_slip.grams import compute as aggregation
 from fleet_slip.grams import compute as gram_statement
@@ -26,6 +25,7 @@ from fleet_slip.grams import job
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.resources import folder
 from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts

@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.definitions import WEIGHT, Definition, Gate
 from fleet_slip.catalogue.features import features, load_features_over
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.columns.sql import with_columns
-from fleet_slip.config import folder
 from fleet_slip.errors import ConfigError
 from fleet_slip.models.request import load_model_list
+from fleet_slip.resources import folder
 
 BY = Definition(of="ay")
 SHIPPED = folder("configs") / "features.toml"

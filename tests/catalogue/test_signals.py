@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import Signal, catalogue, load_catalogue
-from fleet_slip.config import folder
 from fleet_slip.errors import ConfigError, QuestionError
+from fleet_slip.resources import folder
 
 SHIPPED = (folder("configs") / "signals.toml").read_text()
 

@@ -284,7 +284,7 @@ def test_a_long_condition_is_not_printed_whole_unless_all_is(
 def test_a_changed_campaign_is_refused_and_changes_nothing(
     run_command: RunCommand, tmp_path: Path
 ) -> None:
-    from fleet_slip.config import find_config  # noqa: PLC0415
+    from fleet_slip.resources import find_config  # noqa: PLC0415
 
     text = find_config("campaigns", "smoke").read_text()
     (tmp_path / "mine.toml").write_text(text)

@@ -14,7 +14,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.cli import app as program
-from fleet_slip.cli.output import progress, progress_of_steps
+from fleet_slip.cli.progress import progress, progress_of_steps
 from fleet_slip.storage.runs import LOGGER
 from tests.support.commands import PATIENCE_S, run
 

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 import fleet_slip
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.cli.app import app
-from fleet_slip.config import find_config
 from fleet_slip.errors import FleetSlipError
+from fleet_slip.resources import find_config
 from tests.support.commands import Finished, RunCommand, done_on
 from tests.support.once import made_once
 

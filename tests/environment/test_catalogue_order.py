@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.config import folder
+from fleet_slip.resources import folder
 from tests.support.commands import RunCommand
 
 

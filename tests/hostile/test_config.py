@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.config import find_config, load_toml
+from fleet_slip.config import load_toml
 from fleet_slip.errors import ConfigError, FleetSlipError, StorageError
+from fleet_slip.resources import find_config
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.storage.data_root import data_root
 from tests.support.commands import RunCommand

@@ -7,18 +7,12 @@ from typing import Any
 
 import pytest
 
-from fleet_slip.config import (
-    CONFIG_VARIABLE,
-    LONGEST_FILE_BYTES,
-    config_file,
-    find_config,
-    load_config,
-    read_named_file,
-)
+from fleet_slip.config import LONGEST_FILE_BYTES, load_config, read_named_file
 from fleet_slip.errors import ConfigError, FleetSlipError, InputError
 from fleet_slip.ingest.formats.can import CanBus, parse_database, read_can_database
 from fleet_slip.ingest.mapping import read_vehicle_facts
 from fleet_slip.models.acceptance import Floor
+from fleet_slip.resources import CONFIG_VARIABLE, config_file, find_config
 from tests.support.commands import RunCommand
 from tests.support.waiting import within
 

@@ -8,13 +8,13 @@ import pytest
 
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE, catalogue
-from fleet_slip.config import CONFIG_VARIABLE, folder
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.compute import by_sql
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.migration import migrate
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import verify
+from fleet_slip.resources import CONFIG_VARIABLE, folder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import a_mapping, csv_text, ingest_file, physical, read_columns, ticks

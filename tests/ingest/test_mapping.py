@@ -3,9 +3,9 @@ from typing import Any
 
 import pytest
 
-from fleet_slip.config import config_names
 from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.resources import config_names
 
 GOOD = """
 name = "car"

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.ingest.resampling import average, build_resampler, choose_method, interpolate, snap
 
 steps = st.lists(st.floats(0.0005, 0.09), min_size=3, max_size=60)

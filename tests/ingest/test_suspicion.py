@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import fleet_slip
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.cli.app import app
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.ingest import suspicion as relations

@@ -14,7 +14,7 @@ import polars as pl
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import log_rows, raw_columns, stream
 from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, ClockSource

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.config import config_file
 from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest.mapping import Mapping, load_mapping
+from fleet_slip.resources import config_file
 from tests.support.measured import read_columns
 
 MAPPING = """

@@ -9,13 +9,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from fleet_slip.config import find_config
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.publish import Publication, manifest_of, publish
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
+from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_campaign
 from fleet_slip.storage.local import LocalFolder

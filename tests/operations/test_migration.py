@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE, catalogue
-from fleet_slip.config import folder
 from fleet_slip.errors import ConflictError, RefusedError
 from fleet_slip.grams.check import check_grams
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.migration import migrate, rescale_counts
+from fleet_slip.resources import folder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Table, compare_schemas
 from fleet_slip.views import connect

@@ -12,13 +12,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.config import find_config
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.find_drives import vacuum
 from fleet_slip.operations.repair import repair
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import verify
+from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_campaign
 from fleet_slip.storage.documents import DocumentFolder

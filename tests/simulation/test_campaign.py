@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.config import config_names, find_config
 from fleet_slip.errors import ConfigError
+from fleet_slip.resources import config_names, find_config
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.plan import GridPlan
 from fleet_slip.simulation.roads import random_generator

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
 from fleet_slip.simulation.sensors import Delay, Distortion, LowPass, Pulses, Wander
 from fleet_slip.vehicle.batch_kernel import CHANNELS, IMPERFECT_CHANNELS

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from fleet_slip.config import find_config
 from fleet_slip.errors import ConfigError
+from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.imperfections import NONE, ImperfectionRanges, Range, RoadImperfections
 from fleet_slip.simulation.job import simulate_logs

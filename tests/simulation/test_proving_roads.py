@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.config import find_config
 from fleet_slip.errors import ConfigError
 from fleet_slip.evaluation.blind import blind_scenarios
+from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
 from fleet_slip.simulation.imperfections import Imperfections, RoadImperfections
 from fleet_slip.simulation.job import simulate_logs

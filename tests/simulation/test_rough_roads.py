@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet_slip.config import config_file, load_toml
+from fleet_slip.config import load_toml
 from fleet_slip.evaluation.blind import BlindSet
+from fleet_slip.resources import config_file
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.imperfections import Imperfections
 from fleet_slip.simulation.job import simulate_logs

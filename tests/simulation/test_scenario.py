@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_slip.config import config_names
 from fleet_slip.errors import ConfigError
+from fleet_slip.resources import config_names
 from fleet_slip.simulation.campaign import DriveSpec
 from fleet_slip.simulation.scenario import ScenarioDrive, load_scenario, shipped_scenarios
 

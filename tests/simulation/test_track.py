@@ -8,8 +8,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import fresnel
 
-from fleet_slip.config import config_names
 from fleet_slip.errors import ConfigError
+from fleet_slip.resources import config_names
 from fleet_slip.simulation.roads import Segment, Track, load_track
 from tests.support.evidence import EVIDENCE
 

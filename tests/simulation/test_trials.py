@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_slip.config import find_config
 from fleet_slip.errors import ConfigError
+from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
 from fleet_slip.simulation.job import lane_drive
 from fleet_slip.simulation.plan import TrialPlan

@@ -4,7 +4,7 @@ import pytest
 from obstore.exceptions import GenericError, NotFoundError
 
 from fleet_slip.errors import StorageError
-from fleet_slip.storage.folder import known_meaning, meaning_of, object_errors
+from fleet_slip.storage.storage_errors import known_meaning, meaning_of, object_errors
 
 SECRET = "AKIDSECRETOFSOMEBODY"  # noqa: S105 - made up
 

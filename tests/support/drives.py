@@ -5,7 +5,7 @@ from datetime import date
 
 import numpy as np
 
-from fleet_slip.base import BoolArray, FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation.single_track import STEP_S, DriveSignals, LabelledDrive, loaded_axles
 from fleet_slip.simulation.campaign import Batch, load_campaign

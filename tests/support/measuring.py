@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import Signal
 from fleet_slip.simulation.sensors import EXACT, Measurement, Recorder, Sensors, noisy_counts
 

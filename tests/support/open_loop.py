@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.vehicle.driver import SAMPLE_S, SPEED_GAIN_1PS
 from fleet_slip.vehicle.imperfections import (
     Around,

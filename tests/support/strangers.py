@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from asammdf import MDF, Signal
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import SignalColumn, conversion_factor

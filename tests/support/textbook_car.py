@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.ingest.suspicion import RADIUS_M, TRACK_M
 
 Car = dict[str, FloatArray]

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.config import config_names, find_config
 from fleet_slip.errors import ConfigError
+from fleet_slip.resources import config_names, find_config
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, constants, load_vehicle
 from tests.support.rolling import CAR, SEDAN
 

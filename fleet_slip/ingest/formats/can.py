@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from fleet_slip.base import FloatArray, IntArray, shown
+from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.base import shown
 from fleet_slip.config import Config, Name, read_named_file
 from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest.formats.source import Spool, reading_with

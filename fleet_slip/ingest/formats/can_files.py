@@ -22,7 +22,8 @@ import polars as pl
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from fleet_slip.base import BoolArray, IntArray, shown
+from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.base import shown
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.can import (
     MOST_BYTES,

@@ -15,7 +15,8 @@ import polars as pl
 import pyarrow as pa
 from pydantic import Field, field_validator, model_validator
 
-from fleet_slip.base import is_finite, shown
+from fleet_slip.arrays import is_finite
+from fleet_slip.base import shown
 from fleet_slip.compute.tasks import map_ahead
 from fleet_slip.config import Config, added
 from fleet_slip.errors import InputError

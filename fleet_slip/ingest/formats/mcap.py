@@ -20,7 +20,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from fleet_slip.base import FloatArray, IntArray, shown
+from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.base import shown
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.source import (
     OWN_TIME,

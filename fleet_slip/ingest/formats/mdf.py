@@ -13,7 +13,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from fleet_slip.base import FloatArray, shown
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import shown
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.can import Bytes, CanBus, FrameBlock, parse_database
 from fleet_slip.ingest.formats.can_files import CanSource

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError, RefusedError
 from fleet_slip.evaluation import drives as evaluated_drives
 from fleet_slip.evaluation import kalman

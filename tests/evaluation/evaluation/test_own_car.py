@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.evaluation import ekf, filters, own_car
 from fleet_slip.evaluation.identify import Fitted, Identified, Tuned

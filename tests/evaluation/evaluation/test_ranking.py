@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rich.text import Text
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.accuracy import print_ranking
 from fleet_slip.evaluation.drives import EvaluatedDrive, visible_signals

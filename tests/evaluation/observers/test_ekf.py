@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation import ekf
 from fleet_slip.evaluation.belief import Belief, belief_of, condition
 from fleet_slip.evaluation.ekf import EkfNoise, axles_of, chassis, variances

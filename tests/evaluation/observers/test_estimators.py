@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.rivals.observers import ObserverPoles, SlidingGains, luenberger, sliding_mode
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, kalman
 from fleet_slip.evaluation.single_track import LabelledDrive

@@ -17,7 +17,7 @@ from benchmarks.rivals.observers import (
     sliding_mode,
     state_space,
 )
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.single_track import STEP_S, DriveSignals
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import axle_stiffness_n, rolling_drive, steady_sideslip_rad

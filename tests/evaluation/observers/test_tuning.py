@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, kalman

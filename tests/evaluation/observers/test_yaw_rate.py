@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet_slip.base import FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation import belief
 from fleet_slip.evaluation.belief import YawRateNoise
 from fleet_slip.evaluation.single_track import STEP_S, DriveSignals, undriven_axle

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 from jinja2 import meta
 
-from fleet_slip.config import config_names
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.charts import draw_pictures
 from fleet_slip.evaluation.claims import (
@@ -33,6 +32,7 @@ from fleet_slip.models.request import CandidateModel
 from fleet_slip.models.select import validate
 from fleet_slip.pages.drawing import png_file, svg_file
 from fleet_slip.pages.page import degrees, number
+from fleet_slip.resources import config_names
 from fleet_slip.storage.documents import Document
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
-from fleet_slip.config import read_sql
 from fleet_slip.grams.cohort import load_cohort, sum_cohort
 from fleet_slip.grams.folding import EACH, Folding
 from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.resources import read_sql
 from tests.support.measured import csv_text
 
 BEGAN = datetime(2024, 5, 31, 8, tzinfo=UTC)

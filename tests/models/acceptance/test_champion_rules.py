@@ -11,7 +11,6 @@ import pytest
 import fleet_slip
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.config import CONFIG_VARIABLE
 from fleet_slip.errors import ConfigError, RefusedError, StorageError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models import acceptance as champion_rules
@@ -25,6 +24,7 @@ from fleet_slip.operations.forget import forget, models_trained_on
 from fleet_slip.regression.folds import cross_validate, held_out_errors, least_squares
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import stepwise_order
+from fleet_slip.resources import CONFIG_VARIABLE
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse

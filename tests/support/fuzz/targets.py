@@ -22,7 +22,6 @@ import pyarrow as pa
 
 from fleet_slip.catalogue.features import load_features
 from fleet_slip.catalogue.signals import catalogue, load_catalogue
-from fleet_slip.config import find_config, folder
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import FoldKey
@@ -34,6 +33,7 @@ from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.score import score
 from fleet_slip.models.select import answer_request
 from fleet_slip.operations.retention import load_retention
+from fleet_slip.resources import find_config, folder
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario

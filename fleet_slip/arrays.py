@@ -1,0 +1,31 @@
+"""Types of numpy arrays, by what they hold."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+FloatArray = NDArray[np.float64]
+
+IntArray = NDArray[np.int64]
+
+BoolArray = NDArray[np.bool_]
+
+ObjectArray = NDArray[np.object_]
+"""Python objects, such as integers that never overflow."""
+
+
+def is_finite(values: FloatArray) -> bool:
+    """Whether neither NaN nor infinity is among values, nor their sum, by which it is told."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.isfinite(values.sum()))
+
+
+def float_column(rows: "pa.Table", name: str) -> FloatArray:
+    """Return a column of rows in float64, NaN where null."""
+    values: FloatArray = rows[name].to_numpy().astype(np.float64)
+    return values
