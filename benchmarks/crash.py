@@ -39,7 +39,7 @@ from benchmarks.crash_commands import COMMANDS, Command, prepare_inputs
 from benchmarks.forking import forked
 from fleet_slip.cli.main import main as fleet_slip_main
 from fleet_slip.errors import PendingError
-from fleet_slip.grams.job import BEING_WRITTEN_HOURS
+from fleet_slip.grams.backlog import BEING_WRITTEN_HOURS
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.verify import verify

@@ -17,7 +17,7 @@ from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.models.registry import ModelVersion, Registry
-from fleet_slip.operations.forget import marked_models
+from fleet_slip.operations.marked_models import marked_models
 from fleet_slip.operations.verify import verify
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import fit

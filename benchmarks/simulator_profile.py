@@ -28,7 +28,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.job import lane_drive, simulate_logs, tabulate
 from fleet_slip.simulation.sensors import Recorder
-from fleet_slip.storage.folder import checksum_of
+from fleet_slip.storage.checksums import checksum_of
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
 from fleet_slip.vehicle import batch_kernel

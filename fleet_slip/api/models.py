@@ -42,7 +42,7 @@ class PublishedModels(Rooted):
         `trained_on_forgotten`: whether drives were forgotten since. Raises `QuestionError`,
         `StorageError`.
         """
-        from fleet_slip.operations.forget import marked_models
+        from fleet_slip.operations.marked_models import marked_models
 
         self.warehouse.require()
         registry = self.registry()

@@ -9,14 +9,14 @@ import duckdb
 import pyarrow as pa
 
 from fleet_slip.errors import QueryGoesOnError, QuestionError, RefusedError
-from fleet_slip.grams.job import GramReport
-from fleet_slip.models.publish import Publication
-from fleet_slip.models.select import RequestedSelection
 from fleet_slip.views import add_calibration
 from fleet_slip.warehouse.database import database_errors, interruptible, one_query, reading_files
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
+    from fleet_slip.grams.job import GramReport
+    from fleet_slip.models.publish import Publication
+    from fleet_slip.models.select import RequestedSelection
     from fleet_slip.simulation.job import SimulationReport
 
 Result = TypeVar("Result")
@@ -93,10 +93,10 @@ class RunReport:
 
     campaign: str
     simulation: "SimulationReport"
-    gram: GramReport
-    gram_features: GramReport | None
-    selection: RequestedSelection | None
-    publication: Publication | None
+    gram: "GramReport"
+    gram_features: "GramReport | None"
+    selection: "RequestedSelection | None"
+    publication: "Publication | None"
     refusal: str
     seconds: float
 
@@ -134,7 +134,7 @@ class Training:
     def made_already(self, fleet: "Fleet") -> "Publication | None":
         """Return the champion if a selection would come to it again, whatever it looks at."""
         from fleet_slip.models.publish import Publication, is_up_to_date
-        from fleet_slip.operations.forget import marked_models
+        from fleet_slip.operations.marked_models import marked_models
 
         champion = fleet.registry().champion(self.name)
         if champion is None or champion.reference in marked_models(fleet.root):
@@ -156,7 +156,7 @@ class Training:
 
         With `replace_marked`, what was trained on forgotten drives is replaced even by a worse one.
         """
-        from fleet_slip.operations.forget import marked_models
+        from fleet_slip.operations.marked_models import marked_models
 
         champion = fleet.registry().champion(self.name)
         force = (

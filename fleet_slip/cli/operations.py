@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from statistics import median, pstdev
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -30,9 +30,11 @@ from fleet_slip.cli.selection import say_without_log
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.grams.calibration import SURE_ERRORS, Calibration, ChangedNumber
 from fleet_slip.grams.car_evidence import FEWEST_CARS, CalibratedNumber, Roads
-from fleet_slip.operations.monitor import Chart
-from fleet_slip.operations.quality import QualityReport
 from fleet_slip.operations.status import WarehouseStatus
+
+if TYPE_CHECKING:
+    from fleet_slip.operations.monitor import Chart
+    from fleet_slip.operations.quality import QualityReport
 
 
 def status(
@@ -293,7 +295,7 @@ def monitor(
         raise AlarmError(f"the error of {chart.model} is beyond its limits on {days}")
 
 
-def _print_chart(chart: Chart) -> None:
+def _print_chart(chart: "Chart") -> None:
     mean, std = chart.mean_limits, chart.std_limits
     print_table(
         f"{chart.model}, drives where {chart.cohort}; limits from the training days: "
@@ -397,7 +399,7 @@ def quality(
         )
 
 
-def _print_quality(found: QualityReport) -> None:
+def _print_quality(found: "QualityReport") -> None:
     examined = (
         f"{number_of(found.drives, 'drive')} examined, {found.compared:,} of them beside their "
         f"peers ({'other' if found.compared else 'too few'} drives of a car or vehicle model)"

@@ -13,10 +13,11 @@ import pyarrow.compute as pc
 from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.errors import DataError, StorageError
+from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.grams.compute import aggregate, by_sql, rows_by_drive, wide_grams
 from fleet_slip.grams.gram_files import is_of_received
 from fleet_slip.grams.gram_rows import is_received
-from fleet_slip.grams.job import find_backlog, unit_name
+from fleet_slip.grams.job import unit_name
 from fleet_slip.grams.receiver_delay import recorded_cars
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.table import TableFile, on_newest

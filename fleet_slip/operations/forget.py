@@ -7,21 +7,17 @@ that have not seen it conflict. Then Gram rows are fenced, against those that ha
 logs. What such jobs have written is deleted by them or here.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from typing import Literal, TypeAlias
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.base import Progress, no_progress
-from fleet_slip.errors import FleetSlipError, QuestionError
-from fleet_slip.grams.gram_rows import Hashes, hash_numbers
+from fleet_slip.errors import QuestionError
 from fleet_slip.grams.job import reconcile
-from fleet_slip.models.manifest import TrainedOn, hash_drives
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import (
     Located,
@@ -33,6 +29,7 @@ from fleet_slip.operations.find_drives import (
     read_old_files,
     remove_old_files,
 )
+from fleet_slip.operations.marked_models import models_trained_on
 from fleet_slip.operations.rewriting import (
     Rewriting,
     drop_unused_names,
@@ -40,11 +37,9 @@ from fleet_slip.operations.rewriting import (
     rewrite,
     write_without,
 )
-from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import runs_under_way
 from fleet_slip.storage.table import Change, retry_conflicts, rows_in
 from fleet_slip.views import connect
-from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -53,135 +48,6 @@ from fleet_slip.warehouse.tables import Warehouse
 # Who forgets judges the versions there are. One published meanwhile, of older Gram rows, counts as
 # trained on them until the erasure is done; then if one of its own drives
 # (`models/trained_drives.py`), or an unknown one, has no Gram rows any more.
-
-
-def marked_models(root: Folder) -> frozenset[str]:
-    """Return the model versions, NAME@VERSION, that were or may have been trained on them."""
-    entries = Audit(root).entries()
-    found = {name for entry in entries for name in entry.get("models", ())}
-    judged: dict[str, dict[str, int]] = {}
-    without: dict[str, int | None] = {}
-    for entry in entries:
-        if entry["event"] == "begun" and "judged" in entry:
-            judged[entry["subject"]] = entry["judged"]
-            without[entry["subject"]] = None
-        elif entry["event"] == "done":
-            without[entry["subject"]] = entry.get("grams_version")
-    warehouse = Warehouse(root)
-    registry = Registry.of(warehouse)
-    versions = [(n, number) for n in registry.names() if judged for number in registry.versions(n)]
-    hashes = cache(lambda: _hashes_of_present(warehouse))
-    present = cache(lambda name: hash_drives(name, hashes()))
-    for subject, numbers in judged.items():
-        found |= {
-            f"{name}@{number}"
-            for name, number in versions
-            if number > numbers.get(name, 0)
-            and _may_have_seen(registry, name, number, without[subject], present)
-        }
-    return frozenset(found)
-
-
-def _hashes_of_present(warehouse: Warehouse) -> Hashes:
-    grams = warehouse.grams.snapshot()
-    drives = (grams.table.read(file.path, ["drive_id"])["drive_id"] for file in grams.files)
-    found = [hash_numbers(some.unique()) for some in drives]
-    return np.unique(np.concatenate(found)) if found else np.array([], dtype=np.uint64)
-
-
-def _may_have_seen(
-    registry: Registry,
-    name: str,
-    number: int,
-    without: int | None,
-    present: Callable[[str], Hashes],
-) -> bool:
-    """Whether a version was, or may have been, trained on drives that Gram rows lack since then."""
-    if without is None:
-        return True
-    try:
-        manifest = registry.load(name, number).manifest
-        here = manifest.imported_from is None
-        if here and manifest.trained_on.grams_version >= without:
-            return False
-        made = registry.trained_drives(manifest)
-        return made is None or not bool(np.isin(made.salted, present(name)).all())
-    except FleetSlipError:
-        return True
-
-
-def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
-    """Return the model versions that were trained on one of the drives.
-
-    Each keeps which; for older ones the cohort is asked again of the Gram rows it could see. Those
-    of which it cannot be told count as trained on them.
-    """
-    registry = Registry.of(warehouse)
-    hashes = hash_numbers(pa.array(sorted(drives), pa.string()))
-    versions: dict[str, TrainedOn] = {}
-    known: list[str] = []
-    for name in registry.names():
-        for number in registry.versions(name):
-            reference = f"{name}@{number}"
-            try:
-                manifest = registry.load(name, number).manifest
-                made = registry.trained_drives(manifest)
-                if made is None:
-                    versions[reference] = manifest.trained_on
-                elif made.among(hashes).any():
-                    known.append(reference)
-            except FleetSlipError:
-                known.append(reference)
-    return sorted([*known, *_asked_again(warehouse, versions, drives)])
-
-
-def _asked_again(
-    warehouse: Warehouse, versions: Mapping[str, TrainedOn], drives: Collection[str]
-) -> list[str]:
-    """Return the versions that may be made of the drives; each Gram file is read once."""
-    cohorts = {trained.cohort for trained in versions.values()}
-    chosen = _in_cohorts(warehouse, cohorts, drives)
-
-    @cache
-    def drives_in(path: str) -> frozenset[str]:
-        ids = warehouse.grams.read(path, ["drive_id"])["drive_id"].cast(pa.string())
-        return frozenset(drives).intersection(ids.unique().to_pylist())
-
-    @cache
-    def drives_at(version: int) -> frozenset[str]:
-        try:
-            files = warehouse.grams.snapshot(version).files
-            return frozenset().union(*(drives_in(file.path) for file in files))
-        except FleetSlipError:
-            return frozenset(drives)  # that version is gone
-
-    return [
-        reference
-        for reference, trained in versions.items()
-        if (mine := chosen[trained.cohort])
-        and not mine.isdisjoint(drives_at(trained.grams_version))
-    ]
-
-
-def _in_cohorts(
-    warehouse: Warehouse, cohorts: Collection[str], drives: Collection[str]
-) -> dict[str, frozenset[str]]:
-    """Return which of some drives each cohort has; all, of a cohort that cannot be asked for."""
-    found = {}
-    with connect(warehouse.root, query="grams", scenarios=True) as database:
-        database.register(
-            "forgotten", pa.table({"drive_id": pa.array(sorted(drives), pa.string())})
-        )
-        for cohort in cohorts:
-            asked = "SELECT DISTINCT drive_id FROM grams WHERE drive_id IN (FROM forgotten) AND "
-            try:
-                condition = parse_condition(cohort)
-                with asking(database, condition):
-                    rows = database.execute(asked + condition.sql).fetchall()
-                found[cohort] = frozenset(row[0] for row in rows)
-            except FleetSlipError:
-                found[cohort] = frozenset(drives)
-    return found
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from fleet_slip.operations.verify import Verification, read_whole
 from fleet_slip.resources import config_names
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
 from fleet_slip.simulation.job import file_name, simulate_batch
+from fleet_slip.storage.checksums import checksum_in, checksum_of
 from fleet_slip.storage.commits import LATEST, LOG, check_commits
-from fleet_slip.storage.folder import checksum_in, checksum_of
 from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Change, TableFile, retry_conflicts
 from fleet_slip.warehouse.tables import Warehouse

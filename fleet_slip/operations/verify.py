@@ -20,6 +20,7 @@ from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
+from fleet_slip.grams.backlog import named_files
 from fleet_slip.grams.check import (
     DriveGrams,
     differing_drives,
@@ -29,15 +30,15 @@ from fleet_slip.grams.check import (
     stored_grams,
 )
 from fleet_slip.grams.gram_rows import by_signals, gram_table, is_received
-from fleet_slip.grams.job import named_files
 from fleet_slip.grams.on_board import CountedSet, counted_by_identity, find_impossible
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import find_temporary_files, find_unreferenced
 from fleet_slip.resources import read_sql
+from fleet_slip.storage.checksums import checksum_in, checksum_of
 from fleet_slip.storage.commits import LOG
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.encoding import Names, read_names
-from fleet_slip.storage.folder import Folder, StoredFile, checksum_in, checksum_of
+from fleet_slip.storage.folder import Folder, StoredFile
 from fleet_slip.storage.runs import find_changed_lines, find_missing_documents
 from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Snapshot, Table, TableFile, find_commit_faults, on_newest

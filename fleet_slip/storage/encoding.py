@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from fleet_slip.storage.folder import checksum_of, fast_checksum_of
+from fleet_slip.storage.checksums import checksum_of, fast_checksum_of
 
 DAY = "day"
 """The one column of which the Delta log tells the least and the largest value."""

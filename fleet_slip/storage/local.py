@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Self
 import pyarrow as pa
 
 from fleet_slip.errors import StorageError
-from fleet_slip.storage.folder import TEMPORARY_PREFIX, Content, StoredFile, check_local_files
+from fleet_slip.storage.checksums import check_local_files
+from fleet_slip.storage.folder import TEMPORARY_PREFIX, Content, StoredFile
 from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:

@@ -29,7 +29,8 @@ from obstore.store import from_url
 
 from fleet_slip.base import needed
 from fleet_slip.errors import StorageError
-from fleet_slip.storage.folder import Content, StoredFile, checksum_in, require_content
+from fleet_slip.storage.checksums import checksum_in, require_content
+from fleet_slip.storage.folder import Content, StoredFile
 from fleet_slip.storage.storage_errors import is_timeout, object_errors
 
 if TYPE_CHECKING:

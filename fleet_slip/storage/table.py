@@ -20,6 +20,7 @@ from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundErr
 from deltalake.transaction import AddAction, RemoveAction
 
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
+from fleet_slip.storage.checksums import checksum_in
 from fleet_slip.storage.commits import (
     LATEST,
     LOG,
@@ -29,7 +30,7 @@ from fleet_slip.storage.commits import (
     read_landed_units,
 )
 from fleet_slip.storage.encoding import Encoded, Encoding, Names, read_names
-from fleet_slip.storage.folder import Folder, checksum_in
+from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.storage_errors import first_line, storage_errors
 
 _DATA_FILE = re.compile(r"[\w.=-][\w.=/-]*\.parquet", re.ASCII)

@@ -21,7 +21,8 @@ from fleet_slip.errors import (
     printable,
 )
 from fleet_slip.limits import data_needed, memory_bytes
-from fleet_slip.storage.folder import Folder, check_local_files
+from fleet_slip.storage.checksums import check_local_files
+from fleet_slip.storage.folder import Folder
 
 SPILL_LIMIT = "20GB"
 """Largest size of what one connection may write to disk for a query beyond its memory."""

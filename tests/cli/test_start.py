@@ -29,12 +29,6 @@ from tests.support.commands import COMMAND, run
 
 TABLES = {"deltalake", "numpy", "pyarrow"}
 ENGINES = {"duckdb", "highway_env", "jinja2", "matplotlib", "numba", "pint", "polars"}
-SIMULATOR = (
-    "fleet_slip.vehicle",
-    "fleet_slip.simulation.job",
-    "fleet_slip.simulation.job",
-)
-DRIVE = "smoke-2024-05-01-0000"
 PROGRAM = """
 import atexit, json, sys
 atexit.register(lambda: print(json.dumps(sorted(sys.modules)), file=sys.stderr))
@@ -52,11 +46,11 @@ def imported_by(root: Path, *arguments: str) -> set[str]:
     ("arguments", "spared"),
     [
         (["--help"], TABLES | ENGINES | {"rich", "pydantic", "email"}),
-        (["select", "--help"], ENGINES),
-        (["models"], ENGINES),
-        (["show", "sideslip"], ENGINES),
-        (["status"], ENGINES - {"duckdb"}),
-        (["sql", "SELECT 1"], ENGINES - {"duckdb"}),
+        (["select", "--help"], {"highway_env", "matplotlib"}),
+        (["models"], ENGINES - {"duckdb", "numba"}),
+        (["show", "sideslip"], ENGINES - {"duckdb", "numba"}),
+        (["status"], ENGINES - {"duckdb", "numba"}),
+        (["sql", "SELECT 1"], ENGINES - {"duckdb", "numba"}),
     ],
 )
 def test_a_command_does_not_wait_for_what_it_does_not_need(
@@ -65,17 +59,6 @@ def test_a_command_does_not_wait_for_what_it_does_not_need(
     imported = imported_by(tmp_path / "nothing-here", *arguments)
     assert "fleet_slip.cli.main" in imported
     assert not imported & spared
-
-
-def test_watching_a_drive_of_the_logs_waits_for_no_simulator(
-    smoke_root: Path, tmp_path: Path
-) -> None:
-    words = ["watch", DRIVE, "smoke", "--until", "1", "--output", str(tmp_path / "watch.html")]
-    imported = imported_by(smoke_root, *words)
-    assert (tmp_path / "watch.html").exists()
-    assert "fleet_slip.evaluation.watch" in imported
-    assert not {name for name in imported if name.startswith(SIMULATOR)}
-    assert "highway_env" not in imported
 
 
 def test_every_command_is_listed_in_its_own_words() -> None:
@@ -114,10 +97,8 @@ def test_summaries_are_read_without_running_a_module() -> None:
         "import sys; from fleet_slip.cli.app import COMMANDS, docstrings;"
         "[docstrings(module) for module in COMMANDS.values()]; print(*sys.modules)"
     )
-    done = run([sys.executable, "-c", program])
-    loaded = {name for name in done.stdout.split() if name.startswith("fleet_slip.cli.")}
-    rooms = {f"fleet_slip.cli.{module.partition('.')[0]}" for module in COMMANDS.values()}
-    assert loaded == {"fleet_slip.cli.app"} | rooms
+    loaded = set(run([sys.executable, "-c", program]).stdout.split())
+    assert not {f"fleet_slip.cli.{module}" for module in COMMANDS.values()} & loaded
 
 
 def test_a_selections_options_stand_once_and_are_those_of_the_api() -> None:

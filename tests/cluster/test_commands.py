@@ -14,7 +14,7 @@ from fleet_slip.compute.cluster import cluster_executor
 from fleet_slip.compute.cluster_worker import Marker, environment, pickled, work
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import RefusedError, StorageError
-from fleet_slip.storage.folder import checksum_in
+from fleet_slip.storage.checksums import checksum_in
 from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import RunCommand, finish, run, start_on
 from tests.support.dask_processes import DaskProcesses, dask_processes

@@ -14,8 +14,8 @@ import fleet_slip
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import job
 from fleet_slip.ingest.load import write_batch
-from fleet_slip.ingest.log_files import parse_url
 from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.object_inputs import parse_url
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.tables import Warehouse

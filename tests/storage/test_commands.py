@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from fleet_slip.storage.checksums import checksum_in
 from fleet_slip.storage.data_root import data_root
-from fleet_slip.storage.folder import Folder, checksum_in
+from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import finish, start_on
 from tests.support.dask_processes import dask_processes

@@ -7,8 +7,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from fleet_slip.storage.checksums import CHECKSUM_DIGITS, checksum_of
 from fleet_slip.storage.encoding import ROW_GROUP_ROWS, Encoding
-from fleet_slip.storage.folder import CHECKSUM_DIGITS, checksum_of
 
 
 @pytest.mark.parametrize("nulls", [0, 1, 2, 5])

@@ -15,7 +15,7 @@ from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
 from fleet_slip.storage import folder
-from fleet_slip.storage.folder import check_local_files, checksum_in, checksum_of
+from fleet_slip.storage.checksums import check_local_files, checksum_in, checksum_of
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse

@@ -10,7 +10,8 @@ import polars as pl
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.log_files import copy_object, find_object, local_copy
+from fleet_slip.ingest.log_files import local_copy
+from fleet_slip.ingest.object_inputs import copy_object, find_object
 from fleet_slip.storage.objects import client
 from tests.ingest.test_as_one import MAPPING as PLAIN
 from tests.ingest.test_as_one import write_parts

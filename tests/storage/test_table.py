@@ -12,7 +12,8 @@ from deltalake import DeltaTable
 from deltalake.exceptions import DeltaError
 
 from fleet_slip.errors import ConflictError, StorageError
-from fleet_slip.storage.folder import TEMPORARY_PREFIX, checksum_in, checksum_of
+from fleet_slip.storage.checksums import checksum_in, checksum_of
+from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Unit, retry_conflicts
 from fleet_slip.warehouse.tables import Warehouse

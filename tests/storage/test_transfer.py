@@ -10,7 +10,7 @@ from botocore.session import Session
 
 from fleet_slip.errors import InputError, StorageError
 from fleet_slip.ingest import log_files
-from fleet_slip.ingest.log_files import copy_object, find_below, find_object
+from fleet_slip.ingest.object_inputs import copy_object, find_below, find_object
 from fleet_slip.storage import objects
 from fleet_slip.storage import objects as object_files
 from fleet_slip.storage.objects import ObjectFolder, client

@@ -20,7 +20,7 @@ from fleet_slip.regression.gram import Gram
 START_S = 1_714_557_600
 """2024-05-01, 10:00 in UTC."""
 
-PAGE = Path(__file__).parents[2] / "docs" / "edge.md"
+PAGE = Path(__file__).parents[2] / "docs" / "export.md"
 
 
 def row_of(
@@ -51,7 +51,7 @@ def write_counted(path: Path, rows: Iterable[Mapping[str, Any]] | pa.Table) -> P
 def _reading() -> dict[str, Any]:
     """What the Python of the page defines."""
     found: dict[str, Any] = {}
-    exec(re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S)[0], found)  # noqa: S102
+    exec(re.findall(r"```python\n([^`]*def row_of.*?)```", PAGE.read_text(), re.S)[0], found)  # noqa: S102
     return found
 
 

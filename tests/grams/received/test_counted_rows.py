@@ -1,5 +1,6 @@
 """Tables of Gram rows from cars land whole and once; what no drive can have is refused."""
 
+import shutil
 from datetime import date, timedelta
 from pathlib import Path
 from typing import Any
@@ -135,7 +136,7 @@ def test_a_drive_that_is_there_is_refused_under_any_name(
 
 
 def test_a_drive_with_a_log_is_refused(smoke_root: Path, tmp_path: Path) -> None:
-    fleet = fleet_slip.open(smoke_root)
+    fleet = fleet_slip.open(shutil.copytree(smoke_root, tmp_path / "data"))
     row = fleet.sql("FROM grams WHERE feature_set = 'signals' ORDER BY drive_id LIMIT 1")
     (stored,) = row.to_arrow_table().to_pylist()
     signals = tuple(stored["signals"].split(","))

@@ -1,0 +1,146 @@
+"""Which model versions were trained on drives that were forgotten since."""
+
+from collections.abc import Callable, Collection, Mapping
+from functools import cache
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.errors import FleetSlipError
+from fleet_slip.grams.gram_rows import Hashes, hash_numbers
+from fleet_slip.models.manifest import TrainedOn, hash_drives
+from fleet_slip.models.registry import Registry
+from fleet_slip.storage.folder import Folder
+from fleet_slip.views import connect
+from fleet_slip.warehouse.condition import asking, parse_condition
+from fleet_slip.warehouse.forgotten import Audit
+from fleet_slip.warehouse.tables import Warehouse
+
+
+def marked_models(root: Folder) -> frozenset[str]:
+    """Return the model versions, NAME@VERSION, that were or may have been trained on them."""
+    entries = Audit(root).entries()
+    found = {name for entry in entries for name in entry.get("models", ())}
+    judged: dict[str, dict[str, int]] = {}
+    without: dict[str, int | None] = {}
+    for entry in entries:
+        if entry["event"] == "begun" and "judged" in entry:
+            judged[entry["subject"]] = entry["judged"]
+            without[entry["subject"]] = None
+        elif entry["event"] == "done":
+            without[entry["subject"]] = entry.get("grams_version")
+    warehouse = Warehouse(root)
+    registry = Registry.of(warehouse)
+    versions = [(n, number) for n in registry.names() if judged for number in registry.versions(n)]
+    hashes = cache(lambda: _hashes_of_present(warehouse))
+    present = cache(lambda name: hash_drives(name, hashes()))
+    for subject, numbers in judged.items():
+        found |= {
+            f"{name}@{number}"
+            for name, number in versions
+            if number > numbers.get(name, 0)
+            and _may_have_seen(registry, name, number, without[subject], present)
+        }
+    return frozenset(found)
+
+
+def _hashes_of_present(warehouse: Warehouse) -> Hashes:
+    grams = warehouse.grams.snapshot()
+    drives = (grams.table.read(file.path, ["drive_id"])["drive_id"] for file in grams.files)
+    found = [hash_numbers(some.unique()) for some in drives]
+    return np.unique(np.concatenate(found)) if found else np.array([], dtype=np.uint64)
+
+
+def _may_have_seen(
+    registry: Registry,
+    name: str,
+    number: int,
+    without: int | None,
+    present: Callable[[str], Hashes],
+) -> bool:
+    """Whether a version was, or may have been, trained on drives that Gram rows lack since then."""
+    if without is None:
+        return True
+    try:
+        manifest = registry.load(name, number).manifest
+        here = manifest.imported_from is None
+        if here and manifest.trained_on.grams_version >= without:
+            return False
+        made = registry.trained_drives(manifest)
+        return made is None or not bool(np.isin(made.salted, present(name)).all())
+    except FleetSlipError:
+        return True
+
+
+def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
+    """Return the model versions that were trained on one of the drives.
+
+    Each keeps which; for older ones the cohort is asked again of the Gram rows it could see. Those
+    of which it cannot be told count as trained on them.
+    """
+    registry = Registry.of(warehouse)
+    hashes = hash_numbers(pa.array(sorted(drives), pa.string()))
+    versions: dict[str, TrainedOn] = {}
+    known: list[str] = []
+    for name in registry.names():
+        for number in registry.versions(name):
+            reference = f"{name}@{number}"
+            try:
+                manifest = registry.load(name, number).manifest
+                made = registry.trained_drives(manifest)
+                if made is None:
+                    versions[reference] = manifest.trained_on
+                elif made.among(hashes).any():
+                    known.append(reference)
+            except FleetSlipError:
+                known.append(reference)
+    return sorted([*known, *_asked_again(warehouse, versions, drives)])
+
+
+def _asked_again(
+    warehouse: Warehouse, versions: Mapping[str, TrainedOn], drives: Collection[str]
+) -> list[str]:
+    """Return the versions that may be made of the drives; each Gram file is read once."""
+    cohorts = {trained.cohort for trained in versions.values()}
+    chosen = _in_cohorts(warehouse, cohorts, drives)
+
+    @cache
+    def drives_in(path: str) -> frozenset[str]:
+        ids = warehouse.grams.read(path, ["drive_id"])["drive_id"].cast(pa.string())
+        return frozenset(drives).intersection(ids.unique().to_pylist())
+
+    @cache
+    def drives_at(version: int) -> frozenset[str]:
+        try:
+            files = warehouse.grams.snapshot(version).files
+            return frozenset().union(*(drives_in(file.path) for file in files))
+        except FleetSlipError:
+            return frozenset(drives)  # that version is gone
+
+    return [
+        reference
+        for reference, trained in versions.items()
+        if (mine := chosen[trained.cohort])
+        and not mine.isdisjoint(drives_at(trained.grams_version))
+    ]
+
+
+def _in_cohorts(
+    warehouse: Warehouse, cohorts: Collection[str], drives: Collection[str]
+) -> dict[str, frozenset[str]]:
+    """Return which of some drives each cohort has; all, of a cohort that cannot be asked for."""
+    found = {}
+    with connect(warehouse.root, query="grams", scenarios=True) as database:
+        database.register(
+            "forgotten", pa.table({"drive_id": pa.array(sorted(drives), pa.string())})
+        )
+        for cohort in cohorts:
+            asked = "SELECT DISTINCT drive_id FROM grams WHERE drive_id IN (FROM forgotten) AND "
+            try:
+                condition = parse_condition(cohort)
+                with asking(database, condition):
+                    rows = database.execute(asked + condition.sql).fetchall()
+                found[cohort] = frozenset(row[0] for row in rows)
+            except FleetSlipError:
+                found[cohort] = frozenset(drives)
+    return found

@@ -1,0 +1,102 @@
+"""Checksums in the names of data files, and whether a file is still what its name says.
+
+    NAME-x0123456789abcdef-0123456789abcdef0123456789abcdef.parquet
+
+The last is of its SHA-256, which `verify` computes; that with an x of its XXH3, so fast that every
+job looks at every byte. Earlier names have the last only, or none.
+"""
+
+import functools
+import hashlib
+import os
+import re
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import xxhash
+
+from fleet_slip.errors import StorageError
+from fleet_slip.storage.storage_errors import storage_errors
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+CHECKSUM_DIGITS = 32
+"""Hexadecimal digits of a file's SHA-256 in its name: damage passes unseen once in 2^128 times."""
+
+FAST_DIGITS = 16
+"""Hexadecimal digits of a file's XXH3: damage passes unseen once in 2^64 times."""
+
+CHUNK_BYTES = 2**20
+
+REMEMBERED_FILES = 2**17
+
+_CHECKSUM = re.compile(rf"-([0-9a-f]{{{CHECKSUM_DIGITS}}})\.parquet$")
+
+_FAST = re.compile(rf"-x([0-9a-f]{{{FAST_DIGITS}}})-[0-9a-f]{{{CHECKSUM_DIGITS}}}\.parquet$")
+
+
+class _Hash(Protocol):
+    def update(self, data: Any, /) -> None: ...
+    def hexdigest(self) -> str: ...
+
+
+def checksum_of(content: "pa.Buffer | bytes") -> str:
+    """Return the checksum of a file's bytes as it stands at the end of the file's name."""
+    return hashlib.sha256(content).hexdigest()[:CHECKSUM_DIGITS]
+
+
+def fast_checksum_of(content: "pa.Buffer | bytes") -> str:
+    """Return the fast checksum of a file's bytes as it stands in the file's name."""
+    return xxhash.xxh3_64_hexdigest(memoryview(content))
+
+
+def checksum_in(path: str) -> str | None:
+    """Return the checksum in a file's name; None for a file of a version that wrote none."""
+    found = _CHECKSUM.search(path)
+    return found[1] if found else None
+
+
+def require_content(path: str, content: "pa.Buffer | bytes", where: object) -> None:
+    """Raise `StorageError` if bytes are not those that the name of their file tells."""
+    _require(path, (content,), where)
+
+
+def check_local_files(paths: Iterable[str]) -> None:
+    """Raise `StorageError` for a file that is not what its name says; each is read once."""
+    named = [path for path in paths if checksum_in(path)]
+    if len(named) == 1:
+        _check_local(named[0])
+    elif named:
+        with ThreadPoolExecutor(os.cpu_count() or 1) as executor:
+            list(executor.map(_check_local, named))
+
+
+def _check_local(path: str) -> None:
+    with storage_errors(path):
+        status = Path(path).stat()
+    _check_once(path, status.st_size, status.st_mtime_ns, status.st_ino)
+
+
+@functools.lru_cache(maxsize=REMEMBERED_FILES)
+def _check_once(path: str, _size: int, _modified_ns: int, _inode: int) -> None:
+    with storage_errors(path), Path(path).open("rb", buffering=0) as file:
+        buffer = memoryview(bytearray(CHUNK_BYTES))
+        _require(path, iter(lambda: buffer[: file.readinto(buffer) or 0], b""), path)
+
+
+def _require(path: str, chunks: "Iterable[Any]", where: object) -> None:
+    fast = _FAST.search(path)
+    expected = fast[1] if fast else checksum_in(path)
+    if expected is None:
+        return
+    hashed: _Hash = xxhash.xxh3_64() if fast else hashlib.sha256()
+    for chunk in chunks:
+        hashed.update(chunk)
+    if hashed.hexdigest()[: len(expected)] != expected:
+        raise StorageError(
+            f"{where}: its bytes do not match the checksum in its name: it was damaged. See what "
+            "can be repaired with: fleet-slip verify --repair; or restore it from a backup."
+        )
