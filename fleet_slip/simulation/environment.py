@@ -9,10 +9,8 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple, SupportsFloat
 
-import gymnasium
 import numba
 import numpy as np
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from fleet_slip.base import needed
@@ -89,7 +87,8 @@ def move(
 
 
 with needed("highway", "an environment for controllers"):
-    pass
+    import gymnasium
+    from gymnasium.spaces import Box
 
 Observation = NDArray[np.float32]
 WHEELS = ("fl", "fr", "rl", "rr")

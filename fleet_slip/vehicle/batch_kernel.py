@@ -9,9 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.base import needed
@@ -55,7 +52,9 @@ from fleet_slip.vehicle.tyre import arctan2
 # The physics of the lane kernel: what is around all cars, and how they move on by a step.
 
 with needed("compiled", "simulating drives"):
-    pass
+    from llvmlite import ir
+    from numba import types
+    from numba.extending import intrinsic
 
 LANES = 8
 """Lanes of the kernel: one or two of a processor's vectors."""

@@ -9,10 +9,7 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import Any, NamedTuple, Self
 
-import numba
 import numpy as np
-from highway_env.vehicle.dynamics import BicycleVehicle
-from highway_env.vehicle.kinematics import Vehicle
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import needed
@@ -37,7 +34,9 @@ from fleet_slip.vehicle.parameters import (
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
 with needed("highway", "the car as a highway-env vehicle"):
-    pass
+    import numba
+    from highway_env.vehicle.dynamics import BicycleVehicle
+    from highway_env.vehicle.kinematics import Vehicle
 
 NO_SLOPES = Slopes(*(0.0 for _ in Slopes._fields))
 
