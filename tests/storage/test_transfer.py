@@ -9,7 +9,7 @@ import pytest
 from botocore.session import Session
 
 from fleet_slip.errors import InputError, StorageError
-from fleet_slip.ingest import log_files
+from fleet_slip.ingest import object_inputs
 from fleet_slip.ingest.object_inputs import copy_object, find_below, find_object
 from fleet_slip.storage import objects
 from fleet_slip.storage import objects as object_files
@@ -86,14 +86,14 @@ def test_a_flipped_bit_on_the_way_is_seen_and_fetched_again(
     assert found.identity.endswith(f"-{parts}" if parts > 1 else hashlib.md5(content).hexdigest())  # noqa: S324
     with server.misbehaving(flipping="log.csv"), pytest.raises(InputError, match="arrived 3 times"):
         copy_object(found, tmp_path / "log.csv")
-    copy_once, attempts = log_files._copy_once, list[str]()
+    copy_once, attempts = object_inputs._copy_once, list[str]()
 
     def flipped_first(*given: Any) -> str:
         with server.misbehaving(flipping="(?!)" if attempts else "log.csv"):
             attempts.append(copy_once(*given))
         return attempts[-1]
 
-    monkeypatch.setattr(log_files, "_copy_once", flipped_first)
+    monkeypatch.setattr(object_inputs, "_copy_once", flipped_first)
     copy_object(found, tmp_path / "log.csv")
     assert (tmp_path / "log.csv").read_bytes() == content
     assert len(attempts) == 2
