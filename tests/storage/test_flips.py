@@ -14,7 +14,7 @@ from fleet_slip.grams.cohort import sum_cohort
 from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
-from fleet_slip.storage import folder
+from fleet_slip.storage import checksums
 from fleet_slip.storage.checksums import check_local_files, checksum_in, checksum_of
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
@@ -122,7 +122,7 @@ def test_a_file_is_read_once_while_it_stays_the_same(
     paths = filled.logs.snapshot().paths
     assert all(checksum_in(path) for path in paths)
     check_local_files(paths)
-    monkeypatch.setattr(folder, "_require", lambda *_: pytest.fail("read again"))
+    monkeypatch.setattr(checksums, "_require", lambda *_: pytest.fail("read again"))
     check_local_files(paths)
 
 
