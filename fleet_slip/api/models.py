@@ -159,12 +159,13 @@ class PublishedModels(Rooted):
         """Point an alias at a version; return the version. Raises `UsageError`, and as `model`.
 
         `previous` points it back at the version before, and pins it there; the reference is a name
-        alone then. Raises `RefusedError` if it never had another.
+        alone then. Raises `QuestionError`, and `RefusedError` if it never had another.
         """
         registry = self.registry()
         if previous:
             if "@" in reference:
                 raise UsageError(f"{reference}: with previous, give the name of the model alone.")
+            registry.require(reference)
             return registry.load(reference, registry.rollback(reference, alias))
         require_model_name(alias)
         version = self.model(reference)

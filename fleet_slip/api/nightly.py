@@ -1,7 +1,7 @@
 """A night with real cars: what is new comes in, is examined, and trains the model again."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -273,8 +273,3 @@ class Night:
             f"{number_of(forgotten, 'drive')} before {report.before} forgotten, "
             f"{number_of(removed, 'old file')} removed."
         )
-
-
-def _left_out(drives: Iterable[int], cars: str, why: str) -> str:
-    many = sum(drives)
-    return f" {number_of(many, 'drive')} of {cars} left out: {why}." if many else ""

@@ -384,7 +384,7 @@ def _rolling(signals: DriveSignals, vehicle: VehicleParameters) -> FloatArray:
 
 NAME = "ekf_identified"
 
-IDENTIFIED_DRIVES_AT_MOST = 12
+DRIVES_OF_A_CLASS = 12
 """Of each class of cars a dozen tell as much, in half the time."""
 
 
@@ -448,7 +448,7 @@ def _identify(drives: TuningDrives, executor: Executor) -> dict[str, Identified]
     return {
         model: identify(
             Measured.of(load_vehicle(model)),
-            choose_evenly(own, IDENTIFIED_DRIVES_AT_MOST),
+            choose_evenly(own, DRIVES_OF_A_CLASS),
             executor,
         )
         for model, own in sorted(of_class.items())

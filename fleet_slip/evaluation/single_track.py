@@ -142,7 +142,7 @@ def undriven_axle(drive: DriveSignals, car: VehicleParameters) -> AxleSpeeds:
     )
 
 
-DRIVE_SIGNALS_SLOWEST_MPS = 1.0
+SLOWEST_ANGLE_MPS = 1.0
 """Longitudinal velocity below which the angle is taken as if the car drove so fast."""
 
 
@@ -153,7 +153,7 @@ def sideslip_angle(vx_mps: FloatArray, vy_mps: FloatArray) -> FloatArray:
     `SLOWEST_MPS`, and in reverse, vx is therefore replaced by `SLOWEST_MPS`: β stays continuous and
     goes to zero with vy. NaN stays NaN.
     """
-    return np.arctan2(vy_mps, np.maximum(vx_mps, DRIVE_SIGNALS_SLOWEST_MPS))
+    return np.arctan2(vy_mps, np.maximum(vx_mps, SLOWEST_ANGLE_MPS))
 
 
 SLOWEST_MPS = 5.0

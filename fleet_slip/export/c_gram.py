@@ -50,10 +50,10 @@ from fleet_slip.errors import RefusedError
 from fleet_slip.export.c import StepWriter, helper_texts, keep_lines, start_lines, state_fields
 from fleet_slip.export.program import Input, Steps
 from fleet_slip.export.templating import field_names, fill_template
-from fleet_slip.grams.on_board import COUNTED_SETS_MOST_ROWS as MOST_ROWS
 from fleet_slip.grams.on_board import (
     MOST_COLUMNS,
     MOST_SIGNALS,
+    ROWS_IN_A_SUM,
     CountedSet,
     Range,
     counted_by_identity,
@@ -215,7 +215,7 @@ def _words(prefix: str, sets: Sequence[OnBoard]) -> Mapping[str, Any]:
         "changed": changed,
         "rows": rows,
         "most_parts": MOST_PARTS,
-        "most_rows": MOST_ROWS,
+        "most_rows": ROWS_IN_A_SUM,
         "parts": sum(parts),
         "numbers": sum(numbers),
         "longest_vehicle": LONGEST_VEHICLE,

@@ -57,7 +57,7 @@ from fleet_slip.warehouse.tables import Warehouse
 
 Range = tuple[int, int]
 
-COUNTED_SETS_MOST_ROWS = 2**31 - 1
+ROWS_IN_A_SUM = 2**31 - 1
 """Rows of a drive: 248 days. No sum of so many products of int16 counts reaches 2^61."""
 
 MOST_SIGNALS = 32
@@ -228,7 +228,7 @@ def find_impossible(
 def most_rows(ranges: Sequence[tuple[int, int]]) -> int:
     """Return of how many rows a Gram row can be: no sum of their products reaches 2^61."""
     largest = max((abs(end) for one in ranges for end in one), default=1)
-    return min(COUNTED_SETS_MOST_ROWS, (LARGEST_SUM - 1) // largest**2)
+    return min(ROWS_IN_A_SUM, (LARGEST_SUM - 1) // largest**2)
 
 
 def _bad_products(

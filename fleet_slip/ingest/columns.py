@@ -25,7 +25,7 @@ from fleet_slip.config import Config, Name, PositiveFloat, added
 from fleet_slip.ingest.formats.source import OWN_TIME
 
 _TERM = r"(?:°|[^\W\d]+\d?)(?:(?:\^|\*\*)-?\d)?"
-_UNITS_UNIT = re.compile(rf"(?:1/)?{_TERM}(?:[*/ ]{_TERM})*")
+_EXPRESSION = re.compile(rf"(?:1/)?{_TERM}(?:[*/ ]{_TERM})*")
 _POWER = re.compile(r"(?<=[^\W\d_])([2-9])(?!\w)")
 _LONGEST_UNIT = 40
 
@@ -54,7 +54,7 @@ def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
     if si_unit == "1" and unit in _NUMBERS:
         return _NUMBERS[unit]
     # The pattern keeps pint from evaluating arithmetic: '9^9^9^9' would never end.
-    if len(unit) > _LONGEST_UNIT or not _UNITS_UNIT.fullmatch(unit):
+    if len(unit) > _LONGEST_UNIT or not _EXPRESSION.fullmatch(unit):
         raise ValueError(f"is in {unit[:_LONGEST_UNIT]!r}, which is not a unit; {needs}")
     registry = pint.application_registry
     name = "standard_gravity" if unit == "g" and si_unit == "m/s^2" else unit

@@ -96,7 +96,7 @@ def hotelling(
     doubles = np.concatenate(
         [c @ part.double for c, part in zip(contrasts, parts, strict=True)], axis=2
     )
-    eta = size * (size + 1) / _standard_errors_variance(np.asarray(singles), doubles)
+    eta = size * (size + 1) / _variance_of_estimate(np.asarray(singles), doubles)
     denominator = eta - size + 1
     if denominator <= 0:
         raise DataError(
@@ -127,7 +127,7 @@ def _adjust(one: ClusteredFit, at: IntArray, clusters: int) -> _Adjusted:
     return _Adjusted(moved, one.noise * scale, single, double)
 
 
-def _standard_errors_variance(single: FloatArray, double: FloatArray) -> float:
+def _variance_of_estimate(single: FloatArray, double: FloatArray) -> float:
     """Return the sum of the variances of all entries of the covariance, in units of its mean.
 
     With P_gh = [g = h] D_g - K_g K_h', sum (tr P_gh)^2 + tr(P_gh P_gh) over pairs; the second

@@ -357,14 +357,14 @@ def road_with(road: Road, script: Sequence[Manoeuvre]) -> Road:
             ahead %= road.length_m
         passed: FloatArray = ahead / (one.duration_s * planned)
         inside = (passed >= 0) & (passed < 1)
-        curvature[inside] += _manoeuvres_bend(one, passed[inside]) / planned**2
+        curvature[inside] += _bend_of(one, passed[inside]) / planned**2
         if one.kind == "braking":
             dip = min(DEEPEST_DIP, abs(one.strength_mps2) * one.duration_s / 2 / planned)
             speed[inside] *= 1.0 - dip * (1.0 - np.abs(2 * passed[inside] - 1))
     return road._replace(curvature_1pm=curvature, speed_mps=np.maximum(speed, SLOWEST_MPS))
 
 
-def _manoeuvres_bend(one: Manoeuvre, passed: FloatArray) -> FloatArray:
+def _bend_of(one: Manoeuvre, passed: FloatArray) -> FloatArray:
     """Return the further lateral acceleration at the shares of the manoeuvre that have passed."""
     if one.kind == "step":
         return one.strength_mps2 * np.where(passed < 0.5, 1.0, -1.0)

@@ -234,6 +234,7 @@ FORGED = (
         (["select", "--by", "vehicle"], 5, "at least two folds"),
         (["show", "nothing"], 5, "no model is called"),
         (["score", "smoke@9"], 5, "has no version"),
+        (["promote", "nowhere", "--previous"], 5, "no model is called"),
         (["score", "smoke", "--cohort", "mass_kg > 9000"], 5, "no row of the cohort"),
         (["ingest", "none.csv", "--mapping", "race_car_250lm"], 4, "none.csv"),
         (["ingest", "none.csv", "--mapping", "unknown"], 3, "Known: race_car_250lm"),

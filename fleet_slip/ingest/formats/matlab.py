@@ -38,7 +38,7 @@ from fleet_slip.ingest.formats.source import (
 _HEADER = 128
 _BYTE_ORDER_AT = 126
 _MATRIX, _COMPRESSED = 14, 15
-_MATLAB_ELEMENTS_NUMBERS = {
+_DTYPES = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
 }  # fmt: skip
 _CHARACTERS = {1: "u1", 2: "u1", 4: "u2", 16: "u1", 17: "u2", 18: "u4"}
@@ -194,9 +194,9 @@ class _Part:
             yield from self._text(found, path, int(sizes[0]), int(sizes[1]))
         if found is None or of_class not in _NUMERIC or is_complex:
             return
-        if found[0] not in _MATLAB_ELEMENTS_NUMBERS:
+        if found[0] not in _DTYPES:
             raise _DamagedError(f"an element of the type {found[0]}")
-        dtype = np.dtype(self._order + _MATLAB_ELEMENTS_NUMBERS[found[0]])
+        dtype = np.dtype(self._order + _DTYPES[found[0]])
         if found[2] - found[1] != int(np.prod(sizes, dtype=np.int64)) * dtype.itemsize:
             raise _DamagedError(f"{path} has not as many values as its size says")
         shape = tuple(int(size) for size in sizes if size != 1)
@@ -230,9 +230,9 @@ class _Part:
 
     def _numbers(self, found: tuple[int, int, int] | None) -> Array | None:
         """Return the few numbers of an element, None if it has others."""
-        if found is None or found[0] not in _MATLAB_ELEMENTS_NUMBERS:
+        if found is None or found[0] not in _DTYPES:
             return None
-        dtype = np.dtype(self._order + _MATLAB_ELEMENTS_NUMBERS[found[0]])
+        dtype = np.dtype(self._order + _DTYPES[found[0]])
         content = self._elements[found[1] : found[2]]
         return np.frombuffer(content[: len(content) // dtype.itemsize * dtype.itemsize], dtype)
 
