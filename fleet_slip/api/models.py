@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fleet_slip.evaluation.blind import BlindRow
     from fleet_slip.evaluation.report import Written
     from fleet_slip.export.compile import Estimator
-    from fleet_slip.export.files import Target
+    from fleet_slip.export.program import Target
     from fleet_slip.models.diff import Difference
     from fleet_slip.models.manifest import Manifest
     from fleet_slip.models.publish import DryRun, Publication

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,14 +13,14 @@ from fleet_slip.cli.app import record_run
 from fleet_slip.cli.options import OnlyModel, complete_model
 from fleet_slip.cli.output import All, Json, print_json, print_records, print_table, print_text, say
 from fleet_slip.errors import UsageError
-from fleet_slip.export.costs import costs_content, describe_costs
-from fleet_slip.export.files import Target
-from fleet_slip.models.diff import Difference, Term
+from fleet_slip.export.program import Target
 from fleet_slip.models.manifest import CrossValidated, LearnedFrom, ModelTerm
 from fleet_slip.models.registry import CHAMPION, ModelVersion
-from fleet_slip.models.score import score as score_rows
 from fleet_slip.warehouse.condition import Condition, parse_condition, row_columns
 from fleet_slip.warehouse.tables import Warehouse
+
+if TYPE_CHECKING:
+    from fleet_slip.models.diff import Difference, Term
 
 Reference = Annotated[
     str,
@@ -116,6 +116,8 @@ def show(
     """
     version: ModelVersion = context.obj.model(model)
     if json:
+        from fleet_slip.export.costs import costs_content  # noqa: PLC0415 - compiled code
+
         content = version.manifest.model_dump(mode="json")
         facts = {
             "version": version.version,
@@ -190,6 +192,8 @@ def _print_version(version: ModelVersion, everything: bool) -> None:
 
 def _facts(version: ModelVersion) -> dict[str, str]:
     """Return what a version says of itself in sentences."""
+    from fleet_slip.export.costs import describe_costs  # noqa: PLC0415 - compiled code
+
     manifest = version.manifest
     figures, trained, chosen = (
         manifest.cross_validation,
@@ -292,7 +296,7 @@ def diff(context: typer.Context, one: Reference, other: Reference, json: Json = 
         _print_difference(found)
 
 
-def _print_difference(found: Difference) -> None:
+def _print_difference(found: "Difference") -> None:
     one, other = found.one.reference, found.other.reference
     if not found.facts and all(term.same for term in found.terms):
         say(f"{one} and {other} are the same estimator from the same data")
@@ -316,7 +320,7 @@ def _print_difference(found: Difference) -> None:
     print_table("", ["what differs", one, other], rows, left=3)
 
 
-def _coefficients(term: Term) -> list[str]:
+def _coefficients(term: "Term") -> list[str]:
     """Return the two coefficients of a term, with more digits where few would hide a difference."""
     values = (term.one, term.other)
     short = ["" if value is None else f"{value:.6g}" for value in values]
@@ -339,6 +343,8 @@ def score_against(
     warehouse: Warehouse, one: ModelVersion, other: ModelVersion, rows: Condition, json: bool
 ) -> None:
     """Print the figures of two versions on the rows that have the signals of both."""
+    from fleet_slip.models.score import score as score_rows  # noqa: PLC0415 - compiled code
+
     needed = {*one.manifest.columns, *other.manifest.columns}
     complete = " AND ".join(f"{name} IS NOT NULL" for name in sorted(needed))
     both = rows & parse_condition(complete, row_columns())

@@ -28,7 +28,7 @@ from fleet_slip.columns.operations import (
     size_of,
 )
 from fleet_slip.errors import DataError, InputError
-from fleet_slip.export import program as do
+from fleet_slip.export import stepping as do
 from fleet_slip.export.program import (
     LARGEST_ANGLE,
     OUTPUT_COUNTS,

@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalogue.definitions import LARGEST_FACT
@@ -21,7 +21,7 @@ from fleet_slip.export.compile import Check, checks_csv, compile_program, make_c
 from fleet_slip.export.costs import count_costs
 from fleet_slip.export.dbc import dbc_text
 from fleet_slip.export.fmu import fmu
-from fleet_slip.export.program import Angle, Input, Program
+from fleet_slip.export.program import Angle, Input, Program, Target
 from fleet_slip.export.sql import sql_macro, sql_statement
 from fleet_slip.export.templating import c_prefix, file_prefix, fill_in_version
 from fleet_slip.models.manifest import ImportedFrom, Manifest
@@ -135,10 +135,6 @@ def manifest_of(
         "costs": count_costs(program).as_dict(),
         "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
     }
-
-
-Target = Literal["json", "c", "sql", "dbc", "onnx", "fmu"]
-"""What a version can be exported to."""
 
 
 @dataclass(frozen=True)

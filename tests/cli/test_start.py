@@ -47,10 +47,10 @@ def imported_by(root: Path, *arguments: str) -> set[str]:
     [
         (["--help"], TABLES | ENGINES | {"rich", "pydantic", "email"}),
         (["select", "--help"], {"highway_env", "matplotlib"}),
-        (["models"], ENGINES - {"duckdb", "numba"}),
-        (["show", "sideslip"], ENGINES - {"duckdb", "numba"}),
-        (["status"], ENGINES - {"duckdb", "numba"}),
-        (["sql", "SELECT 1"], ENGINES - {"duckdb", "numba"}),
+        (["models"], ENGINES - {"duckdb"}),
+        (["show", "sideslip"], ENGINES - {"duckdb"}),
+        (["status"], ENGINES - {"duckdb"}),
+        (["sql", "SELECT 1"], ENGINES - {"duckdb"}),
     ],
 )
 def test_a_command_does_not_wait_for_what_it_does_not_need(

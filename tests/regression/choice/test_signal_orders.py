@@ -15,15 +15,10 @@ from fleet_slip.regression.choice import nested_fits
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Evidence, infer_by_clusters
+from fleet_slip.regression.leaps import best_by_leaps
 from fleet_slip.regression.least_squares import correlation_matrix, fit
 from fleet_slip.regression.orders import RANKINGS, rank, replacement_sets
-from fleet_slip.regression.subsets import (
-    all_rss,
-    best_by_leaps,
-    best_subsets,
-    candidates,
-    signals_of,
-)
+from fleet_slip.regression.subsets import all_rss, best_subsets, candidates, signals_of
 from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of, unit_scales
 from tests.support.evidence import evidence
 
