@@ -46,14 +46,6 @@ def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> IntArray:
     return values.reshape(-1, width)
 
 
-def list_array(values: IntArray) -> pa.ListArray:
-    """Return a list for each row of a matrix."""
-    rows, width = values.shape
-    flat = pa.array(np.ascontiguousarray(values).reshape(-1), pa.int64())
-    offsets = pa.array(np.arange(rows + 1, dtype=np.int32) * width, pa.int32())
-    return pa.ListArray.from_arrays(offsets, flat)
-
-
 def is_received(rows: pa.Table) -> pa.ChunkedArray:
     """Return which rows of `grams` came without a log."""
     return pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)

@@ -5,9 +5,17 @@ from datetime import UTC, datetime
 import numpy as np
 import pyarrow as pa
 
+from fleet_slip.arrays import IntArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.gram_rows import list_array
 from fleet_slip.grams.on_board import COLUMNS, counted_sets
+
+
+def list_array(values: IntArray) -> pa.ListArray:
+    """Return a list for each row of a matrix."""
+    rows, width = values.shape
+    flat = pa.array(np.ascontiguousarray(values).reshape(-1), pa.int64())
+    offsets = pa.array(np.arange(rows + 1, dtype=np.int32) * width, pa.int32())
+    return pa.ListArray.from_arrays(offsets, flat)
 
 
 def rows_of_fleet(cars: int, start_s: int, seed: int, *, label_follows: bool = False) -> pa.Table:
