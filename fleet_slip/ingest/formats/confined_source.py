@@ -77,16 +77,18 @@ def _end(process: "subprocess.Popen[bytes]", control: socket.socket) -> None:
 
 def _fork_reader(name: str, rows: int, budget: Budget) -> tuple[socket.socket, int]:
     """Return what a reader is asked through, and a handle by which it is ended."""
-    with _ONE_AT_A_TIME:
-        process, control = _server(os.getpid())
-        if process.poll() is not None:
+    ours, theirs = socket.socketpair()
+    handles: list[int] = []
+    with _ONE_AT_A_TIME, theirs:
+        for _ in range(2):  # the server may have ended since the last file: then another forks
+            process, control = _server(os.getpid())
+            with suppress(OSError):
+                socket.send_fds(control, [name.encode()], [theirs.fileno(), rows])
+                _, handles, *_ = socket.recv_fds(control, 1, 1)
+            if handles:
+                break
             _server.cache_clear()
-            _, control = _server(os.getpid())
-        ours, theirs = socket.socketpair()
-        handles: list[int] = []
-        with theirs, suppress(OSError):
-            socket.send_fds(control, [name.encode()], [theirs.fileno(), rows])
-            _, handles, *_ = socket.recv_fds(control, 1, 1)
+            _end(process, control)
     if not handles:
         ours.close()
         raise budget.crashed()
