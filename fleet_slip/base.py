@@ -1,16 +1,70 @@
-"""What every module may use: canonical JSON, days, optional packages, words."""
+"""What every module may use: results and their JSON, canonical JSON, days, extras, words."""
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from datetime import date, datetime
-from typing import TYPE_CHECKING, Any, overload
+from decimal import Decimal
+from typing import Any, overload
 
 from fleet_slip.errors import ExtraError, UsageError
 
-if TYPE_CHECKING:
-    pass
+# What results are as JSON documents: one encoder for all of them.
+
+
+class Record:
+    """A dataclass of results, whose class says what is in its JSON document, key by key.
+
+    `DOCUMENT` has words: `...` is every field; `name` is a field or a property; `key=a.b` is
+    attribute `b` of attribute `a` under another name, null where `a` is None; `*name` is all keys
+    of a record or mapping in its place; a `?` behind any leaves out what is None or empty.
+    """
+
+    DOCUMENT = "..."
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        document: dict[str, Any] = {}
+        for word in self.DOCUMENT.split():
+            if word == "...":
+                document |= _fields_of(self)
+                continue
+            key, _, path = word.strip("*?").rpartition("=")
+            value: Any = self
+            for name in path.split("."):
+                value = None if value is None else getattr(value, name)
+            value = document_of(value)
+            if word.startswith("*"):
+                document |= value or {}
+            elif not word.endswith("?") or value not in (None, "", [], {}):
+                document[key or path] = value
+        return document
+
+
+def document_of(value: Any) -> Any:
+    """Return records, other dataclasses, mappings and sequences as a JSON document has them.
+
+    Numbers that JSON does not know (NaN, infinity) become null. pydantic would write decimal
+    numbers as texts.
+    """
+    if isinstance(value, Mapping):
+        return {key: document_of(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [document_of(item) for item in value]
+    if isinstance(value, Decimal):
+        return int(value) if value == value.to_integral_value() else float(value)
+    if hasattr(value, "as_dict"):
+        return document_of(value.as_dict())
+    if is_dataclass(value) and not isinstance(value, type):
+        return _fields_of(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _fields_of(record: Any) -> dict[str, Any]:
+    return {one.name: document_of(getattr(record, one.name)) for one in fields(record)}
 
 
 # The one text of JSON content, whatever its order and layout, and the checksum of a text.

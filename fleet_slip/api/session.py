@@ -2,12 +2,13 @@
 
 import types
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import duckdb
 import pyarrow as pa
 
+from fleet_slip.base import Record
 from fleet_slip.errors import QueryGoesOnError, QuestionError, RefusedError
 from fleet_slip.views import add_calibration
 from fleet_slip.warehouse.database import database_errors, interruptible, one_query, reading_files
@@ -85,11 +86,15 @@ def any_statement(_database: duckdb.DuckDBPyConnection, text: str) -> str:
 
 
 @dataclass(frozen=True)
-class RunReport:
+class RunReport(Record):
     """The report of each step; `gram_features` is that of the list's feature set.
 
     There is no selection where the champion is up to date, and no publication after a `refusal`.
     """
+
+    DOCUMENT = (
+        "campaign changed simulate=simulation gram gram_features? select=selection publish seconds"
+    )
 
     campaign: str
     simulation: "SimulationReport"
@@ -107,19 +112,10 @@ class RunReport:
         steps = (self.simulation, self.gram, self.gram_features)
         return published or any(one.changed for one in steps if one)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return what `run --json` prints."""
-        refused = {"new": False, "reason": self.refusal}
-        return {
-            "campaign": self.campaign,
-            "changed": self.changed,
-            "simulate": asdict(self.simulation),
-            "gram": asdict(self.gram),
-            **({"gram_features": asdict(self.gram_features)} if self.gram_features else {}),
-            "select": self.selection.as_dict() if self.selection else None,
-            "publish": self.publication.as_dict() if self.publication else refused,
-            "seconds": self.seconds,
-        }
+    @property
+    def publish(self) -> "Publication | dict[str, Any]":
+        """The publication, or why there is none."""
+        return self.publication or {"new": False, "reason": self.refusal}
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,14 @@
 
 import json
 import logging
-import math
 import string
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, is_dataclass
-from decimal import Decimal
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fleet_slip.base import document_of
 from fleet_slip.cli.streams import wrapped
 from fleet_slip.errors import printable
 from fleet_slip.storage.runs import LOGGER
@@ -38,35 +36,13 @@ def say(text: str, level: int = logging.INFO) -> None:
 
 
 def print_json(content: Any) -> None:
-    """Print a JSON document; numbers that JSON does not know (NaN, infinity) become null.
-
-    A dataclass is printed field by field, unless it has an `as_dict` that says otherwise. pydantic
-    would write decimal numbers as texts, and every start would wait for it.
-    """
+    """Print results as a JSON document; see `document_of`."""
     sys.stdout.write(json_text(content))
 
 
 def json_text(content: Any) -> str:
     """Return a JSON document as `print_json` prints it."""
-    return json.dumps(_for_json(content), indent=2, default=str, allow_nan=False) + "\n"
-
-
-def _for_json(value: Any) -> Any:
-    if hasattr(value, "as_dict"):
-        value = value.as_dict()
-    elif is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
-    match value:
-        case dict():
-            return {key: _for_json(item) for key, item in value.items()}
-        case list() | tuple():
-            return [_for_json(item) for item in value]
-        case float() if not math.isfinite(value):
-            return None
-        case Decimal():
-            return int(value) if value == value.to_integral_value() else float(value)
-        case _:
-            return value
+    return json.dumps(document_of(content), indent=2, default=str, allow_nan=False) + "\n"
 
 
 def print_text(text: str) -> None:
