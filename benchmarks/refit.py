@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.cohort import load_cohort, sum_cohort
+from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import answer_request
@@ -46,7 +46,9 @@ def main(root: str, condition: str) -> None:
     cohort = load_cohort(warehouse, condition)
 
     def fitted_from_disk(source: Warehouse | GramReader) -> None:
-        sums = sum_cohort(source, MODELS.folds, condition).folds("drive", MODELS.folds.count)
+        sums = load_cohort(source, condition, folding=MODELS.folds).folds(
+            "drive", MODELS.folds.count
+        )
         fit(sums.serving(INPUTS, label).total, INPUTS, label)
 
     with GramReader(warehouse) as reader:

@@ -1,13 +1,11 @@
 """How a selection is printed: the winner and why, the models, and how sure that is."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import features
 from fleet_slip.cli.output import cell, figures_cells, print_line, print_table, print_text, say
-from fleet_slip.grams.cohort import TaughtCohort
 from fleet_slip.grams.folding import BANDS, PARTS, ROW_FOLDS
 from fleet_slip.models.search import SearchChoice
 from fleet_slip.models.select import RequestedSelection, Selection, Uncertainty, WithoutLabel
@@ -67,7 +65,7 @@ BEST = 10
 CONDITION_WIDTH = 120
 
 
-def print_selection(selection: Selection[Any], everything: bool = False) -> None:
+def print_selection(selection: Selection, everything: bool = False) -> None:
     """Print the winner and why, the best models or all, and how sure that is."""
     winner = selection.winner
     print_text(f"winner: {winner.model.name}. {winner.reason}")
@@ -79,7 +77,7 @@ def print_selection(selection: Selection[Any], everything: bool = False) -> None
         _print_distances(selection.distances)
     _print_models(selection, everything)
     _say_left_out(selection)
-    if isinstance(selection.cohort, TaughtCohort):
+    if selection.cohort.unlabelled:
         say(
             f"a change of the course has {selection.cohort.weight} times the weight of a row with "
             "the label; the figures are of the angle about its mean in each drive with the label."
@@ -112,7 +110,7 @@ def _shortened(condition: str, everything: bool) -> str:
     return f"{condition[:CONDITION_WIDTH].rstrip()} … (--all)" if long else condition
 
 
-def _print_models(selection: Selection[Any], everything: bool) -> None:
+def _print_models(selection: Selection, everything: bool) -> None:
     """Print a table of the models, of many the best; without signals where a table above has them.
 
     A search changes some columns from size to size: how many there are stands here.
@@ -158,7 +156,7 @@ def _print_models(selection: Selection[Any], everything: bool) -> None:
 
 def _say_label_noise(selection: RequestedSelection) -> None:
     """Say how much of the errors is noise of the label they are measured against."""
-    if selection.without_label is not None or isinstance(selection.cohort, TaughtCohort):
+    if selection.without_label is not None or selection.cohort.unlabelled:
         return
     noise = selection.label_noise_deg
     if noise is None:
@@ -197,11 +195,11 @@ def _say_without_label(told: WithoutLabel) -> None:
     say(f"no change tells: the constant, which show says of a published version{late}{away}.")
 
 
-def _say_left_out(selection: Selection[Any]) -> None:
+def _say_left_out(selection: Selection) -> None:
     """Say which drives of the cohort the models were not made of, and what the label is worth."""
-    if not isinstance(selection.cohort, TaughtCohort):
+    if not selection.cohort.unlabelled:
         say_without_information(selection.rows_without, selection.cohort.rows)
-    if without_log := selection.cohort.members.count_received_with():
+    if without_log := selection.cohort.count_received_with():
         say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
     say_without_log(selection.cohort.left_out, selection.cohort.feature_set)
     if isinstance(selection, RequestedSelection):
@@ -224,7 +222,7 @@ def _print_folds(model: CrossValidation) -> None:
     )
 
 
-def _columns_of(model: CrossValidation, selection: Selection[Any]) -> str:
+def _columns_of(model: CrossValidation, selection: Selection) -> str:
     """Return a model's signals; of one that a search found, what its size changed."""
     found = selection.searched.models if selection.searched else ()
     if model not in found or model is selection.winner.model:

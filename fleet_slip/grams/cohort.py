@@ -1,14 +1,15 @@
-"""Cohorts: the Gram rows of the drives that satisfy an SQL condition, and their sums over folds.
+"""Cohorts: Gram rows of the drives that satisfy an SQL condition, each with a fold and a weight.
 
-A cohort is Gram rows with a fold and a weight. What needs every drive reads them into memory; what
-compares given models needs the exact sum of each fold alone, of any number of rows.
+What looks at single drives has all Gram rows in memory; what compares given models needs the exact
+sum of each fold alone, of any number of rows.
 """
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import date
 from fractions import Fraction
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -33,7 +34,7 @@ from fleet_slip.grams.folding import (
     require_divided,
 )
 from fleet_slip.grams.gram_rows import Hashes
-from fleet_slip.grams.reader import HASHES, CohortOrigin, GramReader, OpenedGrams, open_grams
+from fleet_slip.grams.reader import HASHES, GramReader, OpenedGrams, open_grams
 from fleet_slip.regression.choice import TrainingFolds
 from fleet_slip.regression.drives import (
     ClusterUnit,
@@ -48,48 +49,6 @@ from fleet_slip.warehouse.tables import Warehouse
 
 
 @dataclass(frozen=True)
-class Members:
-    """The drives that Gram rows are of, by the rows' signals.
-
-    Each row of an array has the hashes of a drive and of its car, 1 if it came without a log, and
-    its fold; shape (rows, 4).
-    """
-
-    rows: dict[str, Hashes] = field(default_factory=dict)
-
-    def __add__(self, other: "Members") -> "Members":
-        both = dict(self.rows)
-        for signals, rows in other.rows.items():
-            both[signals] = np.concatenate([both[signals], rows]) if signals in both else rows
-        return Members(both)
-
-    def having(self, signals: Collection[str]) -> Hashes:
-        """Return the rows that have all of some signals."""
-        some = [rows for kind, rows in self.rows.items() if set(signals) <= set(kind.split(","))]
-        return np.concatenate([np.empty((0, 4), dtype=np.uint64), *some])
-
-    def drives_with(self, signals: Collection[str]) -> Hashes:
-        """Return the hashes of the drives that have all of some signals, each once, sorted."""
-        return np.unique(self.having(signals)[:, 0])
-
-    def count_vehicles_with(self, signals: Collection[str]) -> int:
-        """Return the number of cars that have all of some signals."""
-        return len(np.unique(self.having(signals)[:, 1]))
-
-    def count_received_with(self, signals: Collection[str] = ()) -> int:
-        """Return the number of drives without a log that have all of some signals."""
-        rows = self.having(signals)
-        return len(np.unique(rows[rows[:, 2] == 1, 0]))
-
-
-def _member_rows(rows: pa.Table | pa.RecordBatch, folds: IntArray) -> Hashes:
-    drives, cars = (rows[name].to_numpy() for name in ("drive_hash", "vehicle_hash"))
-    came = pc.fill_null(pc.equal(rows["source"].cast(pa.string()), RECEIVED), False)
-    received = came.to_numpy(zero_copy_only=False)
-    return np.stack([one.astype(np.uint64) for one in (drives, cars, received, folds)], axis=1)
-
-
-@dataclass(frozen=True)
 class Served:
     """The drives of a cohort with all of some signals: a Gram row and metadata each, in order."""
 
@@ -98,19 +57,40 @@ class Served:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cohort(CohortOrigin):
-    """Gram rows in a `GramTable` for each set of signals, and metadata of each row in their order.
+class Cohort:
+    """Gram rows of drives, each with a fold and a weight.
 
     A drive has several rows if a signal is in some of its rows only, or if its set has parts.
+
+    Attributes:
+        condition: which drives, by the columns of the view `drives`.
+        logs_version, grams_version, feature_set: what was read.
+        left_out: drives of the condition that have no such Gram rows: their cars sent no log.
+        drives: a line for each Gram row: whose it is, its signals, and of how many rows.
+        tables: the Gram rows in the order of `drives`, by signals; none if only sums were kept.
+        sums, folding: the Gram of each fold, if only these were kept, and what the folds are of.
+        source: where the Gram rows were read, and can be read again.
+        unlabelled, weight: Gram rows of drives without the label: in no fold, always trained on,
+            with this weight, where rows with the label have 1.
     """
 
-    tables: tuple[GramTable, ...]
+    condition: Condition
+    logs_version: int
+    grams_version: int
+    feature_set: str = PLAIN
+    left_out: int = 0
     drives: pa.Table
+    tables: tuple[GramTable, ...] = ()
+    sums: CohortFolds | None = None
+    folding: Folding | None = None
+    source: Warehouse | GramReader | None = None
+    unlabelled: "Cohort | None" = None
+    weight: Fraction = Fraction(1)
 
     @property
     def rows(self) -> int:
-        """Number of rows of the logs behind the cohort."""
-        return int(sum(table.n.sum() for table in self.tables))
+        """Number of rows of the logs behind the cohort; those without the label do not count."""
+        return int(pc.sum(self.drives["n"]).as_py())
 
     @cached_property
     def drive_numbers(self) -> IntArray:
@@ -120,35 +100,86 @@ class Cohort(CohortOrigin):
 
     @property
     def drive_count(self) -> int:
-        """Number of drives."""
-        return int(self.drive_numbers.max()) + 1
-
-    @property
-    def members(self) -> Members:
-        """Which drives and cars the Gram rows are of."""
-        rows = _member_rows(self.drives, np.zeros_like(self.drive_numbers))
-        stops = np.cumsum([len(table) for table in self.tables])[:-1]
-        names = (",".join(table.signals) for table in self.tables)
-        return Members(dict(zip(names, np.split(rows, stops), strict=True)))
+        """Number of drives; those without the label do not count."""
+        return int(pc.count_distinct(self.drives["drive_hash"]).as_py())
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Signals and features that any of the drives has, in the order of the feature set."""
-        return self.inputs_among(name for table in self.tables for name in table.signals)
+        """Signals and features that any drive has, in the order of the feature set.
+
+        Beside drives without the label those that some of these have as well.
+        """
+        known = {name for kind in _kinds(self.drives) for name in kind.split(",")}
+        if self.unlabelled is not None:
+            known &= set(self.unlabelled.inputs)
+        return tuple(n for n in features().feature_set(self.feature_set).inputs if n in known)
+
+    def gram_condition(self, inputs: Sequence[str]) -> str:
+        """Return the SQL condition on the view `grams` of the rows that a model is made of."""
+        known = features().calibrated
+        stored = dict.fromkeys(known[name].of if name in known else name for name in inputs)
+        wanted = ", ".join(f"'{name}'" for name in [*stored, catalogue().label])
+        return (
+            f"feature_set = '{features().identity(self.feature_set)}' AND {self.condition.sql} AND "
+            f"list_has_all(string_split(signals, ','), [{wanted}])"
+        )
+
+    def hash_drives_with(self, signals: Collection[str]) -> Hashes:
+        """Return the hashes of the drives trained on with all of some signals, once, sorted."""
+        hashes: Hashes = np.unique(self._with(signals)["drive_hash"].to_numpy())
+        return hashes
+
+    def count_vehicles_with(self, signals: Collection[str]) -> int:
+        """Return the number of cars trained on that have all of some signals."""
+        return int(pc.count_distinct(self._with(signals)["vehicle_hash"]).as_py())
+
+    def count_received_with(self, signals: Collection[str] = ()) -> int:
+        """Return the number of drives trained on without a log that have all of some signals."""
+        rows = self._with(signals)
+        received = rows.filter(pc.equal(rows["source"].cast(pa.string()), RECEIVED))
+        return int(pc.count_distinct(received["drive_hash"]).as_py())
+
+    def count_unlabelled_with(self, signals: Collection[str]) -> tuple[int, int]:
+        """Return how many drives without the label have some signals, and of how many changes."""
+        if self.unlabelled is None:
+            return 0, 0
+        rows = _lines_with(self.unlabelled.drives, signals)
+        return pc.count_distinct(rows["drive_hash"]).as_py(), pc.sum(rows["n"]).as_py() or 0
+
+    def _with(self, signals: Collection[str]) -> pa.Table:
+        every = [self, *([self.unlabelled] if self.unlabelled else [])]
+        names = ["drive_hash", "vehicle_hash", "source"]
+        return pa.concat_tables(_lines_with(one.drives, signals).select(names) for one in every)
 
     def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
         """Divide the cohort into folds, of whole drives unless by `row`.
 
         By a key of `FOLD_KEYS`: a fold for each value, or hashed into `count` if there are more
         (`EACH`: never); by `speed` in bands; by `part` or `row` as the feature set has them. Raises
-        `QuestionError` if it has none.
+        `QuestionError` if it has none. Where only sums were kept the Gram rows are read again.
         """
+        folding = Folding(by=by, count=count)
+        if self.sums is not None and folding == self.folding:
+            return self.sums
+        if self.sums is not None and self.source is not None:
+            again = load_cohort(self.source, self.condition, self.feature_set, folding)
+            return again.folds(by, count)
         require_divided(self.feature_set, by, count)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
-        return CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
+        if self.unlabelled is None:
+            return CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
+        if by == "vehicle" and len(set(values)) == 1:
+            by, values = "drive", self.drives[FOLD_KEYS["drive"]].to_pylist()
+        return replace(
+            CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers),
+            beside=tuple(table.total() for table in self.unlabelled.tables),
+            weight=self.weight,
+        )
 
     def serving(self, inputs: Sequence[str]) -> Served:
         """Return the drives with the label and all inputs, a Gram row each. Raises `DataError`."""
+        if self.sums is not None and self.source is not None:
+            return load_cohort(self.source, self.condition, self.feature_set).serving(inputs)
         table, mask = serving_drives(self.tables, [*inputs, catalogue().label])
         rows = np.flatnonzero(mask)
         numbers = self.drive_numbers[rows]
@@ -173,33 +204,68 @@ class Cohort(CohortOrigin):
         return replace(self, tables=tuple(kept), drives=self.drives.filter(pa.array(wanted)))
 
 
+def _kinds(drives: pa.Table) -> list[str]:
+    return list(drives["signals"].unique().to_pylist())
+
+
+def _lines_with(drives: pa.Table, signals: Collection[str]) -> pa.Table:
+    """Return the lines of the Gram rows that have all of some signals."""
+    wanted = set(signals)
+    kinds = [kind for kind in _kinds(drives) if wanted <= set(kind.split(","))]
+    return drives.filter(pc.is_in(drives["signals"], pa.array(kinds, pa.string())))
+
+
 def load_cohort(
-    warehouse: Warehouse | GramReader,
+    source: Warehouse | GramReader,
     condition: str | Condition = TRAINING_DRIVES,
     feature_set: str = PLAIN,
+    folding: Folding | None = None,
 ) -> Cohort:
     """Read the Gram rows of the drives that satisfy a condition.
 
-    Raises `QuestionError` for an invalid
-    condition, `DataError` if no drive satisfies it or the set was not computed for all logs,
-    `RefusedError` for drives of evaluation scenarios.
+    With a `folding` only the sum of each fold is kept, which takes little memory. Raises
+    `QuestionError` for an invalid condition, `DataError` if no drive satisfies it, for a single
+    fold, or if the set was not computed for all logs, `RefusedError` for drives of evaluation
+    scenarios.
     """
     condition = parse_cohort(condition)
-    with open_grams(warehouse, feature_set, condition) as opened:
-        expansion = expansion_of(opened, feature_set)
-        rows = opened.rows(condition)
-        require_training(rows["source"].unique().to_pylist(), condition)
-        parts = list(expansion.tables(rows))
-        if not parts:  # no row, or none of changes
-            raise empty_cohort_error(opened, condition)
-        origin = opened.origin(condition)
-    # Rows whose calibrated columns are not the same are apart now: their metadata follows them.
-    order = np.concatenate([np.flatnonzero(here) for _, _, here in parts])
-    return Cohort(
-        **vars(origin),
-        tables=tuple(table for _, table, _ in parts),
-        drives=rows.drop_columns(["sums", "products"]).take(order),
-    )
+    if folding is not None:
+        require_divided(feature_set, folding.by, folding.count)
+    with open_grams(source, feature_set, condition) as opened:
+        if folding is None:
+            kept = _read_rows(opened, condition)
+        else:
+            names, fold_of = _find_folds(opened, folding, condition)
+            grams, drives = _add_up(opened, condition, names, fold_of)
+            kept = {"drives": drives, "sums": _used_folds(names, grams, drives), "folding": folding}
+        return Cohort(
+            condition=condition,
+            logs_version=opened.logs_version,
+            grams_version=opened.grams_version,
+            feature_set=features().name_of(opened.identity),
+            left_out=opened.count_left_out(condition),
+            source=source,
+            **kept,
+        )
+
+
+def _read_rows(opened: OpenedGrams, condition: Condition) -> dict[str, Any]:
+    rows = opened.rows(condition)
+    require_training(rows["source"].unique().to_pylist(), condition)
+    expansion = expansion_of(opened, features().name_of(opened.identity))
+    parts = list(expansion.tables(rows))
+    if not parts:  # no row, or none of changes
+        raise empty_cohort_error(opened, condition)
+    lines = rows.drop_columns(["sums", "products", "signals"])
+    # Rows whose calibrated columns are not the same are apart now: their lines follow them.
+    some = [_with_signals(lines.filter(pa.array(here)), signals) for signals, _, here in parts]
+    return {"tables": tuple(table for _, table, _ in parts), "drives": pa.concat_tables(some)}
+
+
+def _with_signals(lines: pa.Table, signals: str) -> pa.Table:
+    """Return lines of Gram rows that all have some signals, whose names may be long."""
+    same = pa.DictionaryArray.from_arrays(np.zeros(len(lines), dtype=np.int32), [signals])
+    return lines.append_column("signals", same)
 
 
 def require_training(sources: Iterable[str], condition: Condition) -> None:
@@ -238,53 +304,20 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
     )
 
 
-# Labels of few cars and the course of all others as one cohort: a weighted sum.
+# Labels of few cars and the course of all others as one cohort.
 #
 # Rows with the label count about their drive's mean, since changes have no constant either: it
 # follows from cars that go straight on (`fleet_slip.models.straight_on`). Only these drives are
 # tested on; the course of others is always trained on, with a weight.
 
 
-@dataclass(frozen=True, kw_only=True)
-class TaughtCohort(Cohort):
-    """The drives with the label, and the changes of others, whose rows have a `weight` beside 1."""
-
-    others: Cohort
-    weight: Fraction
-
-    @property
-    def members(self) -> Members:
-        """Which drives and cars teach, with a label or without."""
-        return super().members + self.others.members
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """The columns that drives with the label and changes of the others both have."""
-        others = set(self.others.inputs)
-        return tuple(name for name in super().inputs if name in others)
-
-    def count_others(self, signals: Collection[str]) -> tuple[int, int]:
-        """Return how many drives, and changes, teach beside those with the label."""
-        served = [one for one in self.others.tables if set(signals) <= set(one.signals)]
-        drives = len(self.others.members.drives_with(signals))
-        return drives, sum(int(one.n.sum()) for one in served)
-
-    def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
-        """Divide the drives with the label into folds; what the others teach is in none."""
-        values = set(self.drives[FOLD_KEYS[by]].to_pylist())
-        if by == "vehicle" and len(values) == 1:
-            by = "drive"
-        beside = tuple(table.total() for table in self.others.tables)
-        return replace(super().folds(by, count), beside=beside, weight=self.weight)
-
-
-def load_taught(
+def load_mixed_labels(
     warehouse: Warehouse, condition: str | Condition, feature_set: str, by: FoldKey
-) -> TaughtCohort:
-    """Read the Gram rows of the drives that satisfy a condition, of both kinds; the weight is 1.
+) -> Cohort:
+    """Read the drives with the label, and beside them the changes of the course of all others.
 
-    What folds are made of teaches by its label alone if it has one. Raises `DataError` if no drive
-    has one, or all have, and as `load_cohort`.
+    What folds are made of is trained on by its label alone if it has one. Raises `DataError` if no
+    drive has one, or all have, and as `load_cohort`.
     """
     base = features().feature_set(feature_set).of
     if base is None:
@@ -292,13 +325,8 @@ def load_taught(
             f"the feature set {feature_set} is not of another, whose Gram rows have the label. Use "
             "one that has of in configs/features.toml, such as course."
         )
-    return taught_by(
-        load_cohort(warehouse, condition, base), load_cohort(warehouse, condition, feature_set), by
-    )
-
-
-def taught_by(every: Cohort, changes: Cohort, by: FoldKey) -> TaughtCohort:
-    """Return what the drives of a cohort with the label teach, and the changes of the others."""
+    every = load_cohort(warehouse, condition, base)
+    changes = load_cohort(warehouse, condition, feature_set)
     label = catalogue().label
     labelled = every.part(
         np.repeat([label in one.signals for one in every.tables], [len(t) for t in every.tables])
@@ -308,7 +336,8 @@ def taught_by(every: Cohort, changes: Cohort, by: FoldKey) -> TaughtCohort:
             f"no drive of the cohort {every.condition.text!r} has the label. Learn from the course "
             "alone: fleet-slip select --label course"
         )
-    key = FOLD_KEYS["vehicle" if by == "vehicle" and _cars(labelled) > 1 else "drive"]
+    cars = labelled.drives["vehicle_id"].unique()
+    key = FOLD_KEYS["vehicle" if by == "vehicle" and len(cars) > 1 else "drive"]
     known = set(labelled.drives[key].to_pylist())
     alone = np.array([one not in known for one in changes.drives[key].to_pylist()])
     if not alone.any():
@@ -316,77 +345,15 @@ def taught_by(every: Cohort, changes: Cohort, by: FoldKey) -> TaughtCohort:
             f"all drives of the cohort {every.condition.text!r} have the label. Learn from it "
             "alone: fleet-slip select"
         )
-    tables = tuple(about_mean(table) for table in labelled.tables)
-    own = {**vars(labelled), "feature_set": changes.feature_set, "tables": tables}
-    own = {name: own[name] for name in Cohort.__dataclass_fields__}
-    return TaughtCohort(**own, others=changes.part(alone), weight=Fraction(1))
-
-
-def _cars(cohort: Cohort) -> int:
-    return len(cohort.drives["vehicle_id"].unique())
+    return replace(
+        labelled,
+        feature_set=changes.feature_set,
+        tables=tuple(about_mean(table) for table in labelled.tables),
+        unlabelled=changes.part(alone),
+    )
 
 
 # The sums of a cohort over its folds, from Gram rows read batch by batch.
-
-
-@dataclass(frozen=True, kw_only=True)
-class SummedCohort(CohortOrigin):
-    """What a selection from given models needs of a cohort.
-
-    Attributes:
-        folding, sums: how the cohort was divided, and the Gram of each fold.
-        rows, drive_count: number of rows of the logs, and of drives, behind the cohort.
-        members: which drives and cars the Gram rows are of.
-        source: where they were read, and can be read again over other folds.
-    """
-
-    folding: Folding
-    sums: CohortFolds
-    rows: int
-    drive_count: int
-    members: Members
-    source: Warehouse | GramReader
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Signals and features that any of the drives has, in the order of the feature set."""
-        return self.inputs_among(name for grams in self.sums.tables for name in grams[0].signals)
-
-    def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
-        """Return the folds; another division reads the Gram rows again, like `sum_cohort`."""
-        if (by, count) == (self.folding.by, self.folding.count):
-            return self.sums
-        folding = Folding(by=by, count=count)
-        return sum_cohort(self.source, folding, self.condition, self.feature_set).sums
-
-
-def sum_cohort(
-    warehouse: Warehouse | GramReader,
-    folding: Folding,
-    condition: str | Condition = TRAINING_DRIVES,
-    feature_set: str = PLAIN,
-) -> SummedCohort:
-    """Add up the Gram rows of a condition's drives over each fold.
-
-    Raises as `load_cohort`, and `DataError` for one fold.
-    """
-    condition = parse_cohort(condition)
-    require_divided(feature_set, folding.by, folding.count)
-    with open_grams(warehouse, feature_set, condition) as opened:
-        folds = _find_folds(opened, folding, condition)
-        grams, members = _add_up(opened, condition, *folds)
-        origin = opened.origin(condition)
-    sums = _used_folds(folds[0], grams, members)
-    return SummedCohort(
-        **vars(origin),
-        folding=folding,
-        sums=sums,
-        rows=sum(gram.n for of_folds in grams.values() for gram in of_folds),
-        drive_count=len(members.drives_with(())),
-        members=members,
-        source=warehouse,
-    )
-
 
 FoldOf = Callable[[pa.RecordBatch], IntArray]
 """Returns the fold of each Gram row, by its metadata."""
@@ -394,28 +361,29 @@ FoldOf = Callable[[pa.RecordBatch], IntArray]
 
 def _add_up(
     opened: OpenedGrams, condition: Condition, names: Sequence[object], fold_of: FoldOf
-) -> tuple[dict[str, list[Gram]], Members]:
-    """Return the exact sums of Gram rows, by signals and fold, and which drives they are of."""
+) -> tuple[dict[str, list[Gram]], pa.Table]:
+    """Return the exact sums of Gram rows, by signals and fold, and whose each row is."""
     expansion = expansion_of(opened, features().name_of(opened.identity))
     grams: dict[str, list[Gram]] = {}
-    rows: dict[str, list[Hashes]] = {}
+    lines: list[pa.Table] = []
     for batch in opened.batches(condition, *HASHES):
         require_training(batch["source"].unique().to_pylist(), condition)
         folds = fold_of(batch)
-        some = _member_rows(batch, folds)
+        some = pa.table({name: batch[name] for name in ("n", "source", *HASHES[:2])})
+        some = some.append_column("fold", pa.array(folds))
         for signals, table, here in expansion.tables(batch):
             totals, before = table.totals(folds[here], len(names)), grams.get(signals)
             grams[signals] = list(map(Gram.__add__, before, totals)) if before else totals
-            rows.setdefault(signals, []).append(some[here])
+            lines.append(_with_signals(some.filter(pa.array(here)), signals))
     if not grams:
         raise empty_cohort_error(opened, condition)
-    return grams, Members({signals: np.concatenate(some) for signals, some in rows.items()})
+    return grams, pa.concat_tables(lines)
 
 
 def _find_folds(
     opened: OpenedGrams, folding: Folding, condition: Condition
 ) -> tuple[Sequence[str], FoldOf]:
-    """Return the folds that there may be, and which a Gram row is in. Raises like `sum_cohort`."""
+    """Return the folds that there may be, and which a Gram row is in. Raises like `load_cohort`."""
     key = FOLD_KEYS[folding.by]
     dealt = folding.by in ("drive", "vehicle") and folding.count != EACH
     found = opened.values_of(key, condition, int(folding.count) + 1 if dealt else None)
@@ -435,7 +403,7 @@ def _places(values: pa.Array, known: pa.Array) -> IntArray:
 
 
 def _used_folds(
-    names: Sequence[str], grams: dict[str, list[Gram]], members: Members
+    names: Sequence[str], grams: dict[str, list[Gram]], drives: pa.Table
 ) -> CohortFolds:
     """Return the folds that have drives. Raises `DataError` if only one has."""
     order = sorted(grams)
@@ -448,7 +416,8 @@ def _used_folds(
 
     @cache
     def count_drives(kinds: tuple[int, ...]) -> int:
-        return len(np.unique(np.concatenate([members.rows[order[i]][:, 0] for i in kinds])))
+        mine = pc.is_in(drives["signals"], pa.array([order[i] for i in kinds]))
+        return int(pc.count_distinct(drives["drive_hash"].filter(mine)).as_py())
 
     return CohortFolds(
         tuple(names[fold] for fold in used),
@@ -482,7 +451,7 @@ def sum_days(
     with open_grams(source, feature_set, condition) as opened:
         found = opened.values_of("day", condition).sort()
         days: list[date] = found.to_pylist()
-        sums, members = _add_up(opened, condition, days, lambda rows: _places(rows["day"], found))
+        sums, lines = _add_up(opened, condition, days, lambda rows: _places(rows["day"], found))
         left_out = opened.count_left_out(condition)
     serving = [one for kind, one in sums.items() if set(signals) <= set(kind.split(","))]
     if not serving:
@@ -491,9 +460,8 @@ def sum_days(
         sum((one[day].restrict(signals) for one in serving), Gram.zero(signals))
         for day in range(len(days))
     ]
-    rows = members.having(signals)
-    _, first = np.unique(rows[:, 0], return_index=True)  # a drive is of one day
-    drives = np.bincount(rows[first, 3].astype(np.int64), minlength=len(days)).tolist()
+    of_drives = _lines_with(lines, signals).group_by("drive_hash").aggregate([("fold", "min")])
+    drives = np.bincount(of_drives["fold_min"].to_numpy(), minlength=len(days)).tolist()
     used = [day for day, gram in enumerate(grams) if gram.n]
     return DailySums(
         tuple(days[day] for day in used),

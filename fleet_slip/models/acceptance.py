@@ -32,7 +32,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
 from fleet_slip.grams.calibration import course_moments
-from fleet_slip.grams.cohort import Cohort, SummedCohort, TaughtCohort, load_cohort
+from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.folding import FOLD_KEYS, FoldKey, assign_folds
 from fleet_slip.grams.gram_rows import hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
@@ -181,7 +181,7 @@ def worth() -> Worth:
     return Worth(math.radians(floor().worth_deg))
 
 
-def contest(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Contest:
+def contest(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest:
     """Return how a selection's winner meets published versions, over drives with all signals.
 
     Raises `DataError` or `QuestionError` if the features of a version are not defined as they were.
@@ -195,7 +195,7 @@ def contest(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Co
     models = tuple(counts_model(version.manifest, feature_set) for version in incumbents)
     every = (name for model in models for name in model.signals)
     signals = tuple(dict.fromkeys((*inputs, *every)))
-    cars = selection.cohort.members.count_vehicles_with((*signals, label))
+    cars = selection.cohort.count_vehicles_with((*signals, label))
     by: FoldKey = "vehicle" if cars >= LEAST_VEHICLES else "drive"
     intercept = selection.intercept
     if found is not None and searched:
@@ -205,7 +205,7 @@ def contest(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Co
     return Contest(signals, by, procedure, models)
 
 
-def compare(selection: Selection[Any], incumbents: Sequence[ModelVersion]) -> Comparison:
+def compare(selection: Selection, incumbents: Sequence[ModelVersion]) -> Comparison:
     """Compare a selection's winner with the own coefficients of published versions.
 
     Raises `DataError` or `QuestionError` if no drive has the signals of all, and as `contest`.
@@ -402,14 +402,14 @@ MOST_DRIVES = 20_000
 _HEX = 4
 
 
-def odd_gain(registry: Registry, selection: Selection[Any], champion: ModelVersion) -> str | None:
+def odd_gain(registry: Registry, selection: Selection, champion: ModelVersion) -> str | None:
     """Return why a person must look first: it is better on odd new drives alone; else None.
 
     Nothing is said where changes of the course taught, or all drives are as known as the others.
     Raises `StorageError` if which drives made the champion cannot be read.
     """
     made = registry.trained_drives(champion.manifest)
-    if made is None or isinstance(selection.cohort, TaughtCohort):
+    if made is None or selection.cohort.unlabelled:
         return None
     try:
         cohort = _some_drives(selection)
@@ -421,9 +421,9 @@ def odd_gain(registry: Registry, selection: Selection[Any], champion: ModelVersi
     return None
 
 
-def _some_drives(selection: Selection[Any]) -> Cohort:
-    cohort: Cohort | SummedCohort = selection.cohort
-    if isinstance(cohort, Cohort):
+def _some_drives(selection: Selection) -> Cohort:
+    cohort = selection.cohort
+    if cohort.source is None or cohort.sums is None:
         return cohort
     condition, drives = cohort.condition, cohort.drive_count
     if drives > MOST_DRIVES:
@@ -434,7 +434,7 @@ def _some_drives(selection: Selection[Any]) -> Cohort:
 
 
 def _compare(
-    selection: Selection[Any], champion: ModelVersion, cohort: Cohort, known: BoolArray
+    selection: Selection, champion: ModelVersion, cohort: Cohort, known: BoolArray
 ) -> str | None:
     asked = contest(selection, [champion])
     every = np.ones(len(known), dtype=np.bool_)
@@ -511,7 +511,7 @@ def judge(
     registry: Registry,
     champion: ModelVersion | None,
     manifest: Manifest,
-    selection: Selection[Any],
+    selection: Selection,
 ) -> Judgement:
     """Compare a challenger with the champion, and with the best of the champions so far."""
     problems = find_faults(manifest, champion.manifest if champion else None)

@@ -11,7 +11,6 @@ from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, QuestionError
-from fleet_slip.grams.cohort import TaughtCohort
 from fleet_slip.models.acceptance import judge
 from fleet_slip.models.manifest import (
     CrossValidated,
@@ -157,9 +156,7 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
     label = signals[signals.label]
     wanted = (*winner.signals, signals.label)
     drives = drives_of(selection, name)
-    beside = rows_beside = 0
-    if isinstance(selection.cohort, TaughtCohort):
-        beside, rows_beside = selection.cohort.count_others(wanted)
+    unlabelled, changes = selection.cohort.count_unlabelled_with(wanted)
     return Manifest(
         name=name,
         label=ModelLabel(
@@ -176,10 +173,10 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
         trained_on=TrainedOn(
             cohort=selection.cohort.condition.text,
             feature_set=features().identity(selection.cohort.feature_set),
-            drives=winner.drives + beside,
-            vehicles=selection.cohort.members.count_vehicles_with(wanted),
-            drives_without_log=selection.cohort.members.count_received_with(wanted) or None,
-            rows=winner.pooled.rows + rows_beside,
+            drives=winner.drives + unlabelled,
+            vehicles=selection.cohort.count_vehicles_with(wanted),
+            drives_without_log=selection.cohort.count_received_with(wanted) or None,
+            rows=winner.pooled.rows + changes,
             logs_version=selection.cohort.logs_version,
             grams_version=selection.cohort.grams_version,
             drives_sha256=checksum_of_drives(drives),
@@ -196,7 +193,7 @@ def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
 
 
 def with_straight_intercept(
-    warehouse: Warehouse, manifest: Manifest, selection: Selection[Any]
+    warehouse: Warehouse, manifest: Manifest, selection: Selection
 ) -> Manifest:
     """Return a manifest with the intercept that changes do not tell, if changes taught its model.
 
@@ -210,7 +207,7 @@ def with_straight_intercept(
     found = StraightOn(Fraction(0), {}, None, 0.0, 0)
     if not manifest.through_origin:
         found = straight_on(warehouse, parse_cohort(manifest.trained_on.cohort), manifest)
-    weight = selection.cohort.weight if isinstance(selection.cohort, TaughtCohort) else None
+    weight = selection.cohort.weight if selection.cohort.unlabelled else None
     learned = LearnedFrom(
         label="course" if weight is None else "course+sideslip",
         weight=weight,
@@ -224,14 +221,14 @@ def with_straight_intercept(
     scales = input_scales()
     terms = (_term(column, slope / scales[column]) for column, slope in found.slopes.items())
     own = {"intercept": float(found.intercept), "intercept_exact": found.intercept}
-    taught = {"learned_from": learned, "terms": (*manifest.terms, *terms)}
-    return manifest.model_copy(update={**own, **taught})
+    origin = {"learned_from": learned, "terms": (*manifest.terms, *terms)}
+    return manifest.model_copy(update={**own, **origin})
 
 
-def drives_of(selection: Selection[Any], name: str) -> bytes:
+def drives_of(selection: Selection, name: str) -> bytes:
     """Return the salted hashes of the drives that a selection's winner was trained on, packed."""
     signals = (*selection.winner.model.signals, catalogue().label)
-    return pack_hashes(hash_drives(name, selection.cohort.members.drives_with(signals)))
+    return pack_hashes(hash_drives(name, selection.cohort.hash_drives_with(signals)))
 
 
 def _term(name: str, coefficient: Fraction) -> ModelTerm:
@@ -295,7 +292,7 @@ class Publication:
 def publish(
     registry: Registry,
     manifest: Manifest,
-    selection: Selection[Any],
+    selection: Selection,
     *,
     force: bool = False,
     candidate: bool = False,
@@ -349,7 +346,7 @@ class DryRun:
 def would_publish(
     registry: Registry,
     manifest: Manifest,
-    selection: Selection[Any],
+    selection: Selection,
     *,
     force: bool = False,
     candidate: bool = False,
@@ -393,7 +390,7 @@ class _Decision:
 def _decide(
     registry: Registry,
     manifest: Manifest,
-    selection: Selection[Any],
+    selection: Selection,
     *,
     force: bool,
     candidate: bool,

@@ -14,7 +14,7 @@ from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.grams.cohort import Cohort, SummedCohort
+from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.folding import Folding, FoldKey
 from fleet_slip.regression.choice import DEFAULT_WORTH, Worth
 from fleet_slip.regression.drives import ClusterUnit
@@ -324,7 +324,7 @@ WHOLE_SET = "catalogue"
 """As an order of signals: all inputs of the feature set, in its order."""
 
 
-def inputs_of(cohort: Cohort | SummedCohort, order: str) -> tuple[str, ...]:
+def inputs_of(cohort: Cohort, order: str) -> tuple[str, ...]:
     """Return the order of inputs in a text, `catalogue` being all; raises as `require_inputs`."""
     if order == WHOLE_SET:
         return cohort.inputs

@@ -9,7 +9,7 @@ import numpy as np
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohort import Cohort, SummedCohort, drive_folds, row_training
+from fleet_slip.grams.cohort import Cohort, drive_folds, row_training
 from fleet_slip.grams.folding import ROW_FOLDS, Folding
 from fleet_slip.models.request import Search, SelectionRequest
 from fleet_slip.regression.choice import (
@@ -190,7 +190,7 @@ class SearchedModels:
 
 
 def search_models(
-    cohort: Cohort | SummedCohort,
+    cohort: Cohort,
     inputs: Sequence[str],
     folding: Folding,
     search: Search,

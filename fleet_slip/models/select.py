@@ -4,10 +4,9 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from fractions import Fraction
-from typing import Any, Generic
+from typing import Any
 
 import numpy as np
-from typing_extensions import TypeVar
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import canonical_json, sha256_of
@@ -20,17 +19,14 @@ from fleet_slip.errors import ConfigError, DataError, NotComputedError, Question
 from fleet_slip.grams.cohort import (
     Cohort,
     Served,
-    SummedCohort,
-    TaughtCohort,
     clustered_moments,
     drive_folds,
     load_cohort,
-    load_taught,
-    sum_cohort,
+    load_mixed_labels,
 )
 from fleet_slip.grams.folding import EACH, PARTS, ROW_FOLDS, Folding, make_folding
 from fleet_slip.grams.gram_rows import by_signals, gram_table
-from fleet_slip.grams.reader import CohortOrigin, open_grams
+from fleet_slip.grams.reader import open_grams
 from fleet_slip.models.request import (
     BOTH,
     COURSE,
@@ -154,7 +150,7 @@ def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Conditi
     return parse_condition(f"{condition.sql} AND {others}")
 
 
-def label_noise_deg(warehouse: Warehouse, cohort: CohortOrigin) -> float | None:
+def label_noise_deg(warehouse: Warehouse, cohort: Cohort) -> float | None:
     """Return the standard deviation of the label's noise, of all rows of a cohort together.
 
     A cross-validated error has it in it, as no model knows the noise of other drives. So has it the
@@ -239,7 +235,7 @@ class WithoutLabel:
         return {name if name in plain else f"{name}_deg": one for name, one in found.items()}
 
 
-def without_label(warehouse: Warehouse, cohort: CohortOrigin, error: float) -> WithoutLabel | None:
+def without_label(warehouse: Warehouse, cohort: Cohort, error: float) -> WithoutLabel | None:
     """Return how good a model of such an error in degrees is; None unless changes taught it."""
     times = features().feature_set(cohort.feature_set).change_s
     if not times:
@@ -314,15 +310,11 @@ def _add_squares(squares: dict[str, list[float]], table: GramTable) -> None:
             found[1] += float(table.n.sum())
 
 
-AnyCohort = TypeVar("AnyCohort", bound=Cohort | SummedCohort, default=Cohort)
-
-
 @dataclass(frozen=True)
-class Selection(Generic[AnyCohort]):
+class Selection:
     """All candidates with their figures, in the order of the list, and the winner.
 
     Attributes:
-        cohort: the Gram rows, or their sums.
         skipped: candidates that the cohort cannot serve, with the reason.
         choice: how an order or a subset was chosen; None for a list of models.
         searched: the models of a search, which are among `models`.
@@ -330,7 +322,7 @@ class Selection(Generic[AnyCohort]):
         intercept: whether models have one; without it they go through the origin.
     """
 
-    cohort: AnyCohort
+    cohort: Cohort
     folds: Folding
     models: tuple[CrossValidation, ...]
     winner: Winner
@@ -385,7 +377,7 @@ class Selection(Generic[AnyCohort]):
             "drives": self.cohort.drive_count,
             "rows": self.cohort.rows,
             "rows_without": self.rows_without,
-            "drives_without_log": self.cohort.members.count_received_with(),
+            "drives_without_log": self.cohort.count_received_with(),
             "drives_left_out": self.cohort.left_out,
             "intercept": self.intercept,
             "folds": {
@@ -411,7 +403,7 @@ class Selection(Generic[AnyCohort]):
 
 
 def select(
-    cohort: AnyCohort,
+    cohort: Cohort,
     candidates: Sequence[CandidateModel],
     folds: Folding,
     worth: Worth | None = None,
@@ -419,7 +411,7 @@ def select(
     inputs: Sequence[str] = (),
     *,
     intercept: bool = True,
-) -> Selection[AnyCohort]:
+) -> Selection:
     """Cross-validate each candidate, and what a search finds among inputs; choose the winner.
 
     `worth` overrides the search's rule. Candidates with absent or dependent signals are skipped,
@@ -468,7 +460,7 @@ def validate(
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class RequestedSelection(Selection[Any]):
+class RequestedSelection(Selection):
     """A selection that can be published: it tells what it was made from.
 
     Attributes:
@@ -512,9 +504,7 @@ class RequestedSelection(Selection[Any]):
         return {**document, **course, **{name: text for name, text in said.items() if text}}
 
     @classmethod
-    def of(
-        cls, selection: Selection[Any], model_list: str, config_sha256: str
-    ) -> "RequestedSelection":
+    def of(cls, selection: Selection, model_list: str, config_sha256: str) -> "RequestedSelection":
         """Return a selection with what it was made from."""
         return cls(**vars(selection), model_list=model_list, config_sha256=config_sha256)
 
@@ -532,7 +522,7 @@ def answer_request(
     usual = not (request.models or request.model or request.label or request.chosen_by_inputs)
     find = _answer_usual if usual else _answer
     answer = replace(find(warehouse, request, condition), request=request, asked=condition)
-    if isinstance(answer.cohort, TaughtCohort):  # its figures are of the angle
+    if answer.cohort.unlabelled:  # its figures are of the angle
         return answer
     told = without_label(warehouse, answer.cohort, answer.winner.model.pooled.rmse_deg)
     noise_deg = None if told else label_noise_deg(warehouse, answer.cohort)
@@ -567,14 +557,14 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
     feature_set = _feature_set(request, model_list)
     if request.label == BOTH:
         folds = folds if request.by else folds.model_copy(update={"by": "vehicle"})
-        taught = load_taught(warehouse, condition, feature_set, folds.by)
-        return weigh(taught, request, model_list, folds)
+        mixed = load_mixed_labels(warehouse, condition, feature_set, folds.by)
+        return weigh(mixed, request, model_list, folds)
     if request.robust:
         return _answer_without(warehouse, request, condition, model_list, feature_set)
     distances = bool(request.nested and not request.ordered and not _search_of(request, model_list))
     if not (request.ordered or request.resampled or distances):
         return _compare_listed(
-            sum_cohort(warehouse, folds, condition, feature_set), request, model_list, folds
+            load_cohort(warehouse, condition, feature_set, folds), request, model_list, folds
         )
     cohort = load_cohort(warehouse, condition, feature_set)
     if request.ordered:
@@ -595,7 +585,7 @@ WEIGHTS = tuple(Fraction(4) ** power for power in range(4, -5, -1))
 
 
 def weigh(
-    cohort: TaughtCohort,
+    cohort: Cohort,
     request: SelectionRequest,
     model_list: ModelList | None,
     folds: Folding,
@@ -672,7 +662,7 @@ def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str
 
 
 def _compare_listed(
-    cohort: Cohort | SummedCohort,
+    cohort: Cohort,
     request: SelectionRequest,
     model_list: ModelList | None,
     folds: Folding,

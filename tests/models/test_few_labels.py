@@ -13,7 +13,7 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, UsageError
-from fleet_slip.grams.cohort import load_cohort, load_taught
+from fleet_slip.grams.cohort import load_cohort, load_mixed_labels
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
@@ -91,7 +91,7 @@ def test_both_teach_with_a_weight(fleet: Fleet, labelled: Fleet) -> None:
 
 def test_a_large_weight_is_the_course_alone_and_a_small_one_the_label(fleet: Fleet) -> None:
     inputs, label = COLUMNS.split(","), catalogue().label
-    cohort = load_taught(fleet.warehouse, "true", "course", "vehicle")
+    cohort = load_mixed_labels(fleet.warehouse, "true", "course", "vehicle")
     course = load_cohort(fleet.warehouse, "true", "course")
     taught = set(cohort.drives["vehicle_id"].to_pylist())
     alone = course.part(

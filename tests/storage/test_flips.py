@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import FleetSlipError, StorageError
-from fleet_slip.grams.cohort import sum_cohort
+from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
@@ -30,8 +30,8 @@ Answer = Callable[[Warehouse], Any]
 
 
 def sums(warehouse: Warehouse) -> Any:
-    found = sum_cohort(warehouse, Folding(count=2))
-    return found.sums.tables, found.drive_count
+    found = load_cohort(warehouse, folding=Folding(count=2))
+    return found.folds("drive", 2).tables, found.drive_count
 
 
 def new_gram_rows(warehouse: Warehouse) -> Any:

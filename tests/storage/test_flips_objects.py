@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from fleet_slip.errors import StorageError
-from fleet_slip.grams.cohort import load_cohort, sum_cohort
+from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.registry import Registry
@@ -31,7 +31,7 @@ def query(warehouse: Warehouse, statement: str) -> Any:
 
 QUESTIONS: dict[str, Callable[[Warehouse], Any]] = {
     "load_cohort": lambda w: load_cohort(w).tables[0].products.sum(),
-    "sum_cohort": lambda w: sum_cohort(w, Folding()).rows,
+    "fold sums": lambda w: load_cohort(w, folding=Folding()).rows,
     "publish": lambda w: publish_from(w, force=True).version.version,
     "score": lambda w: score(w, Registry(w.root / "models").resolve("beta").manifest, "true"),
     "sql": lambda w: query(w, "SELECT sum(ay) FROM log_counts"),

@@ -63,6 +63,8 @@ def cohort_of(
         "drive_id": [one.drive for one in drives],
         "trip": [one.drive for one in drives],
         "source": ["simulated"] * len(drives),
+        "signals": [",".join(signals)] * len(drives),
+        "n": [len(one.counts) for one in drives],
         "vehicle_id": [f"car-{i % 4}" for i in range(len(drives))],
         "track": [f"track-{i % 2}" for i in range(len(drives))],
         "day": days,

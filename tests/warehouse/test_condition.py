@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohort import load_cohort, sum_cohort, sum_days
+from fleet_slip.grams.cohort import load_cohort, sum_days
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.registry import ModelVersion
@@ -153,7 +153,7 @@ def test_every_way_in_passes_the_same_gate(fleet: Warehouse, text: str) -> None:
     )
     ways = (
         lambda: load_cohort(fleet, text),
-        lambda: sum_cohort(fleet, Folding(), text),
+        lambda: load_cohort(fleet, text, folding=Folding()),
         lambda: sum_days(fleet, ["ay"], text),
         lambda: examine_drives(fleet, text),
         lambda: score_statement(published, text),
@@ -239,7 +239,7 @@ def test_a_wrong_regular_expression_is_a_wrong_question(
 ) -> None:
     land(warehouse, "one", log_rows("d1", random_counts(np.random.default_rng(0), 50)))
     update_grams(warehouse)
-    for ask in (load_cohort, lambda w, c: sum_cohort(w, Folding(), c)):
+    for ask in (load_cohort, lambda w, c: load_cohort(w, c, folding=Folding())):
         with pytest.raises(QuestionError, match="cannot be asked"):
             ask(warehouse, condition)
 

@@ -13,7 +13,7 @@ from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, InputError, QuestionError
 from fleet_slip.grams.calibration import calibrate
-from fleet_slip.grams.cohort import load_cohort, sum_cohort
+from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.expansion import expand
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
@@ -131,9 +131,9 @@ def test_gram_rows_have_the_bits_of_the_rows(filled: Warehouse) -> None:
 
 
 def test_sums_over_folds_are_those_of_the_drives(filled: Warehouse) -> None:
-    summed = sum_cohort(filled, Folding(by="vehicle", count=10), "true", "fleet")
+    summed = load_cohort(filled, "true", "fleet", Folding(by="vehicle", count=10))
     total = load_cohort(filled, "true", "fleet").tables[0].total()
-    found = summed.sums.serving(WANTED[:-1], WANTED[-1]).total
+    found = summed.folds("vehicle", 10).serving(WANTED[:-1], WANTED[-1]).total
     assert found == total.restrict(WANTED)
     assert "understeer_ay" not in summed.gram_condition(["understeer_ay"])
     assert "ay_mean_16" in summed.gram_condition(["understeer_ay"])

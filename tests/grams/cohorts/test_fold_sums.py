@@ -10,12 +10,13 @@ import pytest
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError
 from fleet_slip.grams import reader as gram_reader
-from fleet_slip.grams.cohort import load_cohort, sum_cohort, sum_days
+from fleet_slip.grams.cohort import Cohort, load_cohort, sum_days
 from fleet_slip.grams.folding import FoldCount, Folding, FoldKey
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import answer_request, select
+from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import VIEWS, connect, needed_views
 from fleet_slip.warehouse.condition import parse_condition
@@ -42,7 +43,7 @@ def test_sums_equal_those_of_the_cohort(
     monkeypatch.setattr(gram_reader, "BATCH_ROWS", batch)
     plan = Folding(by=by, count=count)
     cohort = load_cohort(fleet, "adhesion > 0.65")
-    summed = sum_cohort(fleet, plan, "adhesion > 0.65")
+    summed = load_cohort(fleet, "adhesion > 0.65", folding=plan)
     one, two = (each.folds(plan.by, plan.count) for each in (cohort, summed))
     assert one.names == two.names
     assert one.tables == two.tables
@@ -64,7 +65,7 @@ def test_drives_with_fewer_signals_serve_the_models_that_they_can(warehouse: War
     update_grams(warehouse)
     plan = Folding(count=3)
     whole = select(load_cohort(warehouse), MODELS.model, plan)
-    summed = select(sum_cohort(warehouse, plan), MODELS.model, plan)
+    summed = select(load_cohort(warehouse, folding=plan), MODELS.model, plan)
     assert summed.as_dict() == whole.as_dict()
     assert {model.drives for model in summed.models} == {30, 36}, summed.skipped
 
@@ -114,19 +115,19 @@ def test_errors_are_those_of_the_cohort(fleet: Warehouse, condition: str) -> Non
     with pytest.raises(FleetSlipError) as whole:
         load_cohort(fleet, condition).folds("drive", 5)
     with pytest.raises(type(whole.value)) as summed:
-        sum_cohort(fleet, Folding(), condition)
+        load_cohort(fleet, condition, folding=Folding())
     assert str(summed.value) == str(whole.value)
 
 
 def test_sums_over_other_folds_are_read_again(fleet: Warehouse) -> None:
-    again = sum_cohort(fleet, Folding()).folds("drive", 7)
-    at_once = sum_cohort(fleet, Folding(count=7)).sums
+    again = load_cohort(fleet, folding=Folding()).folds("drive", 7)
+    at_once = load_cohort(fleet, folding=Folding(count=7)).folds("drive", 7)
     assert (again.names, again.tables) == (at_once.names, at_once.tables)
 
 
 def test_folds_of_rows_need_a_set_that_made_them(fleet: Warehouse) -> None:
     with pytest.raises(QuestionError, match="of whole drives"):
-        sum_cohort(fleet, Folding(by="row"))
+        load_cohort(fleet, folding=Folding(by="row"))
 
 
 def test_gram_job_takes_the_made_history_for_its_own(fleet: Warehouse) -> None:
@@ -190,15 +191,19 @@ def test_a_reader_opens_anew_only_what_changed(tmp_path: Path) -> None:
     warehouse = Warehouse(LocalFolder(tmp_path))
     write_fleet(warehouse, 20)
     plan = Folding(count=3)
+
+    def tables(cohort: Cohort) -> tuple[tuple[Gram, ...], ...]:
+        return cohort.folds(plan.by, plan.count).tables
+
     with GramReader(warehouse) as reader:
-        before = sum_cohort(reader, plan)
+        before = load_cohort(reader, folding=plan)
         opened = reader.opened(PLAIN, parse_condition("true")).database
-        assert sum_cohort(reader, plan, "adhesion > 0.7").drive_count == 14
+        assert load_cohort(reader, "adhesion > 0.7", folding=plan).drive_count == 14
         assert reader.opened(PLAIN, parse_condition("true")).database is opened
-        assert sum_cohort(reader, plan).sums.tables == before.sums.tables
+        assert tables(load_cohort(reader, folding=plan)) == tables(before)
         write_grams(warehouse, [warehouse.logs.snapshot().files[0].path], 10)
-        after = sum_cohort(reader, plan)
-        assert after.sums.tables == sum_cohort(warehouse, plan).sums.tables
+        after = load_cohort(reader, folding=plan)
+        assert tables(after) == tables(load_cohort(warehouse, folding=plan))
         assert after.grams_version == before.grams_version + 1
         assert after.rows > before.rows
 
@@ -207,12 +212,12 @@ def test_a_reader_reads_again_what_came_after_the_table(tmp_path: Path) -> None:
     warehouse = Warehouse(LocalFolder(tmp_path))
     with GramReader(warehouse) as reader:
         with pytest.raises(DataError, match="no Gram rows yet"):
-            sum_cohort(reader, Folding())
+            load_cohort(reader, folding=Folding())
         write_fleet(warehouse, 20)
-        assert sum_cohort(reader, Folding()).drive_count == 20
+        assert load_cohort(reader, folding=Folding()).drive_count == 20
 
 
 def test_where_there_are_logs_the_next_command_is_gram_alone(warehouse: Warehouse) -> None:
     land(warehouse, "a", log_rows("a", random_counts(np.random.default_rng(1), 50)))
     with pytest.raises(DataError, match=r"no Gram rows yet\. Run: fleet-slip gram\.$"):
-        sum_cohort(warehouse, Folding())
+        load_cohort(warehouse, folding=Folding())

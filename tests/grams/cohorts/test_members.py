@@ -3,13 +3,14 @@
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.grams.cohort import Members, load_cohort
+from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.gram_rows import hash_numbers
 from fleet_slip.grams.job import update_grams
+from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 
-DRIVES = {"ax,ay": ["a", "b"], "ax,ay,yaw_rate": ["b", "c"]}
+ROWS = [("a", "ax,ay"), ("b", "ax,ay"), ("b", "ax,ay,yaw_rate"), ("c", "ax,ay,yaw_rate")]
 """Drive b has rows of both kinds; c came without a log."""
 
 
@@ -17,28 +18,37 @@ def hashes(names: list[str]) -> list[int]:
     return sorted(hash_numbers(pa.array(names)).tolist())
 
 
-def members() -> Members:
-    return Members(
-        {
-            signals: np.array(
-                [[*hashes([name]), 7, name == "c", 0] for name in names], dtype=np.uint64
-            )
-            for signals, names in DRIVES.items()
-        }
+def cohort(unlabelled: Cohort | None = None) -> Cohort:
+    columns = {
+        "drive_hash": hash_numbers(pa.array([drive for drive, _ in ROWS])),
+        "vehicle_hash": [7] * len(ROWS),
+        "source": ["received" if drive == "c" else "simulated" for drive, _ in ROWS],
+        "signals": [signals for _, signals in ROWS],
+        "n": [10] * len(ROWS),
+    }
+    return Cohort(
+        condition=parse_condition("true"),
+        logs_version=1,
+        grams_version=1,
+        drives=pa.table(columns),
+        unlabelled=unlabelled,
     )
 
 
 def test_drives_with_signals_are_those_of_rows_that_have_them_all() -> None:
-    assert members().drives_with(["ay", "ax"]).tolist() == hashes(["a", "b", "c"])
-    assert members().drives_with(["ay", "yaw_rate"]).tolist() == hashes(["b", "c"])
-    assert members().drives_with(["yaw"]).tolist() == []
+    assert cohort().hash_drives_with(["ay", "ax"]).tolist() == hashes(["a", "b", "c"])
+    assert cohort().hash_drives_with(["ay", "yaw_rate"]).tolist() == hashes(["b", "c"])
+    assert cohort().hash_drives_with(["yaw"]).tolist() == []
 
 
 def test_a_car_counts_once() -> None:
-    assert members().count_vehicles_with(["ax"]) == 1
-    assert members().count_vehicles_with(["steering_wheel"]) == 0
-    assert members().count_received_with(["ax"]) == 1
-    assert (members() + members()).count_vehicles_with(["ax"]) == 1
+    assert cohort().count_vehicles_with(["ax"]) == 1
+    assert cohort().count_vehicles_with(["steering_wheel"]) == 0
+    assert cohort().count_received_with(["ax"]) == 1
+    both = cohort(cohort())
+    assert (both.count_vehicles_with(["ax"]), both.rows, both.drive_count) == (1, 40, 3)
+    assert both.count_unlabelled_with(["yaw_rate"]) == (2, 20)
+    assert cohort().count_unlabelled_with(["ax"]) == (0, 0)
 
 
 def test_the_statement_hashes_names_as_python_does(warehouse: Warehouse) -> None:

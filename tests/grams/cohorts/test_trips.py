@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
-from fleet_slip.grams.cohort import load_cohort, sum_cohort
+from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import EACH, Folding
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.resources import read_sql
@@ -164,7 +164,7 @@ def test_both_ways_to_read_a_cohort_make_the_same_folds(
 ) -> None:
     warehouse = roots[1].warehouse
     folding = Folding(by="drive", count=count)
-    summed = sum_cohort(warehouse, folding).sums
+    summed = load_cohort(warehouse, folding=folding).folds("drive", count)
     loaded = load_cohort(warehouse).folds("drive", count)
     assert [g.n for t in summed.tables for g in t] == [g.n for t in loaded.tables for g in t]
     assert summed.names == loaded.names
