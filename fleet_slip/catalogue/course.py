@@ -19,7 +19,6 @@ is none, and L is what the receiver and the gyroscope are wrong by: columns of t
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -338,18 +337,3 @@ def relate(moments: FloatArray, delay_s: float = 0.0) -> CourseRelation | None:
         float(np.sqrt(left / 2)) * abs(speed),
         1 - left / turning if turning > 0 else 0.0,
     )
-
-
-# Signals that tell which way a car turns.
-
-WITNESSES: Mapping[str, Mapping[str, int]] = {
-    "ay": {"ay": 1},
-    "yaw_rate": {"yaw_rate": 1},
-    "steering_wheel": {"steering_wheel": 1},
-    "steer_fl": {"steer_fl": 1},
-    "steer_fr": {"steer_fr": 1},
-    "front wheels": {"wheel_fl": -1, "wheel_fr": 1},
-    "rear wheels": {"wheel_rl": -1, "wheel_rr": 1},
-}
-"""What is positive in a left turn (ISO 8855), as a combination of signals: right wheels run faster
-than left ones."""

@@ -13,8 +13,14 @@ from typing import TypeAlias
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.course import COURSE, LARGEST_RAD, WITNESSES, CourseRelation, relate
-from fleet_slip.catalogue.faults import Fault
+from fleet_slip.catalogue.course import COURSE, LARGEST_RAD, CourseRelation, relate
+from fleet_slip.catalogue.faults import (
+    WITNESSES,
+    Fault,
+    MeanMoments,
+    axes_swapped,
+    find_reversed_or_swapped,
+)
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 
 # How signals of a drive go with one another: slopes, fits, a label's delay.
@@ -301,10 +307,6 @@ SLOW_MPS, SURE_EXPLAINED = 20.0, 0.85
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 ROAD_WHEELS = ("steer_fl", "steer")
 LEAST_CORRELATION, SURE_CORRELATION = 0.6, 0.9
-LEAST_AGAINST = -0.3
-"""A correlation above tells no sign, as in `quality`: of noise alone half are below zero."""
-_GOES_WITH, _GOES_NOT = 0.8, 0.5
-"""Correlations of an acceleration with the turns, across the car and along it."""
 _FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
 
 
@@ -323,7 +325,7 @@ def find_suspicions(signals: Signals) -> list[Fault]:
     found = [*still, *magnitudes.values(), *_turning(usual, speed)]
     label: list[Fault] = []
     if speed is not None:
-        for check in (_axes_swapped, _scales_differ, _accelerates, _axles_swapped):
+        for check in (_scales_differ, _accelerates, _axles_swapped):
             found += check(usual, speed)
         if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
             label = list(_label(usual, speed))  # which is judged by them
@@ -352,56 +354,19 @@ def _still(signals: Signals) -> Iterator[Fault]:
 
 
 def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Fault]:
-    """Compare the signs of all that tells left from right.
+    """Compare the signs of all that tells left from right, and both accelerations with the turns.
 
-    The fewest faults that explain all count, as in `quality`: where up to two others are against
-    both axles, the axes are not ISO 8855; where more are, left and right wheels are swapped.
+    The checks are those of Gram rows, here of the rows in which the car moves.
     """
-    known = {
-        name: np.asarray(sum(k * signals[s] for s, k in parts.items()))
-        for name, parts in {**WITNESSES, "steer": {"steer": 1}}.items()
-        if set(parts) <= set(signals)
-    }
-    known = {name: values for name, values in known.items() if np.nanstd(values) > 0}
-    if len(known) < 2:
+    told = {"ax", *(name for parts in WITNESSES.values() for name in parts)}
+    some = {name: values for name, values in signals.items() if name in told}
+    if not some:
         return
-    names, values = list(known), np.array(list(known.values()))
-    rows = moving(speed) & np.isfinite(values).all(axis=0)
-    if rows.sum() < FEWEST_TICKS:
-        return
-    correlations = np.nan_to_num(np.corrcoef(values[:, rows]))
-    loadings = np.linalg.eigh(correlations)[1][:, -1]
-    axles = [loadings[names.index(n)] for n in ("front wheels", "rear wheels") if n in names]
-    agree = len(axles) == 2 and min(map(abs, axles)) > 0.2 and axles[0] * axles[1] > 0
-    few = len(names) - len(axles) <= len(axles)
-    loadings *= np.sign(axles[0] if agree and few else loadings.sum()) or 1
-    for name, loading in zip(names, loadings, strict=True):
-        if loading > -0.2:
-            continue
-        concerned = tuple(WITNESSES.get(name, (name,)))
-        others = np.where(loadings > 0, correlations[names.index(name)], 0.0)
-        against = int(np.argmin(others))
-        if others[against] > LEAST_AGAINST:
-            continue
-        figure = f"its correlation with {names[against]} is {others[against]:+.2f}"
-        if len(concerned) == 2:
-            remedy = "Swap their columns."
-            if agree:
-                remedy += " If all others are positive to the right (SAE J670), negate these."
-            yield Fault("swapped", concerned, figure, remedy)
-        else:
-            yield Fault("reversed", concerned, figure, "Write negate = true.")
-
-
-def _axes_swapped(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
-    """Compare both accelerations with the turns."""
-    if not {"ax", "ay", "yaw_rate"} <= set(signals):
-        return
-    expected, rows = signals["yaw_rate"] * speed, moving(speed)
-    ax, ay = (abs(slope_of(signals[name], expected, rows)[1]) for name in ("ax", "ay"))
-    if ax > _GOES_WITH and ay < _GOES_NOT:
-        figure = f"yaw rate times speed goes with ax by {ax:.2f}, with ay by {ay:.2f}"
-        yield Fault("swapped", ("ax", "ay"), figure, "Swap their columns.")
+    rows = moving(speed) & np.isfinite(list(some.values())).all(axis=0)
+    if rows.sum() >= FEWEST_TICKS:
+        moments = MeanMoments.of_rows(some, rows)
+        yield from find_reversed_or_swapped(moments).get(0, ())
+        yield from axes_swapped(moments).values()
 
 
 def _scales_differ(signals: Signals, speed: FloatArray) -> Iterator[Fault]:

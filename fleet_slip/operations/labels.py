@@ -18,9 +18,8 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.facts import RECEIVED
-from fleet_slip.catalogue.faults import Fault
+from fleet_slip.catalogue.faults import DriveBatches, Fault
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
-from fleet_slip.operations.faults import DriveBatches
 from fleet_slip.operations.peers import MAD_TO_STD, QualityThresholds
 from fleet_slip.regression.gram import GramTable
 

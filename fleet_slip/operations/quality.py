@@ -13,7 +13,7 @@ import pyarrow as pa
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalogue.course import relate
 from fleet_slip.catalogue.facts import DELAY, TRAINING_DRIVES
-from fleet_slip.catalogue.faults import Fault
+from fleet_slip.catalogue.faults import DriveBatches, Fault, find_implausible
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
@@ -22,7 +22,6 @@ from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, req
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.grams.receiver_delay import changed_delays
 from fleet_slip.ingest.load import Origin
-from fleet_slip.operations.faults import DriveBatches, find_implausible
 from fleet_slip.operations.labels import find_odd_days, find_repeated, find_reversed_labels
 from fleet_slip.operations.peers import QualityThresholds, settle, thresholds
 from fleet_slip.regression.gram import GramTable
