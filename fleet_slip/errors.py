@@ -84,12 +84,6 @@ class RepeatedError(InputError):
     exit_code = 15
 
 
-class UnclaimedError(InputError):
-    """A log in a folder that no mapping of several takes, or more than one."""
-
-    exit_code = 10
-
-
 class DataError(FleetSlipError):
     """The data cannot answer: an empty cohort, an absent signal, a rank-deficient model."""
 

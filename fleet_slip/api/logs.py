@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from fleet_slip.ingest.job import IngestReport
     from fleet_slip.ingest.load import Replace
     from fleet_slip.ingest.log_files import Log
-    from fleet_slip.ingest.mapping import Mapping, MappingList
+    from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.ingest.preview import Preview
     from fleet_slip.operations.migration import MigrationReport
     from fleet_slip.simulation.campaign import Campaign
@@ -74,7 +74,7 @@ class LogsAndGrams(Rooted):
     def ingest(
         self,
         files: Iterable[Path | str] | Path | str,
-        mapping: "str | Mapping | MappingList",
+        mapping: "str | Mapping",
         *,
         as_one: bool = False,
         replace: "Replace" = "no",
@@ -84,10 +84,9 @@ class LogsAndGrams(Rooted):
     ) -> "list[IngestReport]":
         """Bring measured logs in through a mapping of columns, units and axes.
 
-        `mapping` is a name, the path of a TOML file, or a `Mapping`; or a list of them for files of
-        their own (`docs/mapping.md`). Rows that cannot be used go to the view `quarantine`. Of
-        folders, at any depth, and patterns, the logs are taken that have not landed unchanged; with
-        `as_one` they are parts of one log. Objects are given as URLs.
+        `mapping` is a name, the path of a TOML file, or a `Mapping`. Rows that cannot be used go to
+        the view `quarantine`. Of folders, at any depth, and patterns, the logs are taken that have
+        not landed unchanged; with `as_one` they are parts of one log. Objects are given as URLs.
         Returns a report of each file read, in order; `each` gets it once the file is committed.
         Progress is in files for folders and patterns, else in bytes.
         Without a cluster, threads read a folder's small files; large ones are read one by one, by
@@ -97,57 +96,49 @@ class LogsAndGrams(Rooted):
         drives give way to the new ones, in one commit; with `corrected` those of the same file and
         an older state of the same mapping do. Raises `ConfigError` for an invalid mapping;
         `InputError`, when all others are in, for files that cannot be used, or `RepeatedError`
-        where these are all in already, or `UnclaimedError` where no mapping of a list takes them,
-        or several do; `StorageError` and `ClusterError`.
+        where these are all in already; `StorageError` and `ClusterError`.
         """
         from fleet_slip.ingest.job import ingest_files, joined
         from fleet_slip.ingest.load import KnownFiles
-        from fleet_slip.ingest.log_files import find_logs, find_whole_logs, names_several
-        from fleet_slip.ingest.mapping import as_list
         from fleet_slip.operations.rewriting import take_out
 
-        plans = as_list(mapping)
-        given = [files] if isinstance(files, Path | str) else list(files)
-        paths = find_whole_logs(given) if as_one else find_logs(given)
-        folders = any(map(names_several, given))
+        plan, logs, folders = _chosen_logs(files, mapping, as_one=as_one)
         told = count_from_start(progress)
         failures: list[InputError] = []
-        reports = {}
+        reports: list[IngestReport] = []
         with open_workers(self.root, workers) as executor, step("ingest") as figures:
             elsewhere = unless_local(executor)
             if elsewhere:  # a worker has a working directory of its own
-                paths = [one.absolute() if isinstance(one, Path) else one for one in paths]
+                logs = [one.absolute() if isinstance(one, Path) else one for one in logs]
             figures.rows = 0
             warehouse = within_reach(self.warehouse, executor)
-            shares, unclaimed = plans.share_out(paths, given)
             by_file = folders and not as_one
             threads = executor if by_file else elsewhere
             out = partial(take_out, self.warehouse)
-            logs = [log for _, share in shares for log in share]
             read = no_progress if by_file or progress is None else _bytes_of(logs, told)
-            for plan, share in shares:
-                known = KnownFiles.of(self.warehouse, plan) if folders else None
-                wanted = share
-                if known is not None and not as_one:  # what is in a folder its size does not tell
-                    wanted = known.without_landed(share, warehouse)
-                if landed := len(share) - len(wanted):
-                    told(landed, len(logs))
-                try:
-                    for report in ingest_files(
-                        warehouse, wanted, plan, threads, known, read, replace, out, failures
-                    ):
-                        reports[report.file] = report
-                        figures.rows += report.counts.ticks if report.new else 0
-                        if each is not None:
-                            each(report)
-                        if by_file:
-                            told(1, len(logs))
-                finally:
-                    if known is not None:
-                        known.save()
-            if failures or unclaimed:
-                raise joined(failures, unclaimed)
-        return [reports[str(path)] for path in paths if str(path) in reports]
+            known = KnownFiles.of(self.warehouse, plan) if folders else None
+            wanted = logs
+            if known is not None and not as_one:  # what is in a folder its size does not tell
+                wanted = known.without_landed(logs, warehouse)
+            if landed := len(logs) - len(wanted):
+                told(landed, len(logs))
+            try:
+                for report in ingest_files(
+                    warehouse, wanted, plan, threads, known, read, replace, out, failures
+                ):
+                    reports.append(report)
+                    figures.rows += report.counts.ticks if report.new else 0
+                    if each is not None:
+                        each(report)
+                    if by_file:
+                        told(1, len(logs))
+            finally:
+                if known is not None:
+                    known.save()
+            if failures:
+                raise joined(failures)
+        order = {str(log): number for number, log in enumerate(logs)}
+        return sorted(reports, key=lambda report: order[report.file])
 
     @record_call
     def ingest_counted(self, file: Path | str) -> "CountedReport":
@@ -179,7 +170,7 @@ class LogsAndGrams(Rooted):
     def preview(
         self,
         files: Iterable[Path | str] | Path | str,
-        mapping: "str | Mapping | MappingList",
+        mapping: "str | Mapping",
         *,
         as_one: bool = False,
     ) -> "list[Preview]":
@@ -188,17 +179,10 @@ class LogsAndGrams(Rooted):
         Tells rows, drives, rejections, each signal's range, and what looks wrong in the longest
         drive: a sign, a unit, swapped wheels, a delay of the label.
         """
-        from fleet_slip.ingest.log_files import find_logs, find_whole_logs
-        from fleet_slip.ingest.mapping import as_list
         from fleet_slip.ingest.preview import preview_log
 
-        plans = as_list(mapping)
-        given = [files] if isinstance(files, Path | str) else list(files)
-        logs = find_whole_logs(given) if as_one else find_logs(given)
-        shares, unclaimed = plans.share_out(logs, given)
-        if unclaimed:
-            raise unclaimed
-        return [preview_log(log, plan) for plan, share in shares for log in share]
+        plan, logs, _ = _chosen_logs(files, mapping, as_one=as_one)
+        return [preview_log(log, plan) for log in logs]
 
     @record_call
     def gram(
@@ -258,6 +242,19 @@ class LogsAndGrams(Rooted):
             report = migrate(self.warehouse, count_from_start(progress))
             figures.rows = report.rows_rewritten
         return report
+
+
+def _chosen_logs(
+    files: Iterable[Path | str] | Path | str, mapping: "str | Mapping", *, as_one: bool
+) -> "tuple[Mapping, list[Log], bool]":
+    """Return a mapping, the logs that are meant, and whether these are in folders or patterns."""
+    from fleet_slip.ingest.log_files import find_logs, find_whole_logs, names_several
+    from fleet_slip.ingest.mapping import load_mapping
+
+    plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
+    given = [files] if isinstance(files, Path | str) else list(files)
+    logs = find_whole_logs(given) if as_one else find_logs(given)
+    return plan, logs, any(map(names_several, given))
 
 
 def _bytes_of(logs: "Iterable[Log]", told: Progress) -> Progress:

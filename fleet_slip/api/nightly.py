@@ -15,9 +15,9 @@ from fleet_slip.api.session import Training
 from fleet_slip.base import date_of, number_of
 from fleet_slip.catalogue.facts import CALIBRATION, DELAY
 from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError, UnclaimedError
+from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError
 from fleet_slip.ingest.log_files import find_logs, is_url
-from fleet_slip.ingest.mapping import as_list
+from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.registry import CANDIDATE, ModelVersion
 from fleet_slip.models.request import load_model_list
 from fleet_slip.operations.night import NightReport, NightStep, State
@@ -159,7 +159,7 @@ class Night:
         return f"{name}@{pointed}" if waits else None
 
     def _ingest(self) -> Told:
-        mapping = as_list(self.asked.mapping)
+        mapping = load_mapping(self.asked.mapping)
         landing = self.asked.landing
         if not is_url(landing) and not Path(landing).is_dir():
             raise InputError(
@@ -181,7 +181,7 @@ class Night:
                 each=reports.append,
                 progress=of_step(self.asked.progress, "ingest"),
             )
-        except (RepeatedError, UnclaimedError) as error:  # all others are in
+        except RepeatedError as error:  # all others are in
             again = str(error)
         rows = self.fleet.warehouse.logs.snapshot().rows - self.before.rows
         told = f"{number_of(max(rows, 0), 'new row')}."
@@ -190,11 +190,7 @@ class Night:
             told = f"{told} The mapping was corrected: its drives are in place of {drives}."
         if again:
             return "attention", f"{told} Left out: {again}"
-        alike = {name for one in reports for names in one.look_alikes for name in names}
-        if alike:
-            names = f": {', '.join(sorted(alike))}"
-            return "attention", f"{told} Names that look the same{names}."
-        if wrong := {str(found): one.file for one in reports for found in one.suspicions}:
+        if wrong := {str(found): one.file for one in reports for found in one.alarms}:
             found, file = next(iter(wrong.items()))
             return "attention", f"{told} {file}: looks wrong: {found}"
         return "done", told

@@ -57,7 +57,7 @@ class NightRequest:
     ]
     mapping: Annotated[
         str,
-        Doc("A mapping or a list of them: of configs/mappings, or a TOML file."),
+        Doc("A mapping: of configs/mappings, or a TOML file."),
     ]
     name: Annotated[str, Doc("Name of the model.")]
     _: KW_ONLY

@@ -108,8 +108,7 @@ def ingest(
     mapping: Annotated[
         str | None,
         typer.Option(
-            help="A mapping of configs/mappings, or the path of a TOML file: a mapping, or a list "
-            "of them, each for files of its own.",
+            help="A mapping of configs/mappings, or the path of a TOML file.",
             show_default=False,
         ),
     ] = None,
@@ -119,10 +118,6 @@ def ingest(
             "--dry-run", help="Store nothing; show what would be, and what looks wrong (exit 10)."
         ),
     ] = False,
-    plot: Annotated[
-        Path | None,
-        typer.Option(help="With --dry-run and one file, draw its longest drive: .png, .svg, .pdf."),
-    ] = None,
     as_one: Annotated[
         bool, typer.Option("--as-one", help="The files of each folder are parts of one log.")
     ] = False,
@@ -161,12 +156,10 @@ def ingest(
     if not files:
         raise UsageError("give files; or --undo alone, to take drives out again.")
     if mapping is None:
-        _ingest_counted(fleet, files, json, alone=not (dry_run or as_one or replace or plot))
+        _ingest_counted(fleet, files, json, alone=not (dry_run or as_one or replace))
         return
-    if plot is not None and not (dry_run and len(files) == 1):
-        raise UsageError("--plot draws one file, with --dry-run.")
     if dry_run:
-        _show_previews(fleet.preview(files, mapping, as_one=as_one), plot, json)
+        _show_previews(fleet.preview(files, mapping, as_one=as_one), json)
         return
     folders = any(map(names_several, files)) and not as_one
     each = remarks(quiet=json or folders)
@@ -210,24 +203,13 @@ def _ingest_counted(fleet: Fleet, files: list[str], json: bool, *, alone: bool) 
 
 
 def _require_sound(reports: "list[IngestReport]") -> None:
-    """Raise `AlarmError` for much that was refused, and for whatever looks wrong and does harm."""
-    from fleet_slip.ingest import suspicion as file_suspicion  # noqa: PLC0415 - takes a while
-
+    """Raise `AlarmError` for whatever looks wrong and does harm."""
     for report in reports:
-        refused, read = sum(report.counts.quarantined.values()), report.counts.rows_read
-        many = max(read * file_suspicion.LARGEST_REFUSED, file_suspicion.FEWEST_REFUSED)
-        if report.new and refused > many:
+        for one in report.alarms:
             raise AlarmError(
-                f"{report.file}: {refused:,} of {number_of(read, 'row')} were refused. See: "
-                'fleet-slip sql "FROM quarantine". Correct the mapping and give the command again '
-                "with --replace."
+                f"{report.file}: {one} Rows that were not refused are in. Give the command again "
+                "with --replace when the mapping is right."
             )
-        for one in report.suspicions:
-            if one.kind != "scale":
-                raise AlarmError(
-                    f"{report.file}: {one} Its rows are in. Give the command again with --replace "
-                    "when the mapping is right."
-                )
 
 
 def _take_back(fleet: Fleet, what: str, json: bool, *, alone: bool) -> None:
@@ -272,13 +254,6 @@ def remarks(*, quiet: bool) -> "Callable[[IngestReport], None]":
     def tell(report: "IngestReport") -> None:
         if not quiet:
             say(_ingested(report.as_dict()))
-        for names in report.look_alikes:
-            say(
-                f"{report.file}: the names {' and '.join(map(ascii, names))} look the same and "
-                "count as several: they differ in their Unicode form. Write such names in one form "
-                "in the files or the mapping, normally NFC.",
-                logging.WARNING,
-            )
         for one in report.suspicions:
             if (one.kind, one.signals) not in told:
                 told.add((one.kind, one.signals))
@@ -302,13 +277,8 @@ def _ingested(report: dict[str, Any]) -> str:
     )
 
 
-def _show_previews(previews: "list[Preview]", plot: Path | None, json: bool) -> None:
-    """Print previews, and draw the only one. Raises `AlarmError` if anything looks wrong."""
-    if plot is not None:
-        from fleet_slip.ingest.preview import draw_preview  # noqa: PLC0415 - draws
-
-        draw_preview(previews[0], plot)
-        say(f"drawn to {plot}")
+def _show_previews(previews: "list[Preview]", json: bool) -> None:
+    """Print previews. Raises `AlarmError` if anything looks wrong."""
     if json:
         print_json(previews)
     for preview in () if json else previews:
@@ -328,7 +298,7 @@ def _show_previews(previews: "list[Preview]", plot: Path | None, json: bool) -> 
         )
         for suspicion in preview.suspicions:
             print_text(f"looks wrong: {suspicion}")
-    if suspicions := sum(len(preview.suspicions) for preview in previews):
+    if suspicions := sum(len(preview.alarms) for preview in previews):
         raise AlarmError(
             f"{number_of(suspicions, 'thing')} to look at before ingesting. Nothing was stored."
         )

@@ -23,11 +23,10 @@ from fleet_slip.ingest.load import (
     write_batch,
 )
 from fleet_slip.ingest.log_files import Log, StoredParts
-from fleet_slip.ingest.log_rows import find_look_alikes
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.stream import IngestCounts
 from fleet_slip.storage.folder import StoredFile
-from fleet_slip.warehouse.tables import Warehouse, connect_tables
+from fleet_slip.warehouse.tables import Warehouse
 
 BATCH_BYTES = 2**24
 """Files are read, written and committed together up to this size."""
@@ -44,14 +43,17 @@ class IngestReport:
     file: str
     new: bool
     counts: IngestCounts
-    look_alikes: tuple[tuple[str, ...], ...] = ()
-    """Names that differ only in their Unicode form: in the file, or of cars in the logs."""
     drives_forgotten: int = 0
     """Drives that were left out: of cars that were forgotten, or forgotten themselves."""
     suspicions: tuple[Fault, ...] = ()
     """What looks wrong in its longest drive; of small files that land together, in one of all."""
     drives_replaced: int = 0
     """Drives that gave way to it: its recording, from another file or through another mapping."""
+
+    @property
+    def alarms(self) -> tuple[Fault, ...]:
+        """What looks wrong and does harm."""
+        return tuple(one for one in self.suspicions if one.does_harm)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `ingest --json` prints."""
@@ -68,7 +70,6 @@ class IngestReport:
             "drives_replaced": self.drives_replaced,
             "drives_resampled": self.counts.drives_resampled,
             "ticks": self.counts.ticks,
-            "look_alikes": self.look_alikes,
             "suspicions": [vars(one) for one in self.suspicions],
         }
 
@@ -162,42 +163,25 @@ def _report(warehouse: Warehouse, outcome: FileOutcome, new: frozenset[str]) -> 
     if not is_new and not outcome.left_out and are_gone(warehouse, outcome.digest):
         outcome.left_out = outcome.counts.drives
         outcome.counts = outcome.counts.without(outcome.left_out, 0)
-    vehicles = _find_vehicles_like(warehouse, outcome.vehicles) if is_new else ()
-    look_alikes = tuple(sorted({*outcome.look_alikes, *vehicles}))
     suspicions = outcome.suspicions if is_new else ()
     return IngestReport(
         str(outcome.file),
         is_new,
         outcome.counts,
-        look_alikes,
         outcome.left_out,
         suspicions,
         outcome.drives_replaced if is_new else 0,
     )
 
 
-def _find_vehicles_like(
-    warehouse: Warehouse, vehicles: Iterable[str]
-) -> tuple[tuple[str, ...], ...]:
-    """Return the groups of cars of the logs that look like one of these; names in ASCII do not."""
-    suspects = {name for name in vehicles if not name.isascii()}
-    if not suspects:
-        return ()
-    with connect_tables(warehouse, "drives") as database:
-        stored = database.sql("SELECT DISTINCT vehicle_id FROM drives").fetchall()
-    groups = find_look_alikes({name for (name,) in stored if name is not None} | suspects)
-    return tuple(group for group in groups if suspects.intersection(group))
-
-
-def joined(failures: list[InputError], beside: InputError | None = None) -> InputError:
-    """Return one error that tells of all, and of what is wrong beside them."""
-    if len(failures) + bool(beside) == 1:
-        return beside or failures[0]
+def joined(failures: list[InputError]) -> InputError:
+    """Return one error that tells of all."""
+    if len(failures) == 1:
+        return failures[0]
     first = " ".join(map(str, failures[:FAILURES_SHOWN]))
     more = len(failures) - FAILURES_SHOWN
     kind = RepeatedError if all(isinstance(o, RepeatedError) for o in failures) else InputError
     return kind(
         f"{number_of(len(failures), 'file')} cannot be used; all others are in. {first}"
         + (f" And {more:,} more." if more > 0 else "")
-        + (f" {beside}" if beside else "")
     )

@@ -531,7 +531,7 @@ class FileOutcome:
 
     Attributes:
         is_new: whether its content is not in the logs yet.
-        vehicles: the cars of its new rows; `left_out` are drives that were forgotten.
+        left_out: drives that were forgotten.
         same: which files, and drives of others, have its fingerprints, whether still there or not.
         replaced: those that give way to it, and how many drives that are.
     """
@@ -540,9 +540,7 @@ class FileOutcome:
     digest: str
     is_new: bool
     counts: IngestCounts
-    look_alikes: tuple[tuple[str, ...], ...]
     suspicions: tuple[Fault, ...] = ()
-    vehicles: frozenset[str] = frozenset()
     left_out: int = 0
     fingerprints: dict[str, int] = field(default_factory=dict)
     same: frozenset[Origin] = frozenset()
@@ -658,13 +656,12 @@ def _write_file(
     names = (f"measured-{digest[:24]}-{number}" for number in count(1))
     refused, rest = _RefusedRows(stream), dict[TableName, Rows]()
     longest: MeasuredDrive | None = None
-    left_out, vehicles, ticks = set[str](), set[str](), 0
+    left_out, ticks = set[str](), 0
     fingerprints = {f"{PREFIX}{stream.content[:16]}": Origin.of(digest).number}
     for drives in _groups(_read_drives(stream, refused)):
         longest = max([*([longest] if longest else []), *drives], key=lambda one: one.ticks.size)
         kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), audit)
         left_out |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in kept}
-        vehicles |= set(map(car_of, kept))
         ticks += _rows_of(kept)
         for drive in kept if is_new else ():
             if origin := Origin.of_drive(drive.drive_id):
@@ -677,7 +674,6 @@ def _write_file(
             rest["logs"] = kept
     for table, following in pairwise(chain(refused.tables(), [None])):
         allowed = keep_refused(table, audit, left_out)
-        vehicles |= names_in(allowed, "vehicle_id")
         if not allowed.num_rows or "quarantine" not in lacking:
             continue
         if following is not None:
@@ -685,11 +681,11 @@ def _write_file(
         else:
             rest["quarantine"] = [allowed]
     counts = stream.counts()
-    outcome = FileOutcome(file, digest, is_new, counts, stream.look_alikes())
+    outcome = FileOutcome(file, digest, is_new, counts)
     if not is_new:
         return outcome, None, {}
     outcome.counts = counts.without(len(left_out), ticks)
-    outcome.vehicles, outcome.left_out = frozenset(vehicles), len(left_out)
+    outcome.left_out = len(left_out)
     outcome.suspicions = stream.suspicions()
     outcome.fingerprints = fingerprints if ticks else {}
     return outcome, longest, rest

@@ -5,9 +5,8 @@ floats, dates or timestamps. CSV fields stay text, so that what is not a number 
 as it was written. A time base goes on from file to file, each open only while it is read.
 """
 
-import unicodedata
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from collections.abc import Mapping as Named
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -384,14 +383,6 @@ def _split(batch: pl.DataFrame, fields: list[Field]) -> tuple[pl.DataFrame, pl.D
     bad = checked.filter(pl.col(_PROBLEM).is_not_null())
     explained = [_explain(rows, fields) for rows in bad.partition_by(_PROBLEM)]
     return good, pl.concat([no_rows(), *explained])
-
-
-def find_look_alikes(names: Iterable[str]) -> tuple[tuple[str, ...], ...]:
-    """Return the groups of names that differ only in their Unicode form (NFC, NFD)."""
-    groups = defaultdict(set)
-    for name in names:
-        groups[unicodedata.normalize("NFC", name)].add(name)
-    return tuple(sorted(tuple(sorted(group)) for group in groups.values() if len(group) > 1))
 
 
 def describe_refused(rows: pl.DataFrame, which: BoolArray | None, reason: str) -> pl.DataFrame:

@@ -2,14 +2,10 @@
 
 import csv
 import io
-import os
-import re
-from collections.abc import Container, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Container
 from datetime import date
-from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -21,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from fleet_slip.base import canonical_ascii, number_of, shown
+from fleet_slip.base import canonical_ascii
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import (
     Config,
@@ -30,10 +26,9 @@ from fleet_slip.config import (
     added,
     faults_of,
     load_config,
-    load_toml,
     read_named_file,
 )
-from fleet_slip.errors import ConfigError, UnclaimedError
+from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.columns import (
     WHEELS,
     OffsetM,
@@ -49,7 +44,6 @@ from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.reading import FileFormats
 from fleet_slip.ingest.formats.source import describe_unknown
 from fleet_slip.ingest.formats.tables import DuckdbRows
-from fleet_slip.ingest.log_files import Log, Place, is_pattern, is_url, names_several
 from fleet_slip.resources import find_config
 
 SPEEDS = ("vx", "vehicle_speed")
@@ -315,118 +309,3 @@ def load_mapping(name_or_path: str) -> Mapping:
     if mapping.can is not None:
         mapping = mapping.model_copy(update={"can": read_can_database(mapping.can, folder)})
     return mapping
-
-
-# Which mapping the logs of a folder go through: one all of them, or several each its own.
-
-NAMES_SHOWN = 3
-
-
-class ListedMapping(Config):
-    """Which files of a folder go through a mapping; without one they are left alone."""
-
-    files: Name
-    """A folder in it, a pattern of names at any depth, or, with `/`, of paths below it."""
-    mapping: Name | None = None
-    """A name, or the path of a TOML file, seen from the list's own."""
-
-
-class ListFile(Config):
-    """A TOML file that lists mappings."""
-
-    mappings: tuple[ListedMapping, ...] = Field(min_length=1)
-
-
-class Entry(NamedTuple):
-    """Files, and the mapping that they go through, None if they are left alone."""
-
-    files: str
-    mapping: Mapping | None
-
-    def takes(self, name: str) -> bool:
-        """Whether a path below the folder is among the files."""
-        subject = name if "/" in self.files else name.rpartition("/")[2]
-        return fnmatchcase(subject, self.files) or name.startswith(f"{self.files.rstrip('/')}/")
-
-
-@dataclass(frozen=True)
-class MappingList:
-    """Mappings, each of which takes files of its own."""
-
-    name: str
-    entries: tuple[Entry, ...]
-
-    def share_out(
-        self, logs: Sequence[Log], places: Iterable[Place]
-    ) -> tuple[list[tuple[Mapping, list[Log]]], UnclaimedError | None]:
-        """Return the logs of each mapping, and what tells of those of none or of several.
-
-        Patterns are seen from the `places` in which the logs were found.
-        """
-        folders = sorted(map(_folder_of, places), key=len)
-        shares: list[list[Log]] = [[] for _ in self.entries]
-        none, several = list[str](), list[str]()
-        for log in logs:
-            name = _name_below(folders, log)
-            takers = [n for n, one in enumerate(self.entries) if one.takes(name)]
-            if len(takers) == 1:
-                shares[takers[0]].append(log)
-            else:
-                (several if takers else none).append(name)
-        taken = [
-            (one.mapping, share)
-            for one, share in zip(self.entries, shares, strict=True)
-            if one.mapping is not None and share
-        ]
-        if not none and not several:
-            return taken, None
-        unclaimed = " and ".join(
-            f"{number_of(len(names), 'log')} ({', '.join(map(shown, names[:NAMES_SHOWN]))}"
-            f"{', …' if len(names) > NAMES_SHOWN else ''}) of {of}"
-            for names, of in ((none, "no mapping"), (several, "several mappings"))
-            if names
-        )
-        return taken, UnclaimedError(
-            f"{self.name}: {unclaimed} left out. Give each file one mapping in it, or none, and "
-            "it is left alone."
-        )
-
-
-def as_list(mapping: str | Mapping | MappingList) -> MappingList:
-    """Return what a name, a path, a mapping or a list stands for. Raises `ConfigError`.
-
-    A file with `[[mappings]]` is a list; any other is the mapping of all logs.
-    """
-    if isinstance(mapping, MappingList):
-        return mapping
-    if isinstance(mapping, Mapping):
-        return MappingList(mapping.name, (Entry("*", mapping),))
-    file = find_config("mappings", mapping)
-    if "mappings" not in load_toml(file):
-        return as_list(load_mapping(mapping))
-    folder = Path(str(file)).parent
-
-    def load(name: str | None) -> Mapping | None:
-        if name is None:
-            return None
-        return load_mapping(str(folder / name) if name.endswith(".toml") else name)
-
-    listed = load_config(file, ListFile).mappings
-    return MappingList(mapping, tuple(Entry(one.files, load(one.mapping)) for one in listed))
-
-
-def _folder_of(place: Place) -> str:
-    """Return the folder that is searched, with `/` at its end."""
-    text = str(place) if is_url(place) else os.path.abspath(place)  # noqa: PTH100 - as in a URL
-    if is_pattern(place if is_url(place) else Path(place)):
-        text = re.split(r"[*?[]", text, maxsplit=1)[0]
-    elif names_several(place):
-        return f"{text.rstrip('/')}/"
-    return f"{text.rpartition('/')[0]}/"
-
-
-def _name_below(folders: Sequence[str], log: Log) -> str:
-    """Return the path of a log below the outermost of the folders that have it."""
-    text = os.path.abspath(log) if isinstance(log, Path) else str(log)  # noqa: PTH100
-    inside = (text[len(folder) :] for folder in folders if text.startswith(folder))
-    return next(inside, text.rpartition("/")[2])

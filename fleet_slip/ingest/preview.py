@@ -1,8 +1,6 @@
 """What ingesting a file would do, and a picture of it: nothing is stored."""
 
-import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,16 +9,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import needed
 from fleet_slip.catalogue.faults import Fault
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
-from fleet_slip.errors import ConfigError
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.log_files import Log, local_copy
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.ingest.suspicion import find_suspicions
-from fleet_slip.storage.storage_errors import storage_errors
 
 MOST_TICKS = 200_000
 """Ticks of the longest drive that are looked at: half an hour."""
@@ -48,6 +43,11 @@ class Preview:
     suspicions: tuple[Fault, ...]
     longest: dict[str, FloatArray]
     """The signals of the longest drive, on consecutive ticks from its first."""
+
+    @property
+    def alarms(self) -> tuple[Fault, ...]:
+        """What looks wrong and does harm."""
+        return tuple(one for one in self.suspicions if one.does_harm)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `ingest --dry-run --json` prints."""
@@ -114,40 +114,3 @@ def _range(name: str, found: _Found) -> SignalRange:
         np.nan if end is None else end * float(signal.scale) for end in (found.low, found.high)
     )
     return SignalRange(name, signal.unit, low, high, 1 - found.values / max(found.ticks, 1))
-
-
-_SHOWN = {
-    "rad": ("deg", 180 / math.pi),
-    "rad/s": ("deg/s", 180 / math.pi),
-    "m/s": ("km/h", 3.6),
-}
-"""What people read a unit in, and how many of it one is; others are drawn as they are."""
-
-
-def draw_preview(preview: Preview, file: Path) -> None:
-    """Draw the signals to a file of any format. Raises `ConfigError`, `StorageError`."""
-    with needed("report", "a picture of a measured log"):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - takes a while
-        from matplotlib.figure import Figure  # noqa: PLC0415
-
-    names = list(preview.longest)
-    figure = Figure(figsize=(10, 1.3 * len(names) + 0.8), layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = np.atleast_1d(figure.subplots(len(names), sharex=True))
-    for name, axes in zip(names, panels, strict=True):
-        values, signal = preview.longest[name], catalogue()[name]
-        wrong = [s.kind for s in preview.suspicions if name in s.signals]
-        time_s = np.arange(values.size) * float(SAMPLE_TIME_S)
-        unit, factor = _SHOWN.get(signal.unit, (signal.unit, 1.0))
-        axes.plot(time_s, values * factor, color="tab:red" if wrong else "tab:blue", linewidth=0.8)
-        axes.axhline(0, color="0.8", linewidth=0.5, zorder=0)
-        axes.set_title(f"{name}, {unit}", loc="left", fontsize="small")
-        axes.set_title("; ".join(f"{kind}?" for kind in wrong), loc="right", fontsize="small")
-        axes.spines[["top", "right"]].set_visible(False)
-    panels[-1].set_xlabel("time, s")
-    figure.suptitle(f"{Path(preview.file).name}: its longest drive", x=0.01, ha="left")
-    with storage_errors(file):
-        try:
-            figure.savefig(file, metadata={"Date": None} if file.suffix == ".svg" else None)
-        except ValueError as error:
-            raise ConfigError(f"{file}: {error}") from None

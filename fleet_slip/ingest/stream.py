@@ -39,7 +39,6 @@ from fleet_slip.ingest.log_rows import (
     CheckedBlock,
     RowChecker,
     describe_refused,
-    find_look_alikes,
     join_refused,
     no_rows,
 )
@@ -316,20 +315,11 @@ class MeasuredStream:
         )
 
     def suspicions(self) -> tuple[Fault, ...]:
-        """Return the signals of which many values were refused, once all pieces were taken."""
-        of_signals = Counter[str]()
-        for (_, reason), count in self.totals.refused.items():
-            of_signals[reason] += count
-        others = self.totals.quarantined - of_signals
-        found = tuple(find_refusals(self.totals.refused, self.checker.rows, others))
-        time, drives = self.mapping.time, self.totals.drives
-        of_cars = (*self._cars.suspicions(), *unmapped_cars(self.file, self.mapping, drives))
-        return (*found, *of_cars, *assumed_rate(time.rate_hz if time.assumed else None))
-
-    def look_alikes(self) -> tuple[tuple[str, ...], ...]:
-        """Return names of drives or cars in the file that differ only in their Unicode form."""
-        told = {value for key in self.checker.keys.metadata for value in key.values()}
-        return find_look_alikes({value for value in told if isinstance(value, str)})
+        """Return what looks wrong in the file as a whole, once all pieces were taken."""
+        totals, time = self.totals, self.mapping.time
+        found = list(find_refusals(totals.refused, self.checker.rows, totals.quarantined))
+        found += [*self._cars.suspicions(), *unmapped_cars(self.file, self.mapping, totals.drives)]
+        return (*found, *assumed_rate(time.rate_hz if time.assumed else None))
 
 
 @contextmanager

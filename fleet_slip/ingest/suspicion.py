@@ -6,6 +6,7 @@ with the figure that shows it, and what to try. Axes and signs are ISO 8855.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeAlias
@@ -516,28 +517,32 @@ _OF_TIME = ("time", "isolated", "too_short", "not_a_time")
 
 
 def find_refusals(
-    refused: Mapping[tuple[str, str], int], rows: int, others: Mapping[str, int] | None = None
+    refused: Mapping[tuple[str, str], int], rows: int, reasons: Mapping[str, int]
 ) -> Iterator[Fault]:
-    """Yield the signals of which more than a tenth of a file's rows were refused, by reason.
+    """Yield each signal for which more than a tenth of a file's rows were refused, and all others.
 
-    `others` are the rows refused for anything but a signal, by reason: together they are another.
+    `refused` are rows by signal and reason, `reasons` all refused rows by reason.
     """
-    for (name, reason), count in refused.items():
-        if count > max(rows * LARGEST_REFUSED, FEWEST_REFUSED):
-            kind, remedy = _REFUSED.get(reason, ("values", "Look at the column."))
-            figure = f"{count:,} of {rows:,} rows are refused for it, {reason}"
-            yield Fault(kind, (name,), figure, remedy)
-    total = sum((others or {}).values())
-    if others and total > max(rows * LARGEST_REFUSED, FEWEST_REFUSED):
-        reason = max(others, key=lambda one: others[one])
-        figure = f"{total:,} of {rows:,} rows are refused, {others[reason]:,} as {reason}"
-        if reason.startswith(_OF_TIME):
-            remedy = "Check the column of times, its unit and its format"
-            if reason in {"time_duplicate", "time_backwards"}:
-                remedy += ", and map the column that tells cars or trips apart if there are several"
-            yield Fault("values", ("time",), figure, f"{remedy}.")
-        else:
-            yield Fault("values", ("rows",), figure, "Look at the view quarantine.")
+    most = max(rows * LARGEST_REFUSED, FEWEST_REFUSED)
+    several = {key: count for key, count in refused.items() if count > most}
+    for (name, reason), count in several.items():
+        kind, remedy = _REFUSED.get(reason, ("values", "Look at the column."))
+        figure = f"{count:,} of {rows:,} rows are refused for it, {reason}"
+        yield Fault(kind, (name,), figure, remedy)
+    others = Counter(reasons)
+    for (_, reason), count in several.items():
+        others[reason] -= count
+    if others.total() <= most:
+        return
+    ((reason, count),) = others.most_common(1)
+    figure = f"{others.total():,} of {rows:,} rows are refused, {count:,} as {reason}"
+    if reason.startswith(_OF_TIME):
+        remedy = "Check the column of times, its unit and its format"
+        if reason in {"time_duplicate", "time_backwards"}:
+            remedy += ", and map the column that tells cars or trips apart if there are several"
+        yield Fault("values", ("time",), figure, f"{remedy}.")
+    else:
+        yield Fault("values", ("rows",), figure, "Look at the view quarantine.")
 
 
 def assumed_rate(rate_hz: float | None) -> Iterator[Fault]:

@@ -367,8 +367,9 @@ def _look(
                 f"LIMIT {MOST_TICKS}",
                 {"day": day, "drive": drive},
             ).fetchnumpy()
-            for suspicion in find_suspicions(_signals(columns)):
-                found.setdefault((suspicion.kind, suspicion.signals), []).append(suspicion)
+            for one in find_suspicions(_signals(columns)):
+                if one.does_harm:
+                    found.setdefault((one.kind, one.signals), []).append(one)
     return found, len(chosen), measured
 
 

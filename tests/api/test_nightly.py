@@ -9,7 +9,6 @@ from datetime import date, timedelta
 from pathlib import Path
 from typing import Any
 
-import duckdb
 import numpy as np
 import pytest
 
@@ -216,32 +215,6 @@ def test_a_file_that_cannot_be_used_does_not_hold_up_the_others(
     assert (report.exit_code, report.champion, report.drives) == (4, "smoke@3", 8)
     assert "ingest failed" in str(report.problem)
     assert "torn.parquet" in str(report.problem)
-
-
-def test_a_mixed_folder_lands_through_several_mappings_and_a_stray_file_is_said_once(
-    place: Path, landing: Landing
-) -> None:
-    text = landing.mapping.read_text()
-    (place / "other.toml").write_text(text.replace('"landing"', '"other"').replace("ax_", "a_x_"))
-    (place / "mixed.toml").write_text(
-        '[[mappings]]\nfiles = "night-*"\nmapping = "landing.toml"\n'
-        '[[mappings]]\nfiles = "other"\nmapping = "other.toml"\n'
-    )
-    file = land(landing, 2)
-    (place / "landing/other").mkdir()
-    with duckdb.connect() as database:
-        database.sql(
-            f"COPY (SELECT * RENAME (ax_mps2 AS a_x_mps2) FROM '{file}') "
-            f"TO '{place}/landing/other/log.parquet'"
-        )
-    file.unlink()
-    (place / "landing/stray.csv").write_text("a,b\n1,2\n")
-    done = run_night(place, 2, "--mapping", str(place / "mixed.toml"))
-    assert done.exit_code == 10, done.stderr
-    assert (done.stdout + done.stderr).count("stray.csv") == 1
-    assert done.stderr == f"error: the night of {day_of(2)}: ingest calls for attention\n"
-    assert "new: 2 drives" in done.stdout
-    assert "champion: smoke@3, was smoke@2" in done.stdout
 
 
 def test_with_a_wrong_mapping_what_is_there_is_looked_after(place: Path, landing: Landing) -> None:

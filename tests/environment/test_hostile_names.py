@@ -1,19 +1,12 @@
-"""Names that a spreadsheet would execute, and names that only look the same."""
+"""Names that a spreadsheet would execute."""
 
 import csv
 import io
-import unicodedata
 from pathlib import Path
 
 import pytest
 
-from fleet_slip.ingest.job import ingest_files
-from fleet_slip.ingest.log_rows import find_look_alikes
-from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
-from tests.support.measured import a_mapping, csv_text, good_columns
-
-NFC, NFD = (unicodedata.normalize(form, "Zoë") for form in ("NFC", "NFD"))
 
 
 @pytest.fixture(autouse=True)
@@ -42,32 +35,3 @@ def test_other_texts_are_printed_as_they_are(run_command: RunCommand) -> None:
     done = run_command("sql", query, "--csv")
     assert [row[0] for row in cells(done.stdout)] == ["a=b", "", "", "2024-05-01", " =x"]
     assert done.stderr == ""
-
-
-def test_names_in_another_form_are_found_and_others_are_not() -> None:
-    assert NFC != NFD
-    assert find_look_alikes([NFC, NFD, NFC, "Zoe", "zoë", "other"]) == ((NFD, NFC),)
-
-
-def test_cars_and_drives_of_one_file_that_look_the_same_are_pointed_out(
-    tmp_path: Path, warehouse: Warehouse
-) -> None:
-    columns = good_columns() | {"car": [NFC] * 10 + [NFD] * 10}
-    for place in ("vehicle_id", "column"):
-        columns["ax"] = [f"{len(place)}"] * 20
-        drive = {place: {"column": "car"}} if place == "vehicle_id" else {place: "car"}
-        (tmp_path / "log.csv").write_text(csv_text(columns))
-        (report,) = ingest_files(warehouse, [tmp_path / "log.csv"], a_mapping(drive=drive))
-        assert (report.new, report.look_alikes) == (True, ((NFD, NFC),)), place
-
-
-def test_a_car_that_looks_like_one_of_the_logs_is_pointed_out(
-    tmp_path: Path, warehouse: Warehouse
-) -> None:
-    found = []
-    for number, name in enumerate((NFC, "other", NFD)):
-        columns = good_columns() | {"ax": [f"{number}"] * 20}
-        (tmp_path / "log.csv").write_text(csv_text(columns))
-        mapping = a_mapping(drive={"vehicle_id": name})
-        found += [r.look_alikes for r in ingest_files(warehouse, [tmp_path / "log.csv"], mapping)]
-    assert found == [(), (), ((NFD, NFC),)]

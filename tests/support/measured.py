@@ -36,8 +36,6 @@ class MeasuredLog:
     quarantine: pa.Table
     """`QUARANTINE_SCHEMA`, in the file's order."""
     counts: IngestCounts
-    look_alikes: tuple[tuple[str, ...], ...]
-    """Names of drives or cars in the file that differ only in their Unicode form."""
     digest: str
     """SHA-256 of the file's bytes and the mapping: what has the same one was ingested before."""
 
@@ -55,7 +53,6 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
         log_table(drives, mapping),
         stream.quarantine_table([piece.refused for piece in pieces]),
         stream.counts(),
-        stream.look_alikes(),
         stream.digest,
     )
 
