@@ -1,18 +1,16 @@
-"""Takes in Gram rows that cars counted on board: a Parquet or Arrow table, beside rows of logs.
+"""Loads Gram rows that cars counted on board: a Parquet or Arrow table, beside rows of logs.
 
-The table has the columns of `COLUMNS`. It lands whole, once, in one commit, or not at all: an error
-names the first row that cannot be, and why. A row becomes one of `grams`: its drive has the source
-`received`, and instead of a log file it names `received/` and the digest of the table's file.
+The table has the columns of `COLUMNS`. It is loaded whole, once, in one commit, or not at all: an
+error names the first row that cannot be, and why. The drive of a row has the source `received`, and
+instead of a log file the row names `received/` and the digest of the table's file.
 """
 
 import hashlib
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import date, timedelta
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import NoReturn
 
 import numpy as np
 import pyarrow as pa
@@ -35,18 +33,19 @@ from fleet_slip.catalogue.course import (
     course_units,
 )
 from fleet_slip.catalogue.definitions import limit_of
-from fleet_slip.catalogue.facts import RECEIVED, RECEIVED_FILES
+from fleet_slip.catalogue.facts import RECEIVED_FILES
 from fleet_slip.catalogue.features import PLAIN, FeatureSet, features
 from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, Signal, catalogue
 from fleet_slip.catalogue.time_columns import Feature
 from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.grams.compute import Parts
-from fleet_slip.grams.gram_files import content_keys, files_to_rewrite, rows_to_keep, write_rows
-from fleet_slip.grams.gram_rows import gram_table, is_received
-from fleet_slip.regression.exact import is_semidefinite
-from fleet_slip.regression.gram import packed_size
+from fleet_slip.grams.gram_files import files_to_rewrite, rows_to_keep, write_rows
+from fleet_slip.grams.gram_rows import by_signals, gram_table
+from fleet_slip.grams.reader import BATCH_ROWS
+from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Change, Snapshot, Unit, retry_conflicts
+from fleet_slip.warehouse.database import database_errors, open_database, reading_files
 from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -175,29 +174,20 @@ def _range_beside(column: str, ticks: int) -> Range:
     return -most, most
 
 
-# Which Gram rows no drive of integer counts can have, exactly.
+# Which Gram rows no drive of integer counts can have.
 #
-# Of n rows whose counts x of a signal are whole numbers from l to h, with the sum s and the sum of
-# squares d, and c the sum of products of two signals x and y,
-#
-#     n l <= s <= n h                               each count is in its range
-#     d = s modulo 2                                x^2 and x are both odd or both even
-#     d <= (l + h) s - n l h                        (x - l) (h - x) >= 0
-#     d >= (2 a + 1) s - n a (a + 1), a = floor(s/n)  (x - a) (x - a - 1) >= 0, for any whole a
-#     |c| <= n max|x| max|y|
-#
-# in 64 bits: n is so small (`most_rows`) that nothing reaches 2^63. And the matrix of n, sums and
-# products is positive semidefinite. That is decided in binary64 where it can be, on the matrix
-# scaled to a diagonal of ones: its least eigenvalue is computed to within m^2 u or so, 1e-13 for m
-# = 33 (Higham, Accuracy and Stability of Numerical Algorithms, section 10.1). Beyond `NEAR` of
-# zero its sign is sure; what is between is decided in whole numbers, 0.1 ms each with 11 signals.
+# Of n rows whose counts x of a signal are from l to h, with the sum s, and c the sum of products of
+# two signals x and y: n l <= s <= n h, and |c| <= n max|x| max|y|, in 64 bits: n is so small
+# (`most_rows`) that nothing reaches 2^63. The matrix of n, sums and products is positive
+# semidefinite: scaled to a diagonal of ones, its least eigenvalue is not below zero by more than
+# is computed wrongly (Higham, Accuracy and Stability of Numerical Algorithms, section 10.1).
 
 NEAR = 1e-11
 LARGEST_SUM = 2**61
 
 NO_ROWS = "has no rows, or more than a drive can have"
 SUMS = "has sums outside the ranges of its signals"
-PRODUCTS = "has products that no integer counts can have"
+PRODUCTS = "has products outside the ranges of its signals"
 INDEFINITE = "has a matrix that is not positive semidefinite"
 
 
@@ -206,22 +196,23 @@ def find_impossible(
 ) -> dict[str, IntArray]:
     """Return impossible Gram rows by reason, of n (m,), sums (m, k), products and k ranges."""
     least, most = np.array(ranges, dtype=np.int64).reshape(-1, 2).T
+    row, column = np.tril_indices(len(least))
+    size = np.maximum(np.abs(least), np.abs(most))
+    possible = (rows >= 1) & (rows <= most_rows(ranges))
+    n = np.where(possible, rows, 1)[:, None]
+    bound = n * (size[row] * size[column])
+    judged = (
+        (NO_ROWS, ~possible),
+        (SUMS, ((sums < n * least) | (sums > n * most)).any(axis=1)),
+        (PRODUCTS, ((products > bound) | (products < -bound)).any(axis=1)),
+        (INDEFINITE, _indefinite(n[:, 0], sums, products)),
+    )
     found: dict[str, IntArray] = {}
-    left = np.arange(len(rows))
-    for reason in (NO_ROWS, SUMS, PRODUCTS, INDEFINITE):
-        n, s, p = rows[left], sums[left], products[left]
-        bad: Any
-        if reason == NO_ROWS:
-            bad = np.array((n < 1) | (n > most_rows(ranges)), dtype=np.bool_)
-        elif reason == SUMS:
-            bad = ((s < n[:, None] * least) | (s > n[:, None] * most)).any(axis=1)
-        elif reason == PRODUCTS:
-            bad = _bad_products(n[:, None], s, p, least, most)
-        else:
-            bad = _indefinite(n, s, p)
-        if bad.any():
-            found[reason] = left[bad]
-            left = left[~bad]
+    left = np.ones(len(rows), dtype=np.bool_)
+    for reason, bad in judged:
+        if (bad & left).any():
+            found[reason] = np.flatnonzero(bad & left)
+            left &= ~bad
     return found
 
 
@@ -229,20 +220,6 @@ def most_rows(ranges: Sequence[tuple[int, int]]) -> int:
     """Return of how many rows a Gram row can be: no sum of their products reaches 2^61."""
     largest = max((abs(end) for one in ranges for end in one), default=1)
     return min(ROWS_IN_A_SUM, (LARGEST_SUM - 1) // largest**2)
-
-
-def _bad_products(
-    n: IntArray, sums: IntArray, products: IntArray, least: IntArray, most: IntArray
-) -> BoolArray:
-    row, column = np.tril_indices(len(least))
-    size = np.maximum(np.abs(least), np.abs(most))
-    bound = n * (size[row] * size[column])
-    squares, below = products[:, np.flatnonzero(row == column)], sums // n
-    bad: BoolArray = ((products > bound) | (products < -bound)).any(axis=1)
-    bad |= ((squares ^ sums) & 1 != 0).any(axis=1)
-    bad |= (squares > (least + most) * sums - n * (least * most)).any(axis=1)
-    bad |= (squares < (2 * below + 1) * sums - n * (below * (below + 1))).any(axis=1)
-    return bad
 
 
 def _indefinite(n: IntArray, sums: IntArray, products: IntArray) -> BoolArray:
@@ -254,14 +231,7 @@ def _indefinite(n: IntArray, sums: IntArray, products: IntArray) -> BoolArray:
     matrix[:, row + 1, column + 1] = products
     scale = 1 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), 1.0))
     matrix *= scale[:, :, None] * scale[:, None, :]
-    smallest = np.linalg.eigvalsh(matrix)[:, 0]  # of the lower triangle
-    bad: BoolArray = smallest < -NEAR
-    for at in np.flatnonzero(np.abs(smallest) <= NEAR).tolist():
-        packed = products[at].tolist()
-        triangle = [[int(n[at])]]
-        for i, total in enumerate(sums[at].tolist()):
-            triangle.append([total, *packed[i * (i + 1) // 2 : (i + 1) * (i + 2) // 2]])
-        bad[at] = not is_semidefinite(triangle)
+    bad: BoolArray = np.linalg.eigvalsh(matrix)[:, 0] < -NEAR  # of the lower triangle
     return bad
 
 
@@ -282,15 +252,11 @@ COLUMNS = pa.schema(
 )
 """The table of Gram rows; `part` and `course_late` may be null or absent (`docs/export.md`)."""
 
-_NUMBERS = ("sums", "products")
 OPTIONAL = ("part", COURSE_LATE)
 LARGEST_BYTES, MOST_UNPACKED_BYTES = 2**28, 2**30
 MOST_ROWS = 500_000
-BATCH_ROWS = 2**13
 LONGEST_ROWS = 86_400 * round(1 / SAMPLE_TIME_S)
 """Rows of a day: a drive is over by then."""
-FIRST_DAY = date(2000, 1, 1)
-"""A car's clock that says less has not been set."""
 ONE_AT_A_TIME = "receive"
 """Unit of every such commit: two at once, which could bring the same drive, are a conflict."""
 
@@ -307,16 +273,18 @@ class CountedReport:
 
 
 def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:
-    """Land the Gram rows of a file, once. Raises `InputError`, `RepeatedError`, `ConflictError`."""
+    """Load the Gram rows of a file, once. Raises `InputError`, `RepeatedError`, `ConflictError`."""
     content = read_named_file(file, LARGEST_BYTES, InputError)
     table = _read(file, content)
     digest = hashlib.sha256(content).hexdigest()
     unit = Unit(f"receive/{digest}", 1)
     drives, rows = pc.count_distinct(table["drive_id"]).as_py(), pc.sum(table["n"]).as_py()
-    report = CountedReport(str(file), True, len(table), drives, rows or 0)
-    if warehouse.grams.snapshot().landed(unit.name) is not None:
-        return CountedReport(str(file), False, len(table), drives, rows or 0)
-    mine = _gram_rows(file, table, warehouse.grams.schema, f"{RECEIVED_FILES}{digest[:24]}")
+    new = warehouse.grams.snapshot().landed(unit.name) is None
+    report = CountedReport(str(file), new, len(table), drives, rows or 0)
+    if not new:
+        return report
+    _require_possible(file, table)
+    mine = _gram_rows(table, warehouse.grams.schema, f"{RECEIVED_FILES}{digest[:24]}")
 
     def attempt() -> None:
         grams = warehouse.grams.snapshot()
@@ -404,137 +372,81 @@ _NEXT_FIELD_I32 = 0x15
 """In Thrift's compact protocol: the next field, an integer of 32 bits."""
 
 
-def _gram_rows(file: Path, table: pa.Table, schema: pa.Schema, name: str) -> pa.Table:
-    """Return rows of `grams`. Raises `InputError` for the first row that no drive can have."""
-    wrong = dict(_find_wrong(table))
-    if wrong:
-        _refuse(file, table, min(wrong), wrong[min(wrong)])
+def _gram_rows(table: pa.Table, schema: pa.Schema, name: str) -> pa.Table:
+    """Return rows of `grams`."""
     identities = {one.key: one.identity for one in counted_sets().values()}
-    known: dict[str, Any] = {one: table[one] for one in COLUMNS.names}
-    known["feature_set"] = [identities[key] for key in table["feature_set"].to_pylist()]
+    sets = pa.array([identities[key] for key in table["feature_set"].to_pylist()])
+    known = dict(zip(table.column_names, table.columns, strict=True)) | {"feature_set": sets}
     known |= {"file": pa.repeat(name, len(table)), "clipped": pa.repeat(0, len(table))}
     columns = [
-        pa.array(known[one.name], one.type)
-        if isinstance(known.get(one.name), list)
-        else known[one.name].cast(one.type)
-        if one.name in known
-        else pa.nulls(len(table), one.type)
+        known[one.name].cast(one.type) if one.name in known else pa.nulls(len(table), one.type)
         for one in schema
     ]
     return pa.table(columns, schema=schema)
 
 
 def _refuse(
-    file: Path, table: pa.Table, row: int, reason: str, error: type[InputError] = InputError
-) -> None:
-    drive = shown(str(table["drive_id"][row].as_py()))
+    file: Path, row: int, drive: object, reason: str, error: type[InputError] = InputError
+) -> NoReturn:
     raise error(
-        f"{file}: row {row + 1} (drive {drive}) {reason}. Nothing of the file landed: mend the row "
-        "or leave it out, and give the file again."
+        f"{file}: row {row} (drive {shown(str(drive))}) {reason}. Nothing of the file was loaded: "
+        "mend the row or leave it out, and give the file again."
     )
 
 
-def _find_wrong(table: pa.Table) -> Iterator[tuple[int, str]]:
-    """Yield rows that cannot be, by number from 0, and why."""
+def _numbered(table: pa.Table) -> pa.Table:
+    return table.append_column("number", pa.array(range(1, len(table) + 1)))
+
+
+def _require_possible(file: Path, table: pa.Table) -> None:
+    """Raise `InputError` for the first row that no drive can have."""
     sets = {one.key: one for one in counted_sets().values()}
-    kinds: dict[tuple[str, str], list[int]] = defaultdict(list)
-    rows_of: Counter[tuple[str, ...]] = Counter()
-    first_of: dict[tuple[str, ...], int] = {}
-    car_of: dict[str, tuple[str, date]] = {}
-    plain = table.select([name for name in COLUMNS.names if name not in _NUMBERS])
-    lists = [table[name].combine_chunks() for name in _NUMBERS]
-    lengths = zip(*(pc.list_value_length(one).to_pylist() for one in lists), strict=True)
-    holes = any(one.flatten().null_count for one in lists)
-    for row, (said, sizes) in enumerate(zip(plain.to_pylist(), lengths, strict=True)):
-        one = sets.get(said["feature_set"])
-        if reason := _contradiction(said, sizes, one):
-            yield row, reason
-            continue
-        drive, signals = said["drive_id"], said["signals"]
-        whole = (drive, said["feature_set"], said["part"] or "")
-        rows_of[whole] += said["n"]
-        car = said["vehicle_id"], said["day"]
-        if car_of.setdefault(drive, car) != car:
-            yield row, "is of another car or day than a row of its drive before"
-        elif first_of.setdefault((*whole, signals), row) != row:
-            yield row, "is there twice"
-        elif rows_of[whole] > LONGEST_ROWS:
-            yield row, "has more rows than the day of a drive has time for"
-        elif holes:
-            yield row, "or another has a sum or a product that is null"
-        else:
-            kinds[said["feature_set"], signals].append(row)
-    for (key, signals), rows in kinds.items():
-        for first in range(0, len(rows) if signals else 0, BATCH_ROWS):
-            some = rows[first : first + BATCH_ROWS]
-            told = gram_table(signals, table.take(pa.array(some)))
-            ranges = sets[key].ranges_of(told.signals)
-            for reason, at in find_impossible(told.n, told.sums, told.products, ranges).items():
-                yield from ((some[place], reason) for place in at.tolist())
-
-
-def _contradiction(said: dict[str, Any], sizes: tuple[Any, ...], one: CountedSet | None) -> str:
-    """Return why a row cannot be of a feature set, by all but its numbers; nothing if it can."""
-    if absent := [name for name, value in said.items() if value is None and name not in OPTIONAL]:
-        return f"has no {absent[0]}"
-    if one is None:
-        return "is of a feature set, or of signals, that mean something else here"
-    signals, late = _names(said["signals"]), said[COURSE_LATE]
-    least, most = (LATE_PARTS * ticks * one.in_time for ticks in (MOST_EARLY, MOST_LATE))
-    wrong = {
-        f"has another source than {RECEIVED!r}": said["source"] != RECEIVED,
-        "has no rows": said["n"] < 1,
-        "has no name of a car": not said["vehicle_id"].strip(),
-        "has no name of a drive": not said["drive_id"].strip(),
-        "has signals that its set has not, or in another order": signals
-        != [name for name in one.columns if name in signals],
-        "has not the sums and products of its signals": sizes
-        != (len(signals), packed_size(len(signals))),
-        "has a part that its set has not": said["part"] not in one.parts,
-        "is corrected by a delay that no course has": one.in_time != (late is not None)
-        or not least <= (late or 0) <= most,
-        "is of a day before 2000 or in the future": not FIRST_DAY
-        <= said["day"]
-        <= date.today() + timedelta(days=1),
-    }
-    return next((reason for reason, holds in wrong.items() if holds), "")
-
-
-def _names(signals: str) -> list[str]:
-    return signals.split(",") if signals else []
+    known = [
+        {"columns": one.columns, "parts": [part or "" for part in one.parts]}
+        | {"key": key, "in_time": one.in_time}
+        for key, one in sets.items()
+    ]
+    late = {"earliest": LATE_PARTS * MOST_EARLY, "latest": LATE_PARTS * MOST_LATE}
+    with open_database() as database, database_errors("checking Gram rows"):
+        database.register("counted", _numbered(table))
+        database.register("known", pa.Table.from_pylist(known))
+        statement = read_sql("jobs", "counted_wrong.sql")
+        wrong = database.execute(statement, {**late, "longest": LONGEST_ROWS}).fetchone()
+    if wrong:
+        _refuse(file, *wrong)
+    for key in table["feature_set"].unique().to_pylist():
+        of_set = _numbered(table).filter(pc.equal(table["feature_set"], key)).combine_chunks()
+        for batch in of_set.to_batches(BATCH_ROWS):
+            for signals, rows, _ in by_signals(batch):
+                if not signals:
+                    continue
+                one, ranges = gram_table(signals, rows), sets[key].ranges_of(signals.split(","))
+                for reason, at in find_impossible(one.n, one.sums, one.products, ranges).items():
+                    row = rows.slice(int(at[0]), 1).to_pylist()[0]
+                    _refuse(file, row["number"], row["drive_id"], reason)
 
 
 def _require_allowed(file: Path, warehouse: Warehouse, rows: pa.Table) -> None:
     """Raise `InputError` for a car or a drive that was forgotten."""
     cars, drives = (rows[name].cast(pa.string()) for name in ("vehicle_id", "drive_id"))
     barred = Audit(warehouse.root).barred(cars.unique().to_pylist(), drives.unique().to_pylist())
-    for row, names in enumerate(zip(cars.to_pylist(), drives.to_pylist(), strict=True)):
-        if names[0] in barred.vehicles or names[1] in barred.drives:
-            _refuse(file, rows, row, "was forgotten; fleet-slip forget --allow lets it come back")
+    for row, (car, drive) in enumerate(zip(cars.to_pylist(), drives.to_pylist(), strict=True), 1):
+        if car in barred.vehicles or drive in barred.drives:
+            _refuse(file, row, drive, "was forgotten; fleet-slip forget --allow lets it come back")
 
 
 def _require_new(file: Path, grams: Snapshot, rows: pa.Table) -> None:
-    """Raise `RepeatedError` for a drive that is there, with a log or without, under any name.
-
-    A drive that cars sent may come again with the rows of another feature set.
-    """
-    columns = [rows[name].cast(pa.string()) for name in ("drive_id", "feature_set", "vehicle_id")]
-    drives, sets, cars = (one.to_pylist() for one in columns)
-    asked: dict[Any, int] = {}
-    for row, drive in enumerate(drives):
-        asked.setdefault((drive, sets[row]), row)
-        asked.setdefault((drive, None), row)
-    asked |= {key: row for row, key in enumerate(content_keys(rows)) if key}
-    of = pa.array(sorted({*cars}), pa.string()), pa.array(sorted({*drives}), pa.string())
-    for one in grams.files:
-        there = grams.table.read(one.path)
-        told = (there[name].cast(pa.string()) for name in ("vehicle_id", "drive_id"))
-        there = there.filter(pc.or_(*(pc.is_in(a, b) for a, b in zip(told, of, strict=True))))
-        came, names = is_received(there).to_pylist(), there["drive_id"].to_pylist()
-        identities = there["feature_set"].to_pylist()
-        for at, content in enumerate(content_keys(there)):
-            named = (names[at], identities[at] if came[at] else None)
-            found = asked.get(named, asked.get(content))
-            if found is not None:
-                why = f"is there already, as {shown(names[at])}"
-                _refuse(file, rows, found, why, RepeatedError)
+    """Raise `RepeatedError` for a drive that is there, with a log or without, under any name."""
+    if not grams.paths:
+        return
+    statement = read_sql("jobs", "counted_again.sql").format(
+        received=RECEIVED_FILES, plain=features().identity(PLAIN)
+    )
+    with open_database(reading=grams.table.folder) as database:
+        database.register("counted", _numbered(rows))
+        database.execute("SET VARIABLE gram_files = $files", {"files": grams.paths})
+        with reading_files(database, "looking for drives that are there"):
+            found = database.execute(statement).fetchone()
+    if found:
+        row, drive, there = found
+        _refuse(file, row, drive, f"is there already, as {shown(there)}", RepeatedError)

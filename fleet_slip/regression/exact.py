@@ -109,28 +109,6 @@ def adjugate(matrix: Sequence[Sequence[int]]) -> tuple[list[list[int]], int]:
     return [row[size:] for row in work], previous
 
 
-def is_semidefinite(lower: Sequence[Sequence[int]]) -> bool:
-    """Whether a symmetric integer matrix, of rows of i + 1 values, is positive semidefinite.
-
-    Each pivot must be positive, or zero with zeros below it; then it is left out.
-    """
-    work = [list(row) for row in lower]
-    previous = 1
-    for t, row in enumerate(work):
-        pivot = row[t]
-        below = [other[t] for other in work[t + 1 :]]
-        if pivot < 0 or (pivot == 0 and any(below)):
-            return False
-        if pivot:
-            for i, factor in enumerate(below):
-                other = work[t + 1 + i]
-                for j in range(i + 1):
-                    column = t + 1 + j
-                    other[column] = (other[column] * pivot - factor * below[j]) // previous
-            previous = pivot
-    return True
-
-
 MAX_SWEEPS = 60
 """Convergence is quadratic: five to ten sweeps are usual."""
 
