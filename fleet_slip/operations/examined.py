@@ -9,7 +9,7 @@ Whatever trains, scores or publishes asks here, so that all have the same answer
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -30,7 +30,7 @@ from fleet_slip.ingest.drives import SOURCE
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.operations.quality import SensorFault, examine_drives
 from fleet_slip.storage.runs import hash_drive, without_drives
-from fleet_slip.storage.table import Snapshot, TableFile
+from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.condition import (
     Condition,
     asking,
@@ -94,20 +94,20 @@ class Examined:
 
     def __str__(self) -> str:
         """Return what is left out, and what was not examined; nothing if all are in order."""
-        told = []
+        said = []
         if self.made:
             drives = number_of(self.made, "measured drive")
-            told.append(f"made the Gram rows of {drives} that were not there, to examine them.")
+            said.append(f"made the Gram rows of {drives} that were not there, to examine them.")
         if self.found:
             out = number_of(len(self.found), "drive")
-            told.append(
-                f"{out} of {self.drives:,} left out, not in order: {self._told_faults}. See "
+            said.append(
+                f"{out} of {self.drives:,} left out, not in order: {self._faults_text}. See "
                 "fleet-slip quality; --unexamined takes them all the same."
             )
-        return " ".join([*told, self.lacking]).strip()
+        return " ".join([*said, self.lacking]).strip()
 
     @property
-    def _told_faults(self) -> str:
+    def _faults_text(self) -> str:
         return ", ".join(f"{number:,} {fault}" for fault, number in self.faults.items())
 
     @contextmanager
@@ -123,7 +123,7 @@ class Examined:
             ):
                 raise
             raise DataError(
-                f"none of {number_of(self.drives, 'drive')} is in order: {self._told_faults}. "
+                f"none of {number_of(self.drives, 'drive')} is in order: {self._faults_text}. "
                 "See fleet-slip quality; --unexamined takes them all the same."
             ) from None
 
@@ -216,11 +216,7 @@ def _known(kept: Path, state: list[Any]) -> Mapping[str, Any] | None:
         known = json.loads(kept.read_bytes())
         checksum = known.pop("sha256")
         if known["state"] == state and checksum == sha256_of(canonical_json(known)):
-            found = {
-                str(name): [str(kind), [str(one) for one in signals], str(figure)]
-                for name, (kind, signals, figure) in known["found"].items()
-            }
-            return {"found": found, "examined": int(known["examined"])}
+            return dict(known)
     return None
 
 
@@ -258,14 +254,10 @@ def _lacking(
     if not missing:
         return 0, 0
     query = f"SELECT count(*) FROM drives WHERE {condition.sql} AND source <> '{RECEIVED}'"
-    others = frozenset(_paths(logs.files)) - frozenset(_paths(missing))
+    others = frozenset(f.path for f in logs.files) - frozenset(f.path for f in missing)
     only = [grams, replace(logs, without=others)]
     with open_tables(warehouse, views_in(query), only) as database:
         lock(database, [path for one in only for path in one.paths])
         with asking(database, condition):
             [(drives,)] = database.execute(query).fetchall()
     return int(drives), sum(file.rows for file in missing)
-
-
-def _paths(files: Iterable[TableFile]) -> list[str]:
-    return [file.path for file in files]

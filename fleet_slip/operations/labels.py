@@ -8,13 +8,10 @@ or all cars are laden, medians differ as well, by less than `FACTOR` and `LEAST_
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.facts import RECEIVED
@@ -22,6 +19,8 @@ from fleet_slip.catalogue.faults import DriveBatches, Fault
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.operations.peers import MAD_TO_STD, QualityThresholds
 from fleet_slip.regression.gram import GramTable
+from fleet_slip.resources import read_sql
+from fleet_slip.warehouse.database import open_database
 
 # Drives whose label has the sign turned, however many they are.
 #
@@ -138,40 +137,6 @@ LEAST_GAIN = 1e-3
 """Of a label that does not follow its prediction at all."""
 
 
-@dataclass(frozen=True)
-class _Difference:
-    """A group of drives beside all others: medians of offset and gain, and how sure they differ."""
-
-    own: FloatArray
-    others: FloatArray
-    scores: FloatArray
-
-    @classmethod
-    def of(cls, own: FloatArray, others: FloatArray, cars: Sequence[int]) -> "_Difference":
-        """Compare figures, drives first, of so many cars each."""
-        middles = [np.median(figures, axis=0) for figures in (own, others)]
-        variance = np.zeros(2)
-        for figures, middle, many in zip((own, others), middles, cars, strict=True):
-            spread = MAD_TO_STD * np.median(np.abs(figures - middle), axis=0)
-            variance += math.pi / 2 * spread**2 / many
-        error = np.sqrt(np.maximum(variance, np.finfo(np.float64).tiny))
-        return cls(middles[0], middles[1], np.abs(middles[0] - middles[1]) / error)
-
-    def fault(self, label: str, limit: float) -> tuple[int, Fault] | None:
-        """Return which figure is odd, and the fault; None if none is."""
-        scale = float(catalogue()[label].scale)
-        for at, least in ((GAIN, math.log(FACTOR)), (OFFSET, LEAST_OFFSET / scale)):
-            difference = float(self.own[at] - self.others[at])
-            if abs(difference) > least and self.scores[at] > limit:
-                return at, _fault(label, at, difference, "of other days")
-        return None
-
-    def is_nearer(self, figures: FloatArray, at: int) -> BoolArray:
-        """Say which drives are nearer to the group than to the others, by one figure."""
-        own, others = self.own[at], self.others[at]
-        return np.asarray(np.abs(figures[:, at] - own) < np.abs(figures[:, at] - others))
-
-
 def find_odd_days(
     table: GramTable,
     in_order: BoolArray,
@@ -193,7 +158,8 @@ def find_odd_days(
         figures = _figures(DriveBatches.of(table, usual), table.signals.index(label))
         if figures is None:
             break
-        found = list(_odd(figures, [group[usual] for group in groups], cars[usual], limits.limit))
+        chosen = [group[usual] for group in groups]
+        found = list(_odd(figures, chosen, cars[usual], label, limits.limit))
         if not found:
             rows = np.flatnonzero(usual)
             alone = _alone(figures, label, limits.limit)
@@ -221,17 +187,21 @@ def _figures(drives: DriveBatches, label: int) -> FloatArray | None:
     return np.stack([offsets, np.log(np.maximum(gains, LEAST_GAIN))], axis=1)
 
 
+def _least_differences(label: str) -> dict[int, float]:
+    """Return by how much a figure of a group differs at least, the gain first."""
+    return {GAIN: math.log(FACTOR), OFFSET: LEAST_OFFSET / float(catalogue()[label].scale)}
+
+
 def _alone(figures: FloatArray, label: str, limit: float) -> dict[int, Fault]:
     """Return single drives that are far off by twice what a group may be."""
-    middle = np.median(figures, axis=0)
-    apart = figures - middle
+    apart = figures - np.median(figures, axis=0)
     spread = MAD_TO_STD * np.median(np.abs(apart), axis=0)
-    least = {OFFSET: LEAST_OFFSET / float(catalogue()[label].scale), GAIN: math.log(FACTOR)}
-    return {
-        int(drive): _fault(label, at, float(apart[drive, at]), "of other drives")
-        for at, bound in least.items()
-        for drive in np.flatnonzero(np.abs(apart[:, at]) > max(2 * bound, limit * spread[at]))
-    }
+    found: dict[int, Fault] = {}
+    for at, least in reversed(_least_differences(label).items()):
+        far = np.abs(apart[:, at]) > max(2 * least, limit * spread[at])
+        for drive in np.flatnonzero(far).tolist():
+            found[drive] = _fault(label, at, float(apart[drive, at]), "of other drives")
+    return found
 
 
 def _fault(label: str, at: int, difference: float, of: str) -> Fault:
@@ -241,106 +211,52 @@ def _fault(label: str, at: int, difference: float, of: str) -> Fault:
 
 
 def _odd(
-    figures: FloatArray, groups: Sequence[IntArray], cars: IntArray, limit: float
+    figures: FloatArray, groups: Sequence[IntArray], cars: IntArray, label: str, limit: float
 ) -> Iterator[tuple[float, BoolArray, Fault]]:
-    """Yield how sure it is that a group is odd, which drives are of it, and the fault."""
+    """Yield how sure it is that a group is odd, which drives are of it, and the fault.
+
+    Medians of the group and of all others are compared, with the standard error of a median.
+    """
     several = len(np.unique(cars)) > 1
-    for numbers in groups:
-        for number in np.unique(numbers):
-            mask = numbers == number
-            if 2 * mask.sum() > len(mask):
-                continue
-            many = [len(np.unique(cars[m])) if several else int(m.sum()) for m in (mask, ~mask)]
-            if min(many) < FEWEST_CARS:
-                continue
-            unlike = _Difference.of(figures[mask], figures[~mask], many)
-            if found := unlike.fault(catalogue().label, limit):
-                at, fault = found
-                yield float(unlike.scores[at]), mask & unlike.is_nearer(figures, at), fault
+    for mask in (numbers == number for numbers in groups for number in np.unique(numbers)):
+        parts = mask, ~mask
+        many = [len(np.unique(cars[part])) if several else int(part.sum()) for part in parts]
+        if 2 * mask.sum() > len(mask) or min(many) < FEWEST_CARS:
+            continue
+        own, others = middles = [np.median(figures[part], axis=0) for part in parts]
+        variance = np.full(2, np.finfo(np.float64).tiny)
+        for part, middle, number in zip(parts, middles, many, strict=True):
+            spread = MAD_TO_STD * np.median(np.abs(figures[part] - middle), axis=0)
+            variance += math.pi / 2 * spread**2 / number
+        scores = np.abs(own - others) / np.sqrt(variance)
+        for at, least in _least_differences(label).items():
+            if abs(own[at] - others[at]) > least and scores[at] > limit:
+                fault = _fault(label, at, float(own[at] - others[at]), "of other days")
+                to_own, to_others = (np.abs(figures[:, at] - one[at]) for one in (own, others))
+                yield float(scores[at]), mask & (to_own < to_others), fault
+                break
 
 
 # Drives of one car that overlap in time: a car drives once, so that their rows count twice.
-#
-# A drive without a log began when its name says, and lasted as long as its rows: it has no more.
-# Of such a drive and a log that overlap it is named, since the log is what counts where both come;
-# of two drives without one the longer, since one message that covers a day must not accuse all
-# others of that day; of two logs the one that begins later.
 
-LEAST_S = 1.0
+LEAST_OVERLAP_S = 1.0
 """Clocks of two loggers differ by less."""
-
-COLUMNS = ("vehicle_id", "started_at", "duration_s", "drive_id", "source", "n")
 
 
 def find_repeated(drives: pa.Table) -> dict[str, Fault]:
     """Return what is wrong with each drive during which another one of its car was under way.
 
-    `drives` has the columns of `COLUMNS`, a row or more for each drive; those whose time is not
-    known are left out.
+    `drives` has the columns that `jobs/repeated_drives.sql` reads, a row or more for each drive.
     """
-    known = _timed(drives.select(COLUMNS))
-    known = known.group_by(["vehicle_id", "drive_id"]).aggregate(
-        [("start_s", "min"), ("lasted_s", "max"), ("counted_s", "sum"), ("received", "min")]
-    )
-    order = [(name, "ascending") for name in ("vehicle_id", "start_s_min", "drive_id")]
-    found: dict[str, Fault] = {}
-    longest: dict[str, Any] | None = None
-    for row in _of_busy_cars(known.sort_by(order)).to_pylist():
-        if longest is None or row["vehicle_id"] != longest["vehicle_id"]:
-            longest = row
-            continue
-        common_s = min(_ends_s(longest), _ends_s(row)) - row["start_s_min"]
-        earlier = common_s > LEAST_S and _is_suspect(longest, row)
-        if common_s > LEAST_S:
-            named, other = (longest, row) if earlier else (row, longest)
-            figure = f"{common_s:.0f} s are in {other['drive_id']}"
-            found.setdefault(named["drive_id"], Fault("repeated", (), figure))
-        if earlier or _ends_s(row) > _ends_s(longest):
-            longest = row
-    return found
-
-
-def _is_suspect(earlier: Mapping[str, Any], later: Mapping[str, Any]) -> bool:
-    """Whether the earlier of two drives at once is named, not the later."""
-    if not (earlier["received_min"] and later["received_min"]):
-        return bool(earlier["received_min"])
-    lasted_s = (_ends_s(drive) - drive["start_s_min"] for drive in (earlier, later))
-    return bool(next(lasted_s) > next(lasted_s))
-
-
-def _timed(drives: pa.Table) -> pa.Table:
-    """Return when drives began and how long they lasted, of those that tell."""
-    source, name = (drives[column].cast(pa.string()) for column in ("source", "drive_id"))
-    received = pc.equal(source, RECEIVED)
-    moment = pc.utf8_slice_codeunits(name, -16)
-    said_s = pc.strptime(moment, "%Y%m%dT%H%M%SZ", "s", error_is_null=True).cast(pa.int64())
-    logged_us = drives["started_at"].cast(pa.timestamp("us", tz="UTC")).cast(pa.int64())
-    logged_s = pc.divide(logged_us.cast(pa.float64()), 1e6)
-    start_s = pc.if_else(received, said_s.cast(pa.float64()), logged_s)
-    counted_s = pc.multiply(drives["n"].cast(pa.float64()), float(SAMPLE_TIME_S))
-    columns = {
-        "vehicle_id": drives["vehicle_id"].cast(pa.string()),
-        "drive_id": name,
-        "start_s": start_s,
-        "lasted_s": pc.coalesce(drives["duration_s"].cast(pa.float64()), 0.0),
-        "counted_s": pc.if_else(received, counted_s, 0.0),
-        "received": received,
+    given = {
+        "received": RECEIVED,
+        "least_s": LEAST_OVERLAP_S,
+        "sample_time_s": float(SAMPLE_TIME_S),
     }
-    return pa.table(columns).filter(start_s.is_valid())
-
-
-def _of_busy_cars(drives: pa.Table) -> pa.Table:
-    """Return the drives of cars of which one begins before the one before it has ended."""
-    starts = drives["start_s_min"].to_numpy()
-    ends = starts + np.maximum(
-        drives["lasted_s_max"].to_numpy(), drives["counted_s_sum"].to_numpy()
-    )
-    cars = drives["vehicle_id"].combine_chunks().dictionary_encode()
-    codes = cars.indices.to_numpy(zero_copy_only=False)
-    busy = (codes[1:] == codes[:-1]) & (ends[:-1] - starts[1:] > LEAST_S)
-    return drives.filter(pa.array(np.isin(codes, codes[1:][busy])))
-
-
-def _ends_s(drive: Mapping[str, Any]) -> float:
-    lasted_s: float = max(drive["lasted_s_max"], drive["counted_s_sum"])
-    return float(drive["start_s_min"]) + lasted_s
+    with open_database() as database:
+        database.register("drives", drives)
+        found = database.execute(read_sql("jobs", "repeated_drives.sql"), given).fetchall()
+    return {
+        named: Fault("repeated", (), f"{common_s:.0f} s are in {other}")
+        for named, common_s, other in found
+    }
