@@ -125,8 +125,7 @@ def _print_verification(report: Verification, rebuilt: list[str]) -> None:
 def _print_ways(report: CheckReport) -> None:
     ways = {
         "SQL against stored Gram rows": report.drives,
-        "SQL against float64 blocks": report.drives,
-        "SQL against Python integers": report.drives_by_integers,
+        "SQL against the kernel": report.drives,
     }
     if report.wide_sets:
         ways[f"SQL against the kernel: {', '.join(report.wide_sets)}"] = report.wide_drives

@@ -25,10 +25,10 @@ from fleet_slip.grams.check import (
     DriveGrams,
     differing_drives,
     find_gram_files,
-    grams_by_blocks,
-    read_counts,
+    grams_of,
     stored_grams,
 )
+from fleet_slip.grams.compute import wide_grams
 from fleet_slip.grams.gram_rows import by_signals, gram_table, is_received
 from fleet_slip.grams.on_board import CountedSet, counted_by_identity, find_impossible
 from fleet_slip.models.registry import Registry
@@ -334,7 +334,7 @@ def _impossible_among(
 
 
 def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:
-    return grams_by_blocks(warehouse, read_counts(warehouse, file))
+    return grams_of(wide_grams(warehouse, [file], PLAIN))
 
 
 def verify_documents(root: Folder, report: Verification) -> None:

@@ -65,7 +65,7 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         *(pytest.param(job, marks=pytest.mark.long) for job in (compact, compact_and_vacuum)),
     ],
 )
-@pytest.mark.parametrize("moment", ["find_gram_files", "aggregate", "stored_grams", "read_counts"])
+@pytest.mark.parametrize("moment", ["find_gram_files", "by_sql", "stored_grams", "wide_grams"])
 def test_a_check_beside_a_job_that_takes_files_away_finds_no_damage(
     job: Callable[[Warehouse], Any],
     moment: str,
@@ -96,9 +96,7 @@ def test_damage_is_damage_beside_other_jobs_too(
     gone, *_ = filled.logs.snapshot().files
     (path_of(filled.logs.folder) / gone.path).unlink()
     rng = np.random.default_rng(1)
-    meanwhile(
-        check, "aggregate", lambda: land(filled, "more", log_rows("x", random_counts(rng, 9)))
-    )
+    meanwhile(check, "by_sql", lambda: land(filled, "more", log_rows("x", random_counts(rng, 9))))
     with pytest.raises(StorageError, match=gone.path.rpartition("/")[2]):
         check_grams(filled, 3)
     assert {finding.kind for finding in verify(filled).damage} >= {"file"}
@@ -111,6 +109,6 @@ def test_a_check_of_tables_that_never_rest_ends(
         filled.grams.fence()
         raise StorageError("a file is gone")
 
-    meanwhile(check, "aggregate", spoil, once=False)
+    meanwhile(check, "by_sql", spoil, once=False)
     with pytest.raises(StorageError, match="a file is gone"):
         check_grams(filled, 3)
