@@ -11,11 +11,8 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import date
-from functools import partial
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import shown
@@ -28,18 +25,17 @@ from fleet_slip.ingest.guess import (
     Guess,
     TimeGuess,
     choose_units,
+    find_relations,
     guess_cars,
     guess_signals,
     guess_time,
-    guess_unnamed_wheels,
     headings,
-    steering_ratio,
     unit_choices,
 )
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.preview import preview_log
 from fleet_slip.ingest.profile import FileProfile
-from fleet_slip.ingest.suspicion import WHEELS, find_suspicions
+from fleet_slip.ingest.suspicion import STEERING_RATIO, find_suspicions
 from fleet_slip.ingest.vocabulary import parts_of
 
 _MOST_REFUSED = 20
@@ -66,11 +62,6 @@ class Draft:
 def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     """Guess a mapping. Raises `InputError` if nothing in the file looks like a signal."""
     guesses = guess_signals(profile.profiles)
-    taken = {guess.profile.channel.name for guess in guesses.values()}
-    unnamed = not set(WHEELS) & set(guesses)
-    if unnamed:
-        wheels = guess_unnamed_wheels(profile.profiles, taken)
-        guesses |= {guess.signal: guess for guess in wheels}
     if not guesses:
         names = ", ".join(repr(p.channel.name) for p in profile.profiles[:30])
         raise InputError(
@@ -79,62 +70,45 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
         )
     drive_keys, group = guess_cars(profile.profiles)
     bases = [guess.profile.channel.base for guess in guesses.values()]
-    taken = {guess.profile.channel.name for guess in guesses.values()}
-    time = guess_time(profile, taken, bases, group)
-    drive_of = partial(_drive_of, file, profile, time, drive_keys)
-    failures: tuple[str, ...] = ()
+    time = guess_time(profile, {guess.column for guess in guesses.values()}, bases, group)
+
+    def drive_of(guesses: dict[str, Guess]) -> dict[str, FloatArray]:
+        """Return the signals of the longest drive, of all guesses that the catalogue can hold."""
+        usable = {name: guess for name, guess in guesses.items() if not guess.doubts}
+        if COURSE in usable and not {SPEED, "yaw_rate"} <= set(usable):
+            usable.pop(COURSE)
+        if not usable:
+            return {}
+        return preview_log(file, as_mapping(profile, time, usable, drive_keys)).longest
+
+    failures: list[str] = []
     suspicions: list[Fault] = []
     try:
-        if unnamed and set(WHEELS) <= set(guesses):
-            guesses |= _place_wheels(guesses, drive_of(guesses))
         guesses = choose_units(guesses, drive_of(guesses))
         drive = drive_of(guesses)
-        guesses = _road_wheels(guesses, drive)
-        guesses = _correct(guesses, find_suspicions(drive))
+        guesses = _correct(_road_wheels(guesses, drive), find_suspicions(drive))
         suspicions = find_suspicions(drive_of(guesses))
     except FleetSlipError as error:
-        failures = (str(error),)
+        failures = [str(error)]
     guesses = _doubted(guesses, suspicions)
     asked_for = {name for name, guess in guesses.items() if guess.doubts or guess.rivals}
     if COURSE in guesses and asked_for & {COURSE, SPEED, "yaw_rate"}:
         asked_for |= {COURSE, SPEED}  # which stand together
     sure = {name: guess for name, guess in guesses.items() if name not in asked_for}
     left = {name: guess for name, guess in guesses.items() if name in asked_for}
-    asked = () if COURSE in guesses else _ask_of_headings(profile, guesses)
-    notes = (
-        *failures,
-        *map(str, suspicions),
-        *asked,
-        *_notes(profile, guesses),
-        *_refused(profile),
-    )
+    notes = (*failures, *map(str, suspicions), *_notes(profile, guesses), *_refused(profile))
     return Draft(file, profile, time, sure, left, drive_keys, notes)
-
-
-def _drive_of(
-    file: Path,
-    profile: FileProfile,
-    time: TimeGuess,
-    drive_keys: dict[str, dict[str, str]],
-    guesses: dict[str, Guess],
-) -> dict[str, FloatArray]:
-    """Return the signals of the longest drive, of all guesses that the catalogue can hold."""
-    usable = {name: guess for name, guess in guesses.items() if not guess.doubts}
-    if COURSE in usable and not {SPEED, "yaw_rate"} <= set(usable):
-        usable.pop(COURSE)
-    if not usable:
-        return {}
-    return preview_log(file, as_mapping(profile, time, usable, drive_keys)).longest
 
 
 def _road_wheels(guesses: dict[str, Guess], drive: dict[str, FloatArray]) -> dict[str, Guess]:
     """Return an angle called that of steering as the road wheels', where the car turns so."""
     guess = guesses.get("steering_wheel")
-    ratio = steering_ratio(drive, "steering_wheel")
-    if guess is None or ratio is None or not 0.3 < ratio < 4:
+    in_bends = (one for one in find_relations(drive) if not one.expected)
+    ratios = [STEERING_RATIO * abs(one.ratio) for one in in_bends if "steering_wheel" in one.powers]
+    if guess is None or not ratios or not 0.3 < ratios[0] < 4:
         return guesses
-    figure = f"it is {ratio:.1f} times the angle of the road wheels in bends, not 12 to 20 times"
-    named = {"wheel", "whl", "rad", "lenkrad"} & set(parts_of(guess.profile.channel.name))
+    figure = f"it is {ratios[0]:.1f} times the angle of the road wheels in bends, not 12 to 20"
+    named = {"wheel", "whl", "rad", "lenkrad"} & set(parts_of(guess.column))
     if "steer" in guesses or named:
         return {**guesses, "steering_wheel": guess.doubted(figure)}
     others = {name: one for name, one in guesses.items() if name != "steering_wheel"}
@@ -165,7 +139,15 @@ def _doubted(guesses: dict[str, Guess], suspicions: list[Fault]) -> dict[str, Gu
 
 
 def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
-    """Yield what a person is to know of values that mean none, and of a label that is not there."""
+    """Yield what only a person knows: of headings, missing values, and the label's sensor."""
+    taken = {guess.column for guess in guesses.values()}
+    for name in headings(profile.profiles, taken) if COURSE not in guesses else ():
+        yield (
+            f"{shown(name)}: is it where the car points, or where it goes? If a satellite receiver "
+            f"tells it from motion: course = {{ column = {_value(name)}, "
+            'unit = "deg", clockwise_from_north = true, antenna_x_m = ..., antenna_y_m = ... }, '
+            "with satellite_speed beside it. A heading says nothing of side-slip."
+        )
     for name, number in profile.absent.doubtful:
         yield (
             f"{shown(name)}: {number:g} looks like no value, but is one in another column: leave "
@@ -192,18 +174,6 @@ def _refused(profile: FileProfile) -> Iterator[str]:
         yield f"not read: {more:,} channels more."
 
 
-def _ask_of_headings(profile: FileProfile, guesses: dict[str, Guess]) -> tuple[str, ...]:
-    """Return what only a person knows: whether a direction is the car's, or that of its way."""
-    taken = {guess.profile.channel.name for guess in guesses.values()}
-    return tuple(
-        f"{shown(name)}: is it where the car points, or where it goes? If a satellite receiver "
-        f"tells it from motion: course = {{ column = {json.dumps(name, ensure_ascii=False)}, "
-        'unit = "deg", clockwise_from_north = true, antenna_x_m = ..., antenna_y_m = ... }, with '
-        "satellite_speed beside it. A heading says nothing of side-slip."
-        for name in headings(profile.profiles, taken)
-    )
-
-
 def as_mapping(
     profile: FileProfile,
     time: TimeGuess,
@@ -223,18 +193,7 @@ def as_mapping(
 
 def signal_keys(guess: Guess) -> dict[str, Any]:
     """Return the keys of a signal in a mapping, those that are not usual."""
-    keys: dict[str, Any] = {"column": guess.profile.channel.name, "unit": guess.unit}
-    if guess.radius_m is not None:
-        keys["radius_m"] = guess.radius_m
-    if guess.negate:
-        keys["negate"] = True
-    if guess.sign is not None:
-        column, negative = guess.sign
-        keys["sign"] = {"column": column, "negative": negative}
-    if guess.component is not None:
-        keys["component"] = guess.component
-    if guess.clockwise_from_north is not None:
-        keys["clockwise_from_north"] = guess.clockwise_from_north
+    keys = {"column": guess.column, **guess.keys}
     rate_hz = guess.profile.rate_hz
     if rate_hz is not None and rate_hz < 20 and guess.signal not in {COURSE, SPEED}:
         keys["longest_gap_s"] = round(2 / rate_hz, 2)
@@ -252,7 +211,7 @@ def _correct(guesses: dict[str, Guess], suspicions: list[Fault]) -> dict[str, Gu
             if name == COURSE:
                 corrected |= _turned_round(corrected, one.figure)
                 continue
-            turned = not corrected[name].negate
+            turned = None if corrected[name].keys.get("negate") else True
             corrected[name] = corrected[name].because(one.figure, negate=turned)
         elif one.kind == "swapped" and len(one.signals) == 2 and {*one.signals} <= {*corrected}:
             left, right = one.signals
@@ -272,30 +231,6 @@ def _turned_round(guesses: dict[str, Guess], figure: str) -> dict[str, Guess]:
         COURSE: replace(speed.because(figure), signal=COURSE, component="north"),
         SPEED: replace(course.because(figure), signal=SPEED, component="east"),
     }
-
-
-def _place_wheels(guesses: dict[str, Guess], drive: dict[str, FloatArray]) -> dict[str, Guess]:
-    """Return where four wheels are: in bends the outer and the front ones are faster."""
-    if "yaw_rate" not in drive:
-        return {}
-    speeds = np.array([drive[name] for name in WHEELS])
-    rows = np.isfinite(speeds).all(axis=0) & np.isfinite(drive["yaw_rate"]) & (speeds[0] > 5)
-    if rows.sum() < 200:
-        return {}
-    relative = speeds[:, rows] / speeds[:, rows].mean(axis=0) - 1
-    yaw_rate = drive["yaw_rate"][rows]
-    outer = relative @ (yaw_rate - yaw_rate.mean())
-    left, right = np.argsort(outer)[:2], np.argsort(outer)[2:]
-    squared = yaw_rate**2 - np.mean(yaw_rate**2)
-    placed = {}
-    for side, pair in (("l", left), ("r", right)):
-        rear, front = sorted(pair, key=lambda wheel: float(relative[wheel] @ squared))
-        for axle, wheel in (("f", front), ("r", rear)):
-            name = f"wheel_{axle}{side}"
-            reason = "in bends it is the " + ("faster" if axle == "f" else "slower")
-            reason += f" of the two on the {'left' if side == 'l' else 'right'}, as yaw rate tells"
-            placed[name] = replace(guesses[WHEELS[wheel]].because(reason), signal=name)
-    return placed
 
 
 # Writes a draft of a mapping as TOML, each guess with its reasons as a comment.
@@ -398,7 +333,7 @@ def _signals(draft: Draft) -> str:
 def _line(name: str, guess: Guess, guesses: dict[str, Guess]) -> str:
     keys = signal_keys(guess)
     if guess.component:
-        east = guesses[SPEED].profile.channel.name
+        east = guesses[SPEED].column
         keys = {"north": keys["column"], "east": east, "unit": keys["unit"]}
     told = ", ".join(f"{key} = {_value(value)}" for key, value in keys.items())
     return f"{name} = {{ {told} }}"
@@ -407,9 +342,7 @@ def _line(name: str, guess: Guess, guesses: dict[str, Guess]) -> str:
 def _in_other_units(guess: Guess) -> Iterator[Guess]:
     """Yield a guess in the other units that its values may be in."""
     if guess.is_without_unit and not guess.rivals:
-        for unit, radius_m in unit_choices(guess):
-            if unit != guess.unit:
-                yield replace(guess, unit=unit, radius_m=radius_m)
+        yield from (guess.because("", **keys) for keys in unit_choices(guess)[1:])
 
 
 def _table(name: str, keys: dict[str, Any]) -> str:

@@ -8,19 +8,27 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.columns import COURSE, SPEED, Component, conversion_factor, reads_clock
 from fleet_slip.ingest.profile import FileProfile, Profile, sample_rate_hz
-from fleet_slip.ingest.suspicion import RADIUS_M, TURNING, WHEELS, moving, slope_of, speed_mps
+from fleet_slip.ingest.suspicion import (
+    LEAST_CORRELATION,
+    RADIUS_M,
+    ROAD_WHEELS,
+    TURNING,
+    WHEELS,
+    Relation,
+    relations,
+    speed_mps,
+)
 from fleet_slip.ingest.vocabulary import (
-    CORNERS,
     best_words,
     fits_any,
     is_called,
@@ -41,39 +49,52 @@ _ALIKE = 0.02
 
 @dataclass(frozen=True)
 class Guess:
-    """A channel as a signal."""
+    """A channel as a signal.
+
+    Attributes:
+        keys: of the signal in a mapping, without the column: unit, negate, sign …
+        reasons: why, for people.
+        is_weak: whether its name may as well mean something else.
+        doubts: what speaks against it.
+        rivals: others that its name and unit fit as well.
+    """
 
     signal: str
     profile: Profile
-    unit: str
+    keys: Mapping[str, Any]
     reasons: tuple[str, ...]
-    """Why, for people."""
-    radius_m: float | None = None
-    negate: bool = False
-    component: Component | None = None
-    clockwise_from_north: bool | None = None
-    sign: tuple[str, int] | None = None
-    """The column with its sign, and what stands there where it is negative."""
     is_weak: bool = False
-    """Whether its name may as well mean something else."""
     doubts: tuple[str, ...] = ()
-    """What speaks against it."""
     rivals: tuple["Guess", ...] = ()
-    """Others that its name and unit fit as well."""
+
+    @property
+    def column(self) -> str:
+        """Name of the channel."""
+        return self.profile.channel.name
+
+    @property
+    def component(self) -> Component | None:
+        """Which one of the velocity over ground it is."""
+        return self.keys.get("component")
 
     @property
     def is_without_unit(self) -> bool:
         """Whether nothing but the values tell the unit."""
         return any(reason.startswith(NO_UNIT) for reason in self.reasons)
 
-    def because(self, reason: str, **changes: object) -> "Guess":
-        """Return the guess changed, with one more reason."""
-        changed: Guess = replace(self, reasons=(*self.reasons, reason), **changes)  # type: ignore[arg-type]
-        return changed
+    def because(self, reason: str, **keys: Any) -> "Guess":
+        """Return the guess with other keys, None for those to leave out, and one more reason."""
+        changed = {k: value for k, value in {**self.keys, **keys}.items() if value is not None}
+        return replace(self, keys=changed, reasons=(*self.reasons, reason))
 
     def doubted(self, doubt: str) -> "Guess":
         """Return the guess as one that has something against it."""
         return replace(self, doubts=(*self.doubts, doubt))
+
+    def largest(self, **keys: Any) -> float:
+        """Return its largest value, but for outliers, in SI units; with other keys for the unit."""
+        value = float(np.nanquantile(np.abs(self.profile.values), 0.999))
+        return value * si_factor(self.signal, **{**self.keys, **keys})
 
 
 def guess_signals(profiles: tuple[Profile, ...]) -> dict[str, Guess]:
@@ -84,7 +105,7 @@ def guess_signals(profiles: tuple[Profile, ...]) -> dict[str, Guess]:
     best: dict[str, float] = {}
     taken: set[str] = set()
     for score, guess in scored:
-        signal, name = guess.signal, guess.profile.channel.name
+        signal, name = guess.signal, guess.column
         if name in taken:
             continue
         if signal not in guesses:
@@ -129,12 +150,12 @@ def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
     found = dict(guesses)
     north, east = found.pop("north", None), found.pop("east", None)
     course, speed = found.get(COURSE), found.get(SPEED)
-    if north and east and north.unit == east.unit:
-        found[COURSE] = replace(north, signal=COURSE, component="north")
-        found[SPEED] = replace(east, signal=SPEED, component="east")
+    if north and east and north.keys == east.keys:
+        found[COURSE] = replace(north, signal=COURSE, keys={**north.keys, "component": "north"})
+        found[SPEED] = replace(east, signal=SPEED, keys={**east.keys, "component": "east"})
     elif course and speed:
-        told = "clockwise from north, as receivers tell it"
-        found[COURSE] = course.because(told, clockwise_from_north=True)
+        reason = "clockwise from north, as receivers give it"
+        found[COURSE] = course.because(reason, clockwise_from_north=True)
     if "yaw_rate" not in found or not {COURSE, SPEED} <= set(found):
         found.pop(COURSE, None)
         alone = found.pop(SPEED, None)
@@ -147,7 +168,7 @@ def _with_sign(guess: Guess, profiles: tuple[Profile, ...]) -> Guess:
     """Return a magnitude with the column of its sign, where another is called so."""
     if guess.signal not in TURNING or guess.profile.range[0] < 0:
         return guess
-    own = sorted(parts_of(split_unit(guess.profile.channel.name)[0]))
+    own = sorted(parts_of(split_unit(guess.column)[0]))
     for other in profiles:
         parts = parts_of(split_unit(other.channel.name)[0])
         if sorted(p for p in parts if p not in _SIGN_WORDS) != own or len(parts) == len(own):
@@ -155,8 +176,8 @@ def _with_sign(guess: Guess, profiles: tuple[Profile, ...]) -> Guess:
         values = sorted({float(v) for v in np.unique(other.values[np.isfinite(other.values)])[:3]})
         if len(values) == 2 and all(value.is_integer() for value in values):
             negative = int(values[0] if values[0] < 0 else values[1])
-            told = f"{other.channel.name!r} is called its sign, and it is never negative"
-            return guess.because(told, sign=(other.channel.name, negative))
+            reason = f"{other.channel.name!r} is called its sign, and it is never negative"
+            return guess.because(reason, sign={"column": other.channel.name, "negative": negative})
     return guess
 
 
@@ -173,74 +194,58 @@ def headings(profiles: tuple[Profile, ...], taken: set[str]) -> list[str]:
     ]
 
 
-def guess_unnamed_wheels(profiles: tuple[Profile, ...], taken: set[str]) -> list[Guess]:
-    """Return four channels that are called wheels without a place, in the file's order, or none."""
-    found = [
-        p
-        for p in profiles
-        if p.is_number
-        and p.channel.name not in taken
-        and {"wheel", "whl"} & {part[:5] for part in parts_of(p.channel.name)}
-    ]
-    guesses = [_guess(f"wheel_{c}", p, "wheel") for c, p in zip(CORNERS, found, strict=False)]
-    return [g for g in guesses if g] if len(found) == 4 and all(guesses) else []
-
-
-def told_unit(profile: Profile) -> tuple[str, str | None]:
-    """Return the unit that a channel has, as the file says it, and as a mapping writes it."""
-    name, in_brackets = split_unit(profile.channel.name)
-    text = profile.channel.unit.strip() or in_brackets
-    return text, unit_called(text) or unit_behind(name)
-
-
 def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
     """Return a guess with a unit that the signal can have, or None."""
-    si_unit = "m/s" if signal in {"north", "east"} else catalogue()[signal].unit
-    named = f"its name has {words!r}"
-    text, told = told_unit(profile)
-    largest = float(np.nanquantile(np.abs(profile.values), 0.999))
-    for unit, radius_m in ((told, None), (told, RADIUS_M)):
-        measures = si_unit if radius_m is None else "m/s"
-        if unit is None or (radius_m is not None and not signal.startswith("wheel_")):
-            continue
-        try:
-            factor = conversion_factor(unit, measures) / (radius_m or 1.0)
-        except ValueError:
-            continue
-        guess = Guess(signal, profile, unit, (named, f"its unit is {unit}"), radius_m)
-        return _within_range(guess, largest * factor)
-    if told is not None:
-        return None
-    unit, radius_m = _unit_of_values(si_unit, signal, largest)
-    unknown = f" that is known: {text!r}" if text else ""
-    reason = f"{NO_UNIT}{unknown}; values up to {largest:.3g} look like {unit}"
-    guess = Guess(signal, profile, unit, (named, reason), radius_m)
-    factor = conversion_factor(unit, si_unit if radius_m is None else "m/s") / (radius_m or 1.0)
-    return _within_range(guess, largest * factor)
-
-
-def _within_range(guess: Guess, largest: float) -> Guess:
-    """Return a guess, with a doubt if its values are beyond what the catalogue can hold."""
-    if guess.signal not in catalogue().signals:
+    name, in_brackets = split_unit(profile.channel.name)
+    text = profile.channel.unit.strip() or in_brackets
+    unit = unit_called(text) or unit_behind(name)
+    if unit is None:
+        largest = float(np.nanquantile(np.abs(profile.values), 0.999))
+        keys = _keys_of_values(signal, largest)
+        unknown = f" that is known: {text!r}" if text else ""
+        reason = f"{NO_UNIT}{unknown}; values up to {largest:.3g} look like {keys['unit']}"
+    else:
+        reason = f"its unit is {unit}"
+        radii = [{}, {"radius_m": RADIUS_M}] if signal.startswith("wheel_") else [{}]
+        fitting = [radius for radius in radii if _has_unit(signal, unit, **radius)]
+        if not fitting:
+            return None
+        keys = {"unit": unit, **fitting[0]}
+    guess = Guess(signal, profile, keys, (f"its name has {words!r}", reason))
+    if signal not in catalogue().signals or catalogue()[signal].cyclic:
         return guess
-    signal = catalogue()[guess.signal]
-    most = float(max(-signal.min, signal.max))
-    if largest <= most or signal.cyclic:
+    known, in_si = catalogue()[signal], guess.largest()
+    most = float(max(-known.min, known.max))
+    if in_si <= most:
         return guess
     return guess.doubted(
-        f"in {guess.unit} it would be up to {largest:.3g} {signal.unit}, and the catalogue has "
+        f"in {keys['unit']} it would be up to {in_si:.3g} {known.unit}, and the catalogue has "
         f"{most:g}"
     )
 
 
-def _unit_of_values(si_unit: str, signal: str, largest: float) -> tuple[str, float | None]:
+def si_factor(signal: str, unit: str, radius_m: float | None = None, **_: Any) -> float:
+    """Return what one of a unit is of a signal in SI units. Raises `ValueError`."""
+    measured_in = "m/s" if signal in {"north", "east"} or radius_m else catalogue()[signal].unit
+    return conversion_factor(unit, measured_in) / (radius_m or 1.0)
+
+
+def _has_unit(signal: str, unit: str, radius_m: float | None = None) -> bool:
+    try:
+        si_factor(signal, unit, radius_m)
+    except ValueError:
+        return False
+    return True
+
+
+def _keys_of_values(signal: str, largest: float) -> dict[str, Any]:
     """Return the unit that values of a car on a road are likely to have."""
     if signal.startswith("wheel_"):
-        if largest > 300:
-            return "rpm", None
-        return ("rad/s", None) if largest > 110 else ("km/h", RADIUS_M)
+        if largest > 110:
+            return {"unit": "rpm" if largest > 300 else "rad/s"}
+        return {"unit": "km/h", "radius_m": RADIUS_M}
     if signal == "gear":
-        return "1", None
+        return {"unit": "1"}
     likely = {
         "m/s^2": (1.3, "g", "m/s^2"),
         "rad/s": (2.5, "rad/s", "deg/s"),
@@ -249,8 +254,9 @@ def _unit_of_values(si_unit: str, signal: str, largest: float) -> tuple[str, flo
         "Pa": (400.0, "bar", "kPa"),
         "1": (1.2, "1", "%"),
     }
+    si_unit = "m/s" if signal in {"north", "east"} else catalogue()[signal].unit
     limit, small, large = likely[si_unit]
-    return (small if largest < limit else large), None
+    return {"unit": small if largest < limit else large}
 
 
 # Guesses where the times of a log are, and which columns tell its cars and trips apart.
@@ -420,8 +426,6 @@ def _gaps(rate_hz: float | None) -> dict[str, float]:
 # The relations are products: the lateral acceleration is yaw rate times speed, so a wrong unit
 # shows as a factor of 3.6, 9.8 or 57, and which signals share it tells whose it is.
 
-WHEELBASE_M, STEERING_RATIO = 2.7, 15.0
-_LEAST_CORRELATION = 0.6
 _UNLIKELY = 0.7
 """What it costs not to take the unit that the largest value suggests."""
 _WITH_UNITS = {
@@ -433,157 +437,91 @@ _WITH_UNITS = {
 _OF_WHEELS = (("rad/s", None), ("km/h", RADIUS_M), ("m/s", RADIUS_M), ("rpm", None))
 _GROUPS = (("ax", "ay"), ("vx", "vy"), WHEELS, ("steer_fl", "steer_fr"))
 """Signals of one sensor, which have one unit."""
+_TOLERANCES = {"yaw_rate": 0.3, "ax": 0.3, **dict.fromkeys(("steering_wheel", *ROAD_WHEELS), 1.0)}
+"""Of the logarithm of a relation, by its first signal; of others 0.15."""
 
-
-@dataclass(frozen=True)
-class _Relation:
-    """A product of signals that should be 1, to these powers, and how exactly."""
-
-    powers: Mapping[str, int]
-    ratio: float
-    tolerance: float
+Keys: TypeAlias = Mapping[str, Any]
 
 
 def choose_units(guesses: dict[str, Guess], drive: Mapping[str, FloatArray]) -> dict[str, Guess]:
     """Return the guesses without a unit with that in which the car moves as cars do."""
-    relations = list(_relations(drive))
-    groups = _groups(guesses)
-    guesses = _doubt_speeds(guesses, groups, relations)
-    if not relations or not groups:
-        return guesses
-    choices = [list(unit_choices(guesses[group[0]])) for group in groups]
-    best = min(
-        itertools.product(*choices), key=lambda some: _cost(some, groups, guesses, relations)
-    )
-    changed = dict(guesses)
-    for group, (unit, radius_m) in zip(groups, best, strict=True):
-        for name in group:
-            guess = guesses[name]
-            if (guess.unit, guess.radius_m) != (unit, radius_m):
-                reason = f"with {unit} it fits the other signals"
-                changed[name] = guess.because(reason, unit=unit, radius_m=radius_m, doubts=())
-    return changed
-
-
-def steering_ratio(drive: Mapping[str, FloatArray], name: str) -> float | None:
-    """Return an angle over that of the road wheels in a bend: 1, or a steering wheel's 15."""
-    speed = speed_mps(drive)
-    if speed is None or not {name, "yaw_rate"} <= set(drive):
-        return None
-    with np.errstate(divide="ignore", invalid="ignore"):
-        bend = WHEELBASE_M * drive["yaw_rate"] / speed
-    slope, correlation = slope_of(drive[name], bend, moving(speed))
-    return abs(slope) if abs(correlation) > _LEAST_CORRELATION else None
-
-
-def _doubt_speeds(
-    guesses: dict[str, Guess], groups: list[list[str]], relations: list[_Relation]
-) -> dict[str, Guess]:
-    """Return the guesses with a doubt for speeds of which nothing tells the unit.
-
-    The speed of a car in km/h is that of a faster one in m/s, and angles per second of its wheels
-    are near to both; of all else the largest value tells the unit.
-    """
+    related, groups = find_relations(drive), _groups(guesses)
+    by = _speed_source(drive)
+    names = {name for one in related for name in (*one.powers, by)}
     found = dict(guesses)
-    related = {name for relation in relations for name in relation.powers}
     for group in groups:
+        # A car's speed in km/h is that of a faster one in m/s: the largest value does not tell.
         is_speed = catalogue()[group[0]].unit == "m/s" or group[0] in WHEELS
-        if is_speed and group != [SPEED] and not related & set(group):
-            units = " or ".join(unit for unit, _ in unit_choices(guesses[group[0]]))
+        if is_speed and group != [SPEED] and not set(group) & names:
+            units = " or ".join(keys["unit"] for keys in unit_choices(guesses[group[0]]))
             for name in group:
                 found[name] = found[name].doubted(f"nothing tells whether it is in {units}")
+    if not related or not groups:
+        return found
+    choices = itertools.product(*(unit_choices(guesses[group[0]]) for group in groups))
+    best = min(choices, key=lambda some: _cost(some, groups, guesses, related, by))
+    for group, keys in zip(groups, best, strict=True):
+        for name in group:
+            guess = found[name]
+            if {key: guess.keys.get(key) for key in keys} != keys:
+                changed = guess.because(f"with {keys['unit']} it fits the other signals", **keys)
+                found[name] = replace(changed, doubts=())
     return found
+
+
+def find_relations(drive: Mapping[str, FloatArray]) -> list[Relation]:
+    """Return how the signals of a drive go with one another, where they do."""
+    speed = speed_mps(drive)
+    alike = {*WHEELS, _speed_source(drive)}  # which have the unit of the speed itself
+    return [
+        one
+        for one in (() if speed is None else relations(drive, speed))
+        if abs(one.correlation) > LEAST_CORRELATION and one.ratio and not alike & set(one.powers)
+    ]
+
+
+def _speed_source(drive: Mapping[str, FloatArray]) -> str:
+    """Return the first signal that the speed of a drive is of."""
+    return next((n for n in (*WHEELS, "vx", "vehicle_speed") if n in drive), "vehicle_speed")
 
 
 def _groups(guesses: dict[str, Guess]) -> list[list[str]]:
     """Return the signals without a unit, those of one sensor together."""
-    told = {n for n, guess in guesses.items() if not guess.is_without_unit or guess.component}
-    open_ones = [name for name in guesses if name not in {*told, COURSE}]
+    open_ones = [
+        name
+        for name, guess in guesses.items()
+        if guess.is_without_unit and not guess.component and name != COURSE
+    ]
     together = [[name for name in group if name in open_ones] for group in _GROUPS]
     alone = [[n] for n in open_ones if not any(n in group for group in together)]
-    known = {*_WITH_UNITS}
-    return [g for g in (*together, *alone) if g and catalogue()[g[0]].unit in known]
+    return [g for g in (*together, *alone) if g and catalogue()[g[0]].unit in _WITH_UNITS]
 
 
-def unit_choices(guess: Guess) -> list[tuple[str, float | None]]:
+def unit_choices(guess: Guess) -> list[Keys]:
     """Return what units values without one may have: first the likely one."""
-    if guess.signal.startswith("wheel_"):
-        found = list(_OF_WHEELS)
-    else:
-        found = [(unit, None) for unit in _WITH_UNITS.get(catalogue()[guess.signal].unit, ())]
-    first = (guess.unit, guess.radius_m)
-    return [first, *(one for one in found if one != first)]
+    units = [(unit, None) for unit in _WITH_UNITS.get(catalogue()[guess.signal].unit, ())]
+    found = list(_OF_WHEELS) if guess.signal.startswith("wheel_") else units
+    first = guess.keys["unit"], guess.keys.get("radius_m")
+    choices = [first, *(one for one in found if one != first)]
+    return [{"unit": unit, "radius_m": radius_m} for unit, radius_m in choices]
 
 
 def _cost(
-    some: tuple[tuple[str, float | None], ...],
+    some: tuple[Keys, ...],
     groups: list[list[str]],
     guesses: dict[str, Guess],
-    relations: list[_Relation],
+    related: list[Relation],
+    by: str,
 ) -> float:
+    """Return how little a car moves so with some units, one for each group of signals."""
     cost, factors = 0.0, dict[str, float]()
-    for group, (unit, radius_m) in zip(groups, some, strict=True):
+    for group, keys in zip(groups, some, strict=True):
         for name in group:
-            guess = guesses[name]
-            factors[name] = _si(name, unit, radius_m) / _si(name, guess.unit, guess.radius_m)
-            largest = float(np.nanquantile(np.abs(guess.profile.values), 0.999))
-            most = float(catalogue()[name].max)
-            cost += 100.0 * (largest * _si(name, unit, radius_m) > most)
-        likely = guesses[group[0]]
-        cost += _UNLIKELY * ((unit, radius_m) != (likely.unit, likely.radius_m))
-    for relation in relations:
-        off = np.log(relation.ratio)
-        off += sum(p * np.log(factors.get(n, 1.0)) for n, p in relation.powers.items())
-        cost += (off / relation.tolerance) ** 2
+            factors[name] = si_factor(name, **keys) / si_factor(name, **guesses[name].keys)
+            cost += 100.0 * (guesses[name].largest(**keys) > float(catalogue()[name].max))
+        cost += _UNLIKELY * any(guesses[group[0]].keys.get(key) != keys[key] for key in keys)
+    for one in related:
+        off = np.log(abs(one.ratio)) + one.of_speed * np.log(factors.get(by, 1.0))
+        off += sum(power * np.log(factors.get(n, 1.0)) for n, power in one.powers.items())
+        cost += float((off / _TOLERANCES.get(next(iter(one.powers)), 0.15)) ** 2)
     return cost
-
-
-def _si(name: str, unit: str, radius_m: float | None) -> float:
-    measures = catalogue()[name].unit if radius_m is None else "m/s"
-    return conversion_factor(unit, measures) / (radius_m or 1.0)
-
-
-def _relations(drive: Mapping[str, FloatArray]) -> list[_Relation]:
-    """Return what a car's signals have to do with one another, where they do."""
-    speed = speed_mps(drive)
-    if speed is None:
-        return []
-    by = next((n for n in (*WHEELS, "vx", "vehicle_speed") if n in drive), "vehicle_speed")
-    found, rows = [], moving(speed)
-
-    def relate(
-        powers: dict[str, int], values: FloatArray, expected: FloatArray, tolerance: float
-    ) -> None:
-        slope, correlation = slope_of(values, expected, rows)
-        if abs(correlation) > _LEAST_CORRELATION and slope:
-            found.append(_Relation(powers, abs(slope), tolerance))
-
-    for name in ("vx", "vehicle_speed", SPEED):
-        if name in drive and name != by:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                ratios = (drive[name] / speed)[rows & np.isfinite(drive[name])]
-            if ratios.size and np.median(ratios) > 0:
-                found.append(_Relation({name: 1, by: -1}, float(np.median(ratios)), 0.15))
-    if {"ay", "yaw_rate"} <= set(drive):
-        powers = {"ay": 1, "yaw_rate": -1, by: -1}
-        relate(powers, drive["ay"], drive["yaw_rate"] * speed, 0.15)
-    if "yaw_rate" in drive and {"wheel_rl", "wheel_rr"} <= set(drive):
-        turn = (drive["wheel_rr"] - drive["wheel_rl"]) * RADIUS_M / 1.55
-        relate({"yaw_rate": 1, by: -1}, drive["yaw_rate"], turn, 0.3)
-    if "ax" in drive:
-        second = round(1 / float(SAMPLE_TIME_S))
-        change = np.full(speed.size, np.nan)
-        if speed.size > 2 * second:
-            change[second // 2 : -second // 2] = speed[second:] - speed[:-second]
-            smooth = np.convolve(np.nan_to_num(drive["ax"]), np.ones(second) / second, "same")
-            relate({"ax": 1, by: -1}, smooth, change, 0.3)
-    for name, ratio in (("steering_wheel", STEERING_RATIO), ("steer", 1.0), ("steer_fl", 1.0)):
-        if name in drive and "yaw_rate" in drive:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                bend = ratio * WHEELBASE_M * drive["yaw_rate"] / speed
-            relate({name: 1, "yaw_rate": -1, by: 1}, drive[name], bend, 1.0)
-        elif name in drive and "ay" in drive:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                bend = ratio * WHEELBASE_M * drive["ay"] / speed**2
-            relate({name: 1, "ay": -1, by: 2}, drive[name], bend, 1.0)
-    return found

@@ -1,11 +1,11 @@
 """What ingesting a file would do, and a picture of it: nothing is stored."""
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import polars as pl
-import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
@@ -62,19 +62,26 @@ class Preview:
 def preview_log(log: Log, mapping: Mapping) -> Preview:
     """Read a log through a mapping, and look at what came out. Raises `InputError`."""
     longest: MeasuredDrive | None = None
-    found = {name: _Found() for name in mapping.signal_names}
+    ends: dict[str, list[int]] = {name: [] for name in mapping.signal_names}
+    values: Counter[str] = Counter()
     with local_copy(log) as file, open_measured(file, mapping) as stream:
-        for piece in stream.pieces():
-            for drive in piece.drives:
-                if longest is None or drive.ticks.size > longest.ticks.size:
-                    longest = drive
-                for name, counts in drive.counts.items():
-                    found[name].add(counts)
+        for drive in (drive for piece in stream.pieces() for drive in piece.drives):
+            if longest is None or drive.ticks.size > longest.ticks.size:
+                longest = drive
+            for name, counts in drive.counts.items():
+                values[name] += len(counts) - counts.null_count
+                found = pc.min_max(counts).as_py()
+                ends[name] += [] if found["min"] is None else [found["min"], found["max"]]
         of_rows = stream.suspicions()  # which may look into the file again
-    signals = signals_of(longest) if longest is not None else {}
-    ranges = tuple(_range(name, found[name]) for name in mapping.signal_names)
+    counts, signals = stream.counts(), signals_of(longest) if longest is not None else {}
+    ranges = []
+    for name, some in ends.items():
+        scale = float(catalogue()[name].scale)
+        low, high = (scale * min(some), scale * max(some)) if some else (np.nan, np.nan)
+        missing = 1 - values[name] / max(counts.ticks, 1)
+        ranges.append(SignalRange(name, catalogue()[name].unit, low, high, missing))
     suspicions = (*of_rows, *find_suspicions(signals))
-    return Preview(str(log), stream.counts(), ranges, suspicions, signals)
+    return Preview(str(log), counts, tuple(ranges), suspicions, signals)
 
 
 def signals_of(drive: MeasuredDrive) -> dict[str, FloatArray]:
@@ -88,29 +95,3 @@ def signals_of(drive: MeasuredDrive) -> dict[str, FloatArray]:
         values[ticks[kept]] = numbers[kept] * float(catalogue()[name].scale)
         signals[name] = values
     return signals
-
-
-@dataclass
-class _Found:
-    """Counts of a signal so far."""
-
-    low: int | None = None
-    high: int | None = None
-    values: int = 0
-    ticks: int = 0
-
-    def add(self, counts: pa.Array) -> None:
-        self.ticks += len(counts)
-        self.values += len(counts) - counts.null_count
-        ends = pc.min_max(counts).as_py()
-        if ends["min"] is not None:
-            self.low = ends["min"] if self.low is None else min(self.low, ends["min"])
-            self.high = ends["max"] if self.high is None else max(self.high, ends["max"])
-
-
-def _range(name: str, found: _Found) -> SignalRange:
-    signal = catalogue()[name]
-    low, high = (
-        np.nan if end is None else end * float(signal.scale) for end in (found.low, found.high)
-    )
-    return SignalRange(name, signal.unit, low, high, 1 - found.values / max(found.ticks, 1))

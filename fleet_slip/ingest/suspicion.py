@@ -8,7 +8,7 @@ with the figure that shows it, and what to try. Axes and signs are ISO 8855.
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -172,8 +172,8 @@ LEAST_SPEED_MPS = 3.0
 SPEED = "satellite_speed"
 
 
-def course_fault(signals: "Signals", speed: FloatArray | None = None) -> Fault | None:
-    """Return what fault the course of a drive seems to have; `speed` is that of the wheels."""
+def course_fault(signals: "Signals") -> Fault | None:
+    """Return what fault the course of a drive seems to have."""
     if not {"course", "yaw_rate"} <= set(signals):
         return None
     course, turned = signals["course"], np.cumsum(signals["yaw_rate"]) * float(SAMPLE_TIME_S)
@@ -193,28 +193,19 @@ def course_fault(signals: "Signals", speed: FloatArray | None = None) -> Fault |
         if not SOUND[0] <= slope <= SOUND[1]:
             remedy = "Check its unit, and that of the yaw rate."
             return Fault("scaled", (COURSE,), figure, remedy)
-    return _of_fixes(signals, speed) or _of_relation(_relation(signals, turned))
+    return _of_fixes(signals) or _of_relation(_relation(signals, turned))
 
 
-def _of_fixes(signals: "Signals", speed: FloatArray | None) -> Fault | None:
-    """Return what is wrong with the receiver's speed, or with how many fixes have a course."""
-    own_speed = signals.get(SPEED)
-    if own_speed is None:
+def _of_fixes(signals: "Signals") -> Fault | None:
+    """Return whether few fixes have a course of their own."""
+    if SPEED not in signals:
         return None
-    fast = own_speed > LEAST_SPEED_MPS
+    fast = signals[SPEED] > LEAST_SPEED_MPS
     own = float(np.isfinite(signals["course"][fast]).mean()) if fast.any() else 1.0
-    if own < LEAST_OF_THEIR_OWN:
-        figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of backwards"
-        remedy = "They are left out. Map it as the receiver tells it."
-        return Fault("values", (COURSE,), figure, remedy)
-    both = fast & (speed > LEAST_SPEED_MPS) if speed is not None else fast
-    if speed is not None and both.sum() >= SECOND:
-        ratio = float(np.median(own_speed[both] / speed[both]))
-        if not SOUND[0] <= ratio <= SOUND[1]:
-            figure = f"it is {ratio:.2f} times the speed of the wheels"
-            remedy = "Check both units: the antenna's place is by it."
-            return Fault("scaled", (SPEED,), figure, remedy)
-    return None
+    if own >= LEAST_OF_THEIR_OWN:
+        return None
+    figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of backwards"
+    return Fault("values", (COURSE,), figure, "They are left out. Map it as the receiver tells it.")
 
 
 def _of_relation(relation: CourseRelation | None) -> Fault | None:
@@ -300,6 +291,7 @@ LONGEST_M, LARGE_RAD = 8.0, 0.15
 LARGEST_COLLINEAR = 0.995
 LEAST_LEVER_M, LONGEST_LEVER_M, LONGEST_PART = 0.6, 2.6, 0.75
 """The rear axle is so far behind the centre of gravity, and by this part of the wheelbase."""
+USUAL_WHEELBASE_M, STEERING_RATIO = 2.7, 15.0
 WHEELBASE_M = (2.0, 4.5)
 """Beyond, it is the road wheels that are in doubt."""
 LARGEST_ZERO_RAD = math.radians(0.7)
@@ -308,6 +300,11 @@ SLOW_MPS, SURE_EXPLAINED = 20.0, 0.85
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 ROAD_WHEELS = ("steer_fl", "steer")
 LEAST_CORRELATION, SURE_CORRELATION = 0.6, 0.9
+_SOUND_RATIOS = {
+    **dict.fromkeys((*WHEELS, "vx", "vehicle_speed"), (0.7, 1.4)),
+    SPEED: SOUND,
+}
+"""Of a speed to that of the wheels; other quantities are known to a factor of 2.5."""
 _FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
 
 
@@ -326,14 +323,15 @@ def find_suspicions(signals: Signals) -> list[Fault]:
     found = [*still, *magnitudes.values(), *_turning(usual, speed)]
     label: list[Fault] = []
     if speed is not None:
-        for check in (_scales_differ, _accelerates, _axles_swapped):
+        for check in (_scales_differ, _axles_swapped):
             found += check(usual, speed)
         if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
             label = list(_label(usual, speed))  # which is judged by them
     if sideslip and all(one.kind != "biased" for one in label):  # else it is off to one side
         label = [sideslip]
-    fault = course_fault(usual, speed)
-    return [*found, *label, *([fault] if fault else [])]
+    if not any(SPEED in one.signals for one in found) and (fault := course_fault(usual)):
+        label.append(fault)
+    return [*found, *label]
 
 
 def speed_mps(signals: Signals) -> FloatArray | None:
@@ -370,45 +368,85 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Fault]:
         yield from axes_swapped(moments).values()
 
 
-def _scales_differ(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
-    """Compare the size of signals with that of others that tell the same."""
-    pairs: list[tuple[FloatArray, FloatArray, tuple[str, ...], str, tuple[float, float]]] = []
-    wide = (0.4, 2.5)
-    for name in (*WHEELS, "vx", "vehicle_speed"):
+@dataclass(frozen=True)
+class Relation:
+    """A quantity of a drive that should be another one.
+
+    Attributes:
+        powers: of signals in the first over the second; `of_speed` is that of the car's speed.
+        expected: what the second is called; nothing for one that is roughly known.
+        ratio: the first over the second.
+        correlation: of the two.
+    """
+
+    powers: Mapping[str, int]
+    of_speed: int
+    expected: str
+    ratio: float
+    correlation: float
+
+
+def relations(signals: Signals, speed: FloatArray) -> Iterator[Relation]:
+    """Yield what the signals of a moving car have to do with one another."""
+    rows = moving(speed)
+
+    def relate_to(
+        expected: FloatArray, values: FloatArray, powers: dict[str, int], of_speed: int, name: str
+    ) -> Relation:
+        return Relation(powers, of_speed, name, *slope_of(values, expected, rows))
+
+    for name in (*WHEELS, "vx", "vehicle_speed", SPEED):
         if name in signals:
             own = signals[name] * (RADIUS_M if name in WHEELS else 1.0)
-            pairs.append((own, speed, (name,), "the speed of the wheels", (0.7, 1.4)))
-    if "yaw_rate" in signals:
-        yaw_rate = signals["yaw_rate"]
-        if {"wheel_rl", "wheel_rr"} <= set(signals):
-            turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M
-            pairs.append((yaw_rate, turn, ("yaw_rate",), "what the rear wheels tell", wide))
-        if "ay" in signals:
-            both, of = ("ay", "yaw_rate"), "yaw rate times speed"
-            pairs.append((signals["ay"], yaw_rate * speed, both, of, wide))
-        angle = next((name for name in ROAD_WHEELS if name in signals), None)
-        if angle is not None and "steering_wheel" in signals:
-            both, of = ("steering_wheel", angle), "15 times the other"
-            pairs.append((signals["steering_wheel"], 15 * signals[angle], both, of, wide))
-    for values, expected, concerned, of, sound in pairs:
-        slope, correlation = slope_of(values, expected, moving(speed))
-        if abs(correlation) > LEAST_CORRELATION:
-            yield from _wrong_scale(abs(slope), concerned, of, sound)
+            both = rows & np.isfinite(own) & np.isfinite(speed)
+            if both.sum() >= FEWEST_TICKS:
+                ratio = float(np.median(own[both] / speed[both]))
+                yield Relation({name: 1}, -1, "the speed of the wheels", ratio, 1.0)
+    yaw_rate, ay = signals.get("yaw_rate"), signals.get("ay")
+    if yaw_rate is not None and {"wheel_rl", "wheel_rr"} <= set(signals):
+        turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M
+        yield relate_to(turn, yaw_rate, {"yaw_rate": 1}, -1, "what the rear wheels tell")
+    if yaw_rate is not None and ay is not None:
+        powers = {"ay": 1, "yaw_rate": -1}
+        yield relate_to(yaw_rate * speed, ay, powers, -1, "yaw rate times speed")
+    if "ax" in signals and speed.size >= 4 * FEWEST_TICKS:
+        change = np.full(speed.size, np.nan)
+        change[SECOND // 2 : -SECOND // 2] = speed[SECOND:] - speed[:-SECOND]
+        smooth = np.convolve(np.nan_to_num(signals["ax"]), np.ones(SECOND) / SECOND, "same")
+        yield relate_to(change, smooth, {"ax": 1}, -1, "the change of speed")
+    wheel = signals.get("steering_wheel")
+    angle = next((name for name in ROAD_WHEELS if name in signals), None)
+    if wheel is not None and angle is not None:
+        powers = {"steering_wheel": 1, angle: -1}
+        yield relate_to(STEERING_RATIO * signals[angle], wheel, powers, 0, "15 times the other")
+    turning = "ay" if yaw_rate is None else "yaw_rate"
+    for name in ("steering_wheel", *ROAD_WHEELS) if turning in signals else ():
+        if name in signals:
+            of_speed = 1 if turning == "yaw_rate" else 2
+            with np.errstate(divide="ignore", invalid="ignore"):
+                bend = USUAL_WHEELBASE_M * signals[turning] / speed**of_speed
+            bend *= STEERING_RATIO if name == "steering_wheel" else 1.0
+            yield relate_to(bend, signals[name], {name: 1, turning: -1}, of_speed, "")
 
 
-def _accelerates(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
-    """Compare `ax` with the change of speed over a second."""
-    if "ax" not in signals or speed.size < 4 * FEWEST_TICKS:
-        return
-    change = np.full(speed.size, np.nan)
-    change[SECOND // 2 : -SECOND // 2] = speed[SECOND:] - speed[:-SECOND]
-    smooth = np.convolve(np.nan_to_num(signals["ax"]), np.ones(SECOND) / SECOND, "same")
-    slope, correlation = slope_of(smooth, change, moving(speed))
-    if correlation < -LEAST_CORRELATION:
-        figure = f"its correlation with the change of speed is {correlation:+.2f}"
-        yield Fault("reversed", ("ax",), figure, "Write negate = true.")
-    elif correlation > LEAST_CORRELATION:
-        yield from _wrong_scale(slope, ("ax",), "the change of speed", (0.4, 2.5))
+def _scales_differ(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
+    """Compare the size of signals with that of others that tell the same; and the sign of `ax`."""
+    for one in relations(signals, speed):
+        names = tuple(one.powers)
+        low, high = _SOUND_RATIOS.get(names[0], (0.4, 2.5))
+        if names == ("ax",) and one.correlation < -LEAST_CORRELATION:
+            figure = f"its correlation with the change of speed is {one.correlation:+.2f}"
+            yield Fault("reversed", names, figure, "Write negate = true.")
+            continue
+        ratio = one.ratio if one.correlation > 0 else -one.ratio
+        too_weak = abs(one.correlation) <= LEAST_CORRELATION or not one.expected
+        if too_weak or ratio <= 0 or low <= ratio <= high:
+            continue
+        large = max(ratio, 1 / ratio)
+        factor = min(_FACTORS, key=lambda f: abs(np.log(f / large)))
+        near = f" ({factor:g} is between {_FACTORS[factor]})" if 0.6 < factor / large < 1.7 else ""
+        figure = f"it is {ratio:.3g} times {one.expected}{near}"
+        yield Fault("scaled", names, figure, "Check the units.")
 
 
 def _axles_swapped(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
@@ -492,17 +530,6 @@ def _lever(signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool)
     elif abs(zero) > LARGEST_ZERO_RAD:
         figure = f"on a straight it is {np.degrees(zero):+.2f} deg, should be 0"
         yield Fault("biased", (label,), figure, f"Write offset = {-zero:.4f} (rad).")
-
-
-def _wrong_scale(
-    slope: float, concerned: tuple[str, ...], of: str, sound: tuple[float, float]
-) -> Iterator[Fault]:
-    if sound[0] <= slope <= sound[1] or slope <= 0:
-        return
-    large = max(slope, 1 / slope)
-    factor = min(_FACTORS, key=lambda f: abs(np.log(f / large)))
-    near = f" ({factor:g} is between {_FACTORS[factor]})" if 0.6 < factor / large < 1.7 else ""
-    yield Fault("scaled", concerned, f"it is {slope:.3g} times {of}{near}", "Check the units.")
 
 
 # What looks wrong in a file as a whole: many rows refused, and times that are assumed.

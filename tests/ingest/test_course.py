@@ -319,7 +319,7 @@ def shift(place_m: float) -> Callable[[Signals], None]:
             lambda s: s.update(satellite_speed=s["satellite_speed"] / 3.6),
             1.0,
             "scaled",
-            "Check both units",
+            "Check the units",
         ),
         (lambda s: s.update(yaw_rate=s["yaw_rate"] * 1.04), 1.0, "scale", "gyroscope"),
     ],

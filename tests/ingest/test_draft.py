@@ -89,22 +89,6 @@ def test_signs_and_swapped_wheels_are_put_right(tmp_path: Path) -> None:
     assert sum("negate" in keys for keys in signals.values()) == 1
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 1, 0, 2), (2, 3, 1, 0)])
-def test_wheels_without_a_place_are_told_by_how_they_turn(
-    tmp_path: Path, order: tuple[int, ...]
-) -> None:
-    car = a_car(2.5)
-    names = dict(NAMES[0]) | {WHEELS[o]: f"Wheel_{i}" for i, o in enumerate(order)}
-    rows = as_logged({n: car[n] for n in ("ax", "ay", "yaw_rate")}, names, {})
-    rows = rows.with_columns(pl.Series(f"Wheel_{i}", car[WHEELS[o]]) for i, o in enumerate(order))
-    rows.insert_column(0, pl.Series("t", np.arange(rows.height) / 100))
-    rows.write_parquet(tmp_path / "log.parquet")
-    drafted = suggest(tmp_path, tmp_path / "log.parquet")
-    assert "csv" not in drafted
-    signals = drafted["signals"]
-    assert {name: signals[name]["column"] for name in WHEELS} == {n: names[n] for n in WHEELS}
-
-
 def test_units_and_rates_of_an_mdf_file(tmp_path: Path) -> None:
     car, time_s = a_car(), np.arange(6000) / 100
     units = {"ax": "g", "ay": "g", "yaw_rate": "°/s", "steering_wheel": "°", "sideslip": "rad"}

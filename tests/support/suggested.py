@@ -36,7 +36,6 @@ GERMAN = {
     "steering_wheel": "Lenkradwinkel", "wheel_fl": "Raddrehzahl_VL", "wheel_fr": "Raddrehzahl_VR",
     "wheel_rl": "Raddrehzahl_HL", "wheel_rr": "Raddrehzahl_HR", "sideslip": "Schwimmwinkel",
 }  # fmt: skip
-UNNAMED = {**ENGLISH, **{name: f"wheel speed {i}" for i, name in enumerate(WHEELS)}}
 ROS = {
     "ax": "/imu/data.linear_acceleration.x", "ay": "/imu/data.linear_acceleration.y",
     "yaw_rate": "/imu/data.angular_velocity.z", "steering_wheel": "/car.steering_wheel_angle",
@@ -84,7 +83,7 @@ def _german_csv(file: Path, car: Car) -> None:
 
 
 def _parquet(file: Path, car: Car) -> None:
-    _columns(car, UNNAMED, {}).write_parquet(file)
+    _columns(car, ENGLISH, {}).write_parquet(file)
 
 
 def _mdf(file: Path, car: Car) -> None:
@@ -183,7 +182,7 @@ LOGS: dict[str, Suggested] = {
     "CSV, y to the right, rear wheels swapped": Suggested(
         ".csv", _csv(_SWAPPED, _RIGHT), _SWAPPED, _RIGHT
     ),
-    "Parquet, four wheels without a place, SI": Suggested(".parquet", _parquet, UNNAMED, {}, 2.5),
+    "Parquet, SI": Suggested(".parquet", _parquet, ENGLISH, {}, 2.5),
     "MDF 4, g and degrees, a label of 10 Hz": Suggested(
         ".mf4", _mdf, ENGLISH, {"ax": 1 / G_MPS2, "ay": 1 / G_MPS2, **DEGREES}
     ),
