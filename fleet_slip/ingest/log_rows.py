@@ -24,7 +24,7 @@ from fleet_slip.catalogue.signals import catalogue, round_chunks
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import describe
 from fleet_slip.ingest.formats.reading import file_errors, open_source
-from fleet_slip.ingest.formats.source import BASE, Base, Budget, ClockSource, Meter, Source
+from fleet_slip.ingest.formats.source import BASE, Base, Budget, Meter, Source
 from fleet_slip.ingest.formats.tables import BATCH_ROWS
 from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.mapping import SPEEDS, LabelSensor, Mapping
@@ -209,7 +209,7 @@ def _bases_of(
     source: Source, part: Path, mapping: Mapping, wanted: dict[str | None, list[str]]
 ) -> list[Base]:
     """Return the time bases of a file that have one of the wanted columns."""
-    if isinstance(source, ClockSource):
+    if source.has_clock:
         bases = [base for columns in wanted.values() for base in source.bases(columns)]
     else:
         time = str(mapping.time.key)

@@ -4,7 +4,7 @@ import csv
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -249,8 +249,11 @@ def profile_file(file: Path, formats: FileFormats) -> FileProfile:
         else:
             units = {}
         source = opened.enter_context(open_source(file, formats))
+        channels = source.channels()
+        with suppress(InputError):  # of a column; some files are read once for all of them
+            source.bases([channel.name for channel in channels])
         bases: dict[str, list[Channel]] = defaultdict(list)
-        for channel in source.channels():
+        for channel in channels:
             told = replace(channel, unit=channel.unit or units.get(channel.name, ""))
             bases[channel.base].append(told)
         refused: list[str] = []

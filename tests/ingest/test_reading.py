@@ -275,7 +275,7 @@ def test_a_list_is_refused_before_it_is_decoded(
     values = pa.ListArray.from_arrays(pa.array([0, 1, 3_000_000], pa.int32()), np.zeros(3_000_000))
     table = pa.table({"t": [0.0, 0.01], "ax": values, "beta": [0.0, 0.0]})
     pq.write_table(table, tmp_path / "log.parquet")
-    monkeypatch.setattr(tables, "_parquet_batches", None)
+    monkeypatch.setattr(tables, "plain_column", None)
     with pytest.raises(InputError, match=r"3,000,000 rows or more"):
         read_measured(tmp_path / "log.parquet", a_mapping())
     pq.write_table(table.slice(0, 1), tmp_path / "log.parquet")

@@ -20,7 +20,7 @@ from fleet_slip.ingest import drives as open_drives
 from fleet_slip.ingest import load, stream
 from fleet_slip.ingest.drives import DriveCutter
 from fleet_slip.ingest.formats import csv as csv_batches
-from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers, open_csv
+from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
 from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
@@ -208,12 +208,11 @@ def test_plain_numbers_are_those_of_their_texts(
     file.write_text("a;b\n" + "".join(f"{text};x\n" for text in texts))
     form = CsvFormat(separator=";", decimal_comma=comma)
 
-    def read(plain: PlainNumbers | None) -> pl.Series:
-        with open_csv(Budget.of(file), form, plain) as source:
-            return pl.concat(source.batches(["a"]))["a"]
+    def read(plain: PlainNumbers) -> pl.Series:
+        return pl.concat(CsvSource(Budget.of(file), form, plain).batches(["a"]))["a"]
 
     found = read(PlainNumbers(frozenset({"a"}), (-99.0, float("nan"))))
-    told = read(None)
+    told = read(PlainNumbers())
     if found.dtype == pl.String:
         assert found.equals(told)
         return

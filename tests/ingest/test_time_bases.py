@@ -17,14 +17,14 @@ from hypothesis import strategies as st
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import log_rows, raw_columns, stream
-from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, ClockSource
+from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, Source
 from fleet_slip.ingest.raw_columns import DISORDER, HELD, ROW, merge_bases
 from tests.support.measured import MeasuredLog, a_mapping, read_measured
 
 GAP_S = 1.0
 
 
-class FakeSource(ClockSource):
+class FakeSource(Source):
     """A file with clocks that is in memory, read in batches of some rows."""
 
     def __init__(self, frames: Sequence[pl.DataFrame], batch: int) -> None:

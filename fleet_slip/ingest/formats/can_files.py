@@ -10,10 +10,8 @@ import os
 import re
 import struct
 import zlib
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from functools import partial
 from itertools import islice, product
 from typing import Any, BinaryIO, NamedTuple
 
@@ -41,12 +39,11 @@ from fleet_slip.ingest.formats.can import (
 )
 from fleet_slip.ingest.formats.source import (
     OWN_TIME,
-    Base,
     Budget,
     Channel,
-    ClockSource,
+    FormatSource,
     Spool,
-    describe_missing,
+    missing_column,
     reading_with,
 )
 
@@ -267,7 +264,7 @@ _Key = tuple[int, bool]
 """Number of a message, and whether it is of 29 bits."""
 
 
-class CanSource(ClockSource):
+class CanSource(FormatSource):
     """The messages of a CAN trace."""
 
     def __init__(self, bus: CanBus, database: Any, spool: Spool, budget: Budget) -> None:
@@ -289,27 +286,24 @@ class CanSource(ClockSource):
             for signal in message.signals
         ]
 
-    def bases(self, columns: Sequence[str]) -> list[Base]:
-        """Return the messages that have one of the columns. Raises `InputError`."""
-        wanted: dict[str, dict[str, Any]] = defaultdict(dict)
-        for column in columns:
-            name, _, signal = column.partition(".")
-            of = self._messages[name].signals if name in self._messages else ()
-            found = {s.name: s for s in of if is_possible(s)}
-            if signal not in found:
-                known = [f"{m}.{s.name}" for m, of in self._messages.items() for s in of.signals]
-                raise InputError(f"{shown(self._bus.database)}: {describe_missing(column, known)}")
-            if not math.isfinite(found[signal].scale) or not found[signal].scale:
-                raise InputError(
-                    f"{shown(self._bus.database)}: the conversion of {column!r} is not applied: it "
-                    "is not one line (factor and offset). Write it so, or map another signal."
-                )
-            wanted[name][column] = found[signal]
+    def find(self, column: str) -> tuple[str, Any]:
+        """Return the name of a message, and the signal. Raises `InputError`."""
+        name, _, signal_name = column.partition(".")
+        of = self._messages[name].signals if name in self._messages else ()
+        signal = next((s for s in of if s.name == signal_name and is_possible(s)), None)
+        if signal is None:
+            known = [f"{m}.{s.name}" for m, of in self._messages.items() for s in of.signals]
+            raise missing_column(self._bus.database, column, known)
+        if not math.isfinite(signal.scale) or not signal.scale:
+            raise InputError(
+                f"{shown(self._bus.database)}: the conversion of {column!r} is not applied: it "
+                "is not one line (factor and offset). Write it so, or map another signal."
+            )
+        return name, signal
+
+    def prepare(self, wanted: dict[str, dict[str, Any]]) -> None:
+        """Read the trace for some messages."""
         self._want({_key(self._messages[name]) for name in wanted})
-        return [
-            Base(name, partial(self._count, name, signals), partial(self._read, name, signals))
-            for name, signals in wanted.items()
-        ]
 
     def _want(self, asked: set[_Key]) -> None:
         """Read the trace, once more if it was read without these messages."""
@@ -324,13 +318,13 @@ class CanSource(ClockSource):
                     f"{shown(self._file)}: there is no CAN frame in it. Record it again."
                 )
 
-    def _count(self, name: str, signals: dict[str, Any]) -> int:
+    def count(self, name: str, signals: dict[str, Any]) -> int:
         """Return how many frames of a message have one of the signals."""
         if any(signal.multiplexer_ids is None for signal in signals.values()):
             return self._frames[_key(self._messages[name])].sizes_on(self._bus.channel).total()
-        return sum(table.height for table in self._read(name, signals))
+        return sum(table.height for table in self.read(name, signals))
 
-    def _read(self, name: str, signals: dict[str, Any]) -> Iterator[pl.DataFrame]:
+    def read(self, name: str, signals: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield the signals of one message; rows are frames that have one of them."""
         message, needed = self._messages[name], max(map(needed_bytes, signals.values()))
         frames = self._require_usable(message, next(iter(signals)), needed)

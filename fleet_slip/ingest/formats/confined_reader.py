@@ -1,21 +1,30 @@
-"""Reads a stranger's file in a process of its own, which can do no harm, for `confined_source`.
+"""Reads a stranger's file in a process of its own, which can do no harm, for `reading`.
 
 A server, started once, imports what formats need and forks one reader for each file. A reader
 confines itself, opens the file, and answers what it is asked: lines of JSON on a socket. An answer
 is two sizes and JSON; rows are an Arrow stream in memory of both processes.
+
+A reader keeps that file, a folder for its temporary files, and the installed code, of which
+libraries import parts late. It cannot connect, start programs or processes, or signal others. Where
+the kernel has no Landlock (before 5.13, or switched off) other files stay readable.
 """
 
 import contextlib
+import ctypes
 import errno
 import importlib
 import json
 import os
 import pickle
+import platform
+import resource
 import signal
 import socket
 import struct
+import sysconfig
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass
 from functools import partial
@@ -27,14 +36,14 @@ import polars as pl
 from fleet_slip.base import shown
 from fleet_slip.errors import FleetSlipError, is_lack_of_memory
 from fleet_slip.ingest.formats.can import CanBus
-from fleet_slip.ingest.formats.source import Base, Budget, ClockSource, Meter, Source
+from fleet_slip.ingest.formats.source import Base, Budget, Meter, Source
 
 FORMATS = {
     "mdf": ("mdf", "asammdf"),
     "mdf_bus": ("mdf", "asammdf", "cantools"),
     "mcap": ("mcap", "mcap.stream_reader", "mcap_ros2.decoder"),
     "tdms": ("tdms", "nptdms"),
-    "mat": ("matlab",),
+    "mat": ("matlab", "scipy.io"),
     "mat73": ("matlab", "h5py"),
     "can_trace": ("can_files", "can", "cantools"),
 }
@@ -55,7 +64,6 @@ class Job:
     """For its temporary files."""
     limits: tuple[int, int, int]
     """Bytes of memory and of a temporary file, and seconds of a processor."""
-    is_watched: bool
 
 
 def open_here(name: str, bus: CanBus | None, budget: Budget) -> AbstractContextManager[Source]:
@@ -88,7 +96,7 @@ def serve(control: int) -> None:
                         socket.socket(fileno=given[0]) as channel,
                         os.fdopen(given[1], "wb") as rows,
                     ):
-                        _read(_Asker(channel, rows), own)
+                        _Reader(channel, rows).serve(own)
                 finally:
                     os._exit(0)
             for one in given:
@@ -98,106 +106,228 @@ def serve(control: int) -> None:
             os.close(handle)
 
 
-class _Asker:
-    """Who asks, and where rows are put for it."""
+class _Reader(Meter):
+    """An open file, who asks for what is in it, and what of it is being read."""
 
     def __init__(self, channel: socket.socket, rows: BinaryIO) -> None:
-        self.channel, self._rows = channel, rows
+        super().__init__()
+        self._channel, self._rows = channel, rows
+        self._source: Source
+        self._bases: list[Base] = []
+        self._batches: list[Iterator[pl.DataFrame]] = []
+        self._ahead: dict[int, Future[pl.DataFrame | None] | None] = {}
 
-    def tell(self, told: Any, frame: pl.DataFrame | None = None) -> None:
-        """Send an answer, and rows with it."""
+    def serve(self, parent: int) -> None:
+        """Answer what is asked of a file, confined to it."""
+        with self._channel.makefile("rb") as asked, contextlib.ExitStack() as opened:
+            job: Job = pickle.load(asked)  # noqa: S301 - of our own parent
+            os.chdir(job.cwd)
+            tempfile.tempdir = job.folder
+            confine(parent, job.file, job.folder, *job.limits)
+            budget = Budget(Path(job.file), job.size, self)
+
+            def open_it() -> bool:
+                self._source = opened.enter_context(open_here(job.format, job.bus, budget))
+                return self._source.has_clock
+
+            if not self._answer(job.file, open_it):
+                return
+            for line in asked:
+                name, *arguments = json.loads(line)
+                self._answer(job.file, partial(getattr(self, name), *arguments))
+                if name == "rows":
+                    self._look_ahead(*arguments)
+
+    def _answer(self, file: str, find: Callable[[], Any]) -> bool:
+        """Send what is found, or what is wrong; return whether it was found."""
+        try:
+            found = find()
+            if isinstance(found, pl.DataFrame):
+                names = {name: str(place) for place, name in enumerate(found.columns)}
+                self._send({"found": [*names]}, found.rename(names))  # Arrow cuts names at a NUL
+            else:
+                self._send({"found": found})
+        except Exception as error:
+            kind, text = type(error).__name__, str(error)
+            if is_lack_of_memory(error) or getattr(error, "errno", 0) == errno.EFBIG:
+                kind = "MemoryError"
+            elif not isinstance(error, FleetSlipError):
+                reason = shown(text.strip().split("\n")[0][:200]) or kind
+                text = f"{shown(file)}: cannot be read: {reason}. Is it complete? Copy it again."
+            self._send({"error": kind, "text": text})
+            return False
+        return True
+
+    def _send(self, answer: Any, frame: pl.DataFrame | None = None) -> None:
         self._rows.seek(0)
         if frame is not None:
             frame.write_ipc_stream(self._rows, compat_level=pl.CompatLevel.oldest())
             self._rows.flush()
-        line = json.dumps(told).encode()
-        self.channel.sendall(SIZES.pack(len(line), self._rows.tell()) + line)
-
-
-def _read(asker: _Asker, parent: int) -> None:
-    """Answer what is asked of a file, confined to it."""
-    from fleet_slip.ingest.formats.confining import confine  # noqa: PLC0415 - Linux alone
-
-    with asker.channel.makefile("rb") as asked:
-        job: Job = pickle.load(asked)  # noqa: S301 - of our own parent
-        os.chdir(job.cwd)
-        tempfile.tempdir = job.folder
-        confine(parent, job.file, job.folder, *job.limits)
-        with contextlib.ExitStack() as opened:
-            reader = _answer(asker, job.file, partial(_Reader, asker, job, opened))
-            for line in asked if reader else ():
-                name, *arguments = json.loads(line)
-                _answer(asker, job.file, partial(getattr(reader, name), *arguments))
-
-
-def _answer(asker: _Asker, file: str, find: Callable[[], Any]) -> Any:
-    """Send what is found, or what is wrong."""
-    try:
-        found = find()
-        if isinstance(found, pl.DataFrame):
-            names = {name: str(place) for place, name in enumerate(found.columns)}
-            asker.tell({"found": [*names]}, found.rename(names))  # Arrow cuts names at a NUL
-        else:
-            asker.tell({"found": found.told if isinstance(found, _Reader) else found})
-    except Exception as error:
-        kind, text = type(error).__name__, str(error)
-        if is_lack_of_memory(error) or getattr(error, "errno", 0) == errno.EFBIG:
-            kind = "MemoryError"
-        elif not isinstance(error, FleetSlipError):
-            reason = shown(text.strip().split("\n")[0][:200]) or kind
-            text = f"{shown(file)}: cannot be read: {reason}. Is it complete? Copy it again."
-        asker.tell({"error": kind, "text": text})
-        return None
-    return found
-
-
-class _FarMeter(Meter):
-    """Lets the meter of the other process know."""
-
-    def __init__(self, asker: _Asker, is_watched: bool) -> None:
-        super().__init__()
-        self._asker, self.is_watched = asker, is_watched
+        line = json.dumps(answer).encode()
+        self._channel.sendall(SIZES.pack(len(line), self._rows.tell()) + line)
 
     def pass_over(self, at: int, size: int) -> None:
-        if self.is_watched:
-            self._asker.tell({"passed": [at, size]})
-
-
-class _Reader:
-    """An open file, and what of it is being read."""
-
-    def __init__(self, asker: _Asker, job: Job, opened: contextlib.ExitStack) -> None:
-        budget = Budget(Path(job.file), job.size, _FarMeter(asker, job.is_watched))
-        self._source = opened.enter_context(open_here(job.format, job.bus, budget))
-        self._bases: list[Base] = []
-        self._batches: list[Iterator[pl.DataFrame]] = []
-        self.told = isinstance(self._source, ClockSource)
+        """Let the meter of the other process know."""
+        self._send({"passed": [at, size]})
 
     def channels(self) -> list[tuple[str, ...]]:
         """Return all that can be read."""
         return [astuple(one) for one in self._source.channels()]
 
-    def expected_rows(self, columns: Sequence[str]) -> int:
-        """Return about how many rows come."""
-        return self._source.expected_rows(columns)
+    def bases(self, columns: Sequence[str]) -> list[tuple[int, str]]:
+        """Return the number and the name of time bases."""
+        first = len(self._bases)
+        self._bases += self._source.bases(columns)
+        return [(number, base.name) for number, base in enumerate(self._bases[first:], first)]
 
-    def bases(self, columns: Sequence[str]) -> list[tuple[int, str, int]]:
-        """Return the number, the name and the rows of time bases."""
-        first, source = len(self._bases), self._source
-        self._bases += source.bases(columns) if isinstance(source, ClockSource) else []
-        coming = enumerate(self._bases[first:], first)
-        return [(number, base.name, base.count_rows()) for number, base in coming]
+    def count(self, number: int) -> int:
+        """Return the rows of a time base."""
+        return self._bases[number].count_rows()
 
-    def batches(self, columns: Sequence[str]) -> int:
-        """Begin to read columns; return the number by which rows are asked for."""
-        self._batches.append(self._source.batches(columns))
-        return len(self._batches) - 1
-
-    def base(self, number: int) -> int:
-        """Begin to read a time base; return the same."""
+    def read(self, number: int) -> int:
+        """Begin to read a time base; return the number by which rows are asked for."""
         self._batches.append(self._bases[number].read())
         return len(self._batches) - 1
 
     def rows(self, number: int) -> pl.DataFrame | None:
         """Return the next rows, None if there are no more."""
-        return next(self._batches[number], None)
+        ahead = self._ahead.get(number)
+        return next(self._batches[number], None) if ahead is None else ahead.result()
+
+    def _look_ahead(self, number: int) -> None:
+        """Read what is likely asked for next, while the other process is at what it has."""
+        if number not in self._ahead:  # many want the first rows alone
+            self._ahead[number] = None
+            return
+        ahead = self._ahead[number] = Future()
+        try:
+            ahead.set_result(next(self._batches[number], None))
+        except Exception as error:
+            ahead.set_exception(error)
+
+
+# What the kernel takes from a reader.
+
+_PDEATHSIG, _NO_NEW_PRIVS, _SECCOMP, _FILTER = 1, 38, 22, 2
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
+_ASK_VERSION, _BENEATH = 1, 1
+_RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15}
+"""By version of Landlock how many rights on files it knows; later ones know 16."""
+_READ_FILE, _READ = 1 << 2, 1 << 2 | 1 << 3
+_EVERYTHING_HERE = (1 << 13) - 1
+_OURS = (str(Path(__file__).parents[2]),)
+_TIME_ZONES = ("/etc/localtime", "/usr/share/zoneinfo")
+
+_MACHINES = {"x86_64": (0xC000003E, 0), "aarch64": (0xC00000B7, 1)}
+"""How the kernel calls a machine, and which of the numbers below are its own."""
+_FORBIDDEN = (
+    # socket, socketpair, connect, bind, listen
+    (41, 198), (53, 199), (42, 203), (49, 200), (50, 201),
+    # fork, vfork, execve, execveat, ptrace, process_vm_readv, process_vm_writev
+    (57, None), (58, None), (59, 221), (322, 281), (101, 117), (310, 270), (311, 271),
+    # kill, tkill, tgkill, rt_sigqueueinfo, rt_tgsigqueueinfo, pidfd_send_signal, pidfd_getfd
+    (62, 129), (200, 130), (234, 131), (129, 138), (297, 240), (424, 424), (438, 438),
+    # io_uring_setup, bpf, perf_event_open, userfaultfd, keyctl, add_key, request_key
+    (425, 425), (321, 280), (298, 241), (323, 282), (250, 219), (248, 217), (249, 218),
+    # mount, unshare, setns, open_by_handle_at, setpriority, sched_setaffinity
+    (165, 40), (272, 97), (308, 268), (304, 265), (141, 140), (203, 122),
+    # chown, fchown, lchown, fchownat, setxattr, lsetxattr, fsetxattr
+    (92, None), (93, 55), (94, None), (260, 54), (188, 5), (189, 6), (190, 7),
+    # utime, utimes, futimesat, utimensat, shmget, msgget, semget
+    (132, None), (235, None), (261, None), (280, 88), (29, 194), (68, 186), (64, 190),
+)  # fmt: skip
+"""System calls by their numbers on x86_64 and aarch64."""
+_PASSED_BY = ((90, None), (91, 52), (268, 53), (452, 452))
+"""Those that seem to work and do nothing, since who copies a file calls them: chmod and others."""
+_CLONE, _CLONE3, _CLONE_THREAD = (56, 220), 435, 0x10000
+_LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
+_ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050000, 0x80000000
+_PERM, _NOSYS = 1, 38
+
+_LIBC = ctypes.CDLL(None, use_errno=True)
+
+
+def confine(parent: int, file: str, folder: str, memory: int, disk: int, seconds: int) -> None:
+    """Confine this process, a child of `parent`, to a file and a folder; it cannot be undone.
+
+    `memory` are the bytes that it may take beyond what it has, `disk` those of a temporary file,
+    `seconds` those of a processor. It goes with its parent, and first where memory lacks.
+    """
+    _call(_LIBC.prctl(_PDEATHSIG, signal.SIGKILL, 0, 0, 0))
+    if os.getppid() != parent:
+        os._exit(1)
+    Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    _limit(resource.RLIMIT_AS, pages * resource.getpagesize() + memory)
+    _limit(resource.RLIMIT_FSIZE, disk)
+    _limit(resource.RLIMIT_CPU, seconds)
+    _limit(resource.RLIMIT_CORE, 0)
+    _call(_LIBC.prctl(_NO_NEW_PRIVS, 1, 0, 0, 0))
+    _close_files(file, folder)
+    _forbid_calls()
+
+
+def _limit(kind: int, most: int) -> None:
+    _, hard = resource.getrlimit(kind)
+    most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+    resource.setrlimit(kind, (most, most))
+
+
+def _close_files(file: str, folder: str) -> None:
+    """Let Landlock open no other files than these and the installed code."""
+    version = _LIBC.syscall(_CREATE_RULESET, None, 0, _ASK_VERSION)
+    if version < 1:
+        return
+    handled = (1 << _RIGHTS.get(version, 16)) - 1
+    ports, beyond = 3 if version >= 4 else 0, 3 if version >= 6 else 0
+    asked = struct.pack("QQQ", handled, ports, beyond)
+    rules = _call(_LIBC.syscall(_CREATE_RULESET, asked, len(asked), 0))
+    # Of the folder, all that the first version knows, and to cut files.
+    allowed = {file: _READ_FILE, folder: (_EVERYTHING_HERE | 1 << 14) & handled}
+    for place, rights in {**dict(_readable()), **allowed}.items():
+        try:
+            opened = os.open(place, os.O_PATH | os.O_CLOEXEC)
+        except OSError:
+            continue  # who reads it says what is wrong
+        rule = struct.pack("=Qi", rights, opened)
+        _call(_LIBC.syscall(_ADD_RULE, rules, _BENEATH, rule, 0))
+        os.close(opened)
+    _call(_LIBC.syscall(_RESTRICT_SELF, rules, 0))
+    os.close(rules)
+
+
+def _readable() -> Iterator[tuple[str, int]]:
+    """Yield what the libraries may still read, which tells nothing of anybody."""
+    code = (sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+    for place in (*code, *_OURS, *_TIME_ZONES):
+        yield place, _READ if Path(place).is_dir() else _READ_FILE
+
+
+def _forbid_calls() -> None:
+    """Let the kernel refuse system calls that no reader makes (seccomp)."""
+    if platform.machine() not in _MACHINES:
+        return
+    machine, place = _MACHINES[platform.machine()]
+    steps = [
+        (_LOAD, 0, 0, 4), (_EQUAL, 1, 0, machine), (_RETURN, 0, 0, _KILL),
+        (_LOAD, 0, 0, 0),
+        (_EQUAL, 0, 1, _CLONE3), (_RETURN, 0, 0, _REFUSE | _NOSYS),  # then libc takes clone
+        (_EQUAL, 0, 4, _CLONE[place]),
+        (_LOAD, 0, 0, 16), (_ANY_BIT, 1, 0, _CLONE_THREAD), (_RETURN, 0, 0, _REFUSE | _PERM),
+        (_RETURN, 0, 0, _ALLOW),
+        (_AT_LEAST, 0, 1, 0x40000000), (_RETURN, 0, 0, _KILL),  # numbers of 32-bit programs
+    ]  # fmt: skip
+    for numbers in (*_FORBIDDEN, *_PASSED_BY):
+        answer = _REFUSE if numbers in _PASSED_BY else _REFUSE | _PERM
+        if (number := numbers[place]) is not None:
+            steps += [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, answer)]
+    steps.append((_RETURN, 0, 0, _ALLOW))
+    program = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *step) for step in steps))
+    told = struct.pack("HxxxxxxP", len(steps), ctypes.addressof(program))
+    _call(_LIBC.prctl(_SECCOMP, _FILTER, told, 0, 0))
+
+
+def _call(result: int) -> int:
+    if result < 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    return result

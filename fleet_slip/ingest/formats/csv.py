@@ -1,14 +1,13 @@
 """Reads CSV in blocks of whole lines: fields as text, columns of plain numbers as numbers."""
 
-import codecs
 import csv
-from collections.abc import Iterator, Sequence, Set
-from contextlib import contextmanager
+from collections.abc import Iterator, Set
 from dataclasses import dataclass
-from io import BufferedReader, BytesIO, RawIOBase
+from functools import cached_property
+from io import BufferedReader, BytesIO
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, BinaryIO, Literal
+from typing import Annotated, Any, BinaryIO, Literal
 
 import numpy as np
 import polars as pl
@@ -20,11 +19,7 @@ from fleet_slip.base import shown
 from fleet_slip.compute.tasks import map_ahead
 from fleet_slip.config import Config, added
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.source import Budget, Channel, require_columns
-
-if TYPE_CHECKING:
-    from _typeshed import WriteableBuffer
-
+from fleet_slip.ingest.formats.source import Budget, Channel, FormatSource, find_column
 
 # What the text of a CSV file is made of: encoding, separator, and which of its lines are data.
 
@@ -86,30 +81,12 @@ def decompressed(stream: BinaryIO) -> BinaryIO:
     return stream
 
 
-class _Recoded(RawIOBase):
-    """A stream of text in another encoding, as UTF-8."""
-
-    def __init__(self, stream: BinaryIO, encoding: Encoding) -> None:
-        self._stream, self._rest = stream, b""
-        self._decoder = codecs.getincrementaldecoder(encoding)()
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: "WriteableBuffer") -> int:
-        room, ended = memoryview(buffer).cast("B"), False
-        while not self._rest and not ended:
-            more = self._stream.read(max(len(room) // 4, 1024))
-            ended = not more
-            self._rest = self._decoder.decode(more, final=ended).encode()
-        taken, self._rest = self._rest[: len(room)], self._rest[len(room) :]
-        room[: len(taken)] = taken
-        return len(taken)
-
-
 def recoded(stream: BinaryIO, encoding: Encoding) -> BinaryIO:
     """Return text in another encoding as UTF-8."""
-    return stream if encoding == "utf-8" else BufferedReader(_Recoded(stream, encoding), 2**20)
+    if encoding == "utf-8":
+        return stream
+    plain = pa.transcoding_input_stream(pa.PythonFile(stream, "r"), encoding, "utf-8")
+    return BufferedReader(plain, 2**20)
 
 
 def text_of(stream: BinaryIO, csv_format: CsvFormat) -> BinaryIO:
@@ -155,60 +132,62 @@ class PlainNumbers:
         return not (self.missing and column.is_in(self.missing).any())
 
 
-@dataclass(frozen=True)
-class CsvSource:
+class CsvSource(FormatSource):
     """A CSV file, or one that is compressed."""
 
-    budget: Budget
-    csv_format: CsvFormat
-    numbers: PlainNumbers
     has_clock = False
 
-    @property
-    def file(self) -> Path:
-        """The file."""
-        return self.budget.file
+    def __init__(self, budget: Budget, csv_format: CsvFormat, numbers: PlainNumbers) -> None:
+        """Take a file and how it is written; it is opened to be read."""
+        self._file, self._budget = budget.file, budget
+        self.csv_format, self._numbers = csv_format, numbers
+
+    @cached_property
+    def _names(self) -> list[str]:
+        with self._file.open("rb") as stream:
+            return _csv_header(text_of(stream, self.csv_format), self._file, self.csv_format)
 
     def channels(self) -> list[Channel]:
         """Return the columns of the header."""
-        with self.file.open("rb") as stream:
-            names = _csv_header(text_of(stream, self.csv_format), self.file, self.csv_format)
-        return [Channel(name) for name in names if names.count(name) == 1]
+        return [Channel(name) for name in self._names if self._names.count(name) == 1]
 
-    def expected_rows(self, _columns: Sequence[str]) -> int:
+    def find(self, column: str) -> tuple[str, int]:
+        """Return where a column stands. Raises `InputError`."""
+        return "", find_column(self._file, self._names, column)
+
+    def count(self, _base: str, _found: dict[str, Any]) -> int:
         """Return how many lines the file has, if those of its begin are like all others."""
-        with self.file.open("rb") as stream:
+        with self._file.open("rb") as stream:
             sample = stream.read(_SAMPLE_BYTES)
         lines = sample.count(b"\n") - 1  # without the header
         is_text = lines > 0 and b"\0" not in sample
-        return round(self.budget.size * lines / len(sample)) if is_text else 0
+        return round(self._budget.size * lines / len(sample)) if is_text else 0
 
-    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
-        """Yield the named columns as text or plain numbers, and `EXTRA_FIELDS`."""
-        with self.file.open("rb") as stream:
+    def read(self, _base: str, found: dict[str, int]) -> Iterator[pl.DataFrame]:
+        """Yield the columns as text or plain numbers, and `EXTRA_FIELDS`."""
+        with self._file.open("rb") as stream:
             unfolded = decompressed(stream)
             plain = recoded(unfolded, self.csv_format.encoding)
-            names = _csv_header(plain, self.file, self.csv_format)
-            positions = require_columns(self.file, names, columns)
-            numbers = set(self.numbers.columns & set(columns))
+            names = _csv_header(plain, self._file, self.csv_format)
+            numbers = set(self._numbers.columns & set(found))
 
             def parse(block: bytes) -> pl.DataFrame:
                 # Reading on over bad numbers is reading on over bad quotes.
                 fit = frozenset() if b'"' in block else frozenset(numbers)
-                parsed = self._parse(block, len(names), positions, fit)
-                texts = {name for name in fit if not self.numbers.are_in(parsed[name])}
+                parsed = self._parse(block, len(names), found, fit)
+                texts = {name for name in fit if not self._numbers.are_in(parsed[name])}
                 if texts:
                     numbers.difference_update(texts)  # so that others need not be parsed twice
-                    again = self._parse(block, len(names), {n: positions[n] for n in texts}, set())
+                    again = self._parse(block, len(names), {n: found[n] for n in texts}, set())
                     parsed = parsed.with_columns(again.select(sorted(texts)))
                 return parsed
 
             # A line of separators before each block fixes the number of fields and keeps a block
             # from looking like a compressed file.
             padding = self.csv_format.separator.encode() * len(names) + b"\n"
-            blocks = _whole_lines(plain, self.file, padding)
+            blocks = _whole_lines(plain, self._file, padding)
             if unfolded is not stream:
-                blocks = _within(self.budget, blocks)
+                blocks = _within(self._budget, blocks)
             yield from map_ahead(parse, blocks)
 
     def _parse(
@@ -229,14 +208,6 @@ class CsvSource:
         )
         selection = [pl.col(fields[i]).alias(name) for name, i in positions.items()]
         return frame.select(*selection, EXTRA_FIELDS).collect().slice(1)
-
-
-@contextmanager
-def open_csv(
-    budget: Budget, csv_format: CsvFormat, numbers: PlainNumbers | None = None
-) -> Iterator[CsvSource]:
-    """Open a CSV file."""
-    yield CsvSource(budget, csv_format, numbers or PlainNumbers())
 
 
 def _within(budget: Budget, blocks: Iterator[bytes]) -> Iterator[bytes]:

@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -25,12 +25,11 @@ from fleet_slip.base import shown
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.source import (
     OWN_TIME,
-    Base,
     Budget,
     Channel,
-    ClockSource,
+    FormatSource,
     Spool,
-    describe_missing,
+    missing_column,
     reading_with,
 )
 
@@ -367,7 +366,7 @@ class _Rows:
     values: list[list[Any]] = field(default_factory=list)
 
 
-class McapSource(ClockSource):
+class McapSource(FormatSource):
     """The topics of an MCAP file."""
 
     def __init__(self, budget: Budget, spool: Spool) -> None:
@@ -387,33 +386,35 @@ class McapSource(ClockSource):
             for name in names
         ]
 
-    def bases(self, columns: Sequence[str]) -> list[Base]:
-        """Return the topics that have one of the columns. Raises `InputError`."""
-        wanted: dict[str, _Fields] = defaultdict(dict)
-        for column in columns:
-            topics = [topic for topic in self._topics if column.startswith(f"{topic}.")]
-            if not topics:
-                raise self._missing(column, [channel.name for channel in self.channels()])
-            topic = max(topics, key=len)
-            wanted[topic][column] = column[len(topic) + 1 :]
+    def find(self, column: str) -> tuple[str, str]:
+        """Return a topic, and the path of a field. Raises `InputError`."""
+        topics = [topic for topic in self._topics if column.startswith(f"{topic}.")]
+        if not topics:
+            raise missing_column(self._file, column, [one.name for one in self.channels()])
+        topic = max(topics, key=len)
+        return topic, column[len(topic) + 1 :]
+
+    def prepare(self, wanted: dict[str, _Fields]) -> None:
+        """Decode columns and put them aside, unless they are. Raises `InputError`."""
         if any(not of.keys() <= self._kept.get(topic, {}).keys() for topic, of in wanted.items()):
-            self._keep(wanted)
+            self._kept, self._texts = {}, set()
+            while not self._decode(wanted):
+                pass
+            self._kept = wanted
         for topic, of in wanted.items():
             for column in of.keys() - self._numbers - self._texts:
-                raise self._missing(column, [f"{topic}.{name}" for name in self._topics[topic]])
-        return [
-            Base(topic, partial(self._rows.__getitem__, topic), partial(self._read, topic, [*of]))
-            for topic, of in wanted.items()
-        ]
+                names = [f"{topic}.{name}" for name in self._topics[topic]]
+                raise missing_column(self._file, column, names)
 
-    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
-        """Yield the rows of each topic with one of the columns; all topics are read at once."""
-        if not self._kept:
-            self._keep({t: {f"{t}.{name}": name for name in of} for t, of in self._topics.items()})
-        yield from super().batches(columns)
+    def count(self, topic: str, _found: _Fields) -> int:
+        """Return how many messages a topic has."""
+        return self._rows[topic]
 
-    def _missing(self, column: str, names: list[str]) -> InputError:
-        return InputError(f"{shown(self._file)}: {describe_missing(column, names)}")
+    def read(self, topic: str, found: _Fields) -> Iterator[pl.DataFrame]:
+        """Yield fields of a topic."""
+        texts = [pl.col(column).cast(pl.String) for column in found if column in self._texts]
+        for piece in self._spool.read(topic):
+            yield pl.read_ipc_stream(piece).select(OWN_TIME, *found).with_columns(texts)
 
     @cached_property
     def _topics(self) -> dict[str, list[str]]:
@@ -450,12 +451,6 @@ class McapSource(ClockSource):
                 schemas[record.id] = record
             elif kind == "Channel" and record.id not in channels:
                 channels[record.id] = record, decoder_of(record, schemas.get(record.schema_id))
-
-    def _keep(self, wanted: dict[str, _Fields]) -> None:
-        """Decode columns of some topics, and put them aside."""
-        self._kept, self._texts = wanted, set()
-        while not self._decode(wanted):
-            pass
 
     def _decode(self, wanted: dict[str, _Fields]) -> bool:
         """Put columns aside; return False if one of them, all numbers so far, has a text."""
@@ -527,11 +522,6 @@ class McapSource(ClockSource):
             return pl.Series(values, dtype=pl.Float64, strict=False)
         self._texts.add(column)
         return pl.Series([None if v is None else str(v) for v in values], dtype=pl.String)
-
-    def _read(self, topic: str, columns: list[str]) -> Iterator[pl.DataFrame]:
-        texts = [pl.col(column).cast(pl.String) for column in columns if column in self._texts]
-        for piece in self._spool.read(topic):
-            yield pl.read_ipc_stream(piece).select(OWN_TIME, *columns).with_columns(texts)
 
 
 @contextmanager

@@ -1,12 +1,11 @@
 """Reads ASAM MDF, versions 2 to 4, through asammdf: each channel group is a time base."""
 
+import ast
 import mmap
-import traceback
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -18,16 +17,15 @@ from fleet_slip.base import shown
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.can import Bytes, CanBus, FrameBlock, parse_database
 from fleet_slip.ingest.formats.can_files import CanSource
-from fleet_slip.ingest.formats.formulas import compute_formula
 from fleet_slip.ingest.formats.source import (
     OWN_TIME,
     Base,
     Budget,
     Channel,
-    ClockSource,
+    FormatSource,
     Spool,
     as_column,
-    describe_missing,
+    missing_column,
     reading_with,
 )
 
@@ -75,7 +73,7 @@ def to_physical(conversion: Any, raw: Array) -> Array:
     if kind == _NONE:
         return raw
     if kind == _FORMULA:
-        return _by_formula(conversion.formula, raw)
+        return compute_formula(conversion.formula, raw)
     if kind in {_VALUES_TO_TEXT, _RANGES_TO_TEXT, _RANGES_TO_NUMBERS}:
         return _by_ranges(conversion, kind, raw)
     if kind == _TABLE and np.any(np.diff(_listed(conversion, "raw")) < 0):
@@ -95,11 +93,54 @@ def _kind_of(conversion: Any) -> str:
     return kinds[number]
 
 
-def _by_formula(formula: str, raw: Array) -> Array:
+# A formula, as ASAM MCD-2 MC writes it, is a stranger's text: Python parses it and does not run it.
+
+_LONGEST_FORMULA = 1000
+_FUNCTIONS: dict[tuple[str, int], Callable[..., Any]] = {
+    (name, 1): getattr(np, name)
+    for name in (
+        "sin", "cos", "tan", "asin", "acos", "atan", "arcsin", "arccos", "arctan", "sinh", "cosh",
+        "tanh", "exp", "log10", "sqrt", "abs",
+    )
+} | {("ln", 1): np.log, ("pow", 2): np.power}  # fmt: skip
+_OPERATIONS: dict[type[ast.AST], Callable[..., Any]] = {
+    ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide,
+    ast.Pow: np.power, ast.USub: np.negative, ast.UAdd: np.positive,
+}  # fmt: skip
+
+
+def compute_formula(formula: str, raw: Array) -> Array:
+    """Return a formula's value for each raw one. Raises `ValueError`, which says what is wrong."""
+    if len(formula) > _LONGEST_FORMULA:
+        raise ValueError(f"its formula has more than {_LONGEST_FORMULA:,} characters")
     try:
-        return compute_formula(formula.strip("\0"), raw.astype(np.float64))
-    except ValueError as error:
-        raise ValueError(f"its formula {formula[:100]!r} is not computed: {error}") from None
+        text = " ".join(formula.strip("\0").split()).replace("^", "**")
+        with np.errstate(all="ignore"):
+            value = _value_of(ast.parse(text, mode="eval").body, raw.astype(np.float64))
+    except (ValueError, SyntaxError, RecursionError, MemoryError, OverflowError) as error:
+        why = error if type(error) is ValueError else "it is damaged, or too deep"
+        raise ValueError(f"its formula {formula[:100]!r} is not computed: {why}") from None
+    return np.array(np.broadcast_to(value, raw.shape))
+
+
+def _value_of(node: ast.expr, raw: Array) -> Any:
+    """Return the value of a part: numbers, the raw value `X` or `X1`, operations, functions."""
+    match node:
+        case ast.Constant(value=number) if type(number) in {int, float}:
+            return np.float64(number)
+        case ast.Name(id="x" | "X" | "x1" | "X1"):
+            return raw
+        # Of two powers in a row some take the left one first and some the right.
+        case ast.BinOp(op=ast.Pow(), right=ast.BinOp(op=ast.Pow())):
+            pass
+        case ast.BinOp(left, operation, right) if type(operation) in _OPERATIONS:
+            return _OPERATIONS[type(operation)](_value_of(left, raw), _value_of(right, raw))
+        case ast.UnaryOp(operation, operand) if type(operation) in _OPERATIONS:
+            return _OPERATIONS[type(operation)](_value_of(operand, raw))
+        case ast.Call(ast.Name(name), values, []) if (name.lower(), len(values)) in _FUNCTIONS:
+            found = [_value_of(value, raw) for value in values]
+            return _FUNCTIONS[name.lower(), len(values)](*found)
+    raise ValueError(f"{ast.unparse(node)[:30]!r} is not known, or out of place")
 
 
 def _listed(conversion: Any, name: str) -> Array:
@@ -133,7 +174,7 @@ def _by_ranges(conversion: Any, kind: str, raw: Array) -> Array:
             values[mine] = to_physical(part, raw[mine])
         elif b"{X}" in part:  # of MDF 3, between quotes
             formula = part.decode("latin-1").replace("{X}", "X")
-            values[mine] = _by_formula(formula.strip().strip('"'), raw[mine])
+            values[mine] = compute_formula(formula.strip().strip('"'), raw[mine])
     return values
 
 
@@ -144,7 +185,7 @@ _EARLIEST_S = 10**8
 """Loggers without a clock write 0: a start before 1973 is not a date."""
 
 
-class MdfSource(ClockSource):
+class MdfSource(FormatSource):
     """An open MDF file. A channel of several groups is named `CHANNEL@GROUP`."""
 
     def __init__(self, mdf: Any, budget: Budget) -> None:
@@ -163,44 +204,45 @@ class MdfSource(ClockSource):
         ]
 
     def bases(self, columns: Sequence[str]) -> list[Base]:
-        """Return the channel groups that have one of the columns. Raises `InputError`."""
-        groups: dict[int, dict[str, int]] = {}
-        for name in columns:
-            number, index = self._find(name)
-            groups.setdefault(number, {})[name] = index
-        return [
-            Base(
-                f"group {number}",
-                partial(self.count_records, number),
-                partial(self._read, number, of),
-            )
-            for number, of in sorted(groups.items())
-        ]
+        """Return the channel groups that have one of the columns, in the file's order."""
+        return super().bases(sorted(columns, key=lambda name: self._find(name)[0]))
+
+    def find(self, column: str) -> tuple[str, tuple[int, int]]:
+        """Return the group of a channel, and the numbers of both. Raises `InputError`."""
+        number, index = self._find(column)
+        return f"group {number}", (number, index)
+
+    def count(self, _base: str, found: dict[str, tuple[int, int]]) -> int:
+        """Return how many samples a group says that it has."""
+        return self.count_records(next(iter(found.values()))[0])
 
     def count_records(self, number: int) -> int:
         """Return how many samples a group says that it has."""
         return int(self._mdf.groups[number].channel_group.cycles_nr)
 
-    def _read(self, number: int, indices: dict[str, int]) -> Iterator[pl.DataFrame]:
-        """Read channels of a group, some records at a time."""
-        self._require_sound(number, indices)
-        records = self.count_records(number)
-        for start in range(0, max(records, 1), WINDOW_RECORDS):
-            yield self._window(number, indices, start, min(WINDOW_RECORDS, records - start))
+    def read(self, _base: str, found: dict[str, tuple[int, int]]) -> Iterator[pl.DataFrame]:
+        """Read channels of a group, some records at a time; what is marked as invalid is null."""
+        [number] = {number for number, _ in found.values()}
+        for signals in self.windows(number, {name: index for name, (_, index) in found.items()}):
+            frame = {OWN_TIME: pl.Series(self.times_s(signals[0]))}
+            for name, signal in zip(found, signals, strict=True):
+                values = as_column(self._file, name, signal.samples)
+                invalid = signal.invalidation_bits
+                if invalid is not None:
+                    values = values.set(pl.Series(np.asarray(invalid, dtype=np.bool_)), None)
+                frame[name] = values
+            yield pl.DataFrame(frame)
 
-    def _require_sound(self, number: int, indices: dict[str, int]) -> None:
-        """Raise `InputError` for a group that asammdf would read beyond, or without times."""
+    def windows(self, number: int, indices: dict[str, int]) -> Iterator[list[Any]]:
+        """Yield channels of a group as asammdf's signals, some records at a time."""
+        # asammdf would read beyond the records of a damaged group.
         name = next(iter(indices))
         self._require_times(number, name)
         for index in (self._mdf.masters_db[number], *indices.values()):
             self._require_inside(number, index)
         self._require_data(number, name)
-
-    def windows(self, number: int, indices: dict[str, int]) -> Iterator[list[Any]]:
-        """Yield channels of a group as asammdf's signals, some records at a time."""
-        self._require_sound(number, indices)
         records = self.count_records(number)
-        for start in range(0, records, WINDOW_RECORDS):
+        for start in range(0, max(records, 1), WINDOW_RECORDS):
             yield self._signals(number, indices, start, min(WINDOW_RECORDS, records - start))
 
     def times_s(self, signal: Any) -> FloatArray:
@@ -255,20 +297,6 @@ class MdfSource(ClockSource):
         if isinstance(mapped, mmap.mmap) and memoryview(mapped).readonly:
             mapped.madvise(mmap.MADV_DONTNEED)
 
-    def _window(
-        self, number: int, indices: dict[str, int], start: int, records: int
-    ) -> pl.DataFrame:
-        """Read some records of a group; what the file marks as invalid is null."""
-        signals = self._signals(number, indices, start, records)
-        frame = {OWN_TIME: pl.Series(self.times_s(signals[0])[:records])}
-        for name, signal in zip(indices, signals, strict=True):
-            values = as_column(self._file, name, signal.samples[:records])
-            invalid = signal.invalidation_bits
-            if invalid is not None:
-                values = values.set(pl.Series(np.asarray(invalid[:records], dtype=np.bool_)), None)
-            frame[name] = values
-        return pl.DataFrame(frame)
-
     def _require_times(self, number: int, name: str) -> None:
         master = self._mdf.masters_db.get(number)
         group = self._mdf.groups[number]
@@ -320,7 +348,7 @@ class MdfSource(ClockSource):
             places = [p for p in self._places(base) if group in {str(p[0]), self._title(p[0])}]
         if not places:
             names = [channel.name for channel in self.channels()]
-            raise InputError(f"{shown(self._file)}: {describe_missing(name, names)}")
+            raise missing_column(self._file, name, names)
         if len(places) > 1:
             titles = ", ".join(repr(f"{base or name}@{number}") for number, _ in places[:5])
             raise InputError(
@@ -347,32 +375,17 @@ def open_mdf(budget: Budget) -> Iterator[MdfSource]:
     An attachment may be any other file, and so may the database by which asammdf would decode bus
     logging at once: nothing is read of either.
     """
-    file = budget.file
-    # It leaves copies of unfinalised files behind, and more where it fails.
-    with TemporaryDirectory(prefix="fleet-slip-", ignore_cleanup_errors=True) as folder:
-        with reading_with(file, "asammdf") as asammdf:
-            try:
-                mdf = asammdf.MDF(file, temporary_folder=folder, process_bus_logging=False)
-            except Exception as error:
-                _close_half_made(error)
-                raise
-        if getattr(mdf._mdf, "_delete_on_close", False):
-            mdf._mdf.name.unlink()  # it stays open, and goes with the process however that ends
-        mdf._mdf.extract_attachment = lambda *_, **__: (b"", Path(), b"")
-        try:
-            yield MdfSource(mdf, budget)
-        finally:
-            mdf.close()
-
-
-def _close_half_made(error: Exception) -> None:
-    """Mark what asammdf had half opened as closed: its destructor would raise once more."""
-    for frame, _ in traceback.walk_tb(error.__traceback__):
-        half_made: Any = frame.f_locals.get("self")
-        if hasattr(half_made, "_closed"):
-            half_made._closed = True
-            if hasattr(half_made, "_tempfile"):
-                half_made._tempfile.close()  # while its folder is there
+    with reading_with(budget.file, "asammdf") as asammdf:
+        mdf = asammdf.MDF(
+            budget.file, temporary_folder=tempfile.gettempdir(), process_bus_logging=False
+        )
+    if getattr(mdf._mdf, "_delete_on_close", False):
+        mdf._mdf.name.unlink()  # it stays open, and goes with the process however that ends
+    mdf._mdf.extract_attachment = lambda *_, **__: (b"", Path(), b"")
+    try:
+        yield MdfSource(mdf, budget)
+    finally:
+        mdf.close()
 
 
 # Reads the CAN frames that a logger stored in an MDF 4 file (bus logging), through a database.

@@ -1,24 +1,39 @@
-"""Opens measured files of any format.
+"""Opens measured files of any format: tables here, all others through a process of their own.
 
-What a file is, its first bytes say; only what is text goes by the mapping and the name.
+What a file is, its first bytes say; only what is text goes by the mapping and the name. The process
+that forks readers (`confined_reader`) is started once, and ends with this one.
 """
 
+import atexit
 import hashlib
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+import json
+import os
+import pickle
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
+from functools import cache, partial
 from pathlib import Path
-from typing import TypeVar
+from tempfile import TemporaryDirectory
+from threading import Lock
+from typing import Any, TypeVar
 
 import polars as pl
 import pyarrow as pa
 
+from fleet_slip import errors
 from fleet_slip.base import shown
-from fleet_slip.errors import InputError
+from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.ingest.formats.can import CanBus
-from fleet_slip.ingest.formats.confined_source import open_confined
-from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers, open_csv
-from fleet_slip.ingest.formats.source import Budget, Meter, Source
+from fleet_slip.ingest.formats.confined_reader import SIZES, Job
+from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
+from fleet_slip.ingest.formats.source import Base, Budget, Channel, Meter, Source
 from fleet_slip.ingest.formats.tables import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.formats.tables import MAGIC_AT as DUCKDB_AT
 from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, DuckdbRows, open_duckdb, open_parquet
@@ -151,7 +166,7 @@ def _opened(
                 f"{shown(file)}: not {kind}, whatever its name says. Export it again, or name it "
                 "as what it is."
             )
-    return open_csv(budget, formats.csv, formats.plain_numbers)
+    return nullcontext(CsvSource(budget, formats.csv, formats.plain_numbers))
 
 
 def _confined(start: bytes) -> str:
@@ -187,3 +202,183 @@ def file_errors(file: Path) -> Iterator[None]:
         raise InputError(
             f"{shown(file)}: cannot be read: {reason}. Is it complete? Copy or export it again."
         ) from None
+
+
+# A file that another process reads.
+
+_SERVE = (
+    "import sys; sys.path[:] = sys.argv[2:]; "
+    "from fleet_slip.ingest.formats.confined_reader import serve; serve(int(sys.argv[1]))"
+)
+_ENVIRONMENT = {
+    "POLARS_MAX_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+    "MALLOC_MMAP_THRESHOLD_": "1000000000",
+    "MALLOC_TRIM_THRESHOLD_": "1000000000",
+}
+"""Else libraries reserve memory for threads that a reader does not need."""
+_KEPT = ("TZ", "LD_LIBRARY_PATH")
+_LARGEST_TEXT = 2**26
+_ONE_AT_A_TIME = Lock()
+
+
+@cache
+def _server(_pid: int) -> tuple["subprocess.Popen[bytes]", socket.socket]:
+    """Start what forks readers, for this process and not for one that it was forked from."""
+    ours, theirs = socket.socketpair()
+    kept = {name: os.environ[name] for name in _KEPT if name in os.environ}
+    with theirs:
+        process = subprocess.Popen(  # noqa: S603 - our own interpreter
+            [sys.executable, "-I", "-X", "utf8", "-c", _SERVE, str(theirs.fileno())]
+            + [str(Path(place).absolute()) for place in sys.path],
+            env=_ENVIRONMENT | kept,
+            pass_fds=[theirs.fileno()],
+            start_new_session=True,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+    atexit.register(_end, process, ours)
+    return process, ours
+
+
+def _end(process: "subprocess.Popen[bytes]", control: socket.socket) -> None:
+    control.close()
+    process.kill()
+    process.wait()
+
+
+def _fork_reader(name: str, rows: int, budget: Budget) -> tuple[socket.socket, int]:
+    """Return what a reader is asked through, and a handle by which it is ended."""
+    ours, theirs = socket.socketpair()
+    handles: list[int] = []
+    with _ONE_AT_A_TIME, theirs:
+        for _ in range(2):  # the server may have ended since the last file: then another forks
+            process, control = _server(os.getpid())
+            with suppress(OSError):
+                socket.send_fds(control, [name.encode()], [theirs.fileno(), rows])
+                _, handles, *_ = socket.recv_fds(control, 1, 1)
+            if handles:
+                break
+            _server.cache_clear()
+            _end(process, control)
+    if not handles:
+        ours.close()
+        raise budget.crashed()
+    return ours, handles[0]
+
+
+class ConfinedSource(Source):
+    """A file that another process reads. It is trusted with nothing: its answers are checked."""
+
+    def __init__(self, channel: socket.socket, rows: int, budget: Budget) -> None:
+        """Take what a reader is asked through, where it puts rows, and what these may become."""
+        self._channel, self._rows, self._budget = channel, rows, budget
+        self.has_clock = bool(self._receive()[0])
+
+    def channels(self) -> list[Channel]:
+        """Return all that can be read, in the file's order."""
+        return [Channel(*map(str, one)) for one in self._ask("channels")[0]]
+
+    def bases(self, columns: Sequence[str]) -> list[Base]:
+        """Return the time bases that have one of the columns. Raises `InputError`."""
+        return [
+            Base(str(name), partial(self._count, number), partial(self._read, number))
+            for number, name in self._ask("bases", list(columns))[0]
+        ]
+
+    def _count(self, base: int) -> int:
+        return int(self._ask("count", base)[0])
+
+    def _read(self, base: int) -> Iterator[pl.DataFrame]:
+        number = self._ask("read", base)[0]
+        while True:
+            names, content = self._ask("rows", number)
+            if names is None:
+                return
+            try:
+                table = pa.ipc.open_stream(content).read_all()
+                table.validate(full=True)
+                frame = pl.DataFrame(table)
+                frame.columns = [str(name) for name in names]
+            except (pa.ArrowException, pl.exceptions.PolarsError, OSError, ValueError):
+                raise self._budget.crashed() from None
+            yield frame
+
+    def _ask(self, *question: Any) -> tuple[Any, pa.Buffer]:
+        """Return what the reader answers, and rows. Raises `InputError`."""
+        with suppress(OSError):  # then nothing comes back
+            self._channel.sendall(json.dumps(question).encode() + b"\n")
+        return self._receive()
+
+    def _receive(self) -> tuple[Any, pa.Buffer]:
+        """Return what the reader says, and rows; how far it is goes to the meter."""
+        until_s = time.monotonic() + self._budget.seconds
+        while True:
+            text, size = SIZES.unpack(self._take(SIZES.size, until_s))
+            if text > _LARGEST_TEXT or size > self._budget.memory:
+                raise self._budget.crashed()
+            try:
+                said = json.loads(self._take(text, until_s))
+                if isinstance(said, dict) and "passed" in said:
+                    self._budget.meter.pass_over(*map(int, said["passed"]))
+                    continue
+            except (ValueError, TypeError, RecursionError):
+                raise self._budget.crashed() from None
+            # Not the memory itself, which the reader could still change.
+            rows = pa.allocate_buffer(size)
+            if size and os.preadv(self._rows, [memoryview(rows)], 0) != size:
+                raise self._budget.crashed()
+            return self._found(said), rows
+
+    def _found(self, said: Any) -> Any:
+        if not isinstance(said, dict) or not {"found", "error"} & said.keys():
+            raise self._budget.crashed()
+        if "found" in said:
+            return said["found"]
+        if said["error"] == "MemoryError":
+            raise self._budget.over_memory()
+        kind = getattr(errors, str(said["error"]), InputError)
+        is_ours = isinstance(kind, type) and issubclass(kind, FleetSlipError)
+        raise (kind if is_ours else InputError)(str(said.get("text")))
+
+    def _take(self, size: int, until_s: float) -> bytes:
+        """Receive so many bytes. Raises `InputError` if they do not come in time."""
+        taken = bytearray(size)
+        left = memoryview(taken)
+        while left:
+            self._channel.settimeout(max(until_s - time.monotonic(), 1e-3))
+            try:
+                came = self._channel.recv_into(left)
+            except TimeoutError:
+                raise self._budget.over_time() from None
+            except OSError:
+                came = 0
+            if not came:
+                raise self._budget.crashed()
+            left = left[came:]
+        return bytes(taken)
+
+
+@contextmanager
+def open_confined(name: str, bus: CanBus | None, budget: Budget) -> Iterator[Source]:
+    """Open a file of a format for reading by another process. Raises `InputError`."""
+    with TemporaryDirectory(prefix="fleet-slip-", ignore_cleanup_errors=True) as folder:
+        rows = os.memfd_create("rows")
+        with os.fdopen(rows, "rb"):
+            channel, handle = _fork_reader(name, rows, budget)
+            try:
+                job = Job(
+                    *(name, os.fspath(budget.file), budget.size, bus, str(Path.cwd()), folder),
+                    limits=(budget.memory, budget.unfolded, int(10 * budget.seconds) + 1),
+                )
+                channel.sendall(pickle.dumps(job))
+                yield ConfinedSource(channel, rows, budget)
+            finally:
+                with suppress(ProcessLookupError):
+                    signal.pidfd_send_signal(handle, signal.SIGKILL)
+                select.select([handle], [], [])  # until it is gone, and its locks
+                os.close(handle)
+                channel.close()

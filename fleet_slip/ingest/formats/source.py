@@ -15,9 +15,10 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -65,34 +66,11 @@ class Base:
     read: Callable[[], Iterator[pl.DataFrame]]
 
 
-class Source(Protocol):
+class Source(ABC):
     """A file that is open for reading."""
 
-    has_clock: bool
-    """Whether its times are in `OWN_TIME`. Such a file is a `ClockSource`."""
-
-    def channels(self) -> list[Channel]:
-        """Return all that can be read, in the file's order."""
-        ...
-
-    def expected_rows(self, columns: Sequence[str]) -> int:
-        """Return about how many rows `batches` yields; 0 where only reading them would tell."""
-        ...
-
-    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
-        """Yield rows that have the named columns: text, 64-bit floats, dates or timestamps.
-
-        With a clock, the rows of one time base come after those of another; each batch has
-        `OWN_TIME` and those of the columns that are of its base. Raises `InputError`, for a column
-        that is missing or ambiguous too.
-        """
-        ...
-
-
-class ClockSource(ABC):
-    """A file that says when each sample was taken."""
-
     has_clock = True
+    """Whether its times are in `OWN_TIME`."""
 
     @abstractmethod
     def channels(self) -> list[Channel]:
@@ -100,16 +78,51 @@ class ClockSource(ABC):
 
     @abstractmethod
     def bases(self, columns: Sequence[str]) -> list[Base]:
-        """Return the time bases that have one of the columns. Raises `InputError`."""
+        """Return the time bases that have one of the columns; without a clock there is one.
+
+        Their rows have the columns of their base as text, 64-bit floats, dates or timestamps, and
+        `OWN_TIME` with a clock. Raises `InputError`, for a missing or ambiguous column too.
+        """
 
     def expected_rows(self, columns: Sequence[str]) -> int:
-        """Return how many rows the time bases have together."""
+        """Return about how many rows `batches` yields; 0 where only reading them shows it."""
         return sum(base.count_rows() for base in self.bases(columns))
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield the rows of each time base that has one of the columns, base by base."""
         for base in self.bases(columns):
             yield from base.read()
+
+
+class FormatSource(Source):
+    """What a format says of a file: where a column is, and how those of one base are read."""
+
+    @abstractmethod
+    def find(self, column: str) -> tuple[str, Any]:
+        """Return the name of a column's time base, and its place there. Raises `InputError`."""
+
+    @abstractmethod
+    def count(self, base: str, found: dict[str, Any]) -> int:
+        """Return how many rows some columns of a base have, by their places."""
+
+    @abstractmethod
+    def read(self, base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
+        """Yield the rows of some columns of a base, in bounded batches, at least one."""
+
+    def prepare(self, wanted: dict[str, dict[str, Any]]) -> None:
+        """Get ready to read some columns of some bases, where a file is read as a whole first."""
+
+    def bases(self, columns: Sequence[str]) -> list[Base]:
+        """Return the time bases that have one of the columns. Raises `InputError`."""
+        wanted: dict[str, dict[str, Any]] = {}
+        for column in columns:
+            base, place = self.find(column)
+            wanted.setdefault(base, {})[column] = place
+        self.prepare(wanted)
+        return [
+            Base(base, partial(self.count, base, found), partial(self.read, base, found))
+            for base, found in wanted.items()
+        ]
 
 
 @contextmanager
@@ -153,25 +166,22 @@ def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
     return pl.Series(name, np.ascontiguousarray(values, dtype=np.float64))
 
 
-def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> dict[str, int]:
-    """Return where each wanted column stands. Raises `InputError` for none or two of a name."""
+def find_column(file: Path, names: Sequence[str], column: str) -> int:
+    """Return where a column stands. Raises `InputError` for none or two of its name."""
     if len(names) > MAX_COLUMNS:
         raise InputError(
             f"{shown(file)}: {len(names):,} columns, at most {MAX_COLUMNS:,} are read."
         )
-    positions: dict[str, int] = {}
-    for column in wanted:
-        found = [i for i, name in enumerate(names) if name == column]
-        if len(found) > 1:
-            where = ", ".join(str(i + 1) for i in found[:5])
-            raise InputError(
-                f"{shown(file)}: {len(found)} columns are called {column!r} (number {where}). "
-                "Rename all but one."
-            )
-        if not found:
-            raise InputError(f"{shown(file)}: {describe_missing(column, names)}")
-        positions[column] = found[0]
-    return positions
+    found = [i for i, name in enumerate(names) if name == column]
+    if len(found) > 1:
+        where = ", ".join(str(i + 1) for i in found[:5])
+        raise InputError(
+            f"{shown(file)}: {len(found)} columns are called {column!r} (number {where}). "
+            "Rename all but one."
+        )
+    if not found:
+        raise missing_column(file, column, names)
+    return found[0]
 
 
 def describe_unknown(signal: str, known: Iterable[str]) -> str:
@@ -183,15 +193,15 @@ def describe_unknown(signal: str, known: Iterable[str]) -> str:
     return f"unknown signal {signal!r}.{hint} Known signals: {', '.join(names)}"
 
 
-def describe_missing(column: str, names: Sequence[str]) -> str:
-    """Return what to say of a column that is not among a file's."""
+def missing_column(file: object, column: str, names: Sequence[str]) -> InputError:
+    """Return the error of a column that is not among a file's."""
     folded = {name.casefold(): name for name in names}
     matches = difflib.get_close_matches(column.casefold(), folded, n=3, cutoff=0.6)
     near = [folded[match] for match in matches]
     hint = f" Did the mapping mean {' or '.join(repr(name[:80]) for name in near)}?" if near else ""
     there = ", ".join(repr(name[:80]) for name in names[:_SHOWN_COLUMNS])
     more = f" and {len(names) - _SHOWN_COLUMNS:,} more" if len(names) > _SHOWN_COLUMNS else ""
-    return f"no column {column!r}.{hint} Its columns are {there}{more}."
+    return InputError(f"{shown(file)}: no column {column!r}.{hint} Its columns are {there}{more}.")
 
 
 class Meter:
@@ -350,21 +360,6 @@ IN_MEMORY_BYTES = 2**24
 """Up to this size all is in memory, and there is no file."""
 
 
-@contextmanager
-def needing_room(written: int) -> Iterator[None]:
-    """Raise `InputError` where a temporary file, so long already, cannot be written."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno == errno.EFBIG:  # a limit of our own, on a file that unfolds
-            raise
-        raise InputError(
-            f"{tempfile.gettempdir()}: no room for a temporary copy of more than {written:,} bytes "
-            f"({error.strerror}). Free some, or name another folder in the environment variable "
-            "TMPDIR."
-        ) from None
-
-
 class Spool:
     """Pieces of bytes by key, in their order, beyond 16 MiB in a temporary file without a name."""
 
@@ -376,10 +371,18 @@ class Spool:
 
     def add(self, key: Hashable, piece: bytes) -> None:
         """Keep a piece. Raises `InputError` if the disk is full."""
-        with needing_room(self._end):
+        try:
             self._file.seek(self._end)
             self._file.write(piece)
             self._file.flush()
+        except OSError as error:
+            if error.errno == errno.EFBIG:  # a limit of our own, on a file that unfolds
+                raise
+            raise InputError(
+                f"{tempfile.gettempdir()}: no room for a temporary copy of more than {self._end:,} "
+                f"bytes ({error.strerror}). Free some, or name another folder in the environment "
+                "variable TMPDIR."
+            ) from None
         self._pieces[key].append((self._end, len(piece)))
         self._end += len(piece)
 

@@ -1,9 +1,7 @@
-"""Reads Parquet in batches: text, numbers as float64, dates and timestamps."""
+"""Reads tables, of Parquet and of DuckDB: text, numbers as float64, dates and timestamps."""
 
-import json
 import os
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import date
 from pathlib import Path
@@ -16,14 +14,14 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from pydantic import model_validator
+from pydantic import field_validator
 
 from fleet_slip.base import shown
 from fleet_slip.config import Config, Name
-from fleet_slip.errors import InputError, QuestionError
-from fleet_slip.ingest.formats.source import Budget, Channel, require_columns
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.source import Budget, Channel, FormatSource, find_column
 from fleet_slip.limits import memory_bytes
-from fleet_slip.warehouse.database import one_query, sql_text
+from fleet_slip.warehouse.database import sql_text
 
 BATCH_ROWS = 2**15
 """Parquet is read in batches of this many rows."""
@@ -40,7 +38,7 @@ _FIRST_DAY = date.min.toordinal() - date(1970, 1, 1).toordinal()
 _END_DAY = date.max.toordinal() + 1 - date(1970, 1, 1).toordinal()
 
 
-class ParquetSource:
+class ParquetSource(FormatSource):
     """An open Parquet file. Keys in the names of its folders, `car=A7`, are columns of text."""
 
     has_clock = False
@@ -52,30 +50,42 @@ class ParquetSource:
         parquet = pq.ParquetFile(stream)
         _require_within(budget, parquet.metadata)
         self._schema, self._rows = parquet.schema_arrow, parquet.metadata.num_rows
-        self._keys = {
-            name: text
-            for name, text in partition_keys(budget.file).items()
-            if name not in self._schema.names
-        }
+        keys = partition_keys(budget.file).items()
+        self._keys = {name: text for name, text in keys if name not in self._schema.names}
 
     def channels(self) -> list[Channel]:
         """Return the columns."""
         readable = [f.name for f in self._schema if is_readable(f.type)]
         return [Channel(name) for name in (*readable, *self._keys)]
 
-    def expected_rows(self, _columns: Sequence[str]) -> int:
+    def find(self, column: str) -> tuple[str, str | None]:
+        """Return what a folder says of a column, or None. Raises `InputError`."""
+        find_column(self._file, [*self._schema.names, *self._keys], column)
+        if column not in self._keys:  # before anything is decoded: one list can be all of a file
+            _require_readable(self._schema.field(column).type, column, self._file)
+        return "", self._keys.get(column)
+
+    def count(self, _base: str, _found: dict[str, Any]) -> int:
         """Return how many rows there are."""
         return int(self._rows)
 
-    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+    def read(self, _base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield rows. Raises `InputError`."""
-        require_columns(self._file, [*self._schema.names, *self._keys], columns)
-        inside = [name for name in columns if name not in self._keys]
-        for name in inside:  # before anything is decoded: one list can be all of a file
-            _require_readable(self._schema.field(name).type, name, self._file)
-        keys = [pl.lit(self._keys[name]).alias(name) for name in columns if name in self._keys]
-        for batch in _parquet_batches(self._stream, self._file, inside):
-            yield batch.with_columns(keys)
+        inside = [name for name, text in found.items() if text is None]
+        keys = [pl.lit(text).alias(name) for name, text in found.items() if text is not None]
+        texts = [name for name in inside if _is_text(self._schema.field(name).type)]
+        # Buffered before, the bytes of the whole file would stay in memory until its end; and
+        # without a buffer those of each column of a row group, of which a file may have only one.
+        parquet = pq.ParquetFile(
+            self._stream,
+            read_dictionary=texts,
+            page_checksum_verification=True,
+            pre_buffer=False,
+            buffer_size=BUFFER_BYTES,
+        )
+        for batch in parquet.iter_batches(BATCH_ROWS, columns=inside):
+            plain = {name: plain_column(batch.column(name), name, self._file) for name in inside}
+            yield pl.DataFrame(pa.table(plain)).with_columns(keys)
 
 
 @contextmanager
@@ -90,25 +100,6 @@ def partition_keys(file: Path) -> dict[str, str]:
     """Return what the folders above a file say of it, as Hive writes it: `key=value`."""
     named = (part.partition("=") for part in file.parts[:-1])
     return {key: unquote(text) for key, equals, text in named if key and equals}
-
-
-def _parquet_batches(
-    stream: pa.NativeFile, file: Path, columns: Sequence[str]
-) -> Iterator[pl.DataFrame]:
-    schema = pq.ParquetFile(stream).schema_arrow
-    texts = [name for name in columns if _is_text(schema.field(name).type)]
-    # Buffered before, the bytes of the whole file would stay in memory until its end; and without
-    # a buffer those of each column of a row group, of which a file may have a single one.
-    parquet = pq.ParquetFile(
-        stream,
-        read_dictionary=texts,
-        page_checksum_verification=True,
-        pre_buffer=False,
-        buffer_size=BUFFER_BYTES,
-    )
-    for batch in parquet.iter_batches(BATCH_ROWS, columns=list(columns)):
-        plain = {name: plain_column(batch.column(name), name, file) for name in columns}
-        yield pl.DataFrame(pa.table(plain))
 
 
 def _require_sane_footer(stream: pa.NativeFile, file: Path) -> None:
@@ -204,69 +195,64 @@ def _in_calendar(array: pa.Array) -> pa.Array:
     return pc.if_else(inside, array, pa.scalar(None, kind))
 
 
-# Reads a table or a query of a DuckDB file.
+# Reads a table of a DuckDB file.
 
 MAGIC = b"DUCK"
 MAGIC_AT = 8
 _NAME = "measured"
 """What the file is called as a database."""
-_COMPUTED = """
-    SELECT view_name FROM duckdb_views() WHERE NOT internal
-    UNION ALL SELECT function_name FROM duckdb_functions() WHERE NOT internal
-    UNION ALL SELECT table_name FROM duckdb_columns() WHERE is_generated AND NOT internal
+_STORED = """
+    SELECT table_name, estimated_size FROM duckdb_tables()
+    WHERE database_name = $name AND schema_name = 'main' AND lower(table_name) = lower($table)
+    AND table_oid NOT IN (SELECT table_oid FROM duckdb_columns() WHERE is_generated)
 """
-_TABLES = "SELECT table_name, estimated_size FROM duckdb_tables() WHERE NOT internal"
-_LOOK_S = 0.1
 
 
 class DuckdbRows(Config):
-    """What of a DuckDB file is the log: a table, or the answer of a query."""
+    """The table of a DuckDB file that is the log."""
 
-    table: Name | None = None
-    query: str | None = None
+    table: Name
+    query: None = None
+    """Read by earlier releases; part of a mapping's identity."""
 
-    @model_validator(mode="after")
-    def _one_of_both(self) -> "DuckdbRows":
-        if (self.table is None) == (self.query is None):
-            raise ValueError("needs either 'table' or 'query'")
-        return self
+    @field_validator("query", mode="before")
+    @classmethod
+    def _no_query(cls, query: object) -> None:
+        if query is not None:
+            raise ValueError("only tables are read: store the answer, CREATE TABLE … AS …")
 
 
-class DuckdbSource:
-    """Rows of an open DuckDB file, in the table's order or the query's."""
+class DuckdbSource(FormatSource):
+    """A table of an open DuckDB file, in its order."""
 
     has_clock = False
 
     def __init__(
-        self, connection: duckdb.DuckDBPyConnection, rows: DuckdbRows, budget: Budget
+        self, connection: duckdb.DuckDBPyConnection, table: str, rows: int, file: Path
     ) -> None:
-        """Take a connection to a file, which rows of it, and what it may become."""
-        self._file, self._connection, self._budget = budget.file, connection, budget
-        name = (rows.table or "").replace('"', '""')
-        self._query = rows.query or f'SELECT * FROM "{name}"'
+        """Take a connection to a file, the table, and how many rows it has."""
+        self._file, self._connection, self._rows = file, connection, rows
+        name = table.replace('"', '""')
+        self._query = f'SELECT * FROM {_NAME}.main."{name}"'
 
     def channels(self) -> list[Channel]:
         """Return the columns."""
-        with _duckdb_errors(self._file), _in_time(self._connection, self._budget):
+        with _duckdb_errors(self._file):
             return [Channel(name) for name in self._connection.sql(self._query).columns]
 
-    def expected_rows(self, _columns: Sequence[str]) -> int:
-        """Return 0: of a query only its answer tells."""
-        return 0
+    def find(self, column: str) -> tuple[str, int]:
+        """Return where a column is. Raises `InputError`."""
+        return "", find_column(self._file, [one.name for one in self.channels()], column)
 
-    def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+    def count(self, _base: str, _found: dict[str, Any]) -> int:
+        """Return how many rows there are."""
+        return self._rows
+
+    def read(self, _base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield rows. Raises `InputError`."""
         with _duckdb_errors(self._file):
-            with _in_time(self._connection, self._budget):
-                rows = self._connection.sql(self._query)
-                require_columns(self._file, rows.columns, columns)
-                batches = rows.to_arrow_reader(BATCH_ROWS)
-            while True:
-                with _in_time(self._connection, self._budget):
-                    batch = next(batches, None)
-                if batch is None:
-                    return
-                plain = {n: plain_column(batch.column(n), n, self._file) for n in columns}
+            for batch in self._connection.sql(self._query).to_arrow_reader(BATCH_ROWS):
+                plain = {n: plain_column(batch.column(n), n, self._file) for n in found}
                 yield pl.DataFrame(pa.table(plain))
 
 
@@ -274,8 +260,7 @@ class DuckdbSource:
 def open_duckdb(rows: DuckdbRows, budget: Budget) -> Iterator[DuckdbSource]:
     """Open a DuckDB file for reading. Raises `InputError`.
 
-    What is read must stand in the file: no view, macro or generated column of it has a say, since
-    these can compute anything, and go by the name of any function.
+    What is read must stand in the file: views, macros and generated columns can compute anything.
     """
     file = budget.file
     if os.path.lexists(f"{file}.wal"):
@@ -297,67 +282,16 @@ def open_duckdb(rows: DuckdbRows, budget: Budget) -> Iterator[DuckdbSource]:
             connection.execute(f"ATTACH {sql_text(str(file))} AS {_NAME} (TYPE duckdb, READ_ONLY)")
             connection.execute("SET enable_external_access = false")
             connection.execute("SET lock_configuration = true")
-            _require_stored(connection, rows, budget)
-            connection.execute(f"USE {_NAME}")
-            yield DuckdbSource(connection, rows, budget)
-
-
-def _require_stored(
-    connection: duckdb.DuckDBPyConnection, rows: DuckdbRows, budget: Budget
-) -> None:
-    """Raise `InputError` for rows that do not stand in tables of the file, or too many of them."""
-    named = {rows.table or ""}
-    if rows.query is not None:
-        try:
-            named = _names_in(connection, one_query(connection, rows.query))
-        except QuestionError as error:
-            raise InputError(f"{shown(budget.file)}: [duckdb] in the mapping: {error}") from None
-    named = {name.casefold() for name in named}
-    for (name,) in connection.execute(_COMPUTED).fetchall():
-        if name.casefold() in named:
-            raise InputError(
-                f"{shown(budget.file)}: {name!r} is a view, a macro or a table with generated "
-                "columns, and what a file computes is not read. Store it: CREATE TABLE … AS FROM …"
-            )
-    for name, size in connection.execute(_TABLES).fetchall():
-        if name.casefold() in named:
-            budget.require_rows(size)
-
-
-def _names_in(connection: duckdb.DuckDBPyConnection, query: str) -> set[str]:
-    """Return the names of all tables, views and functions in a query."""
-    statement = "SELECT json_serialize_sql($text::VARCHAR)"
-    [(tree,)] = connection.execute(statement, {"text": query}).fetchall()
-    found: set[str] = set()
-
-    def note(node: dict[str, Any]) -> dict[str, Any]:
-        found.update(str(node[key]) for key in ("table_name", "function_name") if key in node)
-        return node
-
-    json.loads(tree, object_hook=note)
-    return found
-
-
-@contextmanager
-def _in_time(connection: duckdb.DuckDBPyConnection, budget: Budget) -> Iterator[None]:
-    """Interrupt what a connection does when the time is over. Raises `InputError`."""
-    done, over = threading.Event(), threading.Event()
-
-    def watch() -> None:
-        if not done.wait(budget.seconds):
-            over.set()
-            while not done.wait(_LOOK_S):  # it forgets an interruption between two tasks
-                connection.interrupt()
-
-    threading.Thread(target=watch, daemon=True).start()
-    try:
-        yield
-    except Exception:
-        if over.is_set():
-            raise budget.over_time() from None
-        raise
-    finally:
-        done.set()
+            asked = {"name": _NAME, "table": rows.table}
+            stored = connection.execute(_STORED, asked).fetchall()
+            if not stored:
+                raise InputError(
+                    f"{shown(file)}: it has no table {rows.table!r}, or it is a view, or has "
+                    "generated columns: what a file computes is not read. Store it: CREATE TABLE "
+                    "… AS FROM …"
+                )
+            budget.require_rows(stored[0][1])
+            yield DuckdbSource(connection, rows.table, stored[0][1], file)
 
 
 @contextmanager

@@ -6,9 +6,8 @@ channel of several groups is named `CHANNEL@GROUP`.
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from logging import CRITICAL
 from typing import Any
 
@@ -17,15 +16,8 @@ import polars as pl
 
 from fleet_slip.base import shown
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.matlab import MatSource
-from fleet_slip.ingest.formats.source import (
-    OWN_TIME,
-    Base,
-    Budget,
-    Channel,
-    ClockSource,
-    reading_with,
-)
+from fleet_slip.ingest.formats.matlab import Matrix, Vectors
+from fleet_slip.ingest.formats.source import OWN_TIME, Budget, Channel, reading_with
 
 READ_AHEAD = 2**17
 """Values that are read at once: for each time npTDMS reads all that a segment has of a channel."""
@@ -39,61 +31,52 @@ _EARLIEST_S = 10**8
 
 
 class _Vector:
-    """The values of a channel; `base` says their times, and is empty where nothing tells them."""
+    """The values of a channel; `base` says their times, and is empty where nothing says them."""
 
-    def __init__(self, told: Any) -> None:
-        self._told, self._first, self._ahead = told, 0, np.zeros(0)
-        of, self.shape = told.properties, (len(told),)
+    def __init__(self, channel: Any) -> None:
+        self._channel, self._first, self._ahead = channel, 0, np.zeros(0)
+        of, self.shape = channel.properties, (len(channel),)
         self.unit, self.step_s = str(of.get("unit_string", "")), float(of.get("wf_increment", 0))
         began_s = np.datetime64(of.get("wf_start_time", 0), "us").astype(np.int64) / 1e6
         offset_s = float(of.get("wf_start_offset", 0))
         self.start_s = offset_s + (began_s if began_s > _EARLIEST_S else 0.0)
-        told_s = f"{self.start_s!r} s and each {self.step_s!r} s, {len(told)} times"
-        self.base = told_s if self.step_s > 0 else ""
-
-    def __len__(self) -> int:
-        return self.shape[0]
+        times = f"{self.start_s!r} s and each {self.step_s!r} s, {len(channel)} times"
+        self.base = times if self.step_s > 0 else ""
 
     def read(self, _column: int, start: int, end: int) -> np.ndarray[Any, Any]:
         """Return some values, scaled."""
         if not self._first <= start <= end <= self._first + len(self._ahead):
             until = max(start + READ_AHEAD, end)
-            self._first, self._ahead = start, np.asarray(self._told[start:until])
+            self._first, self._ahead = start, np.asarray(self._channel[start:until])
         return self._ahead[start - self._first : end - self._first]
 
 
-class TdmsSource(ClockSource):
+class TdmsSource(Vectors):
     """The waveforms of a file."""
 
-    def __init__(self, waves: dict[str, _Vector], budget: Budget) -> None:
-        """Take the waveforms by name."""
-        self._waves, self._table = waves, MatSource(waves, budget)
+    has_clock = True
+    _matrices: dict[str, _Vector]
 
     def channels(self) -> list[Channel]:
         """Return the waveforms, with their units."""
-        return [Channel(name, one.unit, one.base) for name, one in self._waves.items()]
+        return [Channel(name, one.unit, one.base) for name, one in self._matrices.items()]
 
-    def bases(self, columns: Sequence[str]) -> list[Base]:
-        """Return what has the same times. Raises `InputError`."""
-        alike: dict[str, list[str]] = {}
-        for name in columns:
-            self._table.find(name)
-            alike.setdefault(self._waves[name].base, []).append(name)
-        return [
-            Base(base, partial(len, self._waves[names[0]]), partial(self._read, names))
-            for base, names in alike.items()
-        ]
+    def find(self, column: str) -> tuple[str, tuple[Matrix, int]]:
+        """Return what has the same times, and a waveform. Raises `InputError`."""
+        _, found = super().find(column)
+        return self._matrices[column].base, found
 
-    def _read(self, names: list[str]) -> Iterator[pl.DataFrame]:
-        wave, row = self._waves[names[0]], 0
-        for rows in self._table.batches(names):
+    def read(self, base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
+        """Yield all rows, with their times."""
+        wave, row = self._matrices[next(iter(found))], 0
+        for rows in super().read(base, found):
             times_s = wave.start_s + wave.step_s * np.arange(row, row + rows.height)
             row += rows.height
             yield rows.with_columns(pl.Series(OWN_TIME, times_s, dtype=pl.Float64))
 
 
 @contextmanager
-def open_tdms(budget: Budget) -> Iterator[TdmsSource | MatSource]:
+def open_tdms(budget: Budget) -> Iterator[Vectors]:
     """Open a TDMS file; an index beside it may be that of another one, and is not read.
 
     Raises `InputError`, also for a file that ends too early, or has counts of a converter.
@@ -122,7 +105,7 @@ def open_tdms(budget: Budget) -> Iterator[TdmsSource | MatSource]:
             for one in channels
         }
         waves = {name: one for name, one in vectors.items() if one.base}
-        yield TdmsSource(waves, budget) if waves else MatSource(vectors, budget)
+        yield TdmsSource(waves, budget, {}) if waves else Vectors(vectors, budget, {})
 
 
 def _require_scales(budget: Budget, properties: Any) -> None:
