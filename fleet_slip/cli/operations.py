@@ -210,11 +210,7 @@ def _print_fleet(found: Calibration) -> None:
         left=2,
     )
     if not any(one.uncertainty for cars in found.cars.values() for one in cars.values()):
-        return say("no car has two drives: how sure the numbers are cannot be told")
-    header = "number|drives|cars|known to +-|measured"
-    row = "{number}|{drives}|{cars:,}|{stated:.2g}|{measured:.2g}"
-    title = "\nhow sure after so many drives of a car; measured: by the next so many drives"
-    print_records(title, header, row, found.convergence())
+        say("no car has two drives: how sure the numbers are cannot be told")
 
 
 def _print_changed(changed: Sequence[ChangedNumber], since: date) -> None:

@@ -1,13 +1,12 @@
 """How the sensors of every car are off, from the Gram rows of its drives: no label, no log row.
 
-The numbers of a car are exact functions of the sum of its drives' Gram rows (`car_numbers`) and of
-what the roads of all cars have in common (`road_lean`), so that they are the same in whatever order
-drives came, and a drive that is forgotten is gone from them. `car_evidence` tells how sure they
-are, `numbers_over_drives` what more drives make of them.
+The numbers of a car are exact functions of the sum of its drives' Gram rows (`car_estimates`) and
+of what the roads of all cars have in common, so that they are the same in whatever order drives
+came, and a drive that is forgotten is gone from them. `car_evidence` says how sure they are.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import date
 from math import sqrt
@@ -32,7 +31,6 @@ from fleet_slip.grams.car_evidence import (
     three_digits,
     with_others,
 )
-from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.reader import GramReader, OpenedGrams, collect_sums, open_grams
 from fleet_slip.grams.receiver_delay import (
     LASTING_S,
@@ -41,41 +39,19 @@ from fleet_slip.grams.receiver_delay import (
     ReceiverDelays,
     receiver_delays,
 )
-from fleet_slip.regression.gram import GramTable
 from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
-# What more drives of a car make of its numbers: how sure they become, and which have changed.
+# Which numbers of a car have changed.
 
 SURE_ERRORS = 5.0
 """Standard errors by which a number has changed. Of 6,300 numbers of simulated cars in which
 nothing changed, before and after some day, none differed by more."""
 
-STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-"""Numbers of drives that a convergence is shown for."""
-
-
-@dataclass(frozen=True)
-class Convergence:
-    """How sure a number is after so many drives of a car.
-
-    Attributes:
-        drives: the first so many of each car that has them.
-        cars: how many have.
-        stated: root mean square of the standard errors.
-        measured: the same by how much the next so many drives of a car differ; None if no car has.
-    """
-
-    number: NumberName
-    drives: int
-    cars: int
-    stated: float
-    measured: float | None
-
 
 @dataclass(frozen=True)
 class ChangedNumber:
-    """A number of which a car's drives from a day on tell otherwise than those before.
+    """A number of which a car's drives from a day on give another value than those before.
 
     `uncertainty` is the standard error of the difference; all in the number's unit.
     """
@@ -91,8 +67,8 @@ def changed_numbers(evidence: CarEvidence, since: date) -> list[ChangedNumber]:
     """Return the numbers that are others from a day on, surely; by car.
 
     Errors that no drive of a car takes away are in both, and not in the difference. How drives
-    differ is told by each half by itself: a car that changed would pass for one that is uneven.
-    Of a car that is more uneven than others, such as by its loads, its own drives tell it.
+    differ follows from each half by itself: a car that changed would pass for one that is uneven.
+    Of a car that is more uneven than others, such as by its loads, its own drives show it.
     """
     halves = {car: _halves(evidence, car, since) for car in evidence.cars}
     variances = evidence.variances_of(half for both in halves.values() for half in both)
@@ -120,55 +96,7 @@ def _halves(evidence: CarEvidence, car: str, since: date) -> tuple[Piece, Piece]
         early = sum(day < since for _, day, _ in evidence.sums[kind].drives[at])
         before[kind] = slice(at.start, at.start + early)
         after[kind] = slice(at.start + early, at.stop)
-    return (evidence.tell(before), before), (evidence.tell(after), after)
-
-
-def convergence(evidence: CarEvidence) -> tuple[Convergence, ...]:
-    """Return how sure the numbers are after so many drives of a car."""
-    most = max(
-        (
-            len(range(*s.indices(s.stop)))
-            for one in evidence.sums.values()
-            for s in one.cars.values()
-        ),
-        default=0,
-    )
-    return tuple(row for step in STEPS if step <= most for row in _converged(evidence, step))
-
-
-def _converged(evidence: CarEvidence, step: int) -> list[Convergence]:
-    stated: dict[NumberName, list[float]] = {}
-    differences: dict[NumberName, list[float]] = {}
-    for car in evidence.cars:
-        first, others = evidence.slices(car, 0, step), evidence.slices(car, step, 2 * step)
-        if any(at.stop - at.start < step for at in first.values()):
-            continue
-        told = evidence.tell(first)
-        for name, error in evidence.uncertainties(told, first).items():
-            stated.setdefault(name, []).append(error)
-        if all(at.stop - at.start == step for at in others.values()):
-            for name, other in evidence.tell(others).items():
-                if name in told:
-                    apart = float(told[name].value - other.value)
-                    differences.setdefault(name, []).append(apart)
-    return [
-        Convergence(
-            name,
-            step,
-            len(stated[name]),
-            three_digits(_root_mean_square(stated[name])),
-            three_digits(_root_mean_square(differences[name]) / sqrt(2))
-            if name in differences
-            else None,
-        )
-        for name in CAR_NUMBERS
-        if name in stated
-    ]
-
-
-def _root_mean_square(values: Sequence[float]) -> float:
-    squares: FloatArray = np.square(values)
-    return float(np.sqrt(squares.mean()))
+    return (evidence.estimate(before), before), (evidence.estimate(after), after)
 
 
 @dataclass(frozen=True)
@@ -177,7 +105,7 @@ class Calibration:
 
     Attributes:
         cars: the numbers of each car, by its `vehicle_id`; a number is missing that its drives do
-            not tell.
+            not determine.
         logs_version, grams_version: versions of the Delta tables that were read.
         evidence: sums and variances that the numbers came from.
     """
@@ -191,7 +119,7 @@ class Calibration:
         """Return the numbers of a car. Raises `QuestionError` if no drive is of it."""
         if vehicle_id not in self.cars:
             raise QuestionError(
-                f"no drive of a car {vehicle_id!r} tells its numbers. See: fleet-slip sql "
+                f"no drive of a car {vehicle_id!r} determines its numbers. See: fleet-slip sql "
                 '"SELECT DISTINCT vehicle_id FROM drives"'
             )
         return self.cars[vehicle_id]
@@ -212,10 +140,6 @@ class Calibration:
         """Return the numbers of cars that are others from a day on."""
         return changed_numbers(self.evidence, date_of(since, "since"))
 
-    def convergence(self) -> tuple[Convergence, ...]:
-        """Return how sure the numbers are after 1, 2, 5, 10 ... drives of a car."""
-        return convergence(self.evidence)
-
     def as_dict(self) -> dict[str, Any]:
         """Return what `calibrate --json` prints."""
         return {
@@ -235,7 +159,6 @@ class Calibration:
                 "uncertainty": self.roads.uncertainty,
                 "cars": self.roads.cars,
             },
-            "convergence": [vars(one) for one in self.convergence()],
         }
 
 
@@ -258,9 +181,9 @@ TABLE = pa.schema(
 
 
 def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
-    """Return the numbers that Gram rows of `calibration` tell of every car of a cohort.
+    """Return the numbers that Gram rows of `calibration` determine of every car of a cohort.
 
-    With those of the sets that satellites tell more by, as far as there are any.
+    With those of the sets that satellites determine more by, as far as there are any.
     """
     sums = collect_sums(opened.batches(condition), KINDS)
     known = features()
@@ -276,10 +199,10 @@ def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
 def calibration_table(opened: OpenedGrams, of_delay: OpenedGrams) -> pa.Table:
     """Return the table `calibration` that SQL sees: a row for each car and number.
 
-    Of the Gram rows that there are: none are required. `of_delay` are those of the set `delay`,
-    which tell how late satellite receivers are: also a row for each type, and one for its spread.
+    Of the Gram rows that there are: none are required. `of_delay` are those of the set `delay`:
+    how late satellite receivers are, also a row for each type, and one for its spread.
     """
-    told = receiver_delays(of_delay.batches(parse_condition(ALL_DRIVES)))
+    delays = receiver_delays(of_delay.batches(parse_condition(ALL_DRIVES)))
     found = calibration_of(opened, parse_condition(ALL_DRIVES))
     rows = [
         {
@@ -292,13 +215,13 @@ def calibration_table(opened: OpenedGrams, of_delay: OpenedGrams) -> pa.Table:
         for car, numbers in found.cars.items()
         for name, one in numbers.items()
     ]
-    return pa.Table.from_pylist([*rows, *_rows_of_delay(told)], schema=TABLE)
+    return pa.Table.from_pylist([*rows, *_rows_of_delay(delays)], schema=TABLE)
 
 
-def _rows_of_delay(told: ReceiverDelays) -> Iterator[dict[str, Any]]:
-    rows = [{"vehicle_id": car, **vars(one)} for car, one in told.cars.items()]
-    for name, one in told.types.items():
-        cars = [car for car in told.cars.values() if car.receiver == name]
+def _rows_of_delay(delays: ReceiverDelays) -> Iterator[dict[str, Any]]:
+    rows = [{"vehicle_id": car, **vars(one)} for car, one in delays.cars.items()]
+    for name, one in delays.types.items():
+        cars = [car for car in delays.cars.values() if car.receiver == name]
         of_type = {
             "receiver": name,
             "cars": len(cars),
@@ -332,7 +255,7 @@ def calibrate(
     return found
 
 
-# What the course of each drive comes to, from the Gram rows of any set of changes that tell it.
+# What the course of each drive comes to, from the Gram rows of any set of changes of it.
 
 Moments = Mapping[str, Mapping[str, FloatArray]]
 """Sums of products of 1, `COLUMNS` and the label in SI units, by car and drive, shape (6, 6)."""
@@ -343,6 +266,11 @@ def course_moments(reader: GramReader, condition: Condition) -> Moments:
 
     Of the first feature set whose Gram rows are there for the whole cohort; empty without one.
     """
+    label = catalogue().label
+    known = {name: float(scale) for name, scale in input_scales().items()}
+    known |= {COLUMNS[-1]: turned_scale(), label: float(catalogue()[label].scale)}
+    columns = (*COLUMNS, label)
+    scales = np.array([1.0, *(known[name] for name in columns)])
     for name in features().sets:
         one = features().feature_set(name)
         if one.change_ticks and set(COLUMNS) <= set(one.columns):
@@ -350,34 +278,11 @@ def course_moments(reader: GramReader, condition: Condition) -> Moments:
                 opened = reader.opened(name, condition)
             except DataError:  # it has not been computed, or not for all
                 continue
-            found: dict[str, dict[str, FloatArray]] = {}
-            for batch in opened.batches(condition):
-                for names, rows, _ in by_signals(batch):
-                    if not set(COLUMNS) <= set(names.split(",")):
-                        continue
-                    cars, drives = (rows[key].to_pylist() for key in ("vehicle_id", "drive_id"))
-                    for car, drive, own in zip(
-                        cars, drives, _moments(gram_table(names, rows)), strict=True
-                    ):
-                        of_car = found.setdefault(str(car), {})
-                        of_car[drive] = of_car.get(drive, 0.0) + own
-            if found:
-                return found
+            found = collect_sums(opened.batches(condition), {"course": columns}, unnamed=True)
+            if sums := found.get("course"):
+                moments = sums.moments() * np.outer(scales, scales)
+                return {
+                    car: {sums.drives[i][2]: moments[i] for i in range(at.start, at.stop)}
+                    for car, at in sums.cars.items()
+                }
     return {}
-
-
-def _moments(table: GramTable) -> FloatArray:
-    """Return the moments of each row, shape (rows, 6, 6)."""
-    label = catalogue().label
-    columns = (*COLUMNS, label)
-    known = {name: float(scale) for name, scale in input_scales().items()}
-    known |= {COLUMNS[-1]: turned_scale(), label: float(catalogue()[label].scale)}
-    scales = np.array([1.0, *(known[name] for name in columns)])
-    some, size = table.restrict(columns), len(columns) + 1
-    full = np.empty((len(table), size, size))
-    full[:, 0, 0] = some.n
-    full[:, 0, 1:] = full[:, 1:, 0] = some.sums
-    lower = np.tril_indices(len(columns))
-    full[:, 1 + lower[0], 1 + lower[1]] = some.products
-    full[:, 1 + lower[1], 1 + lower[0]] = some.products
-    return np.asarray(full * np.outer(scales, scales))

@@ -11,7 +11,8 @@ side-slip vanish. The gyroscope's noise is in r and in r/v. Where both are input
 it is taken out of their squares.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
 
@@ -25,27 +26,66 @@ from fleet_slip.catalogue.course import (
 from fleet_slip.catalogue.facts import BY_COURSE, BY_SATELLITE, NumberName
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.telling import (
-    ALIKE,
-    EVEN,
-    NO_COURSE,
-    NO_STEERING,
-    NO_TYRE,
-    STRAIGHT,
-    TIGHT_BENDS,
-    Telling,
-    Told,
-)
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms, solve
+
+NO_COURSE = "no row above 3 m/s has the yaw rate, ay and all four wheel speeds"
+NO_STEERING = "no row above 3 m/s has both steering angles beside the other signals"
+STRAIGHT = "it drove too straight: turns are hardly more than noise"
+EVEN = (
+    "it drove too evenly: one over speed must differ to separate offsets of ay and of the yaw rate"
+)
+ALIKE = "its rows are too much alike to separate one number from another"
+NO_TYRE = (
+    "what its sensors say of speed fits no tyre: noise made it, or a signal is of another unit or "
+    "sign. See: fleet-slip quality"
+)
+TIGHT_BENDS = (
+    "bends are so tight that a bank is not in proportion to them: satellite speed determines it"
+)
+"""Why a number is missing."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number of a relation, its gradient by the unknowns, and by others that it depends on.
+
+    `noise` is the variance of the gyroscope's noise that was taken out; `by_lean` is how much a
+    lean of the road adds to the number.
+    """
+
+    kind: str
+    relation: Relation
+    terms: Terms
+    noise: Fraction
+    value: Fraction
+    gradient: tuple[float, ...]
+    also: Mapping[NumberName, float]
+    by_lean: Fraction = Fraction(0)
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """The numbers that the sums of a car's drives determine, and why the others are missing."""
+
+    numbers: dict[NumberName, Estimate] = field(default_factory=dict)
+    missing: dict[NumberName, str] = field(default_factory=dict)
+
+    def take(self, names: Iterable[NumberName], found: dict[NumberName, Estimate] | str) -> None:
+        """Take what was found of some numbers, or why there is none."""
+        if isinstance(found, str):
+            self.missing.update(dict.fromkeys(names, found))
+        else:
+            self.numbers.update(found)
+
 
 LEAST_TURNING_RAD_S = Fraction(2, 100)
 """Standard deviation of how fast the direction changes, below which a car drove too straight. The
 noise of accelerometers is a third of it."""
 
 LEAST_CHANGE_OF_SPEED = {False: Fraction(5, 100), True: Fraction(10, 100)}
-"""Standard deviation of one over speed over its mean, below which a car drove too evenly to tell
-the offset of one sensor from that of the other; on banked roads also the bank from speed."""
+"""Standard deviation of one over speed over its mean, below which a car drove too evenly to
+separate the offsets of both sensors; on banked roads also the bank from speed."""
 
 TIGHT_1PM = Fraction(1, 50)
 """Standard deviation of curvature beyond which bends are mostly so tight that their bank does not
@@ -151,44 +191,46 @@ def steering_terms(yaw_rate_offset: Fraction) -> Terms:
     }
 
 
-def tell_numbers(sums: Mapping[str, Gram | None], banked: bool) -> Told:
-    """Return the numbers that the sums of a car's drives tell, by kind; exactly.
+def estimate_numbers(sums: Mapping[str, Gram | None], banked: bool) -> Estimates:
+    """Return the numbers that the sums of a car's drives determine, by kind; exactly.
 
     `banked`: whether bends are, on the fleet's roads (`road_lean`). A number is missing where its
     columns are, where the sums do not determine it, or where the car drove too straight or too
-    evenly to tell it from noise.
+    evenly to separate it from noise.
     """
-    told = Told()
+    estimates = Estimates()
     course, steering = sums.get("course"), sums.get("steering")
     if course is None or course.n == 0:
-        told.take((*OF_WHEELS, *OF_COURSE, *OF_STEERING), NO_COURSE)
-        return told
+        estimates.take((*OF_WHEELS, *OF_COURSE, *OF_STEERING), NO_COURSE)
+        return estimates
     of_course = ExactSums(course, course_terms())
     noise = gyroscope_noise(course, steering)
     if of_course.variance("course_rate") < LEAST_TURNING_RAD_S**2 or noise is None:
-        told.take((*OF_WHEELS, *OF_COURSE, *OF_STEERING), STRAIGHT)
-        return told
-    told.take(OF_WHEELS, _tell_wheels(of_course, noise))
+        estimates.take((*OF_WHEELS, *OF_COURSE, *OF_STEERING), STRAIGHT)
+        return estimates
+    estimates.take(OF_WHEELS, _estimate_wheels(of_course, noise))
     change = LEAST_CHANGE_OF_SPEED[banked] * of_course.mean("slowness")
     if of_course.variance("slowness") < change**2:
-        told.take((*OF_COURSE, *OF_STEERING), EVEN)
-        return told
-    found = _tell_course(of_course, noise if banked else None)
-    told.take(OF_COURSE, found)
+        estimates.take((*OF_COURSE, *OF_STEERING), EVEN)
+        return estimates
+    found = _estimate_course(of_course, noise if banked else None)
+    estimates.take(OF_COURSE, found)
     if isinstance(found, str):
-        told.take(OF_STEERING, found)
+        estimates.take(OF_STEERING, found)
     elif steering is None or steering.n == 0:
-        told.take(OF_STEERING, NO_STEERING)
+        estimates.take(OF_STEERING, NO_STEERING)
     else:
-        told.take(OF_STEERING, _tell_steering(found, steering, noise if banked else Fraction(0)))
-    if of_course.variance("curvature") > TIGHT_1PM**2 and "speed_ratio" in told.numbers:
-        del told.numbers["speed_ratio"]
-        told.take(("speed_ratio",), TIGHT_BENDS)
-    return told
+        estimates.take(
+            OF_STEERING, _estimate_steering(found, steering, noise if banked else Fraction(0))
+        )
+    if of_course.variance("curvature") > TIGHT_1PM**2 and "speed_ratio" in estimates.numbers:
+        del estimates.numbers["speed_ratio"]
+        estimates.take(("speed_ratio",), TIGHT_BENDS)
+    return estimates
 
 
 def bank_of_bends(sums: Mapping[str, Gram]) -> Fraction | None:
-    """Return s, what of ay grows with curvature, m^2/s^2; None if a car's drives do not tell it."""
+    """Return s, what of ay grows with curvature, m^2/s^2; None if undetermined."""
     course = sums.get("course")
     if course is None or (noise := gyroscope_noise(course, sums.get("steering"))) is None:
         return None
@@ -205,7 +247,7 @@ def gyroscope_noise(course: Gram, steering: Gram | None) -> Fraction | None:
     return sums.residual_variance("yaw_rate", (*inputs, "steer"))
 
 
-def _tell_course(sums: ExactSums, noise: Fraction | None) -> dict[NumberName, Telling] | str:
+def _estimate_course(sums: ExactSums, noise: Fraction | None) -> dict[NumberName, Estimate] | str:
     """Tell by the relation of flat roads, or with a noise by that of banked ones."""
     relation, noise = (FLAT, Fraction(0)) if noise is None else (COURSE, noise)
     solution = solve(relation.system(sums, noise))
@@ -231,26 +273,26 @@ def _tell_course(sums: ExactSums, noise: Fraction | None) -> dict[NumberName, Te
     least, most = SPEED_RATIOS[relation is COURSE]
     if not least <= ratio <= most:
         return NO_TYRE
-    found: dict[NumberName, Telling] = {}
+    found: dict[NumberName, Estimate] = {}
     values = (yaw_rate_offset, ay_offset, ratio)
     for (name, gradient), value in zip(gradients.items(), values, strict=True):
         lean, terms = Fraction(name == "ay_offset"), course_terms()
-        found[name] = Telling("course", relation, terms, noise, value, gradient, {}, lean)
+        found[name] = Estimate("course", relation, terms, noise, value, gradient, {}, lean)
     return found
 
 
-def _tell_wheels(sums: ExactSums, noise: Fraction) -> dict[NumberName, Telling] | str:
+def _estimate_wheels(sums: ExactSums, noise: Fraction) -> dict[NumberName, Estimate] | str:
     solution = solve(WHEELS.system(sums, noise))
     if solution is None:
         return ALIKE
     of_wheels = ("course", WHEELS, course_terms(), noise)
-    told = Telling(*of_wheels, solution[0], (1.0, 0.0, 0.0, 0.0), {})
-    return {"yaw_rate_offset_by_wheels": told}
+    one = Estimate(*of_wheels, solution[0], (1.0, 0.0, 0.0, 0.0), {})
+    return {"yaw_rate_offset_by_wheels": one}
 
 
-def _tell_steering(
-    found: Mapping[NumberName, Telling], gram: Gram, noise: Fraction
-) -> dict[NumberName, Telling] | str:
+def _estimate_steering(
+    found: Mapping[NumberName, Estimate], gram: Gram, noise: Fraction
+) -> dict[NumberName, Estimate] | str:
     yaw_rate_offset, ay_offset = found["yaw_rate_offset"].value, found["ay_offset"].value
     terms = steering_terms(yaw_rate_offset)
     sums = ExactSums(gram, terms)
@@ -267,13 +309,13 @@ def _tell_steering(
     value = straight + understeer * ay_offset
     gradient = (1.0, 0.0, float(ay_offset))
     return {
-        "steering_offset": Telling(*of_plane, value, gradient, also, by_lean=understeer),
-        "steer_per_curvature": Telling(*of_plane, by_bend, (0.0, 1.0, 0.0), {}),
-        "understeer": Telling(*of_plane, understeer, (0.0, 0.0, 1.0), {}),
+        "steering_offset": Estimate(*of_plane, value, gradient, also, by_lean=understeer),
+        "steer_per_curvature": Estimate(*of_plane, by_bend, (0.0, 1.0, 0.0), {}),
+        "understeer": Estimate(*of_plane, understeer, (0.0, 0.0, 1.0), {}),
     }
 
 
-# What a satellite receiver tells of a car beyond its own sensors: its speed, and how it slips.
+# What a satellite receiver determines of a car beyond its own sensors: its speed, and how it slips.
 #
 # The satellite's speed over that of the wheels is the speed ratio, whatever a body that rolls or a
 # bank adds to the accelerometer. And the course changes by more than the yaw rate's integral as
@@ -282,9 +324,9 @@ def _tell_steering(
 # m.
 
 SATELLITE = "satellite_speed"
-"""The kind of sums that tells the speed ratio, and its column."""
+"""The kind of sums that determines the speed ratio, and its column."""
 SLIP = "slip"
-"""The kind of sums that tells how a car slips: changes over some seconds."""
+"""The kind of sums that determines how a car slips: changes over some seconds."""
 
 LASTING_BY_SATELLITE: Mapping[str, Mapping[NumberName, float]] = {
     SATELLITE: {"speed_ratio": 0.0012},
@@ -323,16 +365,16 @@ def kinds_by_set() -> dict[str, dict[str, tuple[str, ...]]]:
     }
 
 
-def tell_by_satellite(sums: Mapping[str, Gram], told: Told) -> None:
-    """Add the numbers that satellites tell of a car, from the sums of its drives; exactly.
+def add_satellite_estimates(sums: Mapping[str, Gram], estimates: Estimates) -> None:
+    """Add the numbers that satellites determine of a car, from the sums of its drives; exactly.
 
-    They replace what its own sensors tell.
+    They replace what its own sensors determine.
     """
-    told.numbers.update(_speed_ratio(sums.get(SATELLITE)))
-    told.take(("slip_lever", "slip_compliance"), _slip(sums.get(SLIP)))
+    estimates.numbers.update(_speed_ratio(sums.get(SATELLITE)))
+    estimates.take(("slip_lever", "slip_compliance"), _slip(sums.get(SLIP)))
 
 
-def _speed_ratio(gram: Gram | None) -> dict[NumberName, Telling]:
+def _speed_ratio(gram: Gram | None) -> dict[NumberName, Estimate]:
     if gram is None or gram.n == 0:
         return {}
     scales = input_scales()
@@ -344,11 +386,11 @@ def _speed_ratio(gram: Gram | None) -> dict[NumberName, Telling]:
     least, most = SPEED_RATIOS[True]
     if solution is None or not least <= solution[0] <= most:
         return {}
-    told = Telling(SATELLITE, SPEED, terms, Fraction(0), solution[0], (1.0,), {})
-    return {"speed_ratio": told}
+    one = Estimate(SATELLITE, SPEED, terms, Fraction(0), solution[0], (1.0,), {})
+    return {"speed_ratio": one}
 
 
-def _slip(gram: Gram | None) -> dict[NumberName, Telling] | str:
+def _slip(gram: Gram | None) -> dict[NumberName, Estimate] | str:
     if gram is None or gram.n == 0:
         return NO_RECEIVER
     terms = slip_terms()
@@ -360,8 +402,8 @@ def _slip(gram: Gram | None) -> dict[NumberName, Telling] | str:
         return NO_CAR
     of_plane = (SLIP, CHANGE, terms, Fraction(0))
     return {
-        "slip_lever": Telling(*of_plane, solution[1], (0.0, 1.0, 0.0, 0.0), {}),
-        "slip_compliance": Telling(*of_plane, solution[2], (0.0, 0.0, 1.0, 0.0), {}),
+        "slip_lever": Estimate(*of_plane, solution[1], (0.0, 1.0, 0.0, 0.0), {}),
+        "slip_compliance": Estimate(*of_plane, solution[2], (0.0, 0.0, 1.0, 0.0), {}),
     }
 
 

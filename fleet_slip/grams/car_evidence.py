@@ -1,9 +1,9 @@
 """What a car's drives are evidence of: its numbers, and how sure they are.
 
-How sure they are is told by how much single drives move them: drives are the independent pieces of
-evidence. One drive has no other to differ from, so that the variance of residuals, as drives
-differ, is that of the whole fleet; how much a car's driving tells is its own. Drives go over the
-same roads again, so that there is a limit to what more of them tell.
+How sure they are follows from how much single drives move them: drives are the independent pieces
+of evidence. One drive has no other to differ from, so that the variance of residuals, as drives
+differ, is that of the whole fleet; how much a car's driving determines is its own. Drives go over
+the same roads again, so that there is a limit to what more of them determine.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,30 +18,31 @@ import numpy as np
 from fleet_slip.catalogue.facts import CAR_NUMBERS, NumberName
 from fleet_slip.grams.car_estimates import (
     LASTING_BY_SATELLITE,
+    Estimate,
+    Estimates,
+    add_satellite_estimates,
     bank_of_bends,
-    tell_by_satellite,
-    tell_numbers,
+    estimate_numbers,
 )
 from fleet_slip.grams.reader import DriveSums
-from fleet_slip.grams.telling import Telling, Told
 from fleet_slip.regression.exact import sqrt as sqrt_exact
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import DriveTermSums, Influence, influence
 
 # What the roads of a fleet have in common: they lean to one side, and are banked in bends.
 #
-# No car alone tells a road that always leans from an accelerometer that is off. The offsets of many
-# cars are of both signs; the road's lean is not. So what all cars share is the road's: the median.
+# No car alone separates a road that always leans from an accelerometer that is off. The offsets of
+# many cars are of both signs; the road's lean is not. The median, which all share, is the road's.
 
 FEWEST_CARS = 10
-"""Fewer do not tell the road's lean from their own offsets."""
+"""Fewer do not separate the road's lean and their own offsets."""
 
 BANKED_M2PS2 = Fraction(-5)
 """Lateral acceleration that bends take per curvature, from which on roads are banked: half a
 percent in bends of 100 m. Noise and slip make a fifth of it on flat ones."""
 
 USUAL_LEAN_MPS2 = 0.2
-"""A crown of 2 %: the standard error of a lean that nobody can tell."""
+"""A crown of 2 %: the standard error of a lean that is unknown."""
 
 SURE = Fraction(31)
 """Square of three standard errors of a median over that of the median deviation and over one less
@@ -53,10 +54,10 @@ class Roads:
     """The roads of a fleet.
 
     Attributes:
-        banked: whether bends are, as far as anybody can tell.
-        lean: m/s^2, what they add to every car's lateral acceleration; None if nobody can tell.
+        banked: whether bends are, as far as can be determined.
+        lean: m/s^2, what they add to every car's lateral acceleration; None if unknown.
         uncertainty: standard error of the lean.
-        cars: how many told it.
+        cars: how many determined it.
     """
 
     banked: bool
@@ -66,7 +67,7 @@ class Roads:
 
     @property
     def hide_offsets(self) -> bool:
-        """Whether nobody can tell how an accelerometer is off from how the roads lean."""
+        """Whether how an accelerometer is off cannot be separated from how the roads lean."""
         return self.banked and self.lean is None
 
 
@@ -113,7 +114,7 @@ LEAST_PART = 1e-9
 """A drive of which the others of its car are less than this part has no other to differ from."""
 
 PAIRS = 300
-"""Cars of which two drives are compared: enough to tell a variance to a tenth."""
+"""Cars of which two drives are compared: enough to determine a variance to a tenth."""
 
 LASTING: Mapping[bool, Mapping[NumberName, float]] = {
     False: {
@@ -133,12 +134,12 @@ slip. Where bends are banked, a body that leans 2 to 6 degrees per g makes its a
 to 10 % more, which is no speed."""
 
 OF_A_DRIVE: Mapping[NumberName, float] = {"yaw_rate_offset_by_wheels": 0.002}
-"""Standard error that each drive adds however much it tells: a circuit turns to one side more than
-to the other, and makes wheels slip to that side. Two drives on one circuit do not show it."""
+"""Standard error that each drive adds however informative: a circuit turns to one side more than to
+the other, and makes wheels slip to that side. Two drives on one circuit do not show it."""
 
 
-Piece = tuple[Mapping[NumberName, Telling], Mapping[str, slice]]
-"""Some drives of a car: what they tell, and where they stand by kind."""
+Piece = tuple[Mapping[NumberName, Estimate], Mapping[str, slice]]
+"""Some drives of a car: what they determine, and where they stand by kind."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ class CalibratedNumber:
         value: in its SI unit; the exact rational rounded once.
         count: the integer count of its grain that models and boards use.
         uncertainty: standard error in the same unit; None if no car has two drives.
-        drives, rows: what tells it.
+        drives, rows: what determines it.
     """
 
     value: float
@@ -160,8 +161,8 @@ class CalibratedNumber:
 
 
 LEANS = (
-    "roads are banked, and may always lean to one side, which nobody can tell from the car's own "
-    f"offset: {FEWEST_CARS} cars or more can"
+    "roads are banked, and may always lean to one side, which cannot be separated from the car's "
+    f"own offset with fewer than {FEWEST_CARS} cars"
 )
 BEYOND = "it is beyond what 16 bits count of its grain"
 """Why a number is missing."""
@@ -177,11 +178,17 @@ class CarEvidence:
         self.cars = sorted({car for one in sums.values() for car in one.cars})
         banks = [bank_of_bends(self._totals(self.slices(car))) for car in self.cars]
         self._banked = are_banked([bank for bank in banks if bank is not None])
-        self._whole = {car: self._tell(self.slices(car)) for car in self.cars}
-        self.told = {car: whole.numbers for car, whole in self._whole.items()}
-        offsets = [told["ay_offset"].value for told in self.told.values() if "ay_offset" in told]
+        self._whole = {car: self._estimate(self.slices(car)) for car in self.cars}
+        self.estimates = {car: whole.numbers for car, whole in self._whole.items()}
+        offsets = [
+            estimates["ay_offset"].value
+            for estimates in self.estimates.values()
+            if "ay_offset" in estimates
+        ]
         self.roads = roads_of(self._banked, offsets)
-        self.variances = self.variances_of((self.told[car], self.slices(car)) for car in self.cars)
+        self.variances = self.variances_of(
+            (self.estimates[car], self.slices(car)) for car in self.cars
+        )
         self.variances_of_one = self._variances_of_one()
 
     def slices(self, car: str, first: int = 0, last: int | None = None) -> dict[str, slice]:
@@ -200,34 +207,33 @@ class CarEvidence:
             if at.stop > at.start
         }
 
-    def tell(self, slices: Mapping[str, slice]) -> dict[NumberName, Telling]:
-        """Return the numbers that some drives tell, with the lean of their roads."""
-        return self._tell(slices).numbers
+    def estimate(self, slices: Mapping[str, slice]) -> dict[NumberName, Estimate]:
+        """Return the numbers that some drives determine, with the lean of their roads."""
+        return self._estimate(slices).numbers
 
-    def _tell(self, slices: Mapping[str, slice]) -> Told:
+    def _estimate(self, slices: Mapping[str, slice]) -> Estimates:
         totals = self._totals(slices)
-        told = tell_numbers(totals, self._banked)
-        tell_by_satellite(totals, told)
-        return told
+        estimates = estimate_numbers(totals, self._banked)
+        add_satellite_estimates(totals, estimates)
+        return estimates
 
-    def influence(self, telling: Telling, at: slice) -> Influence | None:
+    def influence(self, estimate: Estimate, at: slice) -> Influence | None:
         """Return how drives move a number."""
-        signals = self.sums[telling.kind].table.signals
-        sums = DriveTermSums(self._moments[telling.kind][at], signals, telling.terms)
-        return influence(telling.relation, sums, float(telling.noise), telling.gradient)
+        signals = self.sums[estimate.kind].table.signals
+        sums = DriveTermSums(self._moments[estimate.kind][at], signals, estimate.terms)
+        return influence(estimate.relation, sums, float(estimate.noise), estimate.gradient)
 
     def variances_of(self, pieces: Iterable[Piece]) -> dict[NumberName, float]:
         """Return the variance of residuals, as drives differ, of each number's plane.
 
         A drive's shift, about the number of its piece, has the variance times its share times one
         less the part of the share in the piece's. Every drive counts the same: errors do not grow
-        with shares as noise does, and drives that tell little would decide for those that tell
-        much.
+        with shares as noise does, and uninformative drives would decide for informative ones.
         """
         ratios: dict[NumberName, list[float]] = {}
-        for told, slices in pieces:
-            for name, telling in told.items():
-                found = self.influence(telling, slices[telling.kind])
+        for estimates, slices in pieces:
+            for name, estimate in estimates.items():
+                found = self.influence(estimate, slices[estimate.kind])
                 if found is None:
                     continue
                 expected = found.shares * (1 - found.shares / found.shares.sum())
@@ -238,10 +244,10 @@ class CarEvidence:
         return {name: sum(some) / len(some) for name, some in ratios.items() if some}
 
     def _variances_of_one(self) -> dict[NumberName, float]:
-        """Return the same of the numbers that one drive tells: how far a car's first two differ.
+        """Return the same of the numbers of one drive: how far a car's first two differ.
 
         What makes roads differ, such as the bank of their bends, moves a number that several roads
-        tell at once; one road alone explains its own.
+        determine at once; one road alone explains its own.
         """
         ratios: dict[NumberName, list[float]] = {}
         pairs = [
@@ -255,71 +261,71 @@ class CarEvidence:
         return {name: sum(some) / len(some) for name, some in ratios.items()}
 
     def _of_drive(self, car: str, drive: int) -> dict[NumberName, tuple[float, float]]:
-        """Return the numbers that a drive alone tells, and their shares."""
+        """Return the numbers that a drive alone determines, and their shares."""
         at = self.slices(car, drive, drive + 1)
         found = {}
-        for name, telling in self.tell(at).items():
-            influence_of_it = self.influence(telling, at[telling.kind])
+        for name, estimate in self.estimate(at).items():
+            influence_of_it = self.influence(estimate, at[estimate.kind])
             if influence_of_it is not None:
-                found[name] = float(telling.value), float(influence_of_it.shares.sum())
+                found[name] = float(estimate.value), float(influence_of_it.shares.sum())
         return found
 
     def scatter(
         self, piece: Piece, variances: Mapping[NumberName, float], *, same_roads: bool = False
     ) -> dict[NumberName, float]:
-        """Return the variances of what some drives tell, as drives differ.
+        """Return the variances of what some drives determine, as drives differ.
 
-        With `same_roads`, of what they tell beside other drives on these roads: that they go over
-        them again is no error then.
+        With `same_roads`, of what they determine beside other drives on these roads: that they
+        go over them again is no error then.
         """
-        told, slices = piece
+        estimates, slices = piece
         own: dict[NumberName, float] = {}
-        for name, telling in told.items():
-            found = self.influence(telling, slices[telling.kind])
+        for name, estimate in estimates.items():
+            found = self.influence(estimate, slices[estimate.kind])
             if found is None or name not in variances:
                 continue
             drives = len(found.shares)
             of_one = self.variances_of_one if drives == 1 else variances
             again = 1 if same_roads else 1 + drives / ROADS
-            told_by_it = of_one.get(name, variances[name]) * float(found.shares.sum())
-            own[name] = told_by_it * again + OF_A_DRIVE.get(name, 0.0) ** 2 / drives
+            variance = of_one.get(name, variances[name]) * float(found.shares.sum())
+            own[name] = variance * again + OF_A_DRIVE.get(name, 0.0) ** 2 / drives
         return own
 
     def uncertainties(
-        self, told: Mapping[NumberName, Telling], slices: Mapping[str, slice]
+        self, estimates: Mapping[NumberName, Estimate], slices: Mapping[str, slice]
     ) -> dict[NumberName, float]:
-        """Return the standard errors of what some drives tell."""
-        own = self.scatter((told, slices), self.variances)
+        """Return the standard errors of what some drives determine."""
+        own = self.scatter((estimates, slices), self.variances)
         for name in own:
-            by_satellite = LASTING_BY_SATELLITE.get(told[name].kind, {})
+            by_satellite = LASTING_BY_SATELLITE.get(estimates[name].kind, {})
             own[name] += {**LASTING[self._banked], **by_satellite}.get(name, 0.0) ** 2
         common = self.roads.uncertainty
         return {
-            name: sqrt(variance + (common * float(told[name].by_lean)) ** 2)
-            for name, variance in with_others(told, own).items()
+            name: sqrt(variance + (common * float(estimates[name].by_lean)) ** 2)
+            for name, variance in with_others(estimates, own).items()
         }
 
-    def level(self, telling: Telling) -> Fraction:
+    def level(self, estimate: Estimate) -> Fraction:
         """Return a number as it is without the lean of the roads."""
-        return telling.value - (self.roads.lean or 0) * telling.by_lean
+        return estimate.value - (self.roads.lean or 0) * estimate.by_lean
 
     def calibrated(
         self, car: str, drives: int | None = None, *, leaning: bool = False
     ) -> dict[NumberName, CalibratedNumber]:
         """Return the numbers of a car, by all of its drives or by the first so many.
 
-        `ay_offset` is missing where nobody can tell it from the lean of the roads; with `leaning`
-        it is there with it, as the accelerometer says on these roads.
+        `ay_offset` is missing where it cannot be separated from the lean of the roads; with
+        `leaning` it is there with it, as the accelerometer says on these roads.
         """
         slices = self.slices(car, 0, drives)
-        told = self.told[car] if drives is None else self.tell(slices)
-        sure = self.uncertainties(told, slices)
+        estimates = self.estimates[car] if drives is None else self.estimate(slices)
+        sure = self.uncertainties(estimates, slices)
         found: dict[NumberName, CalibratedNumber] = {}
         for name in CAR_NUMBERS:
-            if name in told and (leaning or not self._hidden(name)):
-                at = slices[told[name].kind]
-                rows = int(self.sums[told[name].kind].table.n[at].sum())
-                value = self.level(told[name])
+            if name in estimates and (leaning or not self._hidden(name)):
+                at = slices[estimates[name].kind]
+                rows = int(self.sums[estimates[name].kind].table.n[at].sum())
+                value = self.level(estimates[name])
                 count = CAR_NUMBERS[name].count(value)
                 if count is None:
                     continue
@@ -350,11 +356,11 @@ class CarEvidence:
 
 
 def with_others(
-    told: Mapping[NumberName, Telling], own: Mapping[NumberName, float]
+    estimates: Mapping[NumberName, Estimate], own: Mapping[NumberName, float]
 ) -> dict[NumberName, float]:
     """Return variances of numbers with those of others that they depend on."""
     return {
-        name: variance + sum(d**2 * own.get(n, 0.0) for n, d in told[name].also.items())
+        name: variance + sum(d**2 * own.get(n, 0.0) for n, d in estimates[name].also.items())
         for name, variance in own.items()
     }
 

@@ -254,17 +254,25 @@ class DriveSums:
 
 
 def collect_sums(
-    batches: Iterable[pa.RecordBatch], kinds: Mapping[str, tuple[str, ...]]
+    batches: Iterable[pa.RecordBatch],
+    kinds: Mapping[str, tuple[str, ...]],
+    *,
+    unnamed: bool = False,
 ) -> dict[str, DriveSums]:
-    """Return the sums of the columns of each kind over every drive that says whose it is."""
+    """Return the sums of the columns of each kind over every drive that says whose it is.
+
+    With `unnamed` also over those that do not, as of a car without a name.
+    """
     parts: dict[str, list[GramTable]] = defaultdict(list)
     drives: dict[str, list[Drive]] = defaultdict(list)
     for batch in batches:
-        for names, rows, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
+        some = batch if unnamed else batch.filter(batch["vehicle_id"].is_valid())
+        for names, rows, _ in by_signals(some):
             if not len(rows):
                 continue
             table = gram_table(names, rows)
-            of = list(zip(*(rows[key].to_pylist() for key in _KEY), strict=True))
+            cars, days, names_of = (rows[key].to_pylist() for key in _KEY)
+            of = list(zip(map(str, cars), days, names_of, strict=True))
             for kind, columns in kinds.items():
                 if set(columns) <= set(names.split(",")):
                     parts[kind].append(table.restrict(columns))

@@ -76,7 +76,7 @@ def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) 
     found = []
     for car, gram, facts in _by_car(cohort, tuple(dict.fromkeys((*OFFSETS, *signals)))):
         # Whatever part of ay is the road's: these are the roads that the model was taught on.
-        known = evidence.calibrated(car, leaning=True) if car in evidence.told else {}
+        known = evidence.calibrated(car, leaning=True) if car in evidence.estimates else {}
         if set(OFFSETS.values()) <= set(known):
             told = _of_car(predictor, gram, signals, known, facts)
             found.append((gram.n, *told, *(known[one].count for one in COLUMNS.values())))

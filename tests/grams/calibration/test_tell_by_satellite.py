@@ -11,10 +11,9 @@ from fleet_slip.catalogue.course import TURNED, turned_scale
 from fleet_slip.catalogue.facts import BY_COURSE, BY_SATELLITE
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.car_estimates import NO_CAR, kinds_by_set, tell_by_satellite
+from fleet_slip.grams.car_estimates import NO_CAR, Estimates, add_satellite_estimates, kinds_by_set
 from fleet_slip.grams.car_evidence import CarEvidence
 from fleet_slip.grams.reader import DriveSums, collect_sums
-from fleet_slip.grams.telling import Told
 from fleet_slip.regression.gram import Gram
 
 RATIO, LEVER_M, COMPLIANCE, BIAS_RAD = 1.07, 1.3, -0.006, 0.004
@@ -95,7 +94,7 @@ def test_what_is_no_course_of_a_car_tells_nothing(times: int) -> None:
     counts[catalogue().label] = times * counts[catalogue().label]
     columns = COLUMNS[BY_COURSE]
     table = np.stack([counts[name].astype(np.int64) for name in columns], axis=1)
-    told = Told()
-    tell_by_satellite({"slip": Gram.from_counts(columns, table)}, told)
+    told = Estimates()
+    add_satellite_estimates({"slip": Gram.from_counts(columns, table)}, told)
     assert not told.numbers
     assert told.missing["slip_lever"] == NO_CAR
