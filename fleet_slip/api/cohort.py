@@ -69,16 +69,13 @@ class FleetCohort(Rooted):
 
         Raises `UsageError` for both a model and signals, and what `Fleet.model` raises.
         """
-        from fleet_slip.catalogue.features import features as known
         from fleet_slip.models.diagnose import diagnose
 
         examined = self._examined(request)
         cohort, against = self._load(examined.feature_set), request.against
-        lagged = next(name for name, one in known().sets.items() if one.lagged)
         return diagnose(
             cohort,
             examined.inputs(cohort),
-            lagged=self._load(lagged) if request.serial else None,
             against=self._load(examined.feature_set, against) if against else None,
             sensor_noise=request.sensor_noise,
             cluster=request.cluster,

@@ -134,13 +134,6 @@ class DiagnosisRequest(ExaminedRequest):
     against: Annotated[
         str | None, Doc("Condition of another cohort: does it have the same coefficients?")
     ] = None
-    serial: Annotated[
-        bool,
-        Doc(
-            "Durbin-Watson and AR(1) generalised least squares, from lagged Gram rows: fleet-slip "
-            "gram --features lags"
-        ),
-    ] = False
     sensor_noise: Annotated[
         Mapping[str, float] | None,
         Doc(

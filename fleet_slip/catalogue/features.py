@@ -1,6 +1,6 @@
 """The features in force: `configs/features.toml`, and one's own laid over it."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from decimal import Decimal
 from fractions import Fraction
 from functools import cache, cached_property
@@ -39,14 +39,6 @@ from fleet_slip.resources import config_file, folder
 PLAIN = "signals"
 """The feature set whose columns are the catalogue's inputs and label themselves."""
 
-LAG = "_lag"
-"""What the column of a signal's previous value ends in."""
-
-
-def lag_signals(signals: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns of a lagged set: all signals now, then all one sample before."""
-    return (*signals, *(name + LAG for name in signals))
-
 
 class Regime(Config):
     """Bands of a signal or feature."""
@@ -83,7 +75,6 @@ class FeatureSet(Config):
     regimes: tuple[Identifier, ...] = ()
     block_s: Decimal | None = Field(default=None, gt=0, le=100_000)
     row_folds: int | None = Field(default=None, ge=2, le=1000)
-    lagged: bool = False
     change_s: tuple[Decimal, ...] = ()
     """Instead of the columns, what they change by in so much time, with the course as the label;
     of several times, each is a part of the drive."""
@@ -106,11 +97,11 @@ class FeatureSet(Config):
             raise ValueError(f"not input signals: {', '.join(unknown)}")
         if len(set(self.columns)) < len(self.columns):
             raise ValueError("a column stands twice")
-        if bool(self.regimes) + bool(self.block_s) + bool(self.row_folds) + self.lagged > 1:
-            raise ValueError("a set has regimes, block_s, row_folds or lagged, not several of them")
-        if (self.windows or self.calibrated) and (self.row_folds or self.lagged):
-            raise ValueError("a set with windows has no row_folds or lagged")
-        if self.change_ticks and (self.row_folds or self.lagged or self.regimes or self.block_s):
+        if bool(self.regimes) + bool(self.block_s) + bool(self.row_folds) > 1:
+            raise ValueError("a set has regimes, block_s or row_folds, not several of them")
+        if (self.windows or self.calibrated) and self.row_folds:
+            raise ValueError("a set with windows has no row_folds")
+        if self.change_ticks and (self.row_folds or self.regimes or self.block_s):
             raise ValueError("a set with change_s does not divide rows")
         if self.change_ticks and not (self.windows or self.of):
             raise ValueError("a set with change_s has windows")
@@ -153,8 +144,7 @@ class FeatureSet(Config):
     def columns(self) -> tuple[str, ...]:
         """The columns of a Gram row, in its order; calibrated ones follow from it."""
         beside = BESIDE if self.change_ticks else ()
-        now = (*self.signals, *self.features, *self.windows, *beside, catalogue().label)
-        return lag_signals(now) if self.lagged else now
+        return (*self.signals, *self.features, *self.windows, *beside, catalogue().label)
 
 
 # Features and feature sets: `configs/features.toml` as a catalogue.
@@ -355,7 +345,7 @@ class FeatureCatalogue(Config):
             "features": {f: self._definition(f) for f in used if f in self.features},
             "regimes": {r: self.regimes[r].model_dump(mode="json") for r in one.regimes},
             "row_folds": one.row_folds,
-            "lagged": one.lagged,
+            "lagged": False,  # of sets that earlier releases had: identities stay
         }
         if extras := self._extras(one):
             content["extras"] = {name: str(catalogue()[name].scale) for name in extras}

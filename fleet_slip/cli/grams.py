@@ -232,4 +232,4 @@ def _parts(one: FeatureSet) -> str:
         return f"in blocks of {one.block_s:f} s"
     if one.row_folds:
         return f"{number_of(one.row_folds, 'fold')} of rows"
-    return "with the one before" if one.lagged else "together"
+    return "together"

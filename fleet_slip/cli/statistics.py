@@ -54,13 +54,6 @@ def _print_diagnosis(result: Diagnosis) -> None:
             "not at 100 Hz, so that the standard errors are far too small."
         )
     say_influential(result.influential, "would be left out by select --robust")
-    if result.serial is not None:
-        found = result.serial
-        print_line(
-            f"residuals: correlation {found.correlation.rho:.4f} with the row before, "
-            f"Durbin-Watson {found.correlation.durbin_watson:.4f} (2 if independent); AR(1) with "
-            f"rho {found.autoregressive.rho:.4f}."
-        )
     if result.comparison is not None:
         _print_comparison(result, result.comparison)
 
@@ -69,7 +62,7 @@ def _coefficients(result: Diagnosis) -> list[dict[str, str]]:
     """Return what is told of each coefficient, by heading."""
     rows = []
     both = zip(result.robust.estimates, result.naive.estimates, strict=True)
-    for i, (robust, naive) in enumerate(both):
+    for robust, naive in both:
         name, constant = robust.name, robust.name == INTERCEPT
         row = {
             "signal": name,
@@ -80,10 +73,6 @@ def _coefficients(result: Diagnosis) -> list[dict[str, str]]:
             "s.e. by rows": f"{naive.standard_error:.2g}",
             "VIF": "" if constant else f"{result.inflation[name]:.3g}",
         }
-        if result.serial is not None:
-            slope = result.serial.inference.estimates[i]
-            row["AR(1)"] = "" if constant else f"{slope.value:.6g}"
-            row["s.e. AR(1)"] = "" if constant else f"{slope.standard_error:.2g}"
         if (free := result.noise_free) is not None:
             row["without noise"] = f"{free.offset if constant else free.weights[name]:.6g}"
         rows.append(row)

@@ -47,7 +47,7 @@ TIGHT_BENDS = (
 
 
 @dataclass(frozen=True)
-class Estimate:
+class CarEstimate:
     """A number of a relation, its gradient by the unknowns, and by others that it depends on.
 
     `noise` is the variance of the gyroscope's noise that was taken out; `by_lean` is how much a
@@ -65,13 +65,13 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Estimates:
+class CarEstimates:
     """The numbers that the sums of a car's drives determine, and why the others are missing."""
 
-    numbers: dict[NumberName, Estimate] = field(default_factory=dict)
+    numbers: dict[NumberName, CarEstimate] = field(default_factory=dict)
     missing: dict[NumberName, str] = field(default_factory=dict)
 
-    def take(self, names: Iterable[NumberName], found: dict[NumberName, Estimate] | str) -> None:
+    def take(self, names: Iterable[NumberName], found: dict[NumberName, CarEstimate] | str) -> None:
         """Take what was found of some numbers, or why there is none."""
         if isinstance(found, str):
             self.missing.update(dict.fromkeys(names, found))
@@ -191,14 +191,14 @@ def steering_terms(yaw_rate_offset: Fraction) -> Terms:
     }
 
 
-def estimate_numbers(sums: Mapping[str, Gram | None], banked: bool) -> Estimates:
+def estimate_numbers(sums: Mapping[str, Gram | None], banked: bool) -> CarEstimates:
     """Return the numbers that the sums of a car's drives determine, by kind; exactly.
 
     `banked`: whether bends are, on the fleet's roads (`road_lean`). A number is missing where its
     columns are, where the sums do not determine it, or where the car drove too straight or too
     evenly to separate it from noise.
     """
-    estimates = Estimates()
+    estimates = CarEstimates()
     course, steering = sums.get("course"), sums.get("steering")
     if course is None or course.n == 0:
         estimates.take((*OF_WHEELS, *OF_COURSE, *OF_STEERING), NO_COURSE)
@@ -247,7 +247,9 @@ def gyroscope_noise(course: Gram, steering: Gram | None) -> Fraction | None:
     return sums.residual_variance("yaw_rate", (*inputs, "steer"))
 
 
-def _estimate_course(sums: ExactSums, noise: Fraction | None) -> dict[NumberName, Estimate] | str:
+def _estimate_course(
+    sums: ExactSums, noise: Fraction | None
+) -> dict[NumberName, CarEstimate] | str:
     """Tell by the relation of flat roads, or with a noise by that of banked ones."""
     relation, noise = (FLAT, Fraction(0)) if noise is None else (COURSE, noise)
     solution = solve(relation.system(sums, noise))
@@ -273,26 +275,26 @@ def _estimate_course(sums: ExactSums, noise: Fraction | None) -> dict[NumberName
     least, most = SPEED_RATIOS[relation is COURSE]
     if not least <= ratio <= most:
         return NO_TYRE
-    found: dict[NumberName, Estimate] = {}
+    found: dict[NumberName, CarEstimate] = {}
     values = (yaw_rate_offset, ay_offset, ratio)
     for (name, gradient), value in zip(gradients.items(), values, strict=True):
         lean, terms = Fraction(name == "ay_offset"), course_terms()
-        found[name] = Estimate("course", relation, terms, noise, value, gradient, {}, lean)
+        found[name] = CarEstimate("course", relation, terms, noise, value, gradient, {}, lean)
     return found
 
 
-def _estimate_wheels(sums: ExactSums, noise: Fraction) -> dict[NumberName, Estimate] | str:
+def _estimate_wheels(sums: ExactSums, noise: Fraction) -> dict[NumberName, CarEstimate] | str:
     solution = solve(WHEELS.system(sums, noise))
     if solution is None:
         return ALIKE
     of_wheels = ("course", WHEELS, course_terms(), noise)
-    one = Estimate(*of_wheels, solution[0], (1.0, 0.0, 0.0, 0.0), {})
+    one = CarEstimate(*of_wheels, solution[0], (1.0, 0.0, 0.0, 0.0), {})
     return {"yaw_rate_offset_by_wheels": one}
 
 
 def _estimate_steering(
-    found: Mapping[NumberName, Estimate], gram: Gram, noise: Fraction
-) -> dict[NumberName, Estimate] | str:
+    found: Mapping[NumberName, CarEstimate], gram: Gram, noise: Fraction
+) -> dict[NumberName, CarEstimate] | str:
     yaw_rate_offset, ay_offset = found["yaw_rate_offset"].value, found["ay_offset"].value
     terms = steering_terms(yaw_rate_offset)
     sums = ExactSums(gram, terms)
@@ -309,9 +311,9 @@ def _estimate_steering(
     value = straight + understeer * ay_offset
     gradient = (1.0, 0.0, float(ay_offset))
     return {
-        "steering_offset": Estimate(*of_plane, value, gradient, also, by_lean=understeer),
-        "steer_per_curvature": Estimate(*of_plane, by_bend, (0.0, 1.0, 0.0), {}),
-        "understeer": Estimate(*of_plane, understeer, (0.0, 0.0, 1.0), {}),
+        "steering_offset": CarEstimate(*of_plane, value, gradient, also, by_lean=understeer),
+        "steer_per_curvature": CarEstimate(*of_plane, by_bend, (0.0, 1.0, 0.0), {}),
+        "understeer": CarEstimate(*of_plane, understeer, (0.0, 0.0, 1.0), {}),
     }
 
 
@@ -365,7 +367,7 @@ def kinds_by_set() -> dict[str, dict[str, tuple[str, ...]]]:
     }
 
 
-def add_satellite_estimates(sums: Mapping[str, Gram], estimates: Estimates) -> None:
+def add_satellite_estimates(sums: Mapping[str, Gram], estimates: CarEstimates) -> None:
     """Add the numbers that satellites determine of a car, from the sums of its drives; exactly.
 
     They replace what its own sensors determine.
@@ -374,7 +376,7 @@ def add_satellite_estimates(sums: Mapping[str, Gram], estimates: Estimates) -> N
     estimates.take(("slip_lever", "slip_compliance"), _slip(sums.get(SLIP)))
 
 
-def _speed_ratio(gram: Gram | None) -> dict[NumberName, Estimate]:
+def _speed_ratio(gram: Gram | None) -> dict[NumberName, CarEstimate]:
     if gram is None or gram.n == 0:
         return {}
     scales = input_scales()
@@ -386,11 +388,11 @@ def _speed_ratio(gram: Gram | None) -> dict[NumberName, Estimate]:
     least, most = SPEED_RATIOS[True]
     if solution is None or not least <= solution[0] <= most:
         return {}
-    one = Estimate(SATELLITE, SPEED, terms, Fraction(0), solution[0], (1.0,), {})
+    one = CarEstimate(SATELLITE, SPEED, terms, Fraction(0), solution[0], (1.0,), {})
     return {"speed_ratio": one}
 
 
-def _slip(gram: Gram | None) -> dict[NumberName, Estimate] | str:
+def _slip(gram: Gram | None) -> dict[NumberName, CarEstimate] | str:
     if gram is None or gram.n == 0:
         return NO_RECEIVER
     terms = slip_terms()
@@ -402,8 +404,8 @@ def _slip(gram: Gram | None) -> dict[NumberName, Estimate] | str:
         return NO_CAR
     of_plane = (SLIP, CHANGE, terms, Fraction(0))
     return {
-        "slip_lever": Estimate(*of_plane, solution[1], (0.0, 1.0, 0.0, 0.0), {}),
-        "slip_compliance": Estimate(*of_plane, solution[2], (0.0, 0.0, 1.0, 0.0), {}),
+        "slip_lever": CarEstimate(*of_plane, solution[1], (0.0, 1.0, 0.0, 0.0), {}),
+        "slip_compliance": CarEstimate(*of_plane, solution[2], (0.0, 0.0, 1.0, 0.0), {}),
     }
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from fleet_slip.catalogue.facts import CAR_NUMBERS, NumberName
 from fleet_slip.grams.car_estimates import (
     LASTING_BY_SATELLITE,
-    Estimate,
-    Estimates,
+    CarEstimate,
+    CarEstimates,
     add_satellite_estimates,
     bank_of_bends,
     estimate_numbers,
@@ -138,7 +138,7 @@ OF_A_DRIVE: Mapping[NumberName, float] = {"yaw_rate_offset_by_wheels": 0.002}
 the other, and makes wheels slip to that side. Two drives on one circuit do not show it."""
 
 
-Piece = tuple[Mapping[NumberName, Estimate], Mapping[str, slice]]
+Piece = tuple[Mapping[NumberName, CarEstimate], Mapping[str, slice]]
 """Some drives of a car: what they determine, and where they stand by kind."""
 
 
@@ -207,17 +207,17 @@ class CarEvidence:
             if at.stop > at.start
         }
 
-    def estimate(self, slices: Mapping[str, slice]) -> dict[NumberName, Estimate]:
+    def estimate(self, slices: Mapping[str, slice]) -> dict[NumberName, CarEstimate]:
         """Return the numbers that some drives determine, with the lean of their roads."""
         return self._estimate(slices).numbers
 
-    def _estimate(self, slices: Mapping[str, slice]) -> Estimates:
+    def _estimate(self, slices: Mapping[str, slice]) -> CarEstimates:
         totals = self._totals(slices)
         estimates = estimate_numbers(totals, self._banked)
         add_satellite_estimates(totals, estimates)
         return estimates
 
-    def influence(self, estimate: Estimate, at: slice) -> Influence | None:
+    def influence(self, estimate: CarEstimate, at: slice) -> Influence | None:
         """Return how drives move a number."""
         signals = self.sums[estimate.kind].table.signals
         sums = DriveTermSums(self._moments[estimate.kind][at], signals, estimate.terms)
@@ -292,7 +292,7 @@ class CarEvidence:
         return own
 
     def uncertainties(
-        self, estimates: Mapping[NumberName, Estimate], slices: Mapping[str, slice]
+        self, estimates: Mapping[NumberName, CarEstimate], slices: Mapping[str, slice]
     ) -> dict[NumberName, float]:
         """Return the standard errors of what some drives determine."""
         own = self.scatter((estimates, slices), self.variances)
@@ -305,7 +305,7 @@ class CarEvidence:
             for name, variance in with_others(estimates, own).items()
         }
 
-    def level(self, estimate: Estimate) -> Fraction:
+    def level(self, estimate: CarEstimate) -> Fraction:
         """Return a number as it is without the lean of the roads."""
         return estimate.value - (self.roads.lean or 0) * estimate.by_lean
 
@@ -356,7 +356,7 @@ class CarEvidence:
 
 
 def with_others(
-    estimates: Mapping[NumberName, Estimate], own: Mapping[NumberName, float]
+    estimates: Mapping[NumberName, CarEstimate], own: Mapping[NumberName, float]
 ) -> dict[NumberName, float]:
     """Return variances of numbers with those of others that they depend on."""
     return {

@@ -31,7 +31,7 @@ from fleet_slip.catalogue.course import (
     with_changes,
 )
 from fleet_slip.catalogue.definitions import COUNT_BITS
-from fleet_slip.catalogue.features import LAG, PLAIN, FeatureCatalogue, FeatureSet, features
+from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, FeatureSet, features
 from fleet_slip.catalogue.signals import HALF_TURN, SignalCatalogue
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
@@ -283,7 +283,7 @@ def gram_statement(
     regimes = [known.regimes[name].of for name in one.regimes]
     used = known.rows(dict.fromkeys([*one.features, *regimes]))
     logs = with_absent(LOGS, absent)
-    rows = _lagged(names, logs) if one.lagged else with_columns(logs, used, windows)
+    rows = with_columns(logs, used, windows)
     if one.change_ticks:
         columns = (*one.signals, *one.features, *one.windows)
         rows = with_changes(rows, columns, one.change_ticks, in_time=one.in_time)
@@ -366,26 +366,11 @@ def _absent(names: Sequence[str]) -> str:
     return f"[{', '.join(f'({part})::BIGINT' for part in reversed(parts))}]"
 
 
-def _lagged(names: Sequence[str], logs: str) -> str:
-    """Return the rows that have a predecessor in their drive, with both rows' counts."""
-    now = [name for name in names if not name.endswith(LAG)]
-    lags = _SEPARATOR.join(f"lag({name}) OVER before AS {name}{LAG}" for name in now)
-    return (
-        f"(\n        SELECT\n            drive_id,\n            {', '.join(now)},\n"
-        f"            {lags}\n        FROM {logs}\n"
-        "        WINDOW before AS (PARTITION BY drive_id ORDER BY tick)\n"
-        "        QUALIFY lag(tick) OVER before = tick - 1\n    )"
-    )
-
-
 FILES_PER_QUERY = 16
 """Planning 77 aggregates costs 20 ms, so that one query takes many files."""
 
 Late = Mapping[str, int] | None
 """By how many parts of a tick the course of each car is late; in time where it says nothing."""
-
-LAGGED_FILES_PER_QUERY = 2
-"""Rows are sorted to find the one before, which takes memory for all rows of a query."""
 
 
 def aggregate(
@@ -425,15 +410,16 @@ def compute_grams(
             task = partial(wide_grams, warehouse, feature_set=feature_set, late=late)
             yield from _by_tasks(executor or own, task, _groups(files, 1), progress)
         return
-    step = LAGGED_FILES_PER_QUERY if features().feature_set(feature_set).lagged else FILES_PER_QUERY
     if executor is not None:
-        groups = _groups(files, min(step, max(1, ceil(len(files) / in_flight(executor)))))
+        groups = _groups(
+            files, min(FILES_PER_QUERY, max(1, ceil(len(files) / in_flight(executor))))
+        )
         task = partial(_aggregate_group, warehouse, feature_set)
         yield from _by_tasks(executor, task, groups, progress)
         return
     total = sum(file.rows for file in files)
     with open_database(reading=warehouse.logs.folder, threads=threads) as database:
-        for group in _groups(files, step):
+        for group in _groups(files, FILES_PER_QUERY):
             yield _query(database, warehouse, group, feature_set)
             progress(sum(file.rows for file in group), total)
 

@@ -117,7 +117,7 @@ def counted_by_identity() -> dict[str, CountedSet]:
 
 
 def _can_be(one: FeatureSet) -> bool:
-    divided = one.regimes or one.block_ticks or one.row_folds or one.lagged
+    divided = one.regimes or one.block_ticks or one.row_folds
     return not divided and len(one.columns) <= MOST_COLUMNS
 
 

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.features import LAG, features, input_scales, lag_signals
+from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohort import Cohort, Served, clustered_moments
@@ -13,15 +13,9 @@ from fleet_slip.models.select import influential_cars
 from fleet_slip.regression.choice import nested_fits
 from fleet_slip.regression.drives import (
     LEAST_CARS,
-    AutoregressiveFit,
     ClusterUnit,
     DriveMoments,
     Influential,
-    LagGram,
-    SerialCorrelation,
-    fit_autoregressive,
-    serial_correlation,
-    serving_drives,
 )
 from fleet_slip.regression.figures import Figures, error_sums
 from fleet_slip.regression.inference import (
@@ -36,15 +30,6 @@ from fleet_slip.regression.inference import (
 )
 from fleet_slip.regression.least_squares import Fit, LinearModel, condition_number, fit
 from fleet_slip.regression.shrinkage import disturb, fit_errors_in_variables, fit_noise_matched
-
-
-@dataclass(frozen=True)
-class SerialDiagnosis:
-    """How much a row's residual says of the next one's; slopes of feasible least squares."""
-
-    correlation: SerialCorrelation
-    autoregressive: AutoregressiveFit
-    inference: Inference
 
 
 @dataclass(frozen=True)
@@ -79,7 +64,6 @@ class Diagnosis:
     inflation: Mapping[str, float]
     condition_number: float
     evidence: Evidence
-    serial: SerialDiagnosis | None = None
     comparison: CohortComparison | None = None
     noise_free: LinearModel | None = None
     influential: Mapping[str, Influential] = field(default_factory=dict)
@@ -105,12 +89,6 @@ class Diagnosis:
             document["influential"] = {
                 car: {"times": one.times, "rows": one.rows} for car, one in self.influential.items()
             }
-        if self.serial is not None:
-            document["serial"] = {
-                **asdict(self.serial.correlation),
-                "autoregressive_rho": self.serial.autoregressive.rho,
-                "autoregressive": [asdict(e) for e in self.serial.inference.estimates[1:]],
-            }
         if self.comparison is not None:
             document["against"] = {
                 "cohort": self.comparison.condition,
@@ -132,7 +110,6 @@ def diagnose(
     cohort: Cohort,
     inputs: Sequence[str],
     *,
-    lagged: Cohort | None = None,
     against: Cohort | None = None,
     sensor_noise: Mapping[str, float] | None = None,
     cluster: ClusterUnit | None = None,
@@ -140,8 +117,7 @@ def diagnose(
 ) -> Diagnosis:
     """Fit the inputs to the drives of a cohort that have them all, and examine the fit.
 
-    `lagged` has lagged Gram rows; `sensor_noise` is in SI units. Raises `DataError` for dependent
-    or absent signals.
+    `sensor_noise` is in SI units. Raises `DataError` for dependent or absent signals.
     """
     label, scales = catalogue().label, input_scales()
     served = cohort.serving(inputs)
@@ -166,7 +142,6 @@ def diagnose(
         inflation=variance_inflation(total, inputs),
         condition_number=condition_number(total, inputs),
         evidence=Evidence.naive(fits) if alone else Evidence.clustered(fits, moments),
-        serial=_serial(fitted, lagged) if lagged else None,
         comparison=_compare(served, fitted, moments, against.condition.text, there)
         if against and there
         else None,
@@ -187,18 +162,6 @@ def _infer(fitted: Fit, moments: DriveMoments) -> Inference:
     if _is_alone(moments):
         return infer_classically(fitted, input_scales())
     return infer_by_clusters(fitted, moments, input_scales())
-
-
-def _serial(fitted: Fit, lagged: Cohort) -> SerialDiagnosis:
-    inputs, label = fitted.model.signals, fitted.model.label
-    table, _ = serving_drives(lagged.tables, lag_signals([*inputs, label]))
-    gram = LagGram(table.total(), LAG)
-    autoregressive = fit_autoregressive(gram, inputs, label)
-    return SerialDiagnosis(
-        serial_correlation(fitted.model, fitted.gram, gram),
-        autoregressive,
-        infer_classically(autoregressive.differenced, input_scales()),
-    )
 
 
 def _cars(*cohorts: Served | None) -> list[str]:

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue import features as features_module
-from fleet_slip.catalogue.features import features, lag_signals, load_features
+from fleet_slip.catalogue.features import features, load_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan
@@ -189,7 +189,6 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
         ('column = "speed_mps"', 'column = "ay_mps2"', "names must differ"),
         ('divided_by = "50000"', 'divided_by = "0"', "divided_by is zero"),
         ('regimes = ["speed", "ay"]', 'regimes = ["mood"]', "unknown mood"),
-        ("row_folds = 10", "row_folds = 10\nlagged = true", "not several of them"),
         ("block_s = 60", "block_s = 60\nregimes = ['speed']", "not several of them"),
         ("block_s = 60", "block_s = 0.005", "block_s must be a multiple of 0.01"),
         ("block_s = 60", "row_folds = 5", "a set with windows has no row_folds"),
@@ -257,7 +256,7 @@ def test_a_changed_definition_never_mixes_with_the_old_rows(
     (tmp_path / "features.toml").write_text(changed_text, encoding="utf-8")
     changed = load_features(tmp_path / "features.toml")
     assert changed.identity("motion") != before.identity("motion")
-    assert changed.identity("lags") == before.identity("lags")
+    assert changed.identity("rows") == before.identity("rows")
     for module in (features_module, aggregation, job, gram_statement):
         monkeypatch.setattr(module, "features", lambda: changed)
     assert update_grams(warehouse, feature_set="motion").rows_read == 300
@@ -324,27 +323,6 @@ def test_rows_are_divided_by_regime(warehouse: Warehouse) -> None:
     assert found["speed 20-25, |ay| 1-2"] == int(fast.sum()) > 0
     assert found["speed < 10, |ay| < 1"] == int(((kmps < 10) & (ay < 1)).sum()) > 0
     assert sum(found.values()) == 600
-
-
-def test_lagged_rows_have_a_predecessor_in_their_drive(warehouse: Warehouse) -> None:
-    one, two = drive("a", 50, 6), drive("b", 40, 7)
-    gap = one.filter(pa.compute.not_equal(one["tick"], 20))
-    shuffled = gap.take(np.random.default_rng(0).permutation(len(gap)))
-    land(warehouse, "one", shuffled, two)
-    update_grams(warehouse, feature_set="lags")
-    signals = lag_signals(["ay", LABEL])
-    wanted = Gram.zero(signals)
-    for table in (gap, two):
-        tick = table["tick"].to_numpy()
-        now = np.column_stack([table[name].to_numpy() for name in ("ay", LABEL)]).astype(np.int64)
-        after = np.flatnonzero(np.diff(tick) == 1) + 1
-        wanted += Gram.from_counts(signals, np.hstack([now[after], now[after - 1]]))
-    total = sum(
-        (t.restrict(signals).total() for t in load_cohort(warehouse, "true", "lags").tables),
-        Gram.zero(signals),
-    )
-    assert total == wanted
-    assert total.n == 47 + 39
 
 
 def test_a_drive_with_several_gram_rows_is_one_drive(warehouse: Warehouse) -> None:

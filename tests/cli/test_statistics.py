@@ -164,18 +164,13 @@ def test_a_published_model_with_features_explains_and_evaluates_them(
     assert not again["new"]
 
 
-def test_diagnose_shows_both_kinds_of_errors_and_the_serial_correlation(
-    run_command: RunCommand, every_set: Path
-) -> None:
-    arguments = ("diagnose", "--signals", "ay,steer_fl", "--serial", "--sensor-noise", "ay=0.1")
+def test_diagnose_shows_both_kinds_of_errors(run_command: RunCommand, every_set: Path) -> None:
+    arguments = ("diagnose", "--signals", "ay,steer_fl", "--sensor-noise", "ay=0.1")
     report = run_command(*arguments, "--json", root=every_set).json
     for naive, robust in zip(report["by_rows"], report["by_clusters"], strict=True):
         assert naive["value"] == robust["value"]
         assert robust["standard_error"] > naive["standard_error"]
     assert report["effective_rows"] < report["rows"]
-    # e_t - e_{t-1} has the variance 2 (1 - rho), but for the ends of the drives.
-    serial = report["serial"]
-    assert serial["durbin_watson"] == pytest.approx(2 * (1 - serial["rho"]), rel=0.01)
     weights = {estimate["name"]: estimate["value"] for estimate in report["by_rows"]}
     assert abs(report["noise_free"]["ay"]) > abs(weights["ay"])  # noise attenuates
     fast, slow = "speed_factor > 0.85", "speed_factor <= 0.85"

@@ -8,12 +8,12 @@ import pyarrow as pa
 import pytest
 import statsmodels.api as sm
 
-from fleet_slip.catalogue.features import LAG, input_scales, lag_signals
+from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.models.diagnose import diagnose
 from fleet_slip.regression.drives import ClusterUnit
-from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
+from tests.support.cohorts import INPUTS, LABEL, cohort_of, driven, rows_of
 from tests.support.counts import dense_fit
 from tests.support.few_cars import compared
 
@@ -37,11 +37,11 @@ def test_figures_are_those_of_the_rows() -> None:
     np.testing.assert_allclose([found.inflation[name] for name in INPUTS], inflation, rtol=1e-9)
     assert found.condition_number == pytest.approx(np.linalg.cond(correlations), rel=1e-9)
     assert (found.drives, found.fitted.gram.n) == (12, len(rows))
-    assert (found.serial, found.comparison, found.noise_free) == (None, None, None)
+    assert (found.comparison, found.noise_free) == (None, None)
     document = found.as_dict()
     assert document["rows"] == len(rows)
     assert document["design_effect"] == found.evidence.design_effect
-    assert not {"serial", "against", "noise_free"} & set(document)
+    assert not {"against", "noise_free"} & set(document)
 
 
 def test_an_offset_of_each_drive_makes_the_naive_errors_too_small() -> None:
@@ -99,29 +99,6 @@ def test_the_noise_of_a_sensor_is_taken_out() -> None:
     assert drawn < 0.85 * 0.9 * unit
     assert found.noise_free.weights["yaw_rate"] == pytest.approx(0.9 * unit, rel=0.01)
     assert set(found.as_dict()["noise_free"]) == {"intercept", *INPUTS}
-
-
-def test_the_residual_says_as_much_of_the_next_as_was_put_in() -> None:
-    signals = (*INPUTS, LABEL)
-    rng = np.random.default_rng(9)
-    now, lagged = [], []
-    for one in driven(9, COEFFICIENTS, drives=10, rows=400, noise=0.0):
-        rest = np.zeros(400)
-        for tick in range(1, 400):
-            rest[tick] = 0.8 * rest[tick - 1] + rng.normal(0, 60)
-        counts = one.counts.copy()
-        counts[:, -1] += np.rint(rest).astype(np.int64)
-        now.append(Driven(one.drive, counts))
-        pairs = np.column_stack([counts[1:], counts[:-1]])
-        lagged.append(Driven(one.drive, pairs, signals=(*signals, *(f"{s}{LAG}" for s in signals))))
-    assert set(lag_signals(signals)) == {*signals, *(f"{s}{LAG}" for s in signals)}
-    serial = diagnose(cohort_of(now), INPUTS, lagged=cohort_of(lagged, feature_set="lags")).serial
-    assert serial is not None
-    assert serial.correlation.rho == pytest.approx(0.8, abs=0.03)
-    assert serial.autoregressive.rho == pytest.approx(0.8, abs=0.03)
-    errors = [e.standard_error for e in serial.inference.estimates]
-    assert len(errors) == len(INPUTS) + 1
-    assert min(errors) > 0
 
 
 def test_drives_of_a_car_are_one_piece_of_evidence_unless_told_otherwise() -> None:

@@ -103,7 +103,7 @@ def test_grams_of_old_files_alone_are_the_same_with_a_new_signal(
     use(NEW_SIGNAL)
     now = Warehouse(warehouse.root)
     update_grams(now)
-    update_grams(now, feature_set="lags")
+    update_grams(now, feature_set="rows")
     (signals, first), *_ = fetch(
         now, "SELECT signals, sums[1] FROM grams WHERE feature_set = 'signals'"
     )

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.regression.drives import LagGram
 from fleet_slip.regression.gram import Gram, GramTable
 
 Matrix = NDArray[Any]
@@ -75,26 +74,3 @@ def dense_fit(counts: Matrix) -> tuple[Matrix, float]:
 def unit_scales(inputs: int) -> dict[str, Fraction]:
     """Return the scale 1 for x1, x2, ..., y."""
     return dict.fromkeys(names(inputs), Fraction(1))
-
-
-def autoregressive_drives(
-    seed: int, rho: float, drives: int = 3, rows: int = 400
-) -> list[np.ndarray]:
-    rng = np.random.default_rng(seed)
-    result = []
-    for _ in range(drives):
-        x = np.cumsum(rng.normal(size=(rows, 2)) * 40, axis=0)
-        noise = np.empty(rows)
-        noise[0] = rng.normal() * 100
-        for t in range(1, rows):
-            noise[t] = rho * noise[t - 1] + rng.normal() * 100
-        y = 2 * x[:, 0] - x[:, 1] + 500 + noise
-        result.append(np.rint(np.column_stack([x, y])).astype(np.int64))
-    return result
-
-
-def lag_gram(drives: list[np.ndarray]) -> LagGram:
-    now = names(drives[0].shape[1] - 1)
-    signals = (*now, *(f"{name}_before" for name in now))
-    pairs = [np.column_stack([drive[1:], drive[:-1]]) for drive in drives]
-    return LagGram(Gram.from_counts(signals, np.concatenate(pairs)), "_before")

@@ -11,7 +11,12 @@ from fleet_slip.catalogue.course import TURNED, turned_scale
 from fleet_slip.catalogue.facts import BY_COURSE, BY_SATELLITE
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.car_estimates import NO_CAR, Estimates, add_satellite_estimates, kinds_by_set
+from fleet_slip.grams.car_estimates import (
+    NO_CAR,
+    CarEstimates,
+    add_satellite_estimates,
+    kinds_by_set,
+)
 from fleet_slip.grams.car_evidence import CarEvidence
 from fleet_slip.grams.reader import DriveSums, collect_sums
 from fleet_slip.regression.gram import Gram
@@ -94,7 +99,7 @@ def test_what_is_no_course_of_a_car_tells_nothing(times: int) -> None:
     counts[catalogue().label] = times * counts[catalogue().label]
     columns = COLUMNS[BY_COURSE]
     table = np.stack([counts[name].astype(np.int64) for name in columns], axis=1)
-    told = Estimates()
+    told = CarEstimates()
     add_satellite_estimates({"slip": Gram.from_counts(columns, table)}, told)
     assert not told.numbers
     assert told.missing["slip_lever"] == NO_CAR

@@ -5,13 +5,11 @@ import statsmodels.api as sm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.regression.drives import DriveMoments, fit_autoregressive
+from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.inference import infer_by_clusters, infer_classically
 from fleet_slip.regression.least_squares import fit
 from tests.support.counts import (
-    autoregressive_drives,
     gram_of,
-    lag_gram,
     names,
     table_of,
     unit_scales,
@@ -63,14 +61,3 @@ def test_coefficients_and_both_kinds_of_errors_agree(
         errors = [estimate.standard_error for estimate in mine.estimates]
         np.testing.assert_allclose(errors, other.bse, rtol=AGREEMENT)
     assert abs(ours[0].residual_std / np.sqrt(theirs[0].scale) - 1) < AGREEMENT
-
-
-@settings(max_examples=15)
-@given(seed=st.integers(0, 10**6), rho=st.floats(-0.8, 0.9))
-def test_the_autoregressive_fit_agrees_at_its_correlation(seed: int, rho: float) -> None:
-    drive = autoregressive_drives(seed, rho, drives=1)[0]
-    result = fit_autoregressive(lag_gram([drive]), ["x1", "x2"], "y")
-    design = sm.add_constant(drive[:, :-1].astype(float))
-    other = sm.GLSAR(drive[:, -1].astype(float), design, rho=[result.rho]).fit()
-    values = [result.model.offset, *result.model.weights.values()]
-    np.testing.assert_allclose(values, other.params, rtol=AGREEMENT)
