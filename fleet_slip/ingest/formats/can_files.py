@@ -7,7 +7,6 @@ a signal that has no other values the name itself.
 
 import math
 import os
-import re
 import struct
 import zlib
 from collections.abc import Iterator
@@ -53,7 +52,6 @@ from fleet_slip.ingest.formats.source import (
 MAGIC = b"LOGG"
 _MARK, _OBJECT = b"LOBJ", struct.Struct("<4s4xII")
 """What an object begins with: the mark, its size and its kind."""
-_MARKS = re.compile(_MARK)
 _CONTAINER, _CONTAINER_HEADER = 10, struct.Struct("<16xH14x")
 _PLAIN, _COMPRESSED = 0, 2
 _LARGEST_OBJECT, _PADDING = 2**20, 4
@@ -109,7 +107,7 @@ def read_blf_frames(budget: Budget, start_s: float) -> Iterator[FrameBlock]:
     """
     rest = b""
     with budget.file.open("rb") as stream:
-        for some in _together(_containers(stream, budget)):
+        for some in _containers(stream, budget):
             content = rest + some
             begins, end = _objects(content, budget)
             rest = content[end:]
@@ -119,21 +117,11 @@ def read_blf_frames(budget: Budget, start_s: float) -> Iterator[FrameBlock]:
         raise budget.damaged("a last object that ends too early")
 
 
-def _together(containers: Iterator[bytes]) -> Iterator[bytes]:
-    """Yield contents that are long enough for what it costs to look at one."""
-    some: list[bytes] = []
-    for container in containers:
-        some.append(container)
-        if sum(map(len, some)) >= _AT_ONCE:
-            yield b"".join(some)
-            some = []
-    yield b"".join(some)
-
-
 def _containers(stream: BinaryIO, budget: Budget) -> Iterator[bytes]:
-    """Yield the content of each container."""
+    """Yield the contents of containers, several at once: looking at one costs as much."""
     stream.seek(len(MAGIC))
     (at,) = struct.unpack("<I", stream.read(4).ljust(4, b"\0"))
+    some: list[bytes] = []
     while header := os.pread(stream.fileno(), _CONTAINER_HEADER.size, at):
         mark, size, kind = _OBJECT.unpack_from(header.ljust(_CONTAINER_HEADER.size))
         if mark != _MARK or len(header) < _CONTAINER_HEADER.size:
@@ -144,47 +132,23 @@ def _containers(stream: BinaryIO, budget: Budget) -> Iterator[bytes]:
             content = os.pread(stream.fileno(), size - len(header), at + len(header))
             if len(content) < size - len(header):
                 raise budget.damaged("a container that ends too early")
-            yield _unfolded(content, _CONTAINER_HEADER.unpack(header)[0], budget)
+            (method,) = _CONTAINER_HEADER.unpack(header)
+            if method not in {_PLAIN, _COMPRESSED}:
+                raise budget.damaged(f"a container compressed by an unknown method, {method}")
+            try:
+                some.append(zlib.decompress(content) if method == _COMPRESSED else content)
+            except zlib.error as error:
+                raise budget.damaged(f"a container that zlib cannot unfold ({error})") from None
+        if sum(map(len, some)) >= _AT_ONCE:
+            yield b"".join(some)
+            some = []
         at += size + size % _PADDING
         budget.meter.pass_over(at, budget.size)
-
-
-def _unfolded(content: bytes, method: int, budget: Budget) -> bytes:
-    if method == _COMPRESSED:
-        try:
-            return zlib.decompress(content)
-        except zlib.error as error:
-            raise budget.damaged(f"a container that zlib cannot unfold ({error})") from None
-    if method != _PLAIN:
-        raise budget.damaged(f"a container compressed by an unknown method, {method}")
-    return content
+    yield b"".join(some)
 
 
 def _objects(content: bytes, budget: Budget) -> tuple[IntArray, int]:
-    """Return where whole objects begin, and where the last of them ends.
-
-    Marks are all objects, if each stands where the object before it ends; where one is among data,
-    objects are sought one after the other.
-    """
-    begins = np.array([found.start() for found in _MARKS.finditer(content)], dtype=np.int64)
-    begins = begins[begins <= len(content) - _OBJECT.size]
-    sizes = _read(np.frombuffer(content, np.uint8), begins, _HEADER, _OBJECT.size)["size"]
-    ends = begins + sizes
-    gaps = begins - np.concatenate([[0], ends[:-1]])
-    possible = (sizes >= _OBJECT.size) & (sizes <= _LARGEST_OBJECT)
-    if (possible & (gaps >= 0) & (gaps <= _PADDING)).all():
-        begins = begins[ends <= len(content)]
-        end = int(ends[len(begins) - 1]) if len(begins) else 0
-    else:
-        begins, end = _seek_objects(content, budget)
-    left = content[end : end + _REACH]
-    if len(left) == _REACH and _MARK not in left:
-        raise budget.damaged("no object where the next should begin")
-    return begins, end
-
-
-def _seek_objects(content: bytes, budget: Budget) -> tuple[IntArray, int]:
-    """Do what `_objects` does, from object to object."""
+    """Return where whole objects begin, and where the last of them ends."""
     begins: list[int] = []
     at = 0
     while (begin := content.find(_MARK, at, at + _REACH)) >= 0:
@@ -197,6 +161,9 @@ def _seek_objects(content: bytes, budget: Budget) -> tuple[IntArray, int]:
             break
         begins.append(begin)
         at = begin + size
+    left = content[at : at + _REACH]
+    if len(left) == _REACH and _MARK not in left:
+        raise budget.damaged("no object where the next should begin")
     return np.array(begins, dtype=np.int64), at
 
 

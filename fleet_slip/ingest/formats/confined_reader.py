@@ -106,11 +106,21 @@ def serve(control: int) -> None:
             os.close(handle)
 
 
-class _Reader(Meter):
+class _FarMeter(Meter):
+    """Lets the meter of the other process know."""
+
+    def __init__(self, send: Callable[[Any], None]) -> None:
+        super().__init__()
+        self._send = send
+
+    def pass_over(self, at: int, size: int) -> None:
+        self._send({"passed": [at, size]})
+
+
+class _Reader:
     """An open file, who asks for what is in it, and what of it is being read."""
 
     def __init__(self, channel: socket.socket, rows: BinaryIO) -> None:
-        super().__init__()
         self._channel, self._rows = channel, rows
         self._source: Source
         self._bases: list[Base] = []
@@ -124,7 +134,7 @@ class _Reader(Meter):
             os.chdir(job.cwd)
             tempfile.tempdir = job.folder
             confine(parent, job.file, job.folder, *job.limits)
-            budget = Budget(Path(job.file), job.size, self)
+            budget = Budget(Path(job.file), job.size, _FarMeter(self._send))
 
             def open_it() -> bool:
                 self._source = opened.enter_context(open_here(job.format, job.bus, budget))
@@ -165,10 +175,6 @@ class _Reader(Meter):
             self._rows.flush()
         line = json.dumps(answer).encode()
         self._channel.sendall(SIZES.pack(len(line), self._rows.tell()) + line)
-
-    def pass_over(self, at: int, size: int) -> None:
-        """Let the meter of the other process know."""
-        self._send({"passed": [at, size]})
 
     def channels(self) -> list[tuple[str, ...]]:
         """Return all that can be read."""

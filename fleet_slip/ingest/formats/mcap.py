@@ -11,8 +11,8 @@ import struct
 from array import array
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -33,24 +33,9 @@ from fleet_slip.ingest.formats.source import (
     reading_with,
 )
 
-# The fields of MCAP messages: of one message, and of many that are alike at once.
-#
-# Where in a message a number stands is learned from the decoder: each byte of one message is
-# changed in turn, and what changes in what is decoded tells whose it is. Another message of the
-# same length, whose other bytes are the same (texts, lengths of arrays), has its numbers at the
-# same places.
-
 Decode = Callable[[bytes], Any]
 _MOST_ITEMS, _DEEPEST = 64, 20
 """Items of an array that are columns, and levels of messages in messages."""
-_LONGEST, _MOST_SHAPES = 1024, 8
-"""Bytes of a message whose shape is learned, and shapes of a topic."""
-_CHANGES = (0x01, 0x80, 0xFF)
-_FAILURES = (
-    ValueError, TypeError, IndexError, EOFError, OverflowError, MemoryError, NotImplementedError,
-    struct.error,
-)  # fmt: skip
-"""What the decoder raises for a message that is none."""
 
 
 @dataclass(frozen=True)
@@ -144,133 +129,141 @@ def leaves_of(value: Any, path: str = "", depth: int = 0) -> Iterator[str]:
             yield from leaves_of(_attribute(value, name), below, depth + 1)
 
 
-@dataclass(frozen=True)
-class _Shape:
-    """Where numbers stand in messages like one.
+# Where the numbers of a ROS message are follows from its definition, and from the lengths of the
+# texts and arrays in it. Messages of a channel with the same lengths are read at once.
 
-    Attributes:
-        example: its bytes.
-        fixed: which of them must be the same.
-        numbers: the type and the place of each number, by its path.
-        stamp: the paths of seconds and nanoseconds of its stamp; none without any.
-    """
-
-    example: NDArray[np.uint8]
-    fixed: NDArray[np.bool_]
-    numbers: dict[str, tuple[np.dtype[Any], int]]
-    stamp: list[str]
+_LONGEST, _MOST_LAYOUTS = 1024, 8
+"""Bytes of a message whose layout is computed, and layouts of a channel's messages of one size."""
+_KINDS = {
+    "byte": "u1", "char": "i1", "uint8": "u1", "int8": "i1", "uint16": "u2", "int16": "i2",
+    "uint32": "u4", "int32": "i4", "uint64": "u8", "int64": "i8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
 
 
-class AlikeMessages:
-    """The shapes of messages, learned as they come."""
+class _Layout:
+    """Where numbers are in messages like one: of what type, and at which byte, by their paths."""
 
-    def __init__(self) -> None:
-        """Begin without any."""
-        self._shapes: dict[tuple[str, int], list[_Shape | None]] = defaultdict(list)
+    def __init__(self, schema: Any, decode: Decode, data: bytes) -> None:
+        """Take a definition and a message. Raises what the decoder does, or `ValueError`."""
+        from mcap_ros2 import _dynamic as ros  # noqa: PLC0415 - of the extra `logs`
 
-    def read(
-        self, decode: Decode, topic: str, names: Sequence[str], block: Block
-    ) -> list[FloatArray] | None:
+        time = ros.TimeDefinition
+        self._types = {f"builtin_interfaces/{name}": time for name in ("Time", "Duration")}
+        ros._for_each_msgdef(
+            schema.name,
+            schema.data.decode(),
+            lambda name, short, of: self._types.update({name: of, short: of}),
+        )
+        self._data, self._at, self._order = data, 4, "><"[data[1] & 1]
+        self._fixed = [0, 1, 2, 3]
+        self.numbers: dict[str, tuple[np.dtype[Any], int]] = {}
+        self._message(self._types[schema.name], "")
+        message = decode(data)
+        if self._at > len(data) or any(
+            repr(field_of(message, path)) != repr(np.frombuffer(data, kind, 1, at)[0].item())
+            for path, (kind, at) in self.numbers.items()
+        ):
+            raise ValueError("it is decoded in another way")
+        parts = [field_of(message, name) for name in _stamp_of(message)]
+        self.stamp = _stamp_of(message) if all(isinstance(part, int) for part in parts) else []
+        self._lengths = np.frombuffer(data, np.uint8)[self._fixed]
+
+    def _message(self, definition: Any, above: str) -> None:
+        self._at += not definition.fields  # then it has a byte that means nothing
+        for field in definition.fields:
+            path, kind = f"{above}.{field.name}" if above else field.name, field.type
+            if not kind.is_array:
+                self._value(kind, path)
+                continue
+            items = kind.array_size if kind.is_fixed_size_array() else self._length()
+            if kind.type in {"byte", "uint8"}:  # decoded as bytes, which are no columns
+                self._at += items
+                continue
+            for number in range(items):
+                self._value(kind, f"{path}[{number}]")
+
+    def _value(self, kind: Any, path: str) -> None:
+        if self._at > len(self._data):
+            raise ValueError("it ends too early")
+        if not kind.is_primitive_type():
+            self._message(self._types[f"{kind.pkg_name}/{kind.type}"], path)
+        elif kind.type == "string":
+            size = self._length()
+            self._at += size
+        elif kind.type == "bool":
+            self._at += 1
+        else:
+            dtype = np.dtype(self._order + _KINDS[kind.type])
+            self._align(dtype.itemsize)
+            self.numbers[path] = dtype, self._at
+            self._at += dtype.itemsize
+
+    def _align(self, size: int) -> None:
+        self._at += -(self._at - 4) % size
+
+    def _length(self) -> int:
+        """Return the length of a text or an array, which must be the same in all messages."""
+        self._align(4)
+        self._fixed += range(self._at, self._at + 4)
+        self._at += 4
+        length = self._data[self._at - 4 : self._at]
+        return int.from_bytes(length, "little" if self._order == "<" else "big")
+
+    def fits(self, data: NDArray[np.uint8]) -> bool:
+        """Whether messages, of the same size, have the same lengths."""
+        return bool((data[:, self._fixed] == self._lengths).all())
+
+    def column(self, data: NDArray[np.uint8], path: str) -> FloatArray:
+        """Return a number of each message."""
+        kind, at = self.numbers[path]
+        some = np.ascontiguousarray(data[:, at : at + kind.itemsize])
+        return some.view(kind)[:, 0].astype(np.float64)
+
+
+class RosMessages:
+    """The messages of one channel of ROS, read at once where they are alike."""
+
+    def __init__(self, schema: Any, decode: Decode) -> None:
+        """Take their definition, and what decodes one."""
+        self._schema, self._decode = schema, decode
+        self._layouts: dict[int, list[_Layout | None]] = defaultdict(list)
+
+    def read(self, names: Sequence[str], block: Block) -> list[FloatArray] | None:
         """Return the times in s and the columns of messages, if they are all alike."""
-        channels, begins, ends = block.heads.T
+        _, begins, ends = block.heads.T
         size = int(ends[0] - begins[0])
-        if size > _LONGEST or (ends - begins != size).any() or (channels != channels[0]).any():
+        if size > _LONGEST or (ends - begins != size).any():
             return None
         content = np.frombuffer(block.content, np.uint8)
         data = content[begins[:, np.newaxis] + np.arange(size)]
-        shapes = self._shapes[topic, size]
-        fits = (one for one in shapes if one and _is_alike(one, data))
-        shape = next(fits, None)
-        if shape is None and len(shapes) < _MOST_SHAPES:
-            shape = _learn(decode, data[0].tobytes())
-            shapes.append(shape)
-        if shape is None or not shape.numbers.keys() >= set(names) or not _is_alike(shape, data):
+        layouts = self._layouts[size]
+        layout = next((one for one in layouts if one and one.fits(data)), None)
+        if layout is None and len(layouts) < _MOST_LAYOUTS:
+            with suppress(*_FAILURES):
+                layout = _Layout(self._schema, self._decode, data[0].tobytes())
+            layouts.append(layout)
+        if layout is None or not layout.fits(data):
+            return None
+        if not layout.numbers.keys() >= {*names, *layout.stamp}:
             return None
         times_s: FloatArray = block.published_ns.astype(np.float64) * 1e-9
-        if shape.stamp:
-            seconds, nanoseconds = (_numbers(shape, data, name) for name in shape.stamp)
+        if layout.stamp:
+            seconds, nanoseconds = (layout.column(data, name) for name in layout.stamp)
             known = (seconds != 0) | (nanoseconds != 0)
             times_s = np.where(known, seconds + nanoseconds * 1e-9, times_s)
-        return [times_s, *(_numbers(shape, data, name) for name in names)]
+        return [times_s, *(layout.column(data, name) for name in names)]
 
 
-def _is_alike(shape: _Shape, data: NDArray[np.uint8]) -> bool:
-    return bool((data[:, shape.fixed] == shape.example[shape.fixed]).all())
-
-
-def _numbers(shape: _Shape, data: NDArray[np.uint8], name: str) -> FloatArray:
-    kind, at = shape.numbers[name]
-    some = np.ascontiguousarray(data[:, at : at + kind.itemsize])
-    return some.view(kind)[:, 0].astype(np.float64)
-
-
-def _learn(decode: Decode, example: bytes) -> _Shape | None:
-    """Return where numbers stand in a message; None if its stamp is none of them."""
-    message = decode(example)
-    plain = _values(decode, example)
-    if not plain:
-        return None
-    fixed = np.zeros(len(example), dtype=np.bool_)
-    seen: dict[str, list[tuple[int, bytes, Any]]] = defaultdict(list)
-    for at in range(len(example)):
-        changed = bytearray(example)
-        owners: set[str] = set()
-        found = []
-        for change in _CHANGES:
-            changed[at] = example[at] ^ change
-            values = _values(decode, bytes(changed))
-            if values is None or values.keys() != plain.keys():
-                owners |= plain.keys() | {""}
-                break
-            mine = [name for name, value in values.items() if repr(value) != repr(plain[name])]
-            owners.update(mine)
-            found += [(at, bytes(changed), values[name]) for name in mine]
-        fixed[at] = len(owners) > 1
-        if len(owners) == 1:
-            seen[owners.pop()] += found
-    numbers = {}
-    for name, some in seen.items():
-        places = sorted({at for at, *_ in some})
-        kind = _kind_of(places, some)
-        if kind is not None:
-            numbers[name] = kind, places[0]
-        elif len(places) > 1 or not isinstance(plain[name], bool):
-            fixed[places] = True
-    parts = [field_of(message, name) for name in _stamp_of(message)]
-    stamp = _stamp_of(message) if all(isinstance(part, int) for part in parts) else []
-    if any(name not in numbers for name in stamp):
-        return None
-    return _Shape(np.frombuffer(example, np.uint8), fixed, numbers, stamp)
-
-
-def _values(decode: Decode, message: bytes) -> dict[str, Any] | None:
-    """Return the numbers and texts of a message by their paths; None if it is none."""
-    try:
-        found = decode(message)
-        return {name: field_of(found, name) for name in leaves_of(found)}
-    except _FAILURES:
-        return None
-
-
-def _kind_of(places: Sequence[int], seen: Sequence[tuple[int, bytes, Any]]) -> np.dtype[Any] | None:
-    """Return the type of a number of these bytes, by what it was when they were changed."""
-    first, size = places[0], len(places)
-    types = {type(value) for *_, value in seen}
-    if places[-1] - first + 1 != size or types not in ({int}, {float}):
-        return None
-    for letter in "f" if types == {float} else "iu":
-        for order in "<>":
-            try:
-                kind = np.dtype(f"{order}{letter}{size}")
-            except TypeError:
-                continue
-            told = [np.frombuffer(content, kind, 1, first)[0].item() for _, content, _ in seen]
-            if all(repr(a) == repr(value) for a, (*_, value) in zip(told, seen, strict=True)):
-                return kind
-    return None
+_FAILURES = (
+    ValueError, TypeError, LookupError, EOFError, OverflowError, NotImplementedError, struct.error,
+)  # fmt: skip
+"""What the decoder raises for a message that is none."""
 
 
 # Reads the records of an MCAP file, all messages of a chunk together.
+
+PIECE_ROWS = 2**13
+"""Messages outside of chunks that are read at once."""
 
 _MESSAGE, _MESSAGE_INDEX = 5, 7
 _RECORD, _HEAD = struct.Struct("<BQ"), struct.Struct("<BQH12xQ")
@@ -293,8 +286,13 @@ def read_records(budget: Budget) -> Iterator[Any]:
                 return super()._read_record(kind, length)
 
         reader = Reader(file, emit_chunks=True, validate_crcs=True, record_size_limit=None)
+        alone: list[Any] = []
         for record in reader.records:
-            if type(record).__name__ == "Chunk":
+            kind = type(record).__name__
+            if alone and (kind != "Message" or len(alone) >= PIECE_ROWS):
+                yield _block_of(alone)
+                alone = []
+            if kind == "Chunk":
                 stream, size = mcap.get_chunk_data_stream(record, validate_crc=True)
                 block, others = _messages_in(stream.read(size))
                 record.compression, record.data, record.uncompressed_crc = "", others, 0
@@ -302,11 +300,19 @@ def read_records(budget: Budget) -> Iterator[Any]:
                 yield from mcap.breakup_chunk(record)
                 yield block
                 budget.meter.pass_over(file.tell(), budget.size)
-            elif type(record).__name__ == "Message":
-                heads = np.array([(record.channel_id, 0, len(record.data))])
-                yield Block(record.data, heads, np.array([record.publish_time], np.uint64))
+            elif kind == "Message":
+                alone.append(record)
             else:
                 yield record
+
+
+def _block_of(messages: Sequence[Any]) -> Block:
+    """Return messages that stand in no chunk."""
+    ends = np.cumsum([len(one.data) for one in messages])
+    begins = np.append(0, ends[:-1])
+    heads = np.column_stack([[one.channel_id for one in messages], begins, ends])
+    published_ns = np.array([one.publish_time for one in messages], np.uint64)
+    return Block(b"".join(one.data for one in messages), heads, published_ns)
 
 
 def _messages_in(content: bytes) -> tuple[Block, bytes]:
@@ -328,19 +334,25 @@ def _messages_in(content: bytes) -> tuple[Block, bytes]:
     return Block(content, messages, np.array(published_ns, np.uint64)), b"".join(others)
 
 
-PIECE_ROWS = 2**13
-"""Messages of one topic that are in memory at once."""
+@dataclass(frozen=True)
+class _McapChannel:
+    """What a file says of a channel, and what reads its messages, if anything does."""
+
+    topic: str
+    encoding: str
+    decode: Decode | None
+    ros: RosMessages | None = None
 
 
-def decoder_of(channel: Any, schema: Any) -> Decode | None:
-    """Return what decodes the messages of a channel, None if nothing does."""
+def _channel_of(record: Any, schema: Any) -> _McapChannel:
     from mcap_ros2.decoder import DecoderFactory  # noqa: PLC0415 - of the extra `logs`
 
-    if channel.message_encoding == "json":
-        return json.loads
-    decode: Decode | None = DecoderFactory().decoder_for(channel.message_encoding, schema)
+    encoding = record.message_encoding
+    if encoding == "json":
+        return _McapChannel(record.topic, encoding, json.loads)
+    decode: Decode | None = DecoderFactory().decoder_for(encoding, schema)
     if decode is None:
-        return None
+        return _McapChannel(record.topic, encoding, None)
 
     def decode_plain(data: bytes) -> Any:
         # The decoder reads any other as this one too, with its numbers at wrong places.
@@ -348,22 +360,11 @@ def decoder_of(channel: Any, schema: Any) -> Decode | None:
             raise ValueError(f"a message is not plain CDR (it begins with {data[:2].hex()})")
         return decode(data)
 
-    return decode_plain
+    return _McapChannel(record.topic, encoding, decode_plain, RosMessages(schema, decode_plain))
 
 
 _Fields = dict[str, str]
 """Paths of fields in the messages of one topic, by column."""
-_Channels = dict[int, tuple[Any, Decode | None]]
-"""Channels by their number, with what decodes their messages."""
-
-
-@dataclass
-class _Rows:
-    """Rows of one topic until they are put aside."""
-
-    fields: _Fields
-    times_s: list[float] = field(default_factory=list)
-    values: list[list[Any]] = field(default_factory=list)
 
 
 class McapSource(FormatSource):
@@ -376,7 +377,6 @@ class McapSource(FormatSource):
         self._rows: dict[str, int] = {}
         self._numbers: set[str] = set()
         self._texts: set[str] = set()
-        self._alike = AlikeMessages()
 
     def channels(self) -> list[Channel]:
         """Return the numbers and texts in the first message of each topic."""
@@ -397,10 +397,7 @@ class McapSource(FormatSource):
     def prepare(self, wanted: dict[str, _Fields]) -> None:
         """Decode columns and put them aside, unless they are. Raises `InputError`."""
         if any(not of.keys() <= self._kept.get(topic, {}).keys() for topic, of in wanted.items()):
-            self._kept, self._texts = {}, set()
-            while not self._decode(wanted):
-                pass
-            self._kept = wanted
+            self._decode(wanted)
         for topic, of in wanted.items():
             for column in of.keys() - self._numbers - self._texts:
                 names = [f"{topic}.{name}" for name in self._topics[topic]]
@@ -420,29 +417,27 @@ class McapSource(FormatSource):
     def _topics(self) -> dict[str, list[str]]:
         """The fields of the first message of each topic that can be decoded."""
         found: dict[str, list[str]] = {}
-        encodings: set[str] = set()
-        done: set[int] = set()
+        encodings: dict[int, str] = {}
         with reading_with(self._file, "mcap"):
             for channels, block in self._blocks():
-                for number in set(block.heads[:, 0].tolist()) - done:
-                    channel, decode = channels[number]
-                    encodings.add(channel.message_encoding)
+                for number in set(block.heads[:, 0].tolist()) - encodings.keys():
+                    channel = channels[number]
+                    encodings[number] = channel.encoding
                     _, data, _ = next(block.of([number]).one_by_one())
-                    done.add(number)
-                    if decode is not None and channel.topic not in found:
-                        found[channel.topic] = list(leaves_of(decode(data)))
+                    if channel.decode is not None and channel.topic not in found:
+                        found[channel.topic] = list(leaves_of(channel.decode(data)))
         if not found:
             raise InputError(
                 f"{shown(self._file)}: no message in it can be decoded "
-                f"({', '.join(sorted(encodings)) or 'none'}). Read are ROS 2 messages (cdr with "
-                "ros2msg schemas) and json."
+                f"({', '.join(sorted({*encodings.values()})) or 'none'}). Read are ROS 2 messages "
+                "(cdr with ros2msg schemas) and json."
             )
         return found
 
-    def _blocks(self) -> Iterator[tuple[_Channels, Block]]:
-        """Yield all messages, in the file's order, with their channels and what decodes them."""
+    def _blocks(self) -> Iterator[tuple[dict[int, _McapChannel], Block]]:
+        """Yield all messages, in the file's order, with their channels by number."""
         schemas: dict[int, Any] = {}
-        channels: _Channels = {}
+        channels: dict[int, _McapChannel] = {}
         for record in read_records(self._budget):
             kind = type(record).__name__
             if kind == "Block":
@@ -450,78 +445,64 @@ class McapSource(FormatSource):
             elif kind == "Schema":
                 schemas[record.id] = record
             elif kind == "Channel" and record.id not in channels:
-                channels[record.id] = record, decoder_of(record, schemas.get(record.schema_id))
+                channels[record.id] = _channel_of(record, schemas.get(record.schema_id))
 
-    def _decode(self, wanted: dict[str, _Fields]) -> bool:
-        """Put columns aside; return False if one of them, all numbers so far, has a text."""
+    def _decode(self, wanted: dict[str, _Fields]) -> None:
+        """Put columns of some topics aside."""
         self._spool.clear()
-        self._rows, self._numbers = dict.fromkeys(wanted, 0), set()
-        coming = {topic: _Rows(fields) for topic, fields in wanted.items()}
+        self._kept, self._numbers, self._texts = {}, set(), set()
+        self._rows = dict.fromkeys(wanted, 0)
         with reading_with(self._file, "mcap"):
             for channels, block in self._blocks():
-                by_topic: dict[str, list[int]] = defaultdict(list)
-                for number in np.unique(block.heads[:, 0]).tolist():
-                    by_topic[channels[number][0].topic].append(number)
-                for topic in coming.keys() & by_topic.keys():
-                    some = block.of(by_topic[topic])
-                    coming[topic] = self._take(topic, coming[topic], some, channels)
-                    if self._numbers & self._texts:
-                        return False
-            for topic, rows in coming.items():
-                self._put_aside(topic, rows)
-        return not self._numbers & self._texts
+                for topic, fields in wanted.items():
+                    mine = block.of([n for n, one in channels.items() if one.topic == topic])
+                    if len(mine):
+                        self._put_aside(topic, self._columns(fields, mine, channels))
+            for topic, fields in wanted.items():
+                if not self._rows[topic]:
+                    self._put_aside(topic, dict.fromkeys([OWN_TIME, *fields], np.zeros(0)))
+        self._kept = wanted
 
-    def _take(self, topic: str, rows: _Rows, block: Block, channels: _Channels) -> _Rows:
-        """Decode messages of a topic, many at once where they are alike; return what waits."""
-        channel, decode = channels[int(block.heads[0, 0])]
-        if channel.message_encoding == "cdr" and decode is not None:
-            found = self._alike.read(decode, topic, [*rows.fields.values()], block)
-            if found is not None and not self._texts.intersection(rows.fields):
-                rows = self._put_aside(topic, rows)
-                self._numbers.update(rows.fields)
-                columns = zip([OWN_TIME, *rows.fields], found, strict=True)
-                self._write(topic, pl.DataFrame(dict(columns)))
-                return rows
+    def _columns(
+        self, fields: _Fields, block: Block, channels: dict[int, _McapChannel]
+    ) -> dict[str, Any]:
+        """Return the times and columns of messages of one topic."""
+        numbers = np.unique(block.heads[:, 0]).tolist()
+        ros = channels[numbers[0]].ros
+        if len(numbers) == 1 and ros is not None:
+            found = ros.read([*fields.values()], block)
+            if found is not None:
+                self._numbers.update(fields)
+                return dict(zip([OWN_TIME, *fields], found, strict=True))
+        times_s, rows = [], []
         for number, data, published_ns in block.one_by_one():
-            channel, decode = channels[number]
-            if decode is None:
+            channel = channels[number]
+            if channel.decode is None:
                 raise InputError(
-                    f"{shown(self._file)}: topic {topic!r} has a channel that nothing decodes "
-                    f"({channel.message_encoding!r}) beside one that is read. Record it in one "
+                    f"{shown(self._file)}: topic {channel.topic!r} has a channel that nothing "
+                    f"decodes ({channel.encoding!r}) beside one that is read. Record it in one "
                     "encoding, or map another topic."
                 )
-            message = decode(data)
-            rows.times_s.append(stamp_s(message, published_ns))
-            rows.values.append([field_of(message, name) for name in rows.fields.values()])
-            if len(rows.times_s) >= PIECE_ROWS:
-                rows = self._put_aside(topic, rows)
-        return rows
-
-    def _put_aside(self, topic: str, rows: _Rows) -> _Rows:
-        """Put rows aside; return room for more."""
-        if not rows.times_s and self._rows[topic]:
-            return rows
-        frame = {OWN_TIME: pl.Series(rows.times_s, dtype=pl.Float64)}
-        columns = zip(*rows.values, strict=True) if rows.values else [()] * len(rows.fields)
-        for column, values in zip(rows.fields, columns, strict=True):
-            frame[column] = self._column(column, values)
-        self._write(topic, pl.DataFrame(frame))
-        return _Rows(rows.fields)
-
-    def _write(self, topic: str, rows: pl.DataFrame) -> None:
-        content = io.BytesIO()
-        rows.write_ipc_stream(content)
-        self._spool.add(topic, content.getvalue())
-        self._rows[topic] += len(rows)
+            message = channel.decode(data)
+            times_s.append(stamp_s(message, published_ns))
+            rows.append([field_of(message, path) for path in fields.values()])
+        columns = zip(fields, zip(*rows, strict=True), strict=True)
+        return {OWN_TIME: times_s} | {name: self._column(name, of) for name, of in columns}
 
     def _column(self, column: str, values: Sequence[Any]) -> pl.Series:
         """Return some values of a column: all of it are numbers, or texts."""
         some = [value for value in values if value is not None]
-        if column not in self._texts and all(isinstance(value, int | float) for value in some):
+        if all(isinstance(value, int | float) for value in some):
             self._numbers |= {column} if some else set()
             return pl.Series(values, dtype=pl.Float64, strict=False)
         self._texts.add(column)
         return pl.Series([None if v is None else str(v) for v in values], dtype=pl.String)
+
+    def _put_aside(self, topic: str, columns: dict[str, Any]) -> None:
+        rows, content = pl.DataFrame(columns), io.BytesIO()
+        rows.write_ipc_stream(content)
+        self._spool.add(topic, content.getvalue())
+        self._rows[topic] += len(rows)
 
 
 @contextmanager

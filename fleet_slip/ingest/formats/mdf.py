@@ -126,7 +126,7 @@ def compute_formula(formula: str, raw: Array) -> Array:
 def _value_of(node: ast.expr, raw: Array) -> Any:
     """Return the value of a part: numbers, the raw value `X` or `X1`, operations, functions."""
     match node:
-        case ast.Constant(value=number) if type(number) in {int, float}:
+        case ast.Constant(value=int() | float() as number) if type(number) is not bool:
             return np.float64(number)
         case ast.Name(id="x" | "X" | "x1" | "X1"):
             return raw
