@@ -32,7 +32,7 @@ import pyarrow.parquet as pq
 from deltalake import DeltaTable
 
 # Whatever a command imports late is here before the fork.
-import fleet_slip.ingest.job
+import fleet_slip.ingest.load
 import fleet_slip.operations.repair
 import fleet_slip.simulation.job  # noqa: F401
 from benchmarks.crash_commands import COMMANDS, Command, prepare_inputs

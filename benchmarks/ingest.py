@@ -58,7 +58,7 @@ course = { north = "north", east = "east", unit = "m/s", antenna_x_m = 0.5, ante
 """
 
 _INGEST = """
-from fleet_slip.ingest.job import ingest_files
+from fleet_slip.ingest.load import ingest_files
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from fleet_slip.grams.check import CheckReport
     from fleet_slip.grams.job import GramReport
     from fleet_slip.grams.on_board import CountedReport
-    from fleet_slip.ingest.job import IngestReport
-    from fleet_slip.ingest.load import Replace
+    from fleet_slip.ingest.load import IngestReport
     from fleet_slip.ingest.log_files import Log
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.ingest.preview import Preview
+    from fleet_slip.ingest.recordings import Replace
     from fleet_slip.operations.migration import MigrationReport
     from fleet_slip.simulation.campaign import Campaign
     from fleet_slip.simulation.job import SimulationReport
@@ -98,8 +98,8 @@ class LogsAndGrams(Rooted):
         `InputError`, when all others are in, for files that cannot be used, or `RepeatedError`
         where these are all in already; `StorageError` and `ClusterError`.
         """
-        from fleet_slip.ingest.job import ingest_files, joined
-        from fleet_slip.ingest.load import KnownFiles
+        from fleet_slip.ingest.load import ingest_files, joined
+        from fleet_slip.ingest.recordings import KnownFiles
         from fleet_slip.operations.rewriting import take_out
 
         plan, logs, folders = _chosen_logs(files, mapping, as_one=as_one)

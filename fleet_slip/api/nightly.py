@@ -26,7 +26,7 @@ from fleet_slip.warehouse.tables import connect_tables, gram_snapshots
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
-    from fleet_slip.ingest.job import IngestReport
+    from fleet_slip.ingest.load import IngestReport
     from fleet_slip.operations.monitor import Chart
     from fleet_slip.operations.quality import SensorFault
 

@@ -235,9 +235,9 @@ def find_reversed_or_swapped(
     loadings = np.linalg.eigh(correlations)[1][:, :, -1]
     signs = np.sign(loadings.sum(axis=1))
     axles = loadings[:, [names.index(name) for name in AXLES if name in names]]
-    agree = (axles > _CLEAR).all(axis=1) | (axles < -_CLEAR).all(axis=1)
-    if axles.shape[1] == 2 and len(names) <= 4:
-        signs = np.where(agree, np.sign(axles[:, 0]), signs)
+    agree = np.abs(np.where(np.abs(axles) > _CLEAR, np.sign(axles), 0).sum(axis=1)) == 2
+    if len(names) <= 4:
+        signs = np.where(agree, np.sign(axles.sum(axis=1)), signs)
     loadings *= np.where(signs == 0, 1, signs)[:, None]
     found: dict[int, list[Fault]] = {}
     for drive, i in np.argwhere(loadings < -_CLEAR).tolist():
@@ -250,7 +250,7 @@ def find_reversed_or_swapped(
             fault = Fault("reversed", signals, figure, "Write negate = true.")
         else:
             remedy = "Swap their columns."
-            if axles.shape[1] == 2 and agree[drive]:
+            if agree[drive]:
                 remedy += " If all others are positive to the right (SAE J670), negate these."
             fault = Fault("swapped", signals, figure, remedy)
         found.setdefault(drive, []).append(fault)

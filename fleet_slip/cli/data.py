@@ -28,7 +28,7 @@ from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
     from fleet_slip.ingest.draft import Draft
-    from fleet_slip.ingest.job import IngestReport
+    from fleet_slip.ingest.load import IngestReport
     from fleet_slip.ingest.preview import Preview
 
 

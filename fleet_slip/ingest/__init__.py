@@ -10,8 +10,8 @@ The way of a row, in the order of its stations:
    `resampling`, and to counts.
 5. `stream` goes through 2 to 4 for one log: it yields ended drives and refused rows, and refuses a
    log of which nothing is usable. `suspicion` says what looks wrong in what came out.
-6. `load` leaves out what was forgotten or is in the logs already, writes data files of a batch of
-   logs, and commits them; `job` goes through all batches.
+6. `load` goes through batches of logs: it leaves out what was forgotten or is in the logs already,
+   as `recordings` says, writes data files, and commits them.
 
 A mapping (`mapping`, of `columns`) says which column is which signal.
 """

@@ -228,8 +228,8 @@ def _turned_round(guesses: dict[str, Guess], figure: str) -> dict[str, Guess]:
     if not course.component:
         return {COURSE: course.because(figure, clockwise_from_north=False)}
     return {
-        COURSE: replace(speed.because(figure), signal=COURSE, component="north"),
-        SPEED: replace(course.because(figure), signal=SPEED, component="east"),
+        COURSE: replace(speed.because(figure, component="north"), signal=COURSE),
+        SPEED: replace(course.because(figure, component="east"), signal=SPEED),
     }
 
 

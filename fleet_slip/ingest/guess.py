@@ -24,7 +24,7 @@ from fleet_slip.ingest.suspicion import (
     ROAD_WHEELS,
     TURNING,
     WHEELS,
-    Relation,
+    SignalRelation,
     relations,
     speed_mps,
 )
@@ -469,7 +469,7 @@ def choose_units(guesses: dict[str, Guess], drive: Mapping[str, FloatArray]) -> 
     return found
 
 
-def find_relations(drive: Mapping[str, FloatArray]) -> list[Relation]:
+def find_relations(drive: Mapping[str, FloatArray]) -> list[SignalRelation]:
     """Return how the signals of a drive go with one another, where they do."""
     speed = speed_mps(drive)
     alike = {*WHEELS, _speed_source(drive)}  # which have the unit of the speed itself
@@ -510,7 +510,7 @@ def _cost(
     some: tuple[Keys, ...],
     groups: list[list[str]],
     guesses: dict[str, Guess],
-    related: list[Relation],
+    related: list[SignalRelation],
     by: str,
 ) -> float:
     """Return how little a car moves so with some units, one for each group of signals."""

@@ -73,7 +73,7 @@ def preview_log(log: Log, mapping: Mapping) -> Preview:
                 found = pc.min_max(counts).as_py()
                 ends[name] += [] if found["min"] is None else [found["min"], found["max"]]
         of_rows = stream.suspicions()  # which may look into the file again
-    counts, signals = stream.counts(), signals_of(longest) if longest is not None else {}
+    counts, signals = stream.counts, signals_of(longest) if longest is not None else {}
     ranges = []
     for name, some in ends.items():
         scale = float(catalogue()[name].scale)

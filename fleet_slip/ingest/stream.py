@@ -2,9 +2,9 @@
 
 import os
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -55,7 +55,7 @@ MAX_TICKS = 40_000_000
 MOST_TICKS_A_ROW = 1000
 
 
-@dataclass(frozen=True)
+@dataclass
 class IngestCounts:
     """What became of a file's rows: those read are left out, kept or quarantined.
 
@@ -65,94 +65,13 @@ class IngestCounts:
         ticks: rows of the result; equal to `rows_kept` where nothing was resampled.
     """
 
-    rows_read: int
-    rows_left_out: int
-    rows_kept: int
-    quarantined: dict[str, int]
-    drives: int
-    drives_resampled: int
-    ticks: int
-
-    def without(self, drives: int, ticks: int) -> "IngestCounts":
-        """Return the counts where some drives were left out, and so many ticks are left."""
-        return replace(self, drives=self.drives - drives, ticks=ticks)
-
-
-class Totals:
-    """What became of a file's rows so far.
-
-    Attributes:
-        refused: rejected rows by signal and reason, where a signal is what is wrong.
-        samples: values of each signal in the file's rows; `values` are those on ticks.
-    """
-
-    def __init__(self) -> None:
-        """Begin at nothing."""
-        self.rows_kept = self.drives = self.drives_resampled = self.ticks = 0
-        self.quarantined, self.samples, self.values = Counter[str](), Counter[str](), Counter[str]()
-        self.refused = Counter[tuple[str, str]]()
-        self._first_refused: dict[str, Any] | None = None
-
-    def add(self, rows: DriveRows, drive: MeasuredDrive) -> None:
-        """Count a drive that was made of rows."""
-        self.rows_kept += rows.height
-        self.drives += 1
-        self.drives_resampled += drive.method != "snap"
-        self.ticks += drive.ticks.size
-        for name, counts in drive.counts.items():
-            self.samples[name] += rows.number_of(name)
-            self.values[name] += len(counts) - counts.null_count
-
-    def add_refused(self, refused: pl.DataFrame, signals: Collection[str]) -> None:
-        """Count refused rows, by reason and, where that is one of the signals, by what is wrong."""
-        if refused.height:
-            self.quarantined.update(refused["reason"])
-            of_signals = refused.filter(pl.col("signal").is_in(list(signals)))
-            self.refused.update(zip(of_signals["signal"], of_signals["reason"], strict=True))
-            first = refused.row(refused["row"].arg_min() or 0, named=True)
-            self._first_refused = min(self._first_refused or first, first, key=lambda r: r["row"])
-
-    def require_sane_drives(self, file: Path, mapping: Mapping) -> None:
-        """Raise `InputError` where drives are too many or too long for so few rows."""
-        if self.drives > MAX_DRIVES and self.rows_kept < SHORT_ROWS * self.drives:
-            raise InputError(
-                f"{shown(file)}: it falls into more than {MAX_DRIVES:,} drives, of "
-                f"{self.rows_kept / self.drives:.0f} rows on average. Check time, split_gap_s "
-                f"and the drive's column in the mapping {mapping.name!r}."
-            )
-        if self.ticks > MAX_TICKS and self.ticks > MOST_TICKS_A_ROW * self.rows_kept:
-            raise InputError(
-                f"{shown(file)}: {self.rows_kept:,} rows last {self.ticks:,} ticks of "
-                "100 Hz. Check the unit of time and split_gap_s in the mapping "
-                f"{mapping.name!r}."
-            )
-
-    def require_usable(self, file: Path, mapping: Mapping) -> None:
-        """Raise `InputError` where no row, no tick, or no value of a signal came of all rows."""
-        if not self.rows_kept and self._first_refused is not None:
-            reasons = ", ".join(f"{n:,} {reason}" for reason, n in self.quarantined.most_common())
-            first = self._first_refused
-            example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
-            raise InputError(
-                f"{shown(file)}: none of its "
-                f"{number_of(self.quarantined.total(), 'row')} is usable ({reasons}; first: "
-                f"{example}). Check columns, units and time in the mapping {mapping.name!r}."
-            )
-        if not self.ticks:
-            raise InputError(
-                f"{shown(file)}: no row is on a tick of 100 Hz, and longest_gap_s = "
-                f"{mapping.time.longest_gap_s:g} forbids to interpolate. Raise it in the "
-                f"mapping {mapping.name!r} if the signals change slowly enough."
-            )
-        for signal, source in mapping.signals.items():
-            if self.samples[signal] and not self.values[signal]:
-                raise InputError(
-                    f"{shown(file)}: {signal} has "
-                    f"{number_of(self.samples[signal], 'value')} in {source.column!r}, and none "
-                    "is on a tick of 100 Hz: they are further apart than longest_gap_s. Give the "
-                    f"signal in the mapping {mapping.name!r} a longest_gap_s of its own, or "
-                    "interpolate = false."
-                )
+    rows_read: int = 0
+    rows_left_out: int = 0
+    rows_kept: int = 0
+    quarantined: dict[str, int] = field(default_factory=dict)
+    drives: int = 0
+    drives_resampled: int = 0
+    ticks: int = 0
 
 
 RATE_ROWS, MOST_RATE_ROWS = 2**17, 2**21
@@ -186,7 +105,10 @@ class MeasuredStream:
         self.file, self.mapping, self.digest, self.content = file, mapping, digest, content
         self.prefix = f"{mapping.name}-{digest[:12]}"
         self.checker, self._meter = RowChecker(file, mapping, meter), meter
-        self.totals = Totals()
+        self.counts = IngestCounts()
+        self._refused = Counter[tuple[str, str]]()
+        self._first_refused: dict[str, Any] | None = None
+        self._samples, self._values = Counter[str](), Counter[str]()
         self._open = OpenDrives()
         self._stretches: Counter[int] = Counter()
         self._trips = Trips()
@@ -206,7 +128,8 @@ class MeasuredStream:
             no_more = CheckedBlock(block.rows.clear(), no_rows(), block.read)
             yield self._piece(cutter, no_more, intervals_s, last=True)
         self._meter.end()
-        self.totals.require_usable(self.file, self.mapping)
+        self.counts.quarantined = dict(sorted(self.counts.quarantined.items()))
+        self._require_usable()
 
     def _usual_intervals(
         self, blocks: Iterator[CheckedBlock]
@@ -236,6 +159,8 @@ class MeasuredStream:
         *,
         last: bool = False,
     ) -> Piece:
+        counts = self.counts
+        counts.rows_read, counts.rows_left_out = self.checker.rows, self.checker.left_out
         rows, misplaced = cutter.cut(block.rows, last=last)
         refused = [block.refused, misplaced]
         self._open.add(rows)
@@ -251,8 +176,19 @@ class MeasuredStream:
                 "and none of them ends. Sort the file by drive and time."
             )
         bad = join_refused(refused)
-        self.totals.add_refused(bad, self.mapping.signals)
+        self._count_refused(bad)
         return Piece(drives, bad)
+
+    def _count_refused(self, refused: pl.DataFrame) -> None:
+        """Count refused rows, by reason and, where that is one of the signals, by what is wrong."""
+        if not refused.height:
+            return
+        for reason, number in refused["reason"].value_counts().iter_rows():
+            self.counts.quarantined[reason] = self.counts.quarantined.get(reason, 0) + number
+        of_signals = refused.filter(pl.col("signal").is_in(list(self.mapping.signals)))
+        self._refused.update(zip(of_signals["signal"], of_signals["reason"], strict=True))
+        first = refused.row(refused["row"].arg_min() or 0, named=True)
+        self._first_refused = min(self._first_refused or first, first, key=lambda row: row["row"])
 
     def _drive(self, rows: DriveRows, intervals_s: dict[int, float]) -> MeasuredDrive:
         group = rows.group
@@ -272,10 +208,57 @@ class MeasuredStream:
             drive = to_ticks(rows, self.mapping, intervals_s, name, known)
         except InputError as error:
             raise InputError(f"{shown(self.file)}: {error}") from None
-        self.totals.add(rows, drive)
+        self.counts.rows_kept += rows.height
+        self.counts.drives += 1
+        self.counts.drives_resampled += drive.method != "snap"
+        self.counts.ticks += drive.ticks.size
+        for signal, values in drive.counts.items():
+            self._samples[signal] += rows.number_of(signal)
+            self._values[signal] += len(values) - values.null_count
         self._cars.add(rows, drive)
-        self.totals.require_sane_drives(self.file, self.mapping)
+        self._require_sane_drives()
         return drive
+
+    def _require_sane_drives(self) -> None:
+        """Raise `InputError` where drives are too many or too long for so few rows."""
+        counts, name = self.counts, self.mapping.name
+        if counts.drives > MAX_DRIVES and counts.rows_kept < SHORT_ROWS * counts.drives:
+            raise InputError(
+                f"{shown(self.file)}: it falls into more than {MAX_DRIVES:,} drives, of "
+                f"{counts.rows_kept / counts.drives:.0f} rows on average. Check time, split_gap_s "
+                f"and the drive's column in the mapping {name!r}."
+            )
+        if counts.ticks > MAX_TICKS and counts.ticks > MOST_TICKS_A_ROW * counts.rows_kept:
+            raise InputError(
+                f"{shown(self.file)}: {counts.rows_kept:,} rows last {counts.ticks:,} ticks of "
+                f"100 Hz. Check the unit of time and split_gap_s in the mapping {name!r}."
+            )
+
+    def _require_usable(self) -> None:
+        """Raise `InputError` where no row, no tick, or no value of a signal came of all rows."""
+        counts, file, name = self.counts, shown(self.file), self.mapping.name
+        if not counts.rows_kept and (first := self._first_refused):
+            several = Counter(counts.quarantined)
+            reasons = ", ".join(f"{n:,} {reason}" for reason, n in several.most_common())
+            example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
+            raise InputError(
+                f"{file}: none of its {number_of(several.total(), 'row')} is usable ({reasons}; "
+                f"first: {example}). Check columns, units and time in the mapping {name!r}."
+            )
+        if not counts.ticks:
+            raise InputError(
+                f"{file}: no row is on a tick of 100 Hz, and longest_gap_s = "
+                f"{self.mapping.time.longest_gap_s:g} forbids to interpolate. Raise it in the "
+                f"mapping {name!r} if the signals change slowly enough."
+            )
+        for signal, source in self.mapping.signals.items():
+            if self._samples[signal] and not self._values[signal]:
+                raise InputError(
+                    f"{file}: {signal} has {number_of(self._samples[signal], 'value')} in "
+                    f"{source.column!r}, and none is on a tick of 100 Hz: they are further apart "
+                    f"than longest_gap_s. Give the signal in the mapping {name!r} a longest_gap_s "
+                    "of its own, or interpolate = false."
+                )
 
     def quarantine_table(self, refused: Sequence[pl.DataFrame]) -> pa.Table:
         """Return refused rows as those of the table `quarantine`, in the file's order."""
@@ -301,24 +284,11 @@ class MeasuredStream:
         )
         return frame.to_arrow().cast(QUARANTINE_SCHEMA)
 
-    def counts(self) -> IngestCounts:
-        """Return what became of the rows, once all pieces were taken."""
-        found = self.totals
-        return IngestCounts(
-            rows_read=self.checker.rows,
-            rows_left_out=self.checker.left_out,
-            rows_kept=found.rows_kept,
-            quarantined=dict(sorted(found.quarantined.items())),
-            drives=found.drives,
-            drives_resampled=found.drives_resampled,
-            ticks=found.ticks,
-        )
-
     def suspicions(self) -> tuple[Fault, ...]:
         """Return what looks wrong in the file as a whole, once all pieces were taken."""
-        totals, time = self.totals, self.mapping.time
-        found = list(find_refusals(totals.refused, self.checker.rows, totals.quarantined))
-        found += [*self._cars.suspicions(), *unmapped_cars(self.file, self.mapping, totals.drives)]
+        counts, time = self.counts, self.mapping.time
+        found = list(find_refusals(self._refused, counts.rows_read, counts.quarantined))
+        found += [*self._cars.suspicions(), *unmapped_cars(self.file, self.mapping, counts.drives)]
         return (*found, *assumed_rate(time.rate_hz if time.assumed else None))
 
 

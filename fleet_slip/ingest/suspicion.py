@@ -369,7 +369,7 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Fault]:
 
 
 @dataclass(frozen=True)
-class Relation:
+class SignalRelation:
     """A quantity of a drive that should be another one.
 
     Attributes:
@@ -386,14 +386,14 @@ class Relation:
     correlation: float
 
 
-def relations(signals: Signals, speed: FloatArray) -> Iterator[Relation]:
+def relations(signals: Signals, speed: FloatArray) -> Iterator[SignalRelation]:
     """Yield what the signals of a moving car have to do with one another."""
     rows = moving(speed)
 
     def relate_to(
         expected: FloatArray, values: FloatArray, powers: dict[str, int], of_speed: int, name: str
-    ) -> Relation:
-        return Relation(powers, of_speed, name, *slope_of(values, expected, rows))
+    ) -> SignalRelation:
+        return SignalRelation(powers, of_speed, name, *slope_of(values, expected, rows))
 
     for name in (*WHEELS, "vx", "vehicle_speed", SPEED):
         if name in signals:
@@ -401,7 +401,7 @@ def relations(signals: Signals, speed: FloatArray) -> Iterator[Relation]:
             both = rows & np.isfinite(own) & np.isfinite(speed)
             if both.sum() >= FEWEST_TICKS:
                 ratio = float(np.median(own[both] / speed[both]))
-                yield Relation({name: 1}, -1, "the speed of the wheels", ratio, 1.0)
+                yield SignalRelation({name: 1}, -1, "the speed of the wheels", ratio, 1.0)
     yaw_rate, ay = signals.get("yaw_rate"), signals.get("ay")
     if yaw_rate is not None and {"wheel_rl", "wheel_rr"} <= set(signals):
         turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M

@@ -21,7 +21,7 @@ from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.grams.receiver_delay import changed_delays
-from fleet_slip.ingest.load import Origin
+from fleet_slip.ingest.recordings import Origin
 from fleet_slip.operations.labels import find_odd_days, find_repeated, find_reversed_labels
 from fleet_slip.operations.peers import QualityThresholds, settle, thresholds
 from fleet_slip.regression.gram import GramTable

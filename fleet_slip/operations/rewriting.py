@@ -23,7 +23,7 @@ from fleet_slip.errors import ConflictError, FleetSlipError
 from fleet_slip.grams.gram_files import read_rows, write_rows
 from fleet_slip.grams.gram_rows import is_received
 from fleet_slip.grams.job import land_ahead, reconcile
-from fleet_slip.ingest.load import MEASURED, Fingerprints, Origin, TableName, is_from
+from fleet_slip.ingest.recordings import MEASURED, Fingerprints, Origin, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of
 from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, Unit, retry_conflicts
 from fleet_slip.warehouse.forgotten import Forgettable

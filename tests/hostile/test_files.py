@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.job import ingest_files
+from fleet_slip.ingest.load import ingest_files
 from fleet_slip.ingest.log_files import StrayLink, find_logs
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file, read_measured

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.ingest.drives import MeasuredDrive
-from fleet_slip.ingest.load import keep_drives, keep_refused
+from fleet_slip.ingest.recordings import keep_drives, keep_refused
 from fleet_slip.ingest.stream import open_measured
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.forgotten import Audit, Forgettable

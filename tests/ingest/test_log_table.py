@@ -18,7 +18,7 @@ INGEST = """
 import sys
 from pathlib import Path
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.ingest.job import ingest_files
+from fleet_slip.ingest.load import ingest_files
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.warehouse.tables import Warehouse
 root, log, mapping = sys.argv[1:]

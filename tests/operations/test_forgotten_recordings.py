@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.ingest import job, load
+from fleet_slip.ingest import load
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.operations.forget import forget
 from fleet_slip.storage.local import LocalFolder
@@ -143,9 +143,9 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
         forget(warehouse, Forgettable("drive", name), now=True)
         return land(*written)
 
-    monkeypatch.setattr(job, "commit_batch", overtaken)
+    monkeypatch.setattr(load, "commit_batch", overtaken)
     again, other = write(tmp_path, recording()), a_mapping(name="other")
-    (report,) = job.ingest_files(warehouse, [again], other, replace="all")
+    (report,) = load.ingest_files(warehouse, [again], other, replace="all")
     assert report.drives_forgotten == 1
     assert is_empty(warehouse)
 

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_slip.grams.job import update_grams
-from fleet_slip.ingest.job import ingest_files
+from fleet_slip.ingest.load import ingest_files
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.migration import migrate
 from fleet_slip.operations.rewriting import compact

@@ -10,8 +10,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.job import IngestReport, ingest_files
-from fleet_slip.ingest.load import log_table
+from fleet_slip.ingest.load import IngestReport, ingest_files, log_table
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.warehouse.tables import Warehouse
@@ -52,7 +51,7 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
     return MeasuredLog(
         log_table(drives, mapping),
         stream.quarantine_table([piece.refused for piece in pieces]),
-        stream.counts(),
+        stream.counts,
         stream.digest,
     )
 

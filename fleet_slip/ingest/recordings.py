@@ -1,0 +1,379 @@
+"""Recognises what is in the logs already, and what was forgotten: neither is loaded again."""
+
+import json
+import os
+import re
+from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Mapping as Named
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from hashlib import sha256
+from pathlib import Path
+from typing import Literal, NamedTuple, TypeAlias
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from fleet_slip.base import number_of, shown
+from fleet_slip.caches import cache_folder
+from fleet_slip.errors import RepeatedError
+from fleet_slip.ingest.drives import MeasuredDrive
+from fleet_slip.ingest.log_files import Log, StoredParts
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.storage.folder import StoredFile
+from fleet_slip.storage.table import WITHDRAWN, Change, Snapshot, Table, Unit, retry_conflicts
+from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
+from fleet_slip.warehouse.tables import Warehouse, connect_tables
+
+TableName: TypeAlias = Literal["quarantine", "logs"]
+Replace: TypeAlias = Literal["no", "corrected", "all"]
+"""Which recordings of the logs give way to the same ones: `corrected` are those of the same file
+through a mapping of the same name that has changed since."""
+
+
+def tables_of(warehouse: Warehouse) -> dict[TableName, Table]:
+    """Return the tables that files go to, in the order in which they are committed."""
+    return {"quarantine": warehouse.quarantine, "logs": warehouse.logs}
+
+
+# What was forgotten does not come back.
+
+
+def keep_drives(drives: Sequence[MeasuredDrive], audit: Audit) -> list[MeasuredDrive]:
+    """Return the drives that were not forgotten under any name, nor their cars."""
+    barred = audit.barred(set(map(car_of, drives)), {drive.drive_id for drive in drives})
+    counts = audit.barred_counts()
+    return [
+        drive
+        for drive in drives
+        if drive.drive_id not in barred.drives
+        and car_of(drive) not in barred.vehicles
+        and not (counts and drive.counts_digest in counts)
+    ]
+
+
+def keep_refused(refused: pa.Table, audit: Audit, left_out: Collection[str] = ()) -> pa.Table:
+    """Return the refused rows of what was not forgotten; `left_out` are drives of their file.
+
+    A row goes with its car, or with its drive, whose name begins that of each stretch of it.
+    """
+    vehicles, named = names_in(refused, "vehicle_id"), names_in(refused, "drive_id")
+    barred = audit.barred(vehicles, named)
+    drives = barred.drives | set(left_out)
+    whole = {name for name in named if any(drive.startswith(f"{name}-") for drive in drives)}
+    for column, unwanted in (("vehicle_id", barred.vehicles), ("drive_id", drives | whole)):
+        if unwanted:
+            names = pa.array(sorted(unwanted), pa.string())
+            mine = pc.is_in(refused[column].cast(pa.string()), names)
+            refused = refused.filter(pc.invert(pc.fill_null(mine, False)))
+    return refused
+
+
+def car_of(drive: MeasuredDrive) -> str:
+    """Return the name of the car of a drive."""
+    return str(drive.metadata["vehicle_id"])
+
+
+def names_in(rows: pa.Table, column: str) -> frozenset[str]:
+    """Return the names that stand in a column of rows."""
+    return frozenset(rows[column].unique().drop_null().cast(pa.string()).to_pylist())
+
+
+# Fingerprints recognise a recording: a digest of a file's bytes, or of a drive's counts. Each is a
+# unit of work in the commit of the rows, so that two processes that load one drive are in conflict.
+# Its number says where it is from, and no name of a car follows from it:
+#
+#     40 bits of the file's digest | 3 bits: 0 of a file | 20 bits of the drive's name
+
+FILES, PREFIX = "ingest/", "same/"
+DIGEST_CHARACTERS = 10
+_DRIVE_BITS, _KIND_BITS = 20, 3
+
+MEASURED = rf"-([0-9a-f]{{{DIGEST_CHARACTERS}}})[0-9a-f]{{2}}((-[0-9]+){{1,2}})$"
+"""What the name of a measured drive ends in: its file's digest, and which drive of it."""
+
+_MEASURED = re.compile(MEASURED)
+
+
+class Origin(NamedTuple):
+    """Where a recording is from: the first characters of a file's digest, and a drive's hash or 0.
+
+    0 stands for the whole file.
+    """
+
+    digest: str
+    drive: int = 0
+
+    @classmethod
+    def of(cls, digest: str) -> "Origin":
+        """Return the origin of a file with this digest."""
+        return cls(digest[:DIGEST_CHARACTERS])
+
+    @classmethod
+    def of_drive(cls, drive_id: str) -> "Origin | None":
+        """Return the origin of a drive; None if its name is not that of a measured one."""
+        if (found := _MEASURED.search(drive_id)) is None:
+            return None
+        hashed = int(sha256(found[2].encode()).hexdigest(), 16)
+        return cls(found[1], 1 + hashed % (2**_DRIVE_BITS - 1))
+
+    @classmethod
+    def of_number(cls, number: int) -> "Origin":
+        """Return the origin that a fingerprint's number says."""
+        digest = number >> (_KIND_BITS + _DRIVE_BITS)
+        return cls(f"{digest:0{DIGEST_CHARACTERS}x}", number % 2**_DRIVE_BITS)
+
+    @property
+    def number(self) -> int:
+        """Number of a fingerprint from here."""
+        kind = int(self.drive != 0) << _DRIVE_BITS
+        return int(self.digest, 16) << (_KIND_BITS + _DRIVE_BITS) | kind | self.drive
+
+    @property
+    def file(self) -> "Origin":
+        """The file that it is, or is in."""
+        return Origin(self.digest)
+
+
+def is_from(drive_id: str, origins: Collection[Origin]) -> bool:
+    """Whether a drive is one of some, or came in a file of theirs."""
+    origin = Origin.of_drive(drive_id)
+    return origin is not None and (origin in origins or origin.file in origins)
+
+
+class Fingerprints:
+    """The fingerprints of what is in the logs."""
+
+    def __init__(self, units: Named[str, int]) -> None:
+        """Take the units of a snapshot of the logs."""
+        there = {name: number for name, number in units.items() if number != WITHDRAWN}
+        self._numbers = {name: n for name, n in there.items() if name.startswith(PREFIX)}
+        self._files = [name for name in there if name.startswith(FILES)]
+
+    def find(self, fingerprints: Iterable[str]) -> frozenset[Origin]:
+        """Return which files, and which drives of others, have the same fingerprints."""
+        numbers = map(self._numbers.get, fingerprints)
+        return frozenset(Origin.of_number(number) for number in numbers if number is not None)
+
+    def withdraw(self, origins: Collection[Origin], files: Collection[Origin]) -> list[Unit]:
+        """Return what withdraws fingerprints of origins, and files themselves that are all gone."""
+        of_drives = [
+            name
+            for name, number in self._numbers.items()
+            if (origin := Origin.of_number(number)) in origins or origin.file in files
+        ]
+        of_files = [n for n in self._files if Origin.of(n.removeprefix(FILES)) in files]
+        return [Unit(name, WITHDRAWN) for name in (*of_drives, *of_files)]
+
+
+def unit_of(digest: str) -> Unit:
+    """Return the unit of work that a file's content is."""
+    return Unit(f"{FILES}{digest}", 1)
+
+
+def digest_of(digests: Sequence[str]) -> str:
+    """Return the digest of several files together."""
+    return digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
+
+
+# Which files of this machine are known: a cache, so that a folder of thousands need not be read to
+# find nothing new. Whether their content is in the logs is asked of the logs.
+
+
+@dataclass
+class KnownFiles:
+    """Which content the files of this machine had when they were ingested through a mapping.
+
+    `digests` has size, time of change (of an object, the store's version) and digest by path or
+    URL.
+    """
+
+    cache: Path
+    digests: dict[str, tuple[int, int | str, str]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, warehouse: Warehouse, mapping: Mapping) -> "KnownFiles":
+        """Return what is remembered for a data root and a mapping."""
+        about = sha256(f"{warehouse.root.uri}\n{mapping.canonical_json()}".encode()).hexdigest()
+        cache = cache_folder("ingested") / f"{about[:32]}.json"
+        with suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
+            files = json.loads(cache.read_bytes())["files"]
+            return cls(cache, {path: (int(s), t, str(d)) for path, (s, t, d) in files.items()})
+        return cls(cache)
+
+    def without_landed(self, files: Iterable[Log], warehouse: Warehouse) -> list[Log]:
+        """Return the files that are not in the logs, as far as size and time of change tell."""
+        landed = warehouse.logs.snapshot().landed_among(len(self.digests))
+
+        def is_there(file: Log) -> bool:
+            known = self.digests.get(_name_of(file))
+            return known is not None and _state_of(file) == known[:2] and landed(FILES + known[2])
+
+        return [file for file in files if not is_there(file)]
+
+    def digest_of(self, file: Log) -> str | None:
+        """Return the digest of what a path had when it was ingested, None if it never was."""
+        known = self.digests.get(_name_of(file))
+        return None if known is None else known[2]
+
+    def remember(self, file: Log, digest: str) -> None:
+        """Keep in mind that a file is in the logs."""
+        if state := _state_of(file):
+            self.digests[_name_of(file)] = (*state, digest)
+
+    def save(self) -> None:
+        """Write the cache; what cannot be written is not kept."""
+        with suppress(OSError):
+            self.cache.parent.mkdir(parents=True, exist_ok=True)
+            draft = self.cache.with_suffix(f".{os.getpid()}")
+            draft.write_text(json.dumps({"files": self.digests}))
+            draft.replace(self.cache)
+
+
+def _name_of(log: Log) -> str:
+    return os.path.abspath(log) if isinstance(log, Path) else str(log)  # noqa: PTH100 - the faster
+
+
+def _state_of(log: Log) -> tuple[int, int | str] | None:
+    """Return what changes when the content does; None if that is not known."""
+    if isinstance(log, StoredFile):
+        return log.size_bytes, log.identity
+    if isinstance(log, StoredParts):
+        return None
+    try:
+        found = log.stat()
+    except OSError:
+        return None
+    return found.st_size, found.st_mtime_ns
+
+
+# What becomes of a file whose recording is in the logs already.
+
+
+class Same(NamedTuple):
+    """Which files, and drives of others, have a file's fingerprints, whether still there or not.
+
+    And which of these give way to it, and how many drives that are.
+    """
+
+    origins: frozenset[Origin]
+    replaced: frozenset[Origin]
+    drives_replaced: int
+
+
+class SameRecordings:
+    """Looks for the recordings of a batch of files, in the logs and in the batch."""
+
+    def __init__(
+        self, warehouse: Warehouse, logs: Snapshot, mapping: str, replace: Replace
+    ) -> None:
+        """Take a snapshot of the logs, the mapping's name, and what is to give way."""
+        self._warehouse, self._logs = warehouse, logs
+        self._mapping, self._replace = mapping, replace
+        self._logs_have: Fingerprints | None = None
+        self._batch: dict[str, int] = {}
+        self._files: dict[str, Log] = {}
+
+    def find(
+        self,
+        log: Log,
+        digest: str,
+        fingerprints: Named[str, int],
+        name: str,
+        earlier: str | None,
+    ) -> Same:
+        """Return what the logs have of a file, and what gives way to it.
+
+        `name` is the file's as `source_file` has it; `earlier` is the digest of what its path had
+        before, if that is there. Raises `RepeatedError` for what does not give way to it.
+        """
+        for origin in Fingerprints(self._batch).find(fingerprints):
+            # Another one: the same bytes count once anyway.
+            raise RepeatedError(
+                f"{shown(log)}: it has the recording of {shown(self._files[origin.digest])}, "
+                "which is ingested with it. Leave one of them out."
+            )
+        if self._logs_have is None:
+            self._logs_have = Fingerprints(self._logs.units)
+        origins = self._logs_have.find(fingerprints)
+        changed = earlier is not None and earlier != digest
+        if earlier is not None and changed:
+            origins |= {Origin.of(earlier)}
+        there = _drives_of(self._warehouse, {origin.file for origin in origins})
+        replaced = _replaced(there, origins, name)
+        drives = [drive for drive in there if is_from(drive, replaced)]
+        gives_way = self._replace == "all" or (
+            self._replace == "corrected"
+            and not changed
+            and replaced <= {origin for origin in origins if not origin.drive}
+            and all(drive.startswith(f"{self._mapping}-{_digest(drive)}") for drive in drives)
+        )
+        if drives and not gives_way:
+            what = "its recording is in the logs"
+            what = "it has changed since it was ingested" if changed else what
+            source, more = shown(there[drives[0]]), number_of(len(drives), "drive")
+            such = drives[0] if len(drives) == 1 else f"{more}, {drives[0]} …"
+            raise RepeatedError(
+                f"{shown(log)}: {what}, and would count twice: {such} from {source}. To put "
+                "this in its place, give the command again with --replace; to take the old one "
+                f"out: fleet-slip ingest --undo {source}"
+            )
+        self._batch.update(fingerprints)
+        self._files[Origin.of(digest).digest] = log
+        return Same(origins, replaced if drives else frozenset(), len(drives))
+
+
+def let_return(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
+    """Withdraw a file of which no drive is left, and whose first one may come back; say if so.
+
+    Only what was forgotten by a drive's or a file's name may: what is too old stays away.
+    """
+    audit = Audit(warehouse.root)
+    if not audit.allows_drives or audit.state(Forgettable("drive", first_drive)) != ALLOWED:
+        return False
+
+    def attempt(table: Table) -> None:
+        snapshot = table.snapshot()
+        if _drives_of(warehouse, {Origin.of(digest)}):
+            return
+        if snapshot.landed(f"{FILES}{digest}") not in {None, WITHDRAWN}:
+            units = (Unit(f"{FILES}{digest}", WITHDRAWN),)
+            snapshot.commit(Change(units=units, note={"job": "undo"}))
+
+    for table in tables_of(warehouse).values():
+        retry_conflicts(partial(attempt, table))
+    return True
+
+
+def are_gone(warehouse: Warehouse, digest: str) -> bool:
+    """Whether drives were forgotten, and none is left of a file that was ingested."""
+    return bool(Audit(warehouse.root).entries()) and not _drives_of(warehouse, {Origin.of(digest)})
+
+
+def _digest(drive_id: str) -> str:
+    origin = Origin.of_drive(drive_id)
+    return origin.digest if origin else ""
+
+
+def _replaced(there: Named[str, str], origins: frozenset[Origin], name: str) -> frozenset[Origin]:
+    """Return what gives way: of a file of the same name all, else the drives that are the same."""
+    same = {drive: Origin.of_drive(drive) for drive in there if is_from(drive, origins)}
+    return frozenset(
+        origin.file if origin.file in origins or there[drive] == name else origin
+        for drive, origin in same.items()
+        if origin is not None
+    )
+
+
+def _drives_of(warehouse: Warehouse, files: Collection[Origin]) -> dict[str, str]:
+    """Return the drives that came in some files and are in the logs, and their `source_file`."""
+    if not files:
+        return {}
+    query = (
+        "SELECT drive_id, source_file FROM drives "
+        "WHERE list_contains($digests, regexp_extract(drive_id, $measured, 1)) ORDER BY ALL"
+    )
+    given = {"digests": sorted({one.digest for one in files}), "measured": MEASURED}
+    with connect_tables(warehouse, query) as database:
+        return dict(database.execute(query, given).fetchall())
