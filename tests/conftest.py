@@ -123,7 +123,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
 
 @pytest.fixture
 def run_command(tmp_path: Path) -> RunCommand:
-    """Run `fleet-slip --root <tmp_path>/data ...` in a process of its own."""
+    """Run `fleet-slip --root <tmp_path>/data ...`, see `run_on`."""
 
     def run(*arguments: str, root: Path | None = None, **options: Any) -> Finished:
         return run_on(root or tmp_path / "data", *arguments, cwd=tmp_path, **options)

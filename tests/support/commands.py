@@ -1,15 +1,22 @@
-"""The command line in processes of their own, none of which lasts for ever."""
+"""The command line, in this process or in one of its own, none of which lasts for ever."""
 
+import contextlib
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
+from unittest.mock import patch
 
+from fleet_slip.cli.main import main as fleet_slip_main
+from fleet_slip.resources import CONFIG_VARIABLE
+from fleet_slip.storage.runs import LOGGER
 from tests.support.once import require_no_failed_run
 from tests.support.prepared import server, without_test
 
@@ -58,6 +65,61 @@ def run_prepared(
         return Finished(code, _text(out), _text(err))
 
 
+def run_here(words: Sequence[str], cwd: str | Path | None = None) -> Finished:
+    """Run `fleet-slip` in this process, which is left as it was: a third of what another costs.
+
+    What is no error of ours is raised, and ends no process.
+    """
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        with _left_as_it_was(), contextlib.chdir(cwd or "."), Path(os.devnull).open() as nothing:
+            for descriptor, stream in enumerate((nothing, out, err)):
+                os.dup2(stream.fileno(), descriptor)
+            sys.argv = list(words)
+            assert sys.__stdout__ and sys.__stderr__
+            sys.stdin, sys.stdout, sys.stderr = nothing, sys.__stdout__, sys.__stderr__
+            code = 0
+            try:
+                fleet_slip_main()
+            except SystemExit as ended:
+                code = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+            sys.stdout.flush()
+            sys.stderr.flush()
+        return Finished(code, _text(out), _text(err))
+
+
+_running_here = threading.Lock()
+
+
+@contextlib.contextmanager
+def _left_as_it_was() -> Iterator[None]:
+    """Put back what a command changes of its process: streams, words, log, environment, limits."""
+    kept = [os.dup(descriptor) for descriptor in range(3)]
+    log = (LOGGER.handlers[:], LOGGER.level, LOGGER.propagate)
+    limits = resource.getrlimit(resource.RLIMIT_DATA)
+    streams: Any = {
+        "stdin": sys.stdin,
+        "stdout": sys.stdout,
+        "stderr": sys.stderr,
+        "argv": sys.argv,
+    }
+    with _running_here, patch.dict(os.environ), patch.multiple(sys, **streams):
+        try:
+            yield
+        finally:
+            for descriptor, copy in enumerate(kept):
+                os.dup2(copy, descriptor)
+                os.close(copy)
+            LOGGER.handlers[:], LOGGER.level, LOGGER.propagate = log
+            resource.setrlimit(resource.RLIMIT_DATA, limits)
+
+
+def _can_run_here(words: Sequence[str]) -> bool:
+    """Whether nothing of the process would be another's: configs are read once, streams shared."""
+    own_configs = "--config" in words or CONFIG_VARIABLE in os.environ
+    main_thread = threading.current_thread() is threading.main_thread()
+    return main_thread and not own_configs and not _running_here.locked()
+
+
 def _text(file: IO[bytes]) -> str:
     """Return what a file holds, its ends of lines read as `subprocess` reads them."""
     file.seek(0)
@@ -65,10 +127,17 @@ def _text(file: IO[bytes]) -> str:
 
 
 def run_on(root: object, *arguments: str | Path, **options: Any) -> Finished:
-    """Run `fleet-slip --root ROOT ...`, which never shows a traceback."""
+    """Run `fleet-slip --root ROOT ...`, which never shows a traceback.
+
+    In this process, unless an environment or other options of a process are given.
+    """
     words = [COMMAND, "--root", str(root), *map(str, arguments)]
-    prepared = options.keys() <= {"cwd", "env"}
-    done = run_prepared(words, **options) if prepared else run(words, **options)
+    if options.keys() <= {"cwd"} and _can_run_here(words):
+        done = run_here(words, **options)
+    elif options.keys() <= {"cwd", "env"}:
+        done = run_prepared(words, **options)
+    else:
+        done = run(words, **options)
     assert "Traceback" not in done.stderr, done.stderr
     require_no_failed_run(root)
     return done

@@ -113,6 +113,7 @@ def main(address: str) -> None:
     for module in _modules():
         importlib.import_module(module)
     conversion_factor("km/h", "m/s")  # pint reads its definitions at the first use
+    os.fsync = os.fstat  # type: ignore[assignment]  # as in tests/conftest.py
     gc.freeze()
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(address)
