@@ -2,13 +2,18 @@
 
 import json
 import os
+import shutil
 import sys
 from pathlib import Path
 
+import llvmlite
+import numba
 import pytest
 
 from fleet_slip import caches
 from tests.support.commands import Finished, run
+
+VERSIONS = f"{numba.__version__} {llvmlite.__version__}"
 
 SOURCE = """
 from fleet_slip.compiling import kernel
@@ -22,15 +27,30 @@ print(*half.stats.cache_hits.values())
 """
 
 
-def halve(folder: Path, cache: Path, **environment: str) -> Finished:
-    """Compile a function in another process, or read its code; it prints 1 if that was kept."""
-    (folder / "halving.py").write_text(SOURCE)
-    given = {**os.environ, "NUMBA_CACHE_DIR": str(cache), **environment}
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of this user, with the code of a function that stands beside it."""
+    folder = tmp_path_factory.mktemp("compiled") / "cache"
+    folder.with_name("halving.py").write_text(SOURCE)
+    halve(folder, folder)
+    return folder
+
+
+def halve(compiled: Path, cache: Path) -> Finished:
+    """Compile the function in another process, or read its code; it prints 1 if that was kept."""
     done = run(
-        [sys.executable, str(folder / "halving.py")], env=given, cwd=Path(__file__).parents[2]
+        [sys.executable, str(compiled.with_name("halving.py"))],
+        env={**os.environ, "NUMBA_CACHE_DIR": str(cache)},
+        cwd=Path(__file__).parents[2],
     )
     assert done.exit_code == 0, done.stderr
     return done
+
+
+@pytest.fixture
+def cache(compiled: Path, tmp_path: Path) -> Path:
+    """A copy of the folder, which a test may change."""
+    return shutil.copytree(compiled, tmp_path / "cache")
 
 
 def kept(cache: Path, suffix: str) -> Path:
@@ -38,34 +58,36 @@ def kept(cache: Path, suffix: str) -> Path:
     return file
 
 
-@pytest.fixture
-def cache(tmp_path: Path) -> Path:
-    """A folder of this user, with the code of a function."""
-    folder = tmp_path / "cache"
-    halve(tmp_path, folder)
-    return folder
-
-
-def test_compiled_code_is_kept_and_found(cache: Path, tmp_path: Path) -> None:
-    again = halve(tmp_path, cache)
+def test_compiled_code_is_kept_and_found(compiled: Path) -> None:
+    again = halve(compiled, compiled)
     assert (again.stdout.strip(), again.stderr) == ("1", "")
-    kept(cache, ".nbc").unlink()
-    assert halve(tmp_path, cache).stdout.strip() == ""
-    assert halve(tmp_path, cache).stdout.strip() == "1"
 
 
 @pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
 @pytest.mark.parametrize("damage", ["torn", "flipped"])
-def test_damaged_code_is_compiled_anew(
-    cache: Path, tmp_path: Path, suffix: str, damage: str
+def test_damaged_code_is_deleted(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, damage: str
 ) -> None:
     """A power cut leaves files empty or torn: numba renames them without flushing."""
     file = kept(cache, suffix)
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content if damage == "flipped" else b"")
-    assert halve(tmp_path, cache).stdout.strip() == ""
-    assert halve(tmp_path, cache).stdout.strip() == "1"
+    found_by(cache, monkeypatch)
+    assert not file.exists()
+
+
+def found_by(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path | None:
+    """Return which folder a process is given that asks for it now."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
+    monkeypatch.setattr("fleet_slip.caches.atexit.register", lambda *_: None)
+    return caches.code_folder.__wrapped__(VERSIONS)
+
+
+def test_without_a_part_code_is_compiled_anew_and_kept(compiled: Path, cache: Path) -> None:
+    kept(cache, ".nbc").unlink()
+    assert halve(compiled, cache).stdout.strip() == ""
+    assert halve(compiled, cache).stdout.strip() == "1"
 
 
 def run_if_unpickled(cache: Path, mark: Path) -> None:
@@ -77,46 +99,57 @@ def run_if_unpickled(cache: Path, mark: Path) -> None:
     (folder / caches.CHECKSUMS).write_text(sums)
 
 
-def test_code_that_others_may_have_written_is_not_read(cache: Path, tmp_path: Path) -> None:
+def test_code_that_others_may_have_written_is_not_read(
+    compiled: Path, cache: Path, tmp_path: Path
+) -> None:
     mark = tmp_path / "ran"
     run_if_unpickled(cache, mark)
-    for mode in (0o777, 0o770):
-        cache.chmod(mode)
-        done = halve(tmp_path, cache)
-        assert done.stdout.strip() == ""
-        assert f"others than this user can write {cache}" in done.stderr
-        assert "Set NUMBA_CACHE_DIR" in done.stderr
+    cache.chmod(0o770)
+    done = halve(compiled, cache)
+    assert done.stdout.strip() == ""
+    assert f"others than this user can write {cache}" in done.stderr
+    assert "Set NUMBA_CACHE_DIR" in done.stderr
     assert not mark.exists()
+
+
+def test_a_folder_is_refused_that_others_can_write_or_put_another_in_its_place(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(caches.LOGGER, "propagate", True)
+    (own,) = cache.iterdir()
+    assert found_by(cache, monkeypatch) == own
+    cache.chmod(0o1777)  # as /tmp is: nobody else can rename what is in it
+    assert found_by(cache, monkeypatch) == own
+    assert not caplog.messages
+    cache.chmod(0o777)
+    assert found_by(cache, monkeypatch) is None
+    assert f"others than this user can write {cache}" in caplog.text
     cache.chmod(0o700)
     (tmp_path / "link").symlink_to(cache)
     tmp_path.chmod(0o777)
-    assert f"can write {tmp_path}" in halve(tmp_path, tmp_path / "link").stderr
+    assert found_by(tmp_path / "link", monkeypatch) is None
+    assert f"can write {tmp_path}" in caplog.text
     tmp_path.chmod(0o700)
-    assert not mark.exists()
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
-def test_nor_is_code_in_a_folder_of_another_user(cache: Path, tmp_path: Path) -> None:
-    mark = tmp_path / "ran"
-    run_if_unpickled(cache, mark)
+def test_so_is_a_folder_of_another_user(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(caches.LOGGER, "propagate", True)
     (own,) = cache.iterdir()
     for folder in (own, cache):
         os.chown(folder, 12345, 12345)
-        assert f"can write {folder}" in halve(tmp_path, cache).stderr
+        assert found_by(cache, monkeypatch) is None
+        assert f"can write {folder}" in caplog.text
         os.chown(folder, 0, 0)
-    assert not mark.exists()
 
 
-def test_beside_others_a_folder_of_this_user_is_safe_where_nobody_else_can_rename_it(
-    cache: Path, tmp_path: Path
+def test_where_nothing_can_be_kept_a_kernel_compiles_and_says_so_once(
+    compiled: Path, tmp_path: Path
 ) -> None:
-    cache.chmod(0o1777)
-    assert halve(tmp_path, cache).stdout.strip() == "1"
-
-
-def test_where_nothing_can_be_kept_a_kernel_compiles_and_says_so_once(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    done = halve(tmp_path, tmp_path / "file")
+    done = halve(compiled, tmp_path / "file")
     assert done.stderr.count("there is no folder where compiled code can be kept") == 1
 
 
