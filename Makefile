@@ -16,7 +16,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # uv installs in seconds where it is there; pip comes with Python.
 INSTALL := $(if $(shell command -v uv),uv pip install --python $(BIN)/python,$(BIN)/python -m pip install)
 
-.PHONY: run report gated test test-all lint docs setup bench clean
+.PHONY: run report gated test tests test-all lint docs setup bench clean
 
 run: setup
 	$(BIN)/fleet-slip --root $(ROOT) run --campaign $(CAMPAIGN)
@@ -33,7 +33,11 @@ gated: run
 	$(BIN)/fleet-slip --root $(ROOT) publish gated --models gated --cohort "lost_control_s IS NULL \
 	  AND (campaign = 'waterford' OR campaign = 'proving_ground' AND vehicle_model = 'd_class_sedan')"
 
-test: lint
+# What has one process at a time runs beside the tests, which have two.
+test: $(VENV)/.dev-installed
+	$(MAKE) --no-print-directory -j 2 lint tests
+
+tests: $(VENV)/.dev-installed
 	$(BIN)/pytest -n 2 --dist worksteal
 
 test-all: $(VENV)/.dev-installed
