@@ -1,16 +1,17 @@
 """From nothing to a published model over any number of rows, and what a fleet does to it then.
 
-    python -m benchmarks.billion --root FOLDER --rows 1e6 1e7 1e8 1e9 [--figures FILE] [--plot FILE]
+    python -m benchmarks.billion --root FOLDER --rows 1e6 1e7 1e8 1e9 [--figures FILE]
 
 Each step is a command in a process of its own, as a user would type it, so that its time has the
 start of Python in it and its peak memory is its own. A size that was interrupted goes on where it
 stopped; a step that was interrupted says so, since its time is then not the whole. Figures are
 added to those that FILE already has, so that sizes can be run one by one; without --rows the table
-and the plot are made of the figures that are there.
+is made of the figures that are there.
 """
 
 import argparse
 import json
+import math
 import os
 import platform
 import shutil
@@ -21,9 +22,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks import billion_campaigns as campaigns
-from benchmarks.billion_figures import markdown, plot
-from benchmarks.documents import insert
+from benchmarks.harness import insert
 from benchmarks.usage import Usage, measured
 
 COHORT = "adhesion < 0.8"
@@ -35,6 +37,12 @@ REWRITTEN_SHARE = 0.1
 """More than the share of the files that forgetting one of 300 cars writes again."""
 
 PROGRAM = (str(Path(sys.executable).with_name("fleet-slip")),)
+
+
+Size = dict[str, Any]
+
+FROM_NOTHING = ("simulate", "gram", "select", "publish")
+NEW_DAY = ("new day: simulate", "new day: gram", "new day: select")
 
 
 @dataclass
@@ -178,12 +186,81 @@ def run(sizes: Sequence[int], root: Path, file: Path, *, keep: bool) -> None:
             shutil.rmtree(folder)
 
 
+def seconds(size: Size, steps: Sequence[str]) -> float:
+    """Return the time of some steps together."""
+    return math.fsum(size["steps"][name]["seconds"] for name in steps)
+
+
+def processor_s(size: Size, steps: Sequence[str]) -> float:
+    """Return the time that some steps together took on processors."""
+    return math.fsum(size["steps"][name]["cpu_s"] for name in steps)
+
+
+def slope(rows: Sequence[float], values: Sequence[float]) -> float:
+    """Return the slope of log value over log rows, by least squares."""
+    return float(np.polyfit(np.log(rows), np.log(values), 1)[0])
+
+
+def markdown(sizes: Sequence[Size]) -> str:
+    """Return the figures of all sizes as a Markdown table, with slopes if there are several."""
+    rows = [size["rows"] for size in sizes]
+    slopes = len(sizes) > 1
+    head = ["", *(f"{n:,}" for n in rows), *(["slope", "last slope"] if slopes else [])]
+    lines = [_line(head), _line(["---", *["---:"] * (len(head) - 1)])]
+    for name, figure, shown in _figures(sizes):
+        values = [figure(size) for size in sizes]
+        cells = [shown(value) for value in values]
+        if slopes:
+            cells += [f"{slope(rows, values):.2f}", f"{slope(rows[-2:], values[-2:]):.2f}"]
+        lines.append(_line([name, *cells]))
+    return "\n".join(lines)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _figures(
+    sizes: Sequence[Size],
+) -> list[tuple[str, Callable[[Size], float], Callable[[float], str]]]:
+    time = "{:,.1f}".format
+    commands = [name for name in sizes[0]["steps"] if name != "cohort: in process"]
+    inside = {
+        "cohort in process: read Gram rows and fit, ms": "read_and_fit_ms",
+        "cohort in process: the same, of tables that are open, ms": "read_again_and_fit_ms",
+        "cohort in process: fit, ms": "fit_ms",
+        "cohort in process: five models × five folds, ms": "select_ms",
+    }
+    return [
+        ("files", lambda s: s["files"], "{:,}".format),
+        ("drives", lambda s: s["drives"], "{:,}".format),
+        ("bytes a row", lambda s: s["size_bytes"] / s["rows"], "{:.2f}".format),
+        ("**from nothing to a published model, s**", lambda s: seconds(s, FROM_NOTHING), time),
+        ("the same, processor seconds", lambda s: processor_s(s, FROM_NOTHING), time),
+        ("**a new day of 1 %, s**", lambda s: seconds(s, NEW_DAY), time),
+        ("the same, processor seconds", lambda s: processor_s(s, NEW_DAY), time),
+        *((f"{name}, s", lambda s, name=name: seconds(s, [name]), time) for name in commands),
+        *(
+            (name, lambda s, key=key: s["steps"]["cohort: in process"]["told"][key], time)
+            for name, key in inside.items()
+            if all(key in size["steps"]["cohort: in process"]["told"] for size in sizes)
+        ),
+        *(
+            (f"peak of {name}, MiB", lambda s, name=name: _peak_mib(s, name), "{:,.0f}".format)
+            for name in commands
+        ),
+    ]
+
+
+def _peak_mib(size: Size, step: str) -> float:
+    return float(size["steps"][step]["peak_bytes"]) / 2**20
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--root", type=Path, default=Path("data-billion"), help="where to work")
     parser.add_argument("--rows", type=float, nargs="*", default=[], help="sizes to run, as 1e9")
     parser.add_argument("--figures", type=Path, help="JSON file of figures; default: below --root")
-    parser.add_argument("--plot", type=Path, help="draw cost against rows, as .svg or .png")
     parser.add_argument("--document", type=Path, help="a page to put the table into")
     parser.add_argument("--json", action="store_true", help="print the figures instead of a table")
     parser.add_argument("--keep", action="store_true", help="do not delete the data afterwards")
@@ -194,8 +271,6 @@ def main() -> None:
     if not figures:
         sys.exit(f"{file}: no figures yet. Give sizes: --rows 1e6 1e7")
     sizes = [figures[key] for key in sorted(figures, key=int)]
-    if options.plot:
-        plot(sizes, options.plot)
     if options.document:
         insert(options.document, "billion", markdown(sizes))
     print(json.dumps(figures, indent=1) if options.json else markdown(sizes))

@@ -9,11 +9,10 @@ the same bits is checked: the names of data files carry their checksums.
 
 import argparse
 import tempfile
-import time
-from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 
+from benchmarks.harness import durations, peak_bytes
 from fleet_slip.compute.cluster import cluster_executor
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.grams.job import update_grams
@@ -26,13 +25,6 @@ from tests.support.dask_processes import dask_processes
 WARM_UP = "smoke"
 
 
-def timed(function: Callable[[], object]) -> float:
-    """Return the time of a call, in s."""
-    start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
-
-
 def measure(
     root: Path, campaign: Campaign, days: int, executor: Executor, elsewhere: Executor | None
 ) -> tuple[float, float]:
@@ -43,16 +35,11 @@ def measure(
     update_grams(other, executor=elsewhere)
     warehouse = Warehouse(LocalFolder(root))
     chosen = campaign.days()[:days]
-    return (
-        timed(lambda: simulate_campaign(warehouse, campaign, chosen, executor)),
-        timed(lambda: update_grams(warehouse, executor=elsewhere)),
+    (simulate_s,) = durations(
+        lambda: simulate_campaign(warehouse, campaign, chosen, executor), rounds=1
     )
-
-
-def peak_memory_bytes(process: int) -> int:
-    """Return the most memory that a process has held."""
-    status = Path(f"/proc/{process}/status").read_text()
-    return int(status.partition("VmHWM:")[2].split()[0]) * 1024
+    (gram_s,) = durations(lambda: update_grams(warehouse, executor=elsewhere), rounds=1)
+    return simulate_s, gram_s
 
 
 def data_files(root: Path) -> set[str]:
@@ -76,7 +63,7 @@ def main() -> None:
             dask.wait_for_workers(arguments.workers)
             with cluster_executor(dask.address, LocalFolder(folder)) as executor:
                 cluster = measure(there, campaign, arguments.days, executor, executor)
-            memory = max(peak_memory_bytes(process.pid) for process in dask.processes[1:])
+            memory = max(peak_bytes(process.pid) for process in dask.processes[1:])
         assert data_files(here) == data_files(there), "the bits differ"
         rows = Warehouse(LocalFolder(here)).logs.snapshot().rows
     print(f"{rows:,} rows; the same bits from {arguments.workers} threads and from Dask workers")

@@ -7,23 +7,19 @@ a random moment. Then nothing may be damaged; and after the same command has bee
 rows, Gram rows, quarantine, model versions, aliases and records of forgetting must be those of a
 root on which it was never killed. What a killed job left may be of one that runs, as long as it is
 young: `forget --now` may ask to be repeated for it, and it is repeated then as if an hour later.
-
-A process that has imported everything forks for every command, which takes a tenth of the time.
 """
 
 import argparse
 import hashlib
-import importlib
 import json
 import os
 import random
 import shutil
 import signal
-import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,20 +27,12 @@ from typing import Any
 import pyarrow.parquet as pq
 from deltalake import DeltaTable
 
-# Whatever a command imports late is here before the fork.
-import fleet_slip.ingest.load
-import fleet_slip.operations.repair
-import fleet_slip.simulation.job  # noqa: F401
 from benchmarks.crash_commands import COMMANDS, Command, prepare_inputs
-from benchmarks.forking import forked
-from fleet_slip.cli.main import main as fleet_slip_main
+from benchmarks.harness import call, forked, load_code
 from fleet_slip.errors import PendingError
 from fleet_slip.grams.backlog import BEING_WRITTEN_HOURS
-from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.verify import verify
-from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Table
 from fleet_slip.warehouse.forgotten import Audit
@@ -93,16 +81,6 @@ def give(root: Path, arguments: tuple[str, ...], fatal: int = 0) -> int:
         setattr(owner, name, countdown.around(getattr(owner, name)))
     assert not call(root, arguments), f"{arguments} did not end with 0"
     return countdown.passed
-
-
-def call(root: Path, arguments: tuple[str, ...]) -> int:
-    """Run one command in this process; return its exit code."""
-    sys.argv = ["fleet-slip", "--root", str(root), *arguments]
-    try:
-        fleet_slip_main()
-    except SystemExit as ended:
-        return int(ended.code or 0)
-    return 0
 
 
 def repeat(root: Path, arguments: tuple[str, ...], done: int = 0) -> None:
@@ -222,21 +200,13 @@ class Harness:
         return where
 
 
-def load_code(inputs: Mapping[str, str]) -> None:
-    """Simulate a drive and read a mapping in this process, so that its forks need not load code."""
-    plan = load_campaign(inputs["campaign"])
-    simulate_logs(plan.drives(plan.days()[0])[:1])
-    load_mapping(inputs["mapping"])
-    importlib.import_module("pandas")  # as pyarrow does at its first use
-
-
 def run(kills: int, seed: int, names: list[str]) -> Counter[tuple[str, str]]:
     """Kill so many times in all, the commands in turn. Raises `AssertionError` if it shows."""
     rng = random.Random(seed)  # noqa: S311
     done: Counter[tuple[str, str]] = Counter()
     with tempfile.TemporaryDirectory() as folder:
         inputs = prepare_inputs(Path(folder))
-        load_code(inputs)
+        load_code(inputs["campaign"])
         chosen = [command for command in COMMANDS if command.name in names]
         for place, command in enumerate(chosen):
             share = kills // len(chosen) + (place < kills % len(chosen))

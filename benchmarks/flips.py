@@ -14,23 +14,58 @@ import os
 import random
 import signal
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks.flips_commands import READING, VERIFY, WRITING, Ended, command, preload
 from benchmarks.flips_root import (
     KINDS,
+    Ended,
     Flip,
     campaign,
+    command,
     copied,
     digest,
     fill,
     flipped,
     write_configs,
 )
+from benchmarks.harness import quick_folder
+
+READING: tuple[tuple[str, ...], ...] = (
+    ("models", "--json"),
+    ("show", "smoke", "--json"),
+    ("select", "--json"),
+    ("select", "--nested", "ay,yaw_rate", "--rank", "correlation", "--json"),
+    ("score", "smoke", "--json"),
+    ("quality", "--json"),
+    ("diagnose", "smoke", "--json"),
+    ("what-if", "smoke", "--noise", "ay=0.1", "--json"),
+    ("monitor", "smoke", "--since", "2024-05-07", "--json"),
+    ("diff", "smoke@1", "smoke@2", "--json"),
+    ("status", "--json"),
+    ("verify", "--grams", "--json"),
+    ("sql", "SELECT drive_id, avg(ay_mps2), max(tick) FROM log GROUP BY 1 ORDER BY 1", "--json"),
+    ("sql", "FROM drives ORDER BY ALL", "--json"),
+    ("sql", "FROM grams ORDER BY ALL", "--json"),
+    ("sql", "FROM quarantine ORDER BY ALL", "--json"),
+    ("sql", "FROM models ORDER BY ALL", "--json"),
+    ("sql", "SELECT run_id, command, arguments, outcome, rows FROM runs ORDER BY ALL", "--json"),
+)  # fmt: skip
+
+WRITING: tuple[tuple[str, ...], ...] = (
+    ("gram", "--json"),
+    ("run", "--campaign", "{campaign}", "--threads", "1", "--json"),
+    ("publish", "other", "--cohort", "adhesion > 0", "--json"),
+    ("promote", "smoke@1"),
+    ("promote", "smoke", "--previous"),
+    ("compact",),
+    ("forget", "--drive", "smoke-2024-05-01-0001", "--now"),
+    ("verify", "--repair", "--campaign", "{campaign}"),
+)
+
+VERIFY = ("verify", "--json")
 
 FOR_VERIFY = ("commits", "checkpoints")
 """Kinds of files whose damage `verify` finds, and no other command (docs/durability.md)."""
@@ -144,12 +179,10 @@ def main() -> None:
     parser.add_argument("--kind", choices=list(KINDS), action="append")
     options = parser.parse_args()
     os.environ["FLEET_SLIP_LOG"] = "text"
-    memory = Path("/dev/shm")  # noqa: S108 - where there is one, nothing waits for a disk
     started = time.monotonic()
-    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
-        root = Path(folder) / "data"
+    with quick_folder() as folder:
+        root = folder / "data"
         write_configs(root)
-        preload(campaign(root))
         fill(root)
         kinds = options.kind or list(KINDS)
         found: dict[str, Counts] = collections.defaultdict(Counts)

@@ -1,4 +1,4 @@
-"""A small data root with every kind of file, for `benchmarks/flips.py`, and flips in its files."""
+"""A small data root with every kind of file, flips in its files, and commands on it."""
 
 import contextlib
 import hashlib
@@ -14,12 +14,13 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from benchmarks.flips_commands import Ended, command, in_a_child
+from benchmarks.harness import forked
 from fleet_slip.resources import CONFIG_VARIABLE, find_config, folder
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
+from tests.support.commands import COMMAND, run_prepared
 
 KINDS = {
     "logs": "logs/day=*/*.parquet",
@@ -43,6 +44,46 @@ _CAMPAIGN = (
 )
 _SEARCH = (("most = 24", "most = 3"),)
 _WINDOWS = re.compile(r'(?s)(\[sets\.windows\].*?windows = \[).*?"yaw_rate_bias",.*?\]')
+
+
+PASSING = re.compile(
+    r'"(seconds|at|host|process|run_id|sha256'
+    r'|[a-z_]*(_at|hours|age|bytes|fraction)[a-z_]*)": [^,}\]]*'
+)
+"""What differs from run to run."""
+
+NUMBER = re.compile(r"-?\d+\.\d+(e-?\d+)?")
+"""Averages of floating-point numbers have other last digits on other threads."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended: its exit code, what it printed, and what the root then meant."""
+
+    exit_code: int
+    printed: str
+    remarks: str
+    meaning: str = ""
+
+    @property
+    def answer(self) -> tuple[str, str]:
+        """What must be the same wherever it ended well."""
+        printed = PASSING.sub("", self.printed)
+        return NUMBER.sub(lambda found: f"{float(found[0]):.9g}", printed), self.meaning
+
+    @property
+    def is_bug(self) -> bool:
+        """Whether it ended as nothing may end: exit 1, a signal, or a traceback."""
+        return self.exit_code == 1 or self.exit_code < 0 or "Traceback" in self.remarks
+
+
+def command(root: Path, *arguments: str) -> Ended:
+    """Run a command on a root."""
+    try:
+        done = run_prepared([COMMAND, "--root", str(root), *arguments])
+    except TimeoutError:
+        return Ended(-1, "", "it hung")
+    return Ended(done.exit_code, done.stdout, done.stderr)
 
 
 @dataclass(frozen=True)
@@ -126,7 +167,7 @@ def fill(root: Path) -> None:
         ("forget", "--drive", "smoke-2024-05-01-0000", "--now"),
     ):
         _require_done(command(root, *step))
-    _require_done(in_a_child(lambda: _add_what_is_rare(root)))
+    forked(lambda: _add_what_is_rare(root))
     _require_done(command(root, "simulate", given, "--threads", "1"))
     for kind, pattern in KINDS.items():
         assert any(root.glob(pattern)), f"no {kind}"
@@ -152,7 +193,7 @@ def _add_what_is_rare(root: Path) -> None:
 def digest(root: Path) -> str:
     """Return a digest of what a root means: rows of logs and Gram rows, versions, aliases."""
 
-    def work() -> None:
+    def work() -> str:
         warehouse = Warehouse(LocalFolder(root))
         found = hashlib.sha256()
         for table, order in ((warehouse.logs, "tick"), (warehouse.grams, "feature_set")):
@@ -172,7 +213,9 @@ def digest(root: Path) -> str:
             for varying in ("at", "trained_on"):
                 content.pop(varying, None)
             found.update(json.dumps(content, sort_keys=True).encode())
-        print(found.hexdigest())
+        return found.hexdigest()
 
-    ended = in_a_child(work)
-    return ended.printed if not ended.exit_code else ended.remarks
+    try:
+        return str(forked(work).result)
+    except AssertionError as error:
+        return str(error)

@@ -21,7 +21,7 @@ from typing import Any
 
 from benchmarks.billion import PROGRAM
 from benchmarks.billion_campaigns import Sized, write
-from benchmarks.documents import insert
+from benchmarks.harness import insert
 from benchmarks.usage import Usage, measured
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.storage.local import LocalFolder

@@ -14,6 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import fleet_slip
+from benchmarks.harness import peak_bytes
 from benchmarks.ingest import log_rows, write_mapping
 
 
@@ -23,11 +24,6 @@ def write_folder(folder: Path, files: int, rows: int, kind: str) -> None:
         table = log_rows(number * rows, (number + 1) * rows)
         file = folder / f"drive_{number:06}.{kind}"
         table.write_csv(file) if kind == "csv" else table.write_parquet(file)
-
-
-def _peak_mib() -> float:
-    told = Path("/proc/self/status").read_text().split("VmHWM:")[1]
-    return int(told.split()[0]) / 1024
 
 
 def main() -> None:
@@ -55,7 +51,8 @@ def main() -> None:
             took, cpu = time.perf_counter() - start, time.process_time() - cpu
             print(
                 f"{what:12} {len(reports):7,} files {took:8.2f} s {cpu:8.2f} CPU s "
-                f"{1e3 * cpu / max(len(reports), 1):7.2f} CPU ms a file {_peak_mib():6.0f} MiB",
+                f"{1e3 * cpu / max(len(reports), 1):7.2f} CPU ms a file "
+                f"{peak_bytes() / 2**20:6.0f} MiB",
                 flush=True,
             )
 

@@ -17,33 +17,18 @@ Without --schedules it tries all; with it, so many of them, chosen by the seed.
 """
 
 import argparse
-import contextlib
-import importlib
 import itertools
-import pkgutil
 import random
 import sys
-import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import fleet_slip
-from benchmarks import crash
+from benchmarks.harness import load_code, quick_folder
 from benchmarks.interleave_pair import FATES, Pair, Schedule
-from benchmarks.interleave_roots import COMMANDS, Inputs, LocalRoots, StoredRoots, write_inputs
-from benchmarks.interleave_server import serving
-
-
-def load_code(inputs: Inputs) -> None:
-    """Import in this process what commands import when they are called."""
-    crash.load_code(inputs.files)
-    for found in pkgutil.walk_packages(fleet_slip.__path__, "fleet_slip."):
-        with contextlib.suppress(ImportError):  # an extra that is not there
-            importlib.import_module(found.name)
-    importlib.import_module("pyarrow.dataset")
+from benchmarks.interleave_roots import COMMANDS, LocalRoots, StoredRoots, serving, write_inputs
 
 
 def schedules(pair: Pair, fates: Sequence[str]) -> Iterator[Schedule]:
@@ -55,7 +40,7 @@ def schedules(pair: Pair, fates: Sequence[str]) -> Iterator[Schedule]:
 def run(options: argparse.Namespace, folder: Path, roots: Any) -> dict[str, list[Schedule]]:
     """Run schedules; return those that found something, by what they found."""
     inputs = write_inputs(folder / "inputs")
-    load_code(inputs)
+    load_code(inputs.files["campaign"])
     rng = random.Random(options.seed)  # noqa: S311
     found: dict[str, list[Schedule]] = defaultdict(list)
     pairs = list(itertools.product(options.first, options.second))
@@ -99,9 +84,7 @@ def main() -> None:
     parser.add_argument("--store", action="store_true")
     parser.add_argument("--only", default="")
     options = parser.parse_args()
-    memory = Path("/dev/shm")  # noqa: S108 - where there is one, nothing waits for a disk
-    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as name:
-        folder = Path(name)
+    with quick_folder() as folder:
         if options.store:
             with serving() as server:
                 found = run(options, folder, StoredRoots(*server))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import interleave_checks as checks
-from benchmarks.forking import forked
+from benchmarks.harness import forked
 from benchmarks.interleave_checks import Drive
 from benchmarks.interleave_roots import SETTLING, Inputs, let_temporary_files_age, prepare
 from benchmarks.interleave_stops import Environment, Outcome, Running, command, use

@@ -2,14 +2,18 @@
 
 import csv
 import math
+import multiprocessing
 import os
 import random
 import shutil
+import signal
 import urllib.request
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 from benchmarks.crash_commands import MAPPING, let_time_pass
 from benchmarks.interleave_stops import Environment, Running
@@ -214,3 +218,30 @@ class StoredRoots:
                 )
                 urllib.request.urlopen(request).close()  # noqa: S310
         return f"s3://{self._bucket}/{self._number}"
+
+
+@contextmanager
+def serving(**faults: float) -> Iterator[tuple[str, str]]:
+    """Start an S3 server of its own process, let this one find it, and return its URL and a bucket.
+
+    `faults` says how it misbehaves, as `tests.support.s3_server.Faults`.
+    """
+    methods = multiprocessing.get_context("spawn")
+    here, there = methods.Pipe()
+    process = methods.Process(target=_serve, args=(there, faults), daemon=True)
+    process.start()
+    environment, bucket = here.recv()
+    os.environ.update(environment)
+    yield environment["AWS_ENDPOINT_URL"], bucket
+    process.terminate()
+    process.join()
+
+
+def _serve(connection: Any, faults: dict[str, float]) -> None:
+    from tests.support.s3_server import Server  # noqa: PLC0415 - flask and moto, here only
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    server = Server()
+    connection.send((server.environment, server.bucket().removeprefix("s3://")))
+    with server.misbehaving(**faults):
+        signal.pause()

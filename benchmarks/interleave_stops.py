@@ -7,7 +7,6 @@ What two points have between them is seen by no other process, so that no more s
 import os
 import select
 import signal
-import sys
 import tempfile
 import threading
 from collections.abc import Callable, Mapping
@@ -19,10 +18,9 @@ import obstore
 from deltalake import DeltaTable
 from deltalake.table import TableAlterer
 
-from benchmarks.forking import in_child
+from benchmarks.harness import call, in_child
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.cli.main import main as fleet_slip_main
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.objects import ObjectFolder
 from fleet_slip.storage.table import Table
@@ -146,12 +144,7 @@ class Running:
 def command(root: object, arguments: tuple[str, ...], environment: Environment) -> int:
     """Run one command in this process; return its exit code."""
     use(environment)
-    sys.argv = ["fleet-slip", "--root", str(root), *arguments]
-    try:
-        fleet_slip_main()
-    except SystemExit as ended:
-        return int(ended.code or 0)
-    return 0
+    return call(root, arguments)
 
 
 def use(environment: Environment) -> None:

@@ -136,8 +136,8 @@ def _scale(name: str, *, physical: bool) -> float:
     return float(catalogue()[name].scale) if physical else 1.0
 
 
-def duckdb_float(threads: int, *, physical: bool = False) -> Fit:
-    x = [f"({name} * {_scale(name, physical=physical)!r}::DOUBLE)" for name in COLUMNS]
+def duckdb_float(threads: int) -> Fit:
+    x = [f"{name}::DOUBLE" for name in COLUMNS]
     sums = [f"sum({a})" for a in x]
     products = [f"sum({a} * {b})" for i, a in enumerate(x) for b in x[: i + 1]]
     query = f"SELECT count(*), {', '.join([*sums, *products])} FROM {SOURCE}"
@@ -163,22 +163,6 @@ def polars_streaming(_threads: int, *, physical: bool = False) -> Fit:
 
     def run(paths: list[str]) -> Coefficients:
         return _unpacked(pl.scan_parquet(paths).select(every).collect(engine="streaming").row(0))
-
-    return run
-
-
-def polars_ols(_threads: int) -> Fit:
-    import polars as pl  # noqa: PLC0415
-    import polars_ols as pls  # noqa: PLC0415
-
-    features = [pl.col(name) for name in INPUTS]
-    fit = pls.compute_least_squares(
-        pl.col(LABEL), *features, add_intercept=True, mode="coefficients"
-    )
-
-    def run(paths: list[str]) -> Coefficients:
-        rows = pl.scan_parquet(paths).select(pl.col(COLUMNS).cast(pl.Float64))
-        return [float(b) for b in rows.select(fit.alias("b")).unnest("b").collect().row(0)]
 
     return run
 
@@ -209,18 +193,12 @@ def spark_mllib(threads: int) -> Fit:
 WAYS = {
     "fleet_slip": Way("fleet_slip: integers, exact solve", fleet_slip),
     "duckdb": Way("DuckDB, float64 of counts", duckdb_float),
-    "duckdb-physical": Way(
-        "DuckDB, float64 of physical values",
-        partial(duckdb_float, physical=True),
-        physical=True,
-    ),
     "polars": Way("Polars streaming, float64 of counts", polars_streaming),
     "polars-physical": Way(
         "Polars streaming, float64 of physical values",
         partial(polars_streaming, physical=True),
         physical=True,
     ),
-    "polars-ols": Way("polars-ols", polars_ols, "polars_ols"),
     "lstsq": Way("numpy lstsq", numpy_lstsq),
     "scikit-learn": Way("scikit-learn LinearRegression", scikit_learn, "sklearn"),
     "statsmodels": Way("statsmodels OLS", statsmodels, "statsmodels"),

@@ -18,7 +18,6 @@ import math
 import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -30,14 +29,12 @@ import numpy as np
 import pyarrow.parquet as pq
 from matplotlib.figure import Figure
 
+from benchmarks.harness import add_options, simulated
 from benchmarks.peer_ways import COLUMNS, INPUTS, LABEL, WAYS, thread_variables
-from benchmarks.pipeline import add_options, prepare
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.pages.drawing import PALETTE, STYLE
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import LinearModel, fit
-from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
 
 MOST_DIGITS = 16.0
 """A coefficient that is the exact one, rounded once."""
@@ -148,9 +145,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=list(WAYS), default=list(WAYS))
     parser.add_argument("--plot", type=Path)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        warehouse = Warehouse(LocalFolder(options.root or Path(folder)))
-        prepare(warehouse, options.campaign)
+    with simulated(options) as warehouse:
         logs = warehouse.logs.snapshot()
         exact = exact_model(logs.paths)
         print("| program | million rows/s | of a processor | peak MiB | digits | same bits |")

@@ -13,7 +13,6 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ import duckdb
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from benchmarks.harness import add_options, durations, simulated
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import load_cohort
@@ -30,8 +30,6 @@ from fleet_slip.grams.gram_files import write_rows
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.request import load_model_list
 from fleet_slip.models.select import select
-from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.job import simulate_campaign
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, absent_columns
 from fleet_slip.warehouse.tables import Warehouse
@@ -41,38 +39,14 @@ MODELS = load_model_list("table1")
 SIGNALS = catalogue().gram_signals
 
 
-def best(function: Callable[[], Any], rounds: int = ROUNDS) -> float:
+def best(function: Callable[[], object]) -> float:
     """Return the shortest time of some calls, in s."""
-    times = []
-    for _ in range(rounds):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return min(times)
+    return min(durations(function, ROUNDS))
 
 
 def line(what: str, seconds: float, rows: int, remark: str = "") -> None:
     """Print one measurement."""
     print(f"{what:44s} {seconds * 1e3:9.1f} ms {rows / seconds / 1e6:8.2f} Mrows/s  {remark}")
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Let the user say where the rows are, and whose they are."""
-    parser.add_argument("--root", type=Path, help="default: a temporary folder")
-    parser.add_argument("--campaign", default="waterford")
-
-
-def prepare(warehouse: Warehouse, name: str) -> None:
-    """Simulate the campaign of a name and bring the Gram rows up to date."""
-    campaign = load_campaign(name)
-    with ThreadPoolExecutor(2) as executor:
-        simulate_campaign(warehouse, campaign, campaign.days(), executor)
-    update_grams(warehouse)
-    logs = warehouse.logs.snapshot()
-    print(
-        f"{logs.rows:,} rows in {len(logs.files)} files: {logs.size_bytes / logs.rows:.2f} bytes a "
-        "row, all columns included\n"
-    )
 
 
 def absent_from(warehouse: Warehouse) -> tuple[str, ...]:
@@ -150,9 +124,7 @@ def incremental(warehouse: Warehouse) -> None:
             table = warehouse.logs.read(file.path)
             actions.append(copy.logs.write_file(f"file-{i}", table, file.day))
         copy.logs.snapshot().commit(Change(add=actions))
-        start = time.perf_counter()
-        update_grams(copy)
-        whole_s = time.perf_counter() - start
+        (whole_s,) = durations(lambda: update_grams(copy), 1)
         new = table.slice(0, rows // 100)
         day = logs.files[-1].day
         assert day is not None
@@ -217,9 +189,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--gram-rows", type=int, default=50_000, help="to select from")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        warehouse = Warehouse(LocalFolder(options.root or Path(folder)))
-        prepare(warehouse, options.campaign)
+    with simulated(options) as warehouse:
         for threads in options.threads:
             gram_query(warehouse, threads)
         print()

@@ -10,11 +10,11 @@ before, as for one cohort after another; of the fit alone; and of a whole select
 import json
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from benchmarks.harness import durations
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.reader import GramReader
@@ -32,12 +32,7 @@ INPUTS = MODELS.model[1].signals
 def median_ms(function: Callable[[], Any]) -> float:
     """Return the median time of a call after the first, in ms."""
     function()
-    times = []
-    for _ in range(ROUNDS):
-        started = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - started)
-    return 1e3 * statistics.median(times)
+    return 1e3 * statistics.median(durations(function, ROUNDS))
 
 
 def main(root: str, condition: str) -> None:

@@ -1,29 +1,22 @@
-"""Where the time of `simulate` goes, stage by stage, and what the kernel's inner loops are made of.
+"""Where the time of `simulate` goes, stage by stage.
 
-    python -m benchmarks.simulator_profile [--campaign fleet_realistic] [--loop loop.s]
+    python -m benchmarks.simulator_profile [--campaign fleet_realistic]
 
-Stages: one file of a campaign, time of the processor on one thread, the best of several rounds.
-Instructions: counted in the kernel's assembly. `--loop` writes the longest loop, a step of
-four cars, for a simulator of the processor's pipeline:
-
-    llvm-mca -mcpu=znver3 --bottleneck-analysis loop.s
+One file of a campaign, time of the processor on one thread, the best of several rounds.
 """
 
 import argparse
-import re
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import pyarrow as pa
 
+from benchmarks.harness import durations
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.job import lane_drive, simulate_logs, tabulate
@@ -31,22 +24,15 @@ from fleet_slip.simulation.sensors import Recorder
 from fleet_slip.storage.checksums import checksum_of
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
-from fleet_slip.vehicle import batch_kernel
 from fleet_slip.vehicle.batch import LaneDrive, simulate_blocks
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.whole_drives import simulate_drives
 
 ROUNDS = 5
 
 
 def best(function: Callable[[], Any], clock: Callable[[], float] = time.thread_time) -> float:
     """Return the shortest time of some calls, in s."""
-    times = []
-    for _ in range(ROUNDS):
-        start = clock()
-        function()
-        times.append(clock() - start)
-    return min(times)
+    return min(durations(function, ROUNDS, clock))
 
 
 def drive(drives: list[LaneDrive]) -> None:
@@ -114,53 +100,10 @@ def _commit_s(warehouse: Warehouse, rows: pa.Table, day: date) -> float:
     return best(commit, time.perf_counter)
 
 
-def loops(assembly: str) -> list[list[str]]:
-    """Return the instructions of the stretches without a label in between, longest first."""
-    stretches: list[list[str]] = [[]]
-    for line in assembly.splitlines():
-        if re.match(r"\.L\w+:", line):
-            stretches.append([])
-        elif re.match(r"\t[a-z]", line):
-            stretches[-1].append(line.strip())
-    return sorted(stretches, key=len, reverse=True)
-
-
-def compiled_assembly() -> str:
-    """Return the kernel's assembly on this machine."""
-    fresh = numba.njit(nogil=True, error_model="numpy")(batch_kernel.build_kernel())
-    usual, batch_kernel.simulate = batch_kernel.simulate, fresh
-    try:
-        fleet = load_campaign("fleet")
-        spec = fleet.batches(fleet.first_day)[0].drives[0]
-        simulate_drives([lane_drive(replace(spec, laps=0.01))])
-    finally:
-        batch_kernel.simulate = usual
-    (assembly,) = fresh.inspect_asm().values()
-    return str(assembly)
-
-
-def print_instructions(assembly: str) -> None:
-    """Print what the longest stretches of the assembly are made of."""
-    print(f"\n{'longest stretches of instructions':34}{'all':>6}{'divide':>8}{'root':>6}", end="")
-    print(f"{'stack':>7}{'calls':>7}   most frequent")
-    for number, body in enumerate(loops(assembly)[:3], 1):
-        kinds = Counter(instruction.split()[0] for instruction in body)
-        stack = sum("(%rsp)" in instruction for instruction in body)
-
-        def count(kind: str, kinds: Counter[str] = kinds) -> int:
-            return sum(n for name, n in kinds.items() if kind in name)
-
-        frequent = ", ".join(f"{n} {name}" for name, n in kinds.most_common(5))
-        print(f"{number:<34}{len(body):6}{count('div'):8}{count('sqrt'):6}{stack:7}", end="")
-        print(f"{count('call'):7}   {frequent}")
-    print(f"fused operations: {len(re.findall(r'vfn?m(?:add|sub)', assembly))}")
-
-
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--campaign", default="fleet")
-    parser.add_argument("--loop", type=Path, help="file for the assembly of the longest loop")
     arguments = parser.parse_args()
     campaign = load_campaign(arguments.campaign)
     batch = campaign.batches(campaign.first_day)[0]
@@ -171,10 +114,6 @@ def main() -> None:
         print(f"{name:34}{1e3 * spent:8.0f}{1e9 * spent / rows:10.1f}")
     measured = [spent for name, spent in seconds.items() if "(" not in name]
     print(f"{'together':34}{1e3 * sum(measured):8.0f}{1e9 * sum(measured) / rows:10.1f}")
-    assembly = compiled_assembly()
-    print_instructions(assembly)
-    if arguments.loop:
-        arguments.loop.write_text("\n".join(loops(assembly)[0]) + "\n")
 
 
 if __name__ == "__main__":

@@ -27,16 +27,15 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from benchmarks import interleave_checks as checks
-from benchmarks.forking import forked
-from benchmarks.interleave import load_code
+from benchmarks.harness import forked, load_code
 from benchmarks.interleave_roots import (
     PUBLISH,
     Inputs,
     let_temporary_files_age,
     measure,
+    serving,
     write_inputs,
 )
-from benchmarks.interleave_server import serving
 from benchmarks.interleave_stops import POINTS, Environment, command, use
 
 KILLED, FAILED = 0.15, 0.15
@@ -172,7 +171,7 @@ def _answer(job: Callable[[], Mapping[str, int]], answer: Path) -> NoReturn:
 def run(options: argparse.Namespace, folder: Path, url: str) -> int:
     """Let all work until the time is over; print counts and findings."""
     inputs = write_inputs(folder / "inputs")
-    load_code(inputs)
+    load_code(inputs.files["campaign"])
     soak = Soak(
         url or str(folder / "root"),
         inputs,

@@ -16,7 +16,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
 
-from benchmarks.documents import insert
+from benchmarks.harness import insert
 from fleet_slip.arrays import FloatArray
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.vehicle.batch import LaneDrive, Road

@@ -23,11 +23,10 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 
+from benchmarks.harness import add_options, peak_bytes, simulated
 from benchmarks.peer_ways import COLUMNS, INPUTS
 from benchmarks.peers import digits, exact_model, in_process
-from benchmarks.pipeline import add_options, prepare
 from fleet_slip.regression.least_squares import LinearModel
-from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 
 JAR = Path("/usr/share/java/weka.jar")
@@ -88,11 +87,7 @@ def by_weka(jar: Path, arff: Path, *, plain: bool) -> tuple[list[float], float, 
     model.buildClassifier(data)
     fit_s = time.perf_counter() - start
     found = [float(b) for b in model.coefficients()]
-    peak = next(
-        int(line.split()[1]) * 1024
-        for line in Path(f"/proc/{process.pid}/status").read_text().splitlines()
-        if line.startswith("VmHWM")
-    )
+    peak = peak_bytes(process.pid)
     gateway.shutdown()
     process.stdin.close()
     process.wait()
@@ -137,9 +132,7 @@ def main() -> None:
         sys.exit(f"{options.jar}: not there. Run: apt-get install weka, or give --jar")
     if importlib.util.find_spec("py4j") is None:
         sys.exit("py4j is not installed. Run: pip install --group peers -c constraints.txt")
-    with tempfile.TemporaryDirectory() as folder:
-        warehouse = Warehouse(LocalFolder(options.root or Path(folder) / "data"))
-        prepare(warehouse, options.campaign)
+    with simulated(options) as warehouse, tempfile.TemporaryDirectory() as folder:
         measure(warehouse, options.jar, options.rows, Path(folder))
 
 
