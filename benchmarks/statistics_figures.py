@@ -27,7 +27,6 @@ from fleet_slip.regression.drives import (
     bootstrap_correlations,
     held_out_products,
     percentile_interval,
-    repeated_cross_validation,
     serving_drives,
 )
 from fleet_slip.regression.folds import CohortFolds, by_hash
@@ -146,8 +145,6 @@ def uncertainty(training: TrainingFolds, fold: IntArray) -> None:
     models = [fit(folds.total - test, NINE, LABEL).model for test in folds.grams]
     products = held_out_products(training.drives, fold, models)
     print(" ", percentile_interval(bootstrap_correlations(products, 1000, seed=1)))
-    repeated = repeated_cross_validation(training.drives, 5, 100, seed=1)
-    print(f"  100 repeats: {repeated.mean:.5f} +- {repeated.spread:.5f}")
     final = cross_validate_nested(training, NINE, LABEL)[-1]
     for factor in (0, 1, 2):
         noise = {"ax": 0.1 * factor, "ay": 0.1 * factor, "yaw_rate": 0.01 * factor}

@@ -77,7 +77,6 @@ class FleetCohort(Rooted):
             cohort,
             examined.inputs(cohort),
             against=self._load(examined.feature_set, against) if against else None,
-            sensor_noise=request.sensor_noise,
             cluster=request.cluster,
             intercept=examined.intercept,
         )

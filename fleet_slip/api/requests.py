@@ -134,13 +134,6 @@ class DiagnosisRequest(ExaminedRequest):
     against: Annotated[
         str | None, Doc("Condition of another cohort: does it have the same coefficients?")
     ] = None
-    sensor_noise: Annotated[
-        Mapping[str, float] | None,
-        Doc(
-            "Noise that the logs already have, such as ay=0.1 in SI units, once for each signal: "
-            "shows the coefficients without it (errors in variables)."
-        ),
-    ] = None
     cluster: Annotated[ClusterUnit | None, CLUSTER] = None
 
 

@@ -99,7 +99,6 @@ READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "night": (str | None, lambda night: date_of(night, "--night")),
     "noise": (list[str] | None, lambda values: quantities(values, "--noise")),
     "over": (str | None, lambda over: [one.strip() for one in over.split(",")] if over else ()),
-    "sensor_noise": (list[str] | None, lambda values: quantities(values, "--sensor-noise")),
     "through": (str | None, last_day),
 }
 """Fields of other types on the command line, and what reads them."""

@@ -304,14 +304,8 @@ def _distance_rows(order: Sequence[str], evidence: Evidence) -> Iterator[list[st
 
 
 def _print_uncertainty(found: Uncertainty) -> None:
-    if found.interval is not None:
-        print_line(
-            f"{found.interval.level:.0%} interval of the winner's correlation, drawing its "
-            f"{found.drawn}s {found.interval.replicates:,} times: {found.interval.low:.4f} to "
-            f"{found.interval.high:.4f}."
-        )
-    if found.repeated_mean is not None and found.repeated_spread is not None:
-        print_line(
-            f"{found.repeats} other deals of the drives into folds: correlation "
-            f"{found.repeated_mean:.5f} +- {found.repeated_spread:.5f}."
-        )
+    print_line(
+        f"{found.interval.level:.0%} interval of the winner's correlation, drawing its "
+        f"{found.drawn}s {found.interval.replicates:,} times: {found.interval.low:.4f} to "
+        f"{found.interval.high:.4f}."
+    )

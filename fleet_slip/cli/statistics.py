@@ -73,8 +73,6 @@ def _coefficients(result: Diagnosis) -> list[dict[str, str]]:
             "s.e. by rows": f"{naive.standard_error:.2g}",
             "VIF": "" if constant else f"{result.inflation[name]:.3g}",
         }
-        if (free := result.noise_free) is not None:
-            row["without noise"] = f"{free.offset if constant else free.weights[name]:.6g}"
         rows.append(row)
     return rows
 
@@ -94,23 +92,18 @@ def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
             for here, there in zip(result.robust.estimates, found.other.estimates, strict=True)
         ],
     )
-    for test, kind in (found.drives, f"Wald, by {result.cluster}s"), (found.rows, "Chow, by rows"):
-        if test is not None:
-            degrees = f"{test.numerator}, {_degrees(test.denominator)}"
-            print_line(
-                f"the same coefficients? {kind}: F({degrees}) = {test.f:,.2f}, p = {test.p:.2g}."
-            )
-    if found.drives is None:
+    test = found.test
+    if test is None:
         say(
-            f"there are too few {result.cluster}s to compare so many coefficients by them. Chow's "
-            "test takes neighbouring rows for independent evidence, which they are not: its p is "
-            "far too small, and only a large one says something."
+            f"there are too few {result.cluster}s to compare so many coefficients by them. Choose "
+            "fewer signals, or more drives."
         )
-    elif found.drives.p > 0.05 >= found.rows.p:
-        say(
-            f"by {result.cluster}s, the difference is no more than chance: the rows only look like "
-            "evidence."
-        )
+        return
+    degrees = f"{test.numerator}, {_degrees(test.denominator)}"
+    print_line(
+        f"the same coefficients? Wald, by {result.cluster}s: F({degrees}) = {test.f:,.2f}, "
+        f"p = {test.p:.2g}."
+    )
 
 
 def _degrees(many: float) -> str:

@@ -22,24 +22,22 @@ from fleet_slip.regression.inference import (
     Evidence,
     FTest,
     Inference,
-    chow_test,
     infer_by_clusters,
     infer_classically,
     variance_inflation,
     wald_test,
 )
 from fleet_slip.regression.least_squares import Fit, LinearModel, condition_number, fit
-from fleet_slip.regression.shrinkage import disturb, fit_errors_in_variables, fit_noise_matched
+from fleet_slip.regression.shrinkage import disturb, fit_noise_matched
 
 
 @dataclass(frozen=True)
 class CohortComparison:
-    """Whether another cohort has the same coefficients: Chow's test of rows, Wald's of drives."""
+    """Whether another cohort has the same coefficients: Wald's test; None of too few drives."""
 
     condition: str
     other: Inference
-    rows: FTest
-    drives: FTest | None
+    test: FTest | None
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,6 @@ class Diagnosis:
         inflation: variance inflation of each input.
         condition_number: of the inputs' correlation matrix.
         evidence: effective rows and design effect.
-        noise_free: the model for signals without the noise they were logged with.
         influential: the cars that `robust` would leave out of a selection, by name.
     """
 
@@ -65,7 +62,6 @@ class Diagnosis:
     condition_number: float
     evidence: Evidence
     comparison: CohortComparison | None = None
-    noise_free: LinearModel | None = None
     influential: Mapping[str, Influential] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
@@ -93,15 +89,9 @@ class Diagnosis:
             document["against"] = {
                 "cohort": self.comparison.condition,
                 "by_clusters": [asdict(estimate) for estimate in self.comparison.other.estimates],
-                "chow_rows_independent": asdict(self.comparison.rows),
-                "wald_clusters_independent": asdict(self.comparison.drives)
-                if self.comparison.drives
+                "wald_clusters_independent": asdict(self.comparison.test)
+                if self.comparison.test
                 else None,
-            }
-        if self.noise_free is not None:
-            document["noise_free"] = {
-                "intercept": self.noise_free.offset,
-                **self.noise_free.weights,
             }
         return document
 
@@ -111,13 +101,12 @@ def diagnose(
     inputs: Sequence[str],
     *,
     against: Cohort | None = None,
-    sensor_noise: Mapping[str, float] | None = None,
     cluster: ClusterUnit | None = None,
     intercept: bool = True,
 ) -> Diagnosis:
     """Fit the inputs to the drives of a cohort that have them all, and examine the fit.
 
-    `sensor_noise` is in SI units. Raises `DataError` for dependent or absent signals.
+    Raises `DataError` for dependent or absent signals.
     """
     label, scales = catalogue().label, input_scales()
     served = cohort.serving(inputs)
@@ -129,10 +118,6 @@ def diagnose(
     total = served.table.total()
     fits = nested_fits(total, inputs, label, intercept=intercept)
     fitted = fits[-1]
-    free = None
-    if sensor_noise:
-        seen = total if intercept else total.about_origin()
-        free = fit_errors_in_variables(seen, inputs, label, sensor_noise, scales).physical(scales)
     return Diagnosis(
         fitted=fitted,
         drives=len(served.table),
@@ -145,7 +130,6 @@ def diagnose(
         comparison=_compare(served, fitted, moments, against.condition.text, there)
         if against and there
         else None,
-        noise_free=free,
         influential=influential_cars(served, moments)
         if len(set(_cars(served))) >= LEAST_CARS
         else {},
@@ -181,17 +165,11 @@ def _compare(
     intercept = fitted.has_intercept
     other_moments = clustered_moments(there, moments.unit, _cars(here, there), intercept=intercept)
     other = fit(there.table.total(), inputs, label, intercept=intercept)
-    by_rows = chow_test([fitted.gram, other.gram], inputs, label, intercept=intercept)
     try:
-        by_clusters = wald_test(fitted, moments, other, other_moments)
+        test = wald_test(fitted, moments, other, other_moments)
     except DataError:  # too few of them
-        by_clusters = None
-    return CohortComparison(
-        condition,
-        _infer(other, other_moments),
-        by_rows,
-        by_clusters,
-    )
+        test = None
+    return CohortComparison(condition, _infer(other, other_moments), test)
 
 
 # What worse sensors would do to a model's error, in closed form: no drive is simulated again.

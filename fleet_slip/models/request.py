@@ -150,9 +150,6 @@ class SelectionRequest:
         ),
     ] = None
     most: Annotated[int | None, Doc(f"Most columns of `search`. Default: {DEFAULT_MOST}.")] = None
-    repeat: Annotated[
-        int | None, Doc("Cross-validate the winner again with so many other deals of folds.")
-    ] = None
     bootstrap: Annotated[
         int | None,
         Doc("Confidence interval of the winner's correlation by drawing the drives so many times."),
@@ -167,11 +164,6 @@ class SelectionRequest:
     def chosen_by_inputs(self) -> bool:
         """Whether models are made of an order or a search of inputs, and not of a list alone."""
         return bool(self.nested or self.ordered or self.search)
-
-    @property
-    def resampled(self) -> bool:
-        """Whether the winner's figures are resampled."""
-        return bool(self.bootstrap or self.repeat)
 
     def check(self) -> None:
         """Raise `UsageError` for options that do not go together."""
@@ -197,10 +189,10 @@ class SelectionRequest:
                 "cluster says what is independent evidence for nested, rank, criterion, "
                 "all_subsets and bootstrap: leave it out, or naive."
             )
-        if self.label == BOTH and (self.ordered or self.nested or self.resampled or self.robust):
+        if self.label == BOTH and (self.ordered or self.nested or self.bootstrap or self.robust):
             raise UsageError(
                 "course+sideslip compares a list of models, one model or a search: leave out "
-                "nested, rank, criterion, all_subsets, naive, robust, bootstrap and repeat."
+                "nested, rank, criterion, all_subsets, naive, robust and bootstrap."
             )
         if self.search and self.ordered:
             raise UsageError(

@@ -15,7 +15,7 @@ from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN, features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import load_toml
-from fleet_slip.errors import ConfigError, DataError, NotComputedError, QuestionError, UsageError
+from fleet_slip.errors import ConfigError, DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import (
     Cohort,
     Served,
@@ -24,7 +24,7 @@ from fleet_slip.grams.cohort import (
     load_cohort,
     load_mixed_labels,
 )
-from fleet_slip.grams.folding import EACH, PARTS, ROW_FOLDS, Folding, make_folding
+from fleet_slip.grams.folding import PARTS, ROW_FOLDS, Folding, make_folding
 from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.reader import open_grams
 from fleet_slip.models.request import (
@@ -64,7 +64,6 @@ from fleet_slip.regression.drives import (
     find_influential,
     held_out_products,
     percentile_interval,
-    repeated_cross_validation,
 )
 from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.folds import (
@@ -86,51 +85,25 @@ SEED = 1
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What resampling says of a model's cross-validated correlation.
+    """What resampling says of a model's cross-validated correlation."""
 
-    A percentile interval, drawing drives or cars; mean and spread over `repeats` deals of folds.
-    """
-
-    interval: Interval | None
+    interval: Interval
     drawn: ClusterUnit
-    repeats: int
-    repeated_mean: float | None
-    repeated_spread: float | None
 
 
 def estimate_uncertainty(
-    cohort: Cohort,
-    model: CrossValidation,
-    folding: Folding,
-    request: SelectionRequest,
+    cohort: Cohort, model: CrossValidation, folding: Folding, draws: int, request: SelectionRequest
 ) -> Uncertainty:
-    """Draw drives, or cars of several, `bootstrap` times; deal the folds anew `repeat` times.
+    """Draw drives, or cars of several, so many times.
 
     Raises `QuestionError` for folds of rows, `DataError` for too few drives.
     """
-    bootstrap, repeat, intercept = request.bootstrap, request.repeat, request.intercept
-    label = catalogue().label
     ready = drive_folds(cohort, model.signals, folding, cluster=request.cluster)
-    interval = None
-    if bootstrap:
-        splits = ready.training.folds.splits()
-        refit = least_squares(model.signals, label, intercept=intercept)
-        models = [refit(training) for training, _ in splits]
-        products = held_out_products(ready.moments, ready.fold, models)
-        interval = percentile_interval(bootstrap_correlations(products, bootstrap, SEED))
-    repeated = None
-    if repeat and folding.count != EACH:
-        moments = ready.moments if intercept else DriveMoments.of(ready.served.table, centred=False)
-        repeated = repeated_cross_validation(
-            moments, folding.count, repeat, SEED, intercept=intercept
-        )
-    return Uncertainty(
-        interval,
-        ready.moments.unit,
-        repeat or 0,
-        repeated.mean if repeated else None,
-        repeated.spread if repeated else None,
-    )
+    refit = least_squares(model.signals, catalogue().label, intercept=request.intercept)
+    models = [refit(training) for training, _ in ready.training.folds.splits()]
+    products = held_out_products(ready.moments, ready.fold, models)
+    interval = percentile_interval(bootstrap_correlations(products, draws, SEED))
+    return Uncertainty(interval, ready.moments.unit)
 
 
 def influential_cars(served: Served, moments: DriveMoments) -> dict[str, Influential]:
@@ -562,7 +535,7 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
     if request.robust:
         return _answer_without(warehouse, request, condition, model_list, feature_set)
     distances = bool(request.nested and not request.ordered and not _search_of(request, model_list))
-    if not (request.ordered or request.resampled or distances):
+    if not (request.ordered or request.bootstrap or distances):
         return _compare_listed(
             load_cohort(warehouse, condition, feature_set, folds), request, model_list, folds
         )
@@ -574,9 +547,10 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
     if distances:
         inputs = inputs_of(cohort, request.nested or WHOLE_SET)
         answer = replace(answer, distances=try_distances(cohort, inputs, folds, request))
-    if not request.resampled:
+    if not request.bootstrap:
         return answer
-    figures = estimate_uncertainty(cohort, answer.winner.model, folds, request)
+    winner = answer.winner.model
+    figures = estimate_uncertainty(cohort, winner, folds, request.bootstrap, request)
     return replace(answer, uncertainty=figures)
 
 
@@ -641,10 +615,7 @@ def _given(request: SelectionRequest) -> ModelList | None:
 
 def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding:
     listed = model_list.folds if model_list else Folding()
-    folding = make_folding(request.by or listed.by, request.folds, listed.count)
-    if request.repeat and folding.count == EACH:
-        raise UsageError("repeat deals the folds anew, and folds of each drive have one deal only.")
-    return folding
+    return make_folding(request.by or listed.by, request.folds, listed.count)
 
 
 def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str:

@@ -3,7 +3,6 @@
 They are about the cohort's mean, rounded to a count, while integers: nothing cancels.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
@@ -13,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.base import number_of
 from fleet_slip.errors import DataError
 from fleet_slip.regression.gram import GramTable, packed_position, packed_size
 from fleet_slip.regression.least_squares import LinearModel
@@ -253,9 +251,7 @@ def _inverse(inputs: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.pinv(inputs, rcond=1e-13, hermitian=True), dtype=np.float64)
 
 
-# Repeated k-fold cross-validation and the cluster bootstrap over drives.
-#
-# Both work in float64 on centred and scaled moments: thousands of refits are matrix products.
+# The cluster bootstrap over drives, in float64 on centred and scaled moments.
 
 _BATCH_BYTES = 2**26
 
@@ -306,77 +302,8 @@ def bootstrap_correlations(products: FloatArray, replicates: int, seed: int) -> 
     # The prediction is the label plus the error.
     p, py, pp = y + e, yy + ye, yy + 2 * ye + ee
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(_correlation(n, p, pp, py, y, yy))
-
-
-def _correlation(n: Any, p: Any, pp: Any, py: Any, y: Any, yy: Any) -> Any:
-    return (py - p * y / n) / np.sqrt((pp - p * p / n) * (yy - y * y / n))
-
-
-def solve(totals: FloatArray, *, intercept: bool = True) -> FloatArray:
-    """Solve for (constant, inputs) in each moment matrix, label last; the constant may be zero."""
-    if not intercept:
-        slopes = solve(totals[..., 1:, 1:])
-        return np.concatenate([np.zeros_like(slopes[..., :1]), slopes], axis=-1)
-    try:
-        return np.asarray(np.linalg.solve(totals[..., :-1, :-1], totals[..., :-1, -1:])[..., 0])
-    except np.linalg.LinAlgError:
-        raise DataError(
-            "a resampled cohort cannot be fitted: too few drives have these signals."
-        ) from None
-
-
-@dataclass(frozen=True)
-class RepeatedCrossValidation:
-    """Pooled figures of k-fold cross-validation, one a repeat; the RMSE in counts of the label."""
-
-    correlations: FloatArray
-    rmse: FloatArray
-
-    @property
-    def mean(self) -> float:
-        """Mean correlation."""
-        return float(self.correlations.mean())
-
-    @property
-    def spread(self) -> float:
-        """Standard deviation of the correlation between repeats."""
-        return float(self.correlations.std(ddof=1)) if len(self.correlations) > 1 else 0.0
-
-
-def repeated_cross_validation(
-    drives: DriveMoments, folds: int, repeats: int, seed: int, *, intercept: bool = True
-) -> RepeatedCrossValidation:
-    """Cross-validate least squares with `repeats` random deals into folds. Raises `DataError`."""
-    if len(drives) < folds:
-        raise DataError(
-            f"{number_of(len(drives), 'drive')} cannot fill {number_of(folds, 'fold')}."
-        )
-    rng = np.random.default_rng(seed)
-    batch = max(1, _BATCH_BYTES // (8 * folds * len(drives)))
-    figures = []
-    for start in range(0, repeats, batch):
-        size = min(batch, repeats - start)
-        fold = np.stack([rng.permutation(len(drives)) % folds for _ in range(size)])
-        member = (fold[:, None, :] == np.arange(folds)[:, None]).astype(np.float64)
-        totals = member.reshape(size * folds, -1) @ drives.packed
-        for tests in drives.matrix(totals).reshape(size, folds, drives.size, drives.size):
-            solutions = solve(tests.sum(axis=0) - tests, intercept=intercept)
-            figures.append(_correlation_and_rmse(tests, solutions))
-    correlations, rmse = np.array(figures).T
-    return RepeatedCrossValidation(correlations, rmse * float(drives.spread[-1]))
-
-
-def _correlation_and_rmse(tests: FloatArray, solutions: FloatArray) -> tuple[float, float]:
-    """Return the figures of models, one a fold, on the moments of their test rows together."""
-    inputs, cross = tests[:, :-1, :-1], tests[:, :-1, -1]
-    n, y, yy = tests[:, 0, 0].sum(), tests[:, 0, -1].sum(), tests[:, -1, -1].sum()
-    p = np.einsum("fi,fi->", tests[:, 0, :-1], solutions)
-    pp = np.einsum("fi,fij,fj->", solutions, inputs, solutions)
-    py = np.einsum("fi,fi->", cross, solutions)
-    v = np.concatenate([solutions, -np.ones((len(solutions), 1))], axis=1)
-    error = np.einsum("fi,fij,fj->", v, tests, v)
-    return float(_correlation(n, p, pp, py, y, yy)), math.sqrt(max(float(error), 0.0) / n)
+        root = np.sqrt((pp - p * p / n) * (yy - y * y / n))
+        return np.asarray((py - p * y / n) / root, dtype=np.float64)
 
 
 def _congruence(change: FloatArray) -> FloatArray:

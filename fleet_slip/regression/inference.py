@@ -4,7 +4,7 @@ In the orthogonal basis of a nested order, signal j has the squared length A_j i
 noise, and every criterion is a price on it. Neighbouring rows at 100 Hz are not independent, so the
 evidence that decides is over drives.
 
-Do two sets of drives have the same coefficients? Chow's test by rows, Wald's by clusters.
+Do two sets of drives have the same coefficients? Wald's test by clusters.
 """
 
 import math
@@ -23,7 +23,7 @@ from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import inverse_matrix
 from fleet_slip.regression.figures import f_upper, student_t_two_sided
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import Fit, Scales, dependence, fit, moments
+from fleet_slip.regression.least_squares import Fit, Scales, dependence, moments
 
 # Standard errors, tests and collinearity of a fit.
 #
@@ -449,26 +449,6 @@ class FTest:
     numerator: int
     denominator: float
     p: float
-
-
-def chow_test(
-    groups: Sequence[Gram], inputs: Sequence[str], label: str, *, intercept: bool = True
-) -> FTest:
-    """F = ((RSS_pool - sum RSS_p) / ((P-1)(k+1))) / (sum RSS_p / (n - P(k+1))), or `DataError`."""
-    count, size = len(groups), len(inputs) + intercept
-    if count < 2:
-        raise DataError("a Chow test compares at least two groups of drives.")
-    total = sum(groups[1:], groups[0])
-
-    def rss(group: Gram) -> Fraction:
-        return fit(group, inputs, label, intercept=intercept).rss
-
-    apart, together = sum(map(rss, groups), Fraction(0)), rss(total)
-    numerator, denominator = (count - 1) * size, total.n - count * size
-    if denominator <= 0 or apart == 0:
-        raise DataError("a Chow test needs noise and more rows than coefficients.")
-    f = float((together - apart) / numerator / (apart / denominator))
-    return FTest(f, numerator, denominator, f_upper(f, numerator, denominator))
 
 
 def wald_test(one: Fit, one_drives: DriveMoments, other: Fit, other_drives: DriveMoments) -> FTest:

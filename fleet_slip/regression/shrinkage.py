@@ -20,7 +20,13 @@ from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.exact import eliminate
 from fleet_slip.regression.figures import ErrorSums
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import LinearModel, Scales, moments, through_means
+from fleet_slip.regression.least_squares import (
+    LinearModel,
+    Scales,
+    dependence,
+    moments,
+    through_means,
+)
 
 FEWEST_MEMBERS = 4
 """Of fewer nothing says how much they differ."""
@@ -92,67 +98,45 @@ def _root(falling: Callable[[float], float], least: float, most: float) -> float
     return (least + most) / 2
 
 
-# Least squares with an added diagonal, S b + Lambda b = S_xy.
-#
-# A positive Lambda is ridge regression, or the exact minimiser under noise to come, n times its
-# variance (Bishop 1995); a negative one corrects for noise that is there (Fuller 1987).
-#
 # What sensor bias and noise do to a model's error, in closed form (the paper's section III-A).
 #
-# With biases d_j and noise v_j, the prediction changes by b'd + sum b_j v_j: every sum follows.
-
-
-def fit_penalised(
-    gram: Gram, inputs: Sequence[str], label: str, penalties: Sequence[Fraction]
-) -> LinearModel:
-    """Solve (S + diag(penalties)) b = S_xy exactly, penalties in counts^2, or `DataError`."""
-    part = gram.restrict([*inputs, label])
-    common = math.lcm(*(penalty.denominator for penalty in penalties))
-    matrix = [[common * entry for entry in row] for row in moments(part)]
-    for i, penalty in enumerate(penalties):
-        matrix[i][i] += int(part.n * common * penalty)
-    triangle = eliminate(matrix)
-    if triangle.singular is not None or min(triangle.minors) <= 0:
-        at = triangle.singular
-        if at is None:
-            at = next(i for i, minor in enumerate(triangle.minors) if minor <= 0) - 1
-        raise DataError(
-            f"the moments stop being positive definite at {inputs[at]}: the assumed noise is more "
-            "than the signal holds, or signals are linearly dependent."
-        )
-    numerators, determinant = triangle.solve(len(inputs))
-    slopes = {name: Fraction(x, determinant) for name, x in zip(inputs, numerators, strict=True)}
-    return through_means(part, label, slopes)
+# With biases d_j and noise v_j, the prediction changes by b'd + sum b_j v_j: every sum follows. The
+# best model for noise to come solves (S + Lambda) b = S_xy, Lambda n times its variance (Bishop
+# 1995): ridge regression.
 
 
 def fit_noise_matched(
     gram: Gram, inputs: Sequence[str], label: str, noise: Mapping[str, float], scales: Scales
 ) -> LinearModel:
-    """Return the model of counts that is best with independent noise to come, in SI units."""
-    return fit_penalised(gram, inputs, label, _variances(gram, inputs, noise, scales))
+    """Return the model of counts that is best with independent noise to come, in SI units.
 
-
-def fit_errors_in_variables(
-    gram: Gram, inputs: Sequence[str], label: str, noise: Mapping[str, float], scales: Scales
-) -> LinearModel:
-    """Return the model of counts for signals without `noise` (deviations, physical) in them.
-
-    Raises `DataError` if signals vary less, `QuestionError` for one that is no input.
+    Raises `QuestionError` for noise of another signal, and as `fit_penalised`.
     """
-    variances = _variances(gram, inputs, noise, scales)
-    return fit_penalised(gram, inputs, label, [-variance for variance in variances])
-
-
-def _variances(
-    gram: Gram, inputs: Sequence[str], noise: Mapping[str, float], scales: Scales
-) -> list[Fraction]:
     unknown = [name for name in noise if name not in inputs]
     if unknown:
         raise QuestionError(
             f"noise is given for {', '.join(unknown)}, which the model does not use. "
             f"It uses {', '.join(inputs)}."
         )
-    return [gram.n * (Fraction(noise.get(name, 0)) / scales[name]) ** 2 for name in inputs]
+    variances = [(Fraction(noise.get(name, 0)) / scales[name]) ** 2 for name in inputs]
+    return fit_penalised(gram, inputs, label, [gram.n * one for one in variances])
+
+
+def fit_penalised(
+    gram: Gram, inputs: Sequence[str], label: str, penalties: Sequence[Fraction]
+) -> LinearModel:
+    """Solve (S + diag(penalties)) b = S_xy exactly, penalties >= 0 in counts^2, or `DataError`."""
+    part = gram.restrict([*inputs, label])
+    common = math.lcm(*(penalty.denominator for penalty in penalties))
+    matrix = [[common * entry for entry in row] for row in moments(part)]
+    for i, penalty in enumerate(penalties):
+        matrix[i][i] += int(part.n * common * penalty)
+    triangle = eliminate(matrix)
+    if triangle.singular is not None:
+        raise DataError(dependence(part, inputs))
+    numerators, determinant = triangle.solve(len(inputs))
+    slopes = {name: Fraction(x, determinant) for name, x in zip(inputs, numerators, strict=True)}
+    return through_means(part, label, slopes)
 
 
 def disturb(

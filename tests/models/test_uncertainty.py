@@ -1,6 +1,5 @@
-"""Drawing the drives again, and dealing the folds again."""
+"""Drawing the drives again."""
 
-from dataclasses import asdict
 from fractions import Fraction
 
 import numpy as np
@@ -27,13 +26,9 @@ def test_the_interval_holds_the_figure_and_narrows_with_more_drives() -> None:
     for count in (8, 80):
         drives = driven(1, (0.1, 0.2, 0.1, 0.05), drives=count, noise=150)
         model = validated(drives)
-        found = estimate_uncertainty(
-            cohort_of(drives), model, FIVE, SelectionRequest(bootstrap=400)
-        )
-        assert found.interval is not None
+        found = estimate_uncertainty(cohort_of(drives), model, FIVE, 400, SelectionRequest())
         assert found.interval.low < model.correlation < found.interval.high
         assert (found.interval.level, found.interval.replicates) == (0.95, 400)
-        assert (found.repeats, found.repeated_mean, found.repeated_spread) == (0, None, None)
         widths.append(found.interval.high - found.interval.low)
     assert widths[0] > 2 * widths[1]
 
@@ -43,9 +38,8 @@ def test_the_interval_is_that_of_drawing_clusters_by_hand(cluster: ClusterUnit) 
     """Predictions of each drive by the model that has not seen its fold; whole drives, or cars."""
     drives = driven(2, (0.1, 0.2, 0.1, 0.05), drives=20, noise=150)
     cohort = cohort_of(drives)
-    found = estimate_uncertainty(
-        cohort, validated(drives), FIVE, SelectionRequest(bootstrap=1000, cluster=cluster)
-    )
+    asked = SelectionRequest(cluster=cluster)
+    found = estimate_uncertainty(cohort, validated(drives), FIVE, 1000, asked)
     assert found.drawn == cluster
     assignment = assign_folds([one.drive for one in drives], "drive", 5).fold
     estimates = []
@@ -63,33 +57,14 @@ def test_the_interval_is_that_of_drawing_clusters_by_hand(cluster: ClusterUnit) 
         at = [i for number in clusters for i in members[number]]
         p, y = (np.concatenate([estimates[i][k] for i in at]) for k in (0, 1))
         drawn.append(np.corrcoef(p, y)[0, 1])
-    assert found.interval is not None
     low, high = np.percentile(drawn, [2.5, 97.5])
     spread = np.std(drawn)
     assert found.interval.low == pytest.approx(low, abs=spread / 3)
     assert found.interval.high == pytest.approx(high, abs=spread / 3)
 
 
-def test_folds_dealt_again_give_about_the_same_figure_and_the_same_each_time() -> None:
-    drives = driven(3, (0.1, 0.2, 0.1, 0.05), drives=30, noise=150)
-    model = validated(drives)
-    found, again = (
-        estimate_uncertainty(cohort_of(drives), model, FIVE, SelectionRequest(repeat=20))
-        for _ in range(2)
-    )
-    assert found == again
-    assert found.interval is None
-    assert found.repeats == 20
-    assert found.repeated_mean == pytest.approx(model.correlation, abs=0.01)
-    assert found.repeated_spread is not None
-    assert 0 < found.repeated_spread < 0.01
-    keys = {"interval", "drawn", "repeats", "repeated_mean", "repeated_spread"}
-    assert set(asdict(found)) == keys
-
-
 def test_rows_are_no_drives_to_draw() -> None:
     drives = driven(4, (0.1, 0.2, 0.1, 0.05))
     rows = Folding(by="row", count=5)
     with pytest.raises(QuestionError, match="no drives to hold out"):
-        asked = SelectionRequest(bootstrap=100)
-        estimate_uncertainty(cohort_of(drives), validated(drives), rows, asked)
+        estimate_uncertainty(cohort_of(drives), validated(drives), rows, 100, SelectionRequest())

@@ -12,7 +12,6 @@ from fleet_slip.regression.drives import DriveMoments, serving_drives
 from fleet_slip.regression.figures import incomplete_beta, normal_cdf, normal_density
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import (
-    chow_test,
     cluster_covariance,
     infer_by_clusters,
     infer_classically,
@@ -88,19 +87,6 @@ def test_drive_effects_make_the_classical_error_too_small() -> None:
     assert robust > 3 * naive
 
 
-@settings(max_examples=25)
-@given(st.integers(0, 10**6))
-def test_chow_equals_dense(seed: int) -> None:
-    drives = random_drives(seed, drives=3)
-    result = chow_test([gram_of(counts) for counts in drives], names(4)[:-1], "y")
-    apart = sum(dense_fit(counts)[1] for counts in drives)
-    pooled = dense_fit(np.concatenate(drives))[1]
-    f = (pooled - apart) / 10 / (apart / (180 - 15))
-    assert (result.numerator, result.denominator) == (10, 165)
-    assert result.f == pytest.approx(f, rel=1e-8)
-    assert result.p == pytest.approx(scipy.stats.f.sf(f, 10, 165), rel=1e-8, abs=1e-14)
-
-
 def test_variance_inflation_is_that_of_the_inverse_correlations() -> None:
     counts = np.concatenate(random_drives(11))
     expected = np.diag(np.linalg.inv(np.corrcoef(counts[:, :-1].T.astype(float))))
@@ -114,8 +100,6 @@ def test_variance_inflation_is_that_of_the_inverse_correlations() -> None:
 def test_questions_without_an_answer_are_errors() -> None:
     drives = random_drives(1, drives=2)
     gram = gram_of(drives[0])
-    with pytest.raises(DataError, match="two groups"):
-        chow_test([gram], ["x1"], "y")
     with pytest.raises(DataError, match="two drives"):
         infer_by_clusters(fit(gram, ["x1"], "y"), moments_of(drives[:1]), unit_scales(4))
     few = gram_of(drives[0][:2, [0, -1]])

@@ -1,17 +1,11 @@
-"""Noise-matched ridge and errors in variables by properties."""
-
-from fractions import Fraction
+"""Noise-matched ridge by properties."""
 
 import numpy as np
 import pytest
 
-from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.regression.least_squares import fit
-from fleet_slip.regression.shrinkage import (
-    fit_errors_in_variables,
-    fit_noise_matched,
-    fit_penalised,
-)
+from fleet_slip.regression.shrinkage import fit_noise_matched
 from tests.support.counts import gram_of, names, random_drives, unit_scales
 
 
@@ -30,22 +24,10 @@ def test_noise_matched_ridge_is_best_under_that_noise() -> None:
     )
 
 
-def test_errors_in_variables_recovers_the_clean_slope() -> None:
-    rng = np.random.default_rng(5)
-    clean = rng.normal(size=200_000) * 1000
-    noisy = np.column_stack([clean + rng.normal(size=clean.size) * 700, 0.5 * clean])
-    gram = gram_of(np.rint(noisy).astype(np.int64))
-    attenuated = fit(gram, ["x1"], "y").model.weights["x1"]
-    assert attenuated == pytest.approx(0.5 / 1.49, rel=0.02)
-    model = fit_errors_in_variables(gram, ["x1"], "y", {"x1": 700.0}, unit_scales(1))
-    assert model.weights["x1"] == pytest.approx(0.5, rel=0.02)
-    with pytest.raises(DataError, match="positive definite at x1"):
-        fit_errors_in_variables(gram, ["x1"], "y", {"x1": 2000.0}, unit_scales(1))
-    with pytest.raises(QuestionError, match="noise is given for gyro"):
-        fit_errors_in_variables(gram, ["x1"], "y", {"gyro": 1.0}, unit_scales(1))
-
-
-def test_no_penalty_is_least_squares_exactly() -> None:
+def test_without_noise_it_is_least_squares_exactly() -> None:
     gram = gram_of(np.concatenate(random_drives(6)))
     inputs = names(4)[:-1]
-    assert fit_penalised(gram, inputs, "y", [Fraction(0)] * 4) == fit(gram, inputs, "y").model
+    model = fit_noise_matched(gram, inputs, "y", {}, unit_scales(4))
+    assert model == fit(gram, inputs, "y").model
+    with pytest.raises(QuestionError, match="noise is given for gyro"):
+        fit_noise_matched(gram, inputs, "y", {"gyro": 1.0}, unit_scales(4))
