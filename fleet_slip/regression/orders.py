@@ -67,37 +67,12 @@ def pivoted_cholesky(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str
     return tuple(inputs[i] for i in _pivot(matrix, remaining, largest=True))
 
 
-def replacement(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Order by sequential replacement (Miller 2002, section 3.3): after each step exchange signals.
-
-    Sets need not be nested: a signal ranks by the first size at which it appears.
-    """
-    order: list[str] = []
-    for chosen in replacement_sets(gram, inputs, label):
-        order += [name for name in inputs if name in chosen and name not in order]
-    return tuple(order)
-
-
-def replacement_sets(gram: Gram, inputs: Sequence[str], label: str) -> list[frozenset[str]]:
-    """Return the sets of 1, ..., k signals that sequential replacement ends with."""
-    matrix = _moments(gram, inputs, label)
-    chosen: list[int] = []
-    sets = []
-    for _ in inputs:
-        outside = [i for i in range(len(inputs)) if i not in chosen]
-        chosen.append(min(outside, key=lambda i: (_rss(matrix, [*chosen, i]), i)))
-        _exchange(matrix, chosen)
-        sets.append(frozenset(inputs[i] for i in chosen))
-    return sets
-
-
 RANKINGS: dict[str, Ranking] = {
     "declared": declared,
     "correlation": correlation,
     "t": t_value,
     "forward": forward,
     "backward": backward,
-    "replacement": replacement,
     "pivoted-cholesky": pivoted_cholesky,
 }
 
@@ -151,24 +126,6 @@ def _pivot(matrix: Matrix, score: Score, *, largest: bool, divisor: int = 1) -> 
 def _descending(inputs: Sequence[str], scores: Sequence[Fraction]) -> tuple[str, ...]:
     order = sorted(range(len(inputs)), key=lambda i: (-scores[i], i))
     return tuple(inputs[i] for i in order)
-
-
-def _rss(matrix: Matrix, chosen: Sequence[int]) -> Fraction:
-    at = [*chosen, len(matrix) - 1]
-    return eliminate([[matrix[i][j] for j in at] for i in at]).residual(len(chosen))
-
-
-def _exchange(matrix: Matrix, chosen: list[int]) -> None:
-    """Exchange chosen inputs, in place, until no exchange lowers the residual sum of squares."""
-    best = _rss(matrix, chosen)
-    improved = True
-    while improved:
-        improved = False
-        for position in range(len(chosen)):
-            for i in range(len(matrix) - 1):
-                trial = [*chosen[:position], i, *chosen[position + 1 :]]
-                if i not in chosen and (rss := _rss(matrix, trial)) < best:
-                    chosen[:], best, improved = trial, rss, True
 
 
 # Choosing among many inputs: forward, backward, or exchange.

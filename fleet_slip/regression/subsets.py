@@ -1,8 +1,8 @@
 """The best models of every size among all 2^k subsets of the signals.
 
-Up to `DOUBLING_LIMIT` signals, each doubles a list of moments into copies without it and with it
-(Schur complement) until 2^k residual sums of squares are left, by bit mask; beyond, leaps and
-bounds (Furnival and Wilson 1974). That is float64 on correlations; the best are ordered exactly.
+Each signal doubles a list of moments into copies without it and with it (Schur complement) until
+2^k residual sums of squares are left, by bit mask: float64 on correlations. The best are ordered
+exactly.
 
 Selection criteria: each is a value per model, and the smallest wins.
 
@@ -115,11 +115,8 @@ def _criterion(name: str) -> Callable[[Problem], FloatArray]:
         raise QuestionError(f"unknown criterion {name!r}. Known criteria: {known}.") from None
 
 
-DOUBLING_LIMIT = 22
-"""Most signals for which all subsets are computed: 2^22 take about two seconds."""
-
-MOST_INPUTS = 62
-"""Most signals of a search: bit masks are 64-bit integers."""
+MOST_INPUTS = 22
+"""Most signals of which all subsets are computed: 2^22 take about two seconds."""
 
 _SPARE = 3
 
@@ -162,7 +159,8 @@ def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) 
         raise DataError(relations)
     if len(inputs) > MOST_INPUTS:
         raise QuestionError(
-            f"all subsets of {len(inputs)} signals are too many: give at most {MOST_INPUTS}."
+            f"all subsets of {len(inputs)} signals are too many: give at most {MOST_INPUTS}, or "
+            "search among them with: search exchange."
         )
     part = gram.restrict([*inputs, label])
     matrix = correlation_matrix(part)
@@ -182,10 +180,6 @@ def pick_sizes(results: Sequence[SizeResult], evidence: Evidence) -> dict[str, i
 def candidates(matrix: FloatArray, count: int) -> list[list[int]]:
     """Return bit masks of the `count` best subsets of each size, by float64 RSS."""
     k = len(matrix) - 1
-    if k > DOUBLING_LIMIT:
-        from fleet_slip.regression.leaps import best_by_leaps  # noqa: PLC0415 - compiled code
-
-        return best_by_leaps(matrix, count)
     rss = all_rss(matrix)
     sizes = subset_sizes(k)
     result = []

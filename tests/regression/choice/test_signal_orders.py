@@ -15,10 +15,9 @@ from fleet_slip.regression.choice import nested_fits
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Evidence, infer_by_clusters
-from fleet_slip.regression.leaps import best_by_leaps
 from fleet_slip.regression.least_squares import correlation_matrix, fit
-from fleet_slip.regression.orders import RANKINGS, rank, replacement_sets
-from fleet_slip.regression.subsets import all_rss, best_subsets, candidates, signals_of
+from fleet_slip.regression.orders import RANKINGS, rank, stepwise_order
+from fleet_slip.regression.subsets import all_rss, best_subsets, signals_of
 from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of, unit_scales
 from tests.support.evidence import evidence
 
@@ -87,14 +86,6 @@ def test_all_subsets_equal_brute_force(seed: int, k: int) -> None:
         assert result.best.size == size
 
 
-@pytest.mark.parametrize("k", [1, 4, 12])
-def test_leaps_and_bounds_finds_what_doubling_finds(k: int) -> None:
-    gram = gram_of(np.concatenate(random_drives(k, inputs=k, noise=2000)))
-    matrix = correlation_matrix(gram)
-    found = best_by_leaps(matrix, 4)
-    assert [set(masks) for masks in found] == [set(masks) for masks in candidates(matrix, 4)]
-
-
 @settings(max_examples=20)
 @given(st.integers(0, 10**6))
 def test_greedy_orders_equal_their_definition(seed: int) -> None:
@@ -116,16 +107,9 @@ def test_greedy_orders_equal_their_definition(seed: int) -> None:
         removed = (worst, *removed)
         kept = tuple(name for name in kept if name != worst)
     assert rank("backward", gram, inputs, "y") == removed
-    best = [set(result.best.model.signals) for result in best_subsets(gram, inputs, "y")]
-    for size, chosen in enumerate(replacement_sets(gram, inputs, "y"), start=1):
-        assert rss(tuple(chosen)) <= rss(added[:size])
-        assert rss(tuple(chosen)) >= rss(tuple(best[size]))
-        for one in chosen:  # no exchange of one signal is better
-            for other in set(inputs) - chosen:
-                assert rss((*(chosen - {one}), other)) >= rss(tuple(chosen))
 
 
-def test_replacement_gives_up_what_was_best_alone() -> None:
+def test_exchange_gives_up_what_was_best_alone() -> None:
     """x1 is nearly x2 + x3, as is y: best alone, and of no use beside the other two."""
     rng = np.random.default_rng(0)
     u, v = rng.integers(-1000, 1000, (2, 300))
@@ -133,7 +117,8 @@ def test_replacement_gives_up_what_was_best_alone() -> None:
     gram = gram_of(np.column_stack([proxy, u, v, y]))
     inputs = names(3)[:-1]
     assert rank("forward", gram, inputs, "y")[0] == "x1"
-    assert replacement_sets(gram, inputs, "y") == [{"x1"}, {"x2", "x3"}, {"x1", "x2", "x3"}]
+    exchanged = stepwise_order(gram, inputs, "y", "exchange", 3)
+    assert [set(chosen) for chosen in exchanged] == [{"x1"}, {"x2", "x3"}, {"x1", "x2", "x3"}]
 
 
 @pytest.mark.parametrize("name", RANKINGS)
