@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from fleet_slip.evaluation.blind import BlindRow
     from fleet_slip.evaluation.report import Written
-    from fleet_slip.export.compile import Estimator
     from fleet_slip.export.program import Target
+    from fleet_slip.export.stepping import Estimator
     from fleet_slip.models.diff import Difference
     from fleet_slip.models.manifest import Manifest
     from fleet_slip.models.publish import DryRun, Publication
@@ -205,7 +205,7 @@ class PublishedModels(Rooted):
         of the view `calibration`, in SI units. Raises `InputError` for what the version does not
         use, and what `export` and `model` raise.
         """
-        from fleet_slip.export.compile import Estimator
+        from fleet_slip.export.stepping import Estimator
 
         return Estimator(self.resolve(model).manifest, car)
 

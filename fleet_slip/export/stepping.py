@@ -1,130 +1,176 @@
-"""Runs steps for one tick, compiled: a row of whole numbers for each.
+"""A published version tick by tick, for test benches: `Fleet.estimator`."""
 
-A row is an operation, the place in memory that it writes, and operands, which are places in memory
-or plain numbers. Memory is int64; `MISSING` is a value that is not there.
-"""
-
+import operator
+from collections.abc import Callable, Mapping
+from fractions import Fraction
 from typing import Any
 
-import numpy as np
+from fleet_slip.catalogue.arithmetic import nearest, truncated
+from fleet_slip.catalogue.facts import round_number
+from fleet_slip.columns.operations import operation_of, plain_of
+from fleet_slip.errors import InputError
+from fleet_slip.export.compile import compile_program
+from fleet_slip.export.program import Car, Program
+from fleet_slip.models.manifest import Manifest
 
-from fleet_slip.compiling import inner_loop, kernel
-
-MISSING = -(2**63)
-
-(
-    ADD, SUBTRACT, MULTIPLY, DIVIDE, NEAREST, LEAST, MOST, NEGATIVE, ABSOLUTE, SIGN, CLIP,
-    AT_LEAST, WHERE,  # so far missing where an operand is
-    ELSE, SIGNAL, AGO, SLIDE, KEEP, TERM,
-) = range(19)  # fmt: skip
-"""What a tick does; `SLIDE` is the sums and the values of a window."""
-
-CODES = {
-    **{"+": ADD, "-": SUBTRACT, "*": MULTIPLY, "//": DIVIDE, "nearest": NEAREST, "min": LEAST},
-    **{"max": MOST, "negative": NEGATIVE, "abs": ABSOLUTE, "sign": SIGN, "clip": CLIP},
-    **{"at_least": AT_LEAST, "where": WHERE, "else": ELSE},
+_COMPUTED: Mapping[str, Callable[..., int | None]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "//": lambda a, b: truncated(a, b) if b > 0 else None,
+    "nearest": lambda a, b: nearest(a, b) if b > 0 else None,
+    "min": min,
+    "max": max,
+    "negative": operator.neg,
+    "abs": abs,
+    "sign": lambda a: (a > 0) - (a < 0),
+    "clip": lambda a, most: max(-most, min(a, most)),
+    "at_least": lambda a, least: a if a >= least else None,
+    "where": lambda a, _: a,
 }
-"""Operations of steps that are computed from values of the same tick."""
-
-ROW = 8
-"""Whole numbers of an operation."""
+"""What an operation is, of values of the same tick none of which is missing."""
 
 
-@kernel
-def run_tick(rows: Any, memory: Any, values: Any, intercept: float) -> Any:
-    """Return the angle in rad of the next tick; NaN if there is none.
+class Estimator:
+    """Estimates the side-slip angle of a drive, a sample at a time.
 
-    `values` has the given physical values of the signals first, then constants.
+    Attributes:
+        columns: names in SI units that a sample has.
     """
-    estimate = intercept
-    for n in range(len(rows)):
-        operation, out, a, b = rows[n, 0], rows[n, 1], rows[n, 2], rows[n, 3]
-        if operation < ELSE:
-            memory[out] = _calculate(operation, memory[a], memory[b])
-        elif operation == ELSE:
-            memory[out] = memory[b] if memory[a] == MISSING else memory[a]
-        elif operation == SIGNAL:
-            memory[out] = _count(values[a], values[b], rows[n, 4], rows[n, 5])
-        elif operation == TERM:
-            column = memory[a]
-            term = np.nan if column == MISSING else column * values[rows[n, 4]]
-            estimate += values[b] * term
-        else:
-            _remember(operation, memory, out, a, b, rows[n, 4], rows[n, 5], rows[n, 6], rows[n, 7])
-    return estimate
+
+    def __init__(self, manifest: Manifest, car: Mapping[str, Any] | None = None) -> None:
+        """Take a version, and what is known of the car: facts, and numbers in SI units, by name.
+
+        Raises `InputError` for what the version does not use, and what `compile_program` raises.
+        """
+        self._program = program = compile_program(manifest)
+        known = _known(manifest, program, car or {})
+        self.columns = tuple(one.column for one in program.signals)
+        self._manifest = manifest
+        steps = [(operation_of(step), plain_of(step)) for step in program.steps]
+        car_counts = {
+            "fact": known.fact_counts(program),
+            "number": known.number_counts(program),
+        }
+        self._begin: list[int | None] = [None] * len(steps)
+        self._steps = []
+        for place, (name, plain) in enumerate(steps):
+            if name == "constant":
+                self._begin[place] = plain[0]
+            elif name in car_counts:
+                self._begin[place] = car_counts[name][plain[0]]
+            else:
+                self._steps.append((place, name, _COMPUTED.get(name), plain))
+        scale_of = {one.name: float(one.scale) for one in program.signals}
+        self._terms = [
+            (place, scale_of[t.signal] if t.logged else float(t.scale), t.coefficient)
+            for t, place in zip(manifest.terms, program.angle.places, strict=True)
+        ]
+        self.restart()
+
+    def step(self, sample: Mapping[str, float | None]) -> float | None:
+        """Return the angle of the next tick in rad; None if there is none.
+
+        A sample has the columns of `columns` in SI units, None where a value is missing, as one
+        that is beyond its valid range is; others are left alone. They are rounded to counts, half
+        to even, as the sensors do. The angles of a drive have the bits that `predict` computes.
+
+        Raises `InputError` if the sample lacks a column.
+        """
+        counts, now = self._counts(sample), self._begin.copy()
+        for place, name, compute, plain in self._steps:
+            if compute is not None:
+                values = [now[one] for one in plain]
+                now[place] = None if None in values else compute(*values)
+            elif name == "signal":
+                now[place] = counts[plain[0]]
+            elif name == "else":
+                now[place] = now[plain[1]] if now[plain[0]] is None else now[plain[0]]
+            elif name == "ago":
+                now[place] = self._ago(*plain)
+            elif name == "sum":
+                now[place] = self._slide(now[plain[0]], *plain)
+            else:
+                now[place] = self._windows[plain][1]
+        for of, ring in self._rings.items():
+            ring[self._tick % len(ring)] = now[of]
+        self._tick += 1
+        estimate = self._manifest.intercept
+        for place, scale, coefficient in self._terms:
+            count = now[place]
+            if count is None:
+                return None
+            estimate += coefficient * (count * scale)
+        return estimate
+
+    def skip(self, ticks: int = 1) -> None:
+        """Take ticks that were not logged."""
+        nothing = dict.fromkeys(self.columns)
+        for _ in range(min(ticks, self._program.longest_ticks + 1)):  # then nothing is left
+            self.step(nothing)
+
+    def restart(self) -> None:
+        """Begin another drive of the same car."""
+        self._tick = 0
+        rings = self._program.rings.items()
+        self._rings: dict[int, list[int | None]] = {of: [None] * n for of, n in rings if n}
+        self._windows = {window: [0, 0] for window in self._program.sums}
+
+    def _counts(self, sample: Mapping[str, float | None]) -> list[int | None]:
+        """Return the counts of a sample, None where missing or out of range."""
+        found: list[int | None] = []
+        name = self._manifest.name
+        for one in self._program.signals:
+            try:
+                value = sample[one.column]
+                ratio = float("nan") if value is None else float(value) / float(one.scale)
+            except KeyError:
+                missing = ", ".join(column for column in self.columns if column not in sample)
+                raise InputError(f"{name} needs {missing} in every sample.") from None
+            except (TypeError, ValueError):
+                raise InputError(f"{name}: a sample has what is no number.") from None
+            count = round(ratio) if abs(ratio) < 2**31 else None
+            inside = count is not None and one.min_count <= count <= one.max_count
+            found.append(count if inside else None)
+        return found
+
+    def _ago(self, of: int, ticks: int) -> int | None:
+        ring = self._rings[of]
+        return ring[(self._tick - ticks) % len(ring)]
+
+    def _slide(self, newest: int | None, of: int, ticks: int, most: int) -> int:
+        """Bring a window's sum and number of values to this tick; return the sum."""
+        window = self._windows[of, ticks, most]
+        oldest = self._ago(of, ticks) if ticks else None
+        if oldest is not None:
+            window[0] -= oldest
+            window[1] -= 1
+        if newest is not None and window[1] < most:
+            window[0] += newest
+            window[1] += 1
+        return window[0]
 
 
-@inner_loop
-def _calculate(operation: int, a: int, b: int) -> Any:
-    """Return what a step computes of two values; of one, both are the same."""
-    found = a
-    if MISSING in (a, b):
-        found = MISSING
-    elif operation == ADD:
-        found = a + b
-    elif operation == SUBTRACT:
-        found = a - b
-    elif operation == MULTIPLY:
-        found = a * b
-    elif operation in (DIVIDE, NEAREST):
-        found = _quotient(a, b, operation == NEAREST)
-    elif operation == LEAST:
-        found = min(a, b)
-    elif operation == MOST:
-        found = max(a, b)
-    elif operation == NEGATIVE:
-        found = -a
-    elif operation == ABSOLUTE:
-        found = abs(a)
-    elif operation == SIGN:
-        found = (1 if a > 0 else 0) - (1 if a < 0 else 0)
-    elif operation == CLIP:
-        found = max(-b, min(a, b))
-    elif operation == AT_LEAST and a < b:
-        found = MISSING
-    return found
+def _known(manifest: Manifest, program: Program, given: Mapping[str, Any]) -> Car:
+    """Return a car: numbers in counts."""
+    numbers = {one.name: one for one in program.numbers}
+    used = {*numbers, *(one.name for one in program.facts)}
+    if unknown := sorted({*given} - used):
+        raise InputError(
+            f"{manifest.name} does not use {', '.join(unknown)} of a car. It uses: "
+            f"{', '.join(sorted(used)) or 'nothing'}."
+        )
+    counts = {
+        name: count
+        for name, one in numbers.items()
+        if given.get(name) is not None
+        and (count := round_number(_fraction(given[name]), _fraction(str(one.grain)))) is not None
+    }
+    return Car({name: value for name, value in given.items() if name not in numbers}, counts)
 
 
-@inner_loop
-def _quotient(a: int, b: int, rounds: bool) -> Any:
-    if b <= 0:
-        return MISSING
-    size = (2 * abs(a) + b) // (2 * b) if rounds else abs(a) // b
-    return -size if a < 0 else size
-
-
-@inner_loop
-def _count(value: float, scale: float, least: int, most: int) -> Any:
-    """Return a physical value in counts, as the sensors round it: half to even."""
-    count = np.rint(value / scale)
-    inside = np.float64(least) <= count <= np.float64(most)
-    return np.int64(count) if inside else MISSING
-
-
-@inner_loop
-def _remember(
-    operation: int, memory: Any, out: int, a: int, b: int, c: int, d: int, e: int, f: int
-) -> None:
-    """Read or write a ring of `c` values at `b`, whose next place stands at `d`; or bring a sum
-    and its number of values, at `out` and `f`, to this tick."""
-    if operation == KEEP:
-        memory[b + memory[d]] = memory[a]
-        memory[d] = 0 if memory[d] + 1 == c else memory[d] + 1
-        return
-    if operation == AGO:
-        memory[out] = _ago(memory, b, c, memory[d], e)
-        return
-    oldest = _ago(memory, b, c, memory[d], e) if c else MISSING
-    if oldest != MISSING:
-        memory[out] -= oldest
-        memory[f] -= 1
-    # Without a ring, `e` is how many values are taken at most.
-    if memory[a] != MISSING and (c or memory[f] < e):
-        memory[out] += memory[a]
-        memory[f] += 1
-
-
-@inner_loop
-def _ago(memory: Any, ring: int, length: int, at: int, ticks: int) -> Any:
-    place = at - ticks
-    return memory[ring + (place if place >= 0 else place + length)]
+def _fraction(value: Any) -> Fraction:
+    try:
+        return Fraction(value)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{value!r} is no number of a car.") from None

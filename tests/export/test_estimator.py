@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 import fleet_slip
 from fleet_slip.errors import InputError
-from fleet_slip.export.compile import Estimator, Sample, compile_program, drive_counts
+from fleet_slip.export.compile import Sample, compile_program, drive_counts
 from fleet_slip.export.program import Car, Program
+from fleet_slip.export.stepping import Estimator
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
 from tests.export.models import cars, drives, model_of, models

@@ -22,7 +22,6 @@ from fleet_slip.catalogue.facts import NumberName
 from fleet_slip.catalogue.time_columns import Feature
 from fleet_slip.columns.sql import with_columns
 from fleet_slip.export.compile import (
-    Estimator,
     Sample,
     angles_by_kernel,
     angles_of_columns,
@@ -30,6 +29,7 @@ from fleet_slip.export.compile import (
 )
 from fleet_slip.export.files import program_content
 from fleet_slip.export.program import Car, Program
+from fleet_slip.export.stepping import Estimator
 from fleet_slip.models.manifest import Manifest, ModelTerm
 from fleet_slip.models.registry import ModelVersion
 from tests.export import plain
