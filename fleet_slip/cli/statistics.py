@@ -94,8 +94,9 @@ def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
     )
     test = found.test
     if test is None:
+        unit = "drive" if result.cluster == "row" else result.cluster
         say(
-            f"there are too few {result.cluster}s to compare so many coefficients by them. Choose "
+            f"there are too few {unit}s to compare so many coefficients by them. Choose "
             "fewer signals, or more drives."
         )
         return

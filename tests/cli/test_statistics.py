@@ -458,7 +458,7 @@ def test_of_hundreds_of_inputs_a_message_names_families_and_how_many_more(
     assert len(refused.stderr) < 800
 
 
-def test_single_drives_are_compared_by_rows_with_a_warning(
+def test_single_drives_have_errors_by_rows_with_a_warning(
     run_command: RunCommand, smoke_root: Path
 ) -> None:
     asked = ("diagnose", "--signals", "ay,steer_fl", "--cohort", "drive_id LIKE '%05-01-0000'")
@@ -466,7 +466,7 @@ def test_single_drives_are_compared_by_rows_with_a_warning(
     done = run_command(*asked, *other, root=smoke_root)
     assert done.exit_code == 0
     assert "there is one drive only" in done.stderr
-    assert "Chow, by rows" in done.stdout
+    assert "too few drives to compare" in done.stderr
     assert "Wald" not in done.stdout
     found = run_command(*asked, *other, "--json", root=smoke_root).json
     assert (found["cluster"], found["clusters"]) == ("row", 1)
