@@ -1,13 +1,9 @@
 """Checks the order of time and cuts rows, block by block, into drives: uninterrupted stretches."""
 
-import itertools
-import json
-from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +13,9 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
-from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import catalogue, digest_drive, round_chunks
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
-from fleet_slip.ingest.formats.reading import file_errors, open_source
-from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.log_rows import (
     describe_refused,
     join_refused,
@@ -43,8 +36,6 @@ from fleet_slip.ingest.resampling import (
     course_and_speed,
     fixes_on_ticks,
 )
-from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
-from fleet_slip.ingest.vocabulary import is_called, vocabulary
 
 LONGEST_DRIVE_S = 2**19 * STEP_S
 """A longer stretch is cut after this time, some 87 minutes, so that a drive fits into memory."""
@@ -87,9 +78,6 @@ class DriveCutter:
     def cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
         """Return the rows of a block with their `part`, together; and the misplaced ones."""
         self.ended = []
-        if self._goes_on(rows):
-            part = pl.lit(int(self._state["part"][rows["group"][0]]), pl.Int64)
-            return rows.with_columns(part.alias("part")), no_rows()
         several = "base" in rows.columns
         if self._waiting is not None:
             rows = pl.concat([self._waiting, rows])
@@ -117,25 +105,6 @@ class DriveCutter:
             if (disordered := twice | backwards).any():
                 rows = rows.filter(pl.Series(~disordered))
         return rows, join_refused(refused)
-
-    def _goes_on(self, rows: pl.DataFrame) -> bool:
-        """Whether all rows are of one open part, as most blocks' are; then take note of them."""
-        if "base" in rows.columns or rows.is_empty() or self._waiting is not None:
-            return False
-        group, time = rows["group"].to_numpy(), rows["time"].to_numpy()
-        if group[0] >= self._state.size or not (group == group[0]).all():
-            return False
-        seen = self._state[group[0]]
-        step = np.diff(time, prepend=seen["latest"])
-        near = all(abs(time[0] - seen[at]) <= self._gap_s for at in ("last", "kept"))
-        piece = (time[-1] - seen["start"]) // self._longest_s
-        if not (near and step.min() > 0 and step[1:].max(initial=0) <= self._gap_s):
-            return False
-        if seen["part"] < 0 or piece != seen["piece"]:
-            return False
-        for at in ("last", "kept", "latest"):
-            self._state[at][group[0]] = time[-1]
-        return True
 
     def _grow(self, rows: pl.DataFrame) -> None:
         """Make room for groups that were not there before."""
@@ -599,134 +568,3 @@ class Trips:
             trip_id = drive_id
         self._last[group] = trip_id, end_s
         return trip_id
-
-
-# Rows of several cars that a mapping takes for those of one: neighbouring rows differ by more than
-# a car can change, a car is under way twice, or a column named like cars is not mapped.
-
-_LIMITS = {
-    **dict.fromkeys(WHEELS, (3 / RADIUS_M, 150 / RADIUS_M)),  # a wheel may lock within 0.15 s
-    "vx": (3.0, 30.0),
-    "vehicle_speed": (3.0, 30.0),
-    "steering_wheel": (0.5, 30.0),
-    "yaw_rate": (0.3, 30.0),
-}
-"""More than its own noise, and so much a second, no car's signal changes from row to row."""
-_STANDING = {**dict.fromkeys(WHEELS, 2 / RADIUS_M), "vx": 2.0, "vehicle_speed": 2.0}
-"""A speed below, as any 0, is that of a car that stands, or of a sensor lost for a while."""
-FEWEST_JUMPS, FEWEST_A_MINUTE = 10, 3.0
-MOST_TOLD = 0.15
-"""Where more neighbours than this part jump, these are no single values that went wrong."""
-OVERLAP_S = 1.0
-MOST_NAMES, LEAST_ROWS_A_NAME = 1000, 20
-
-
-class SeveralCars:
-    """What tells, of the drives of one file, that they are of several cars."""
-
-    def __init__(self) -> None:
-        """Begin without drives."""
-        self._jumps: Counter[str] = Counter()
-        self._under_way: dict[str, list[tuple[float, float]]] = defaultdict(list)
-
-    def add(self, rows: DriveRows, drive: MeasuredDrive) -> None:
-        """Look at the rows of a drive."""
-        for name in _LIMITS:
-            if any(name in piece.columns for piece in rows.pieces):
-                self._jumps[name] += _count_jumps(name, *_samples(rows, name))
-        if drive.metadata["started_at"] is not None:
-            car = str(drive.metadata["vehicle_id"])
-            self._under_way[car].append((rows.start_s, rows.end_s))
-
-    def suspicions(self) -> Iterator[Fault]:
-        """Yield what is seen of several cars, once all drives were looked at."""
-        remedy = "Map the column that tells cars or trips apart."
-        for name, jumps in self._jumps.most_common(1):
-            if jumps:
-                figure = f"from row to row it jumps {jumps:,} times as that of no car does"
-                yield Fault("cars", (name,), figure, remedy)
-        twice = sum(_overlaps(under_way) for under_way in self._under_way.values())
-        if twice:
-            figure = f"one car is under way twice at a time, {twice:,} times"
-            yield Fault("repeated", ("time",), figure, remedy)
-
-
-def unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]:
-    """Yield columns named as cars or trips are that tell rows apart, and that a mapping passes by.
-
-    `drives` is what the file fell into. Logs that have clocks of their own are those of one car.
-    """
-    wanted = {
-        key: words
-        for key, words in vocabulary()["cars"].items()
-        if not (mapping.drive.column or isinstance(getattr(mapping.drive, key), FromColumn))
-    }
-    if mapping.time.own_clock or not wanted:
-        return
-    used = {name for names in mapping.time_bases().values() for name in names}
-    part = parts_of(file)[0]
-    with file_errors(part), open_source(part, mapping.formats) as source:
-        names = [channel.name for channel in source.channels()]
-        for key, words in wanted.items():
-            for name in names:
-                if name in used or names.count(name) > 1 or not is_called(words, name):
-                    continue
-                column = pl.concat([batch[name] for batch in source.batches([name])])
-                values, runs = _values_and_runs(column)
-                if values > 1 and (key == "vehicle_id" or runs > values or values > drives):
-                    figure = f"it has {values:,} values, and the mapping does not use it"
-                    told = json.dumps(name, ensure_ascii=False)
-                    where = f"column = {told}"
-                    where = f"{key} = {{ {where} }}" if key != "column" else where
-                    yield Fault("cars", (name,), figure, f"Write {where} under [drive].")
-
-
-def _values_and_runs(column: pl.Series) -> tuple[int, int]:
-    """Return how many names a column has, and how often one begins; none if it is a quantity."""
-    texts = column.cast(pl.String).str.strip_chars()
-    present = texts.filter(texts.is_not_null() & (texts != ""))
-    values = present.n_unique()
-    if values > min(MOST_NAMES, len(present) // LEAST_ROWS_A_NAME):
-        return 0, 0
-    return values, 1 + int((present != present.shift()).sum())
-
-
-def _samples(rows: DriveRows, name: str) -> tuple[FloatArray, FloatArray]:
-    """Return the times and values of a signal of a drive, where it has some."""
-    if rows.bases:
-        samples = rows.samples(name)
-        return samples["time"].to_numpy(), samples[name].to_numpy()
-    values = rows.column(name)
-    present = np.isfinite(values)
-    return (rows.time_s, values) if present.all() else (rows.time_s[present], values[present])
-
-
-def _count_jumps(name: str, time_s: FloatArray, values: FloatArray) -> int:
-    """Return how often a signal jumps from row to row, 0 if so seldom that a sensor may do it."""
-    if time_s.size < FEWEST_JUMPS or not time_s[-1] > time_s[0]:
-        return 0
-    if np.count_nonzero(np.abs(np.diff(values)) > _LIMITS[name][0]) < FEWEST_JUMPS:
-        return 0  # of most drives this tells it, at a third of the cost of all below
-    jumps = _jumps(name, time_s, values)
-    if jumps.sum() < max(FEWEST_JUMPS, MOST_TOLD * jumps.size):  # values that are wrong alone
-        alone = np.zeros(values.size, dtype=np.bool_)
-        alone[1:-1] = jumps[:-1] & jumps[1:]
-        jumps = _jumps(name, time_s[~alone], values[~alone])
-    minutes = (time_s[-1] - time_s[0]) / 60
-    return int(jumps.sum()) if jumps.sum() >= max(FEWEST_JUMPS, FEWEST_A_MINUTE * minutes) else 0
-
-
-def _jumps(name: str, time_s: FloatArray, values: FloatArray) -> BoolArray:
-    noise, rate = _LIMITS[name]
-    slower = np.minimum(np.abs(values[1:]), np.abs(values[:-1]))
-    jumps = np.abs(np.diff(values)) > noise + rate * np.diff(time_s)
-    return np.asarray(jumps & (slower > _STANDING.get(name, 0.0)))
-
-
-def _overlaps(under_way: list[tuple[float, float]]) -> int:
-    """Return how many of some drives begin while an earlier one is under way."""
-    ordered = sorted(under_way)
-    latest = itertools.accumulate((end for _, end in ordered), max)
-    return sum(
-        start < end - OVERLAP_S for (start, _), end in zip(ordered[1:], latest, strict=False)
-    )

@@ -24,16 +24,15 @@ from fleet_slip.ingest.drives import (
     DriveRows,
     MeasuredDrive,
     OpenDrives,
-    SeveralCars,
     Trips,
     drive_id,
     sample_intervals_s,
     to_ticks,
-    unmapped_cars,
 )
 from fleet_slip.ingest.formats.reading import log_digest, require_unchanged_log
 from fleet_slip.ingest.formats.source import Meter
 from fleet_slip.ingest.formats.tables import partition_keys
+from fleet_slip.ingest.log_faults import LogFaults
 from fleet_slip.ingest.log_files import parts_of, size_of
 from fleet_slip.ingest.log_rows import (
     CheckedBlock,
@@ -44,7 +43,6 @@ from fleet_slip.ingest.log_rows import (
 )
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
-from fleet_slip.ingest.suspicion import assumed_rate, find_refusals
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 
 MAX_DRIVES = 10_000
@@ -112,7 +110,7 @@ class MeasuredStream:
         self._open = OpenDrives()
         self._stretches: Counter[int] = Counter()
         self._trips = Trips()
-        self._cars = SeveralCars()
+        self._faults = LogFaults(file, mapping)
         self.name = os.fsencode(file.name).decode("utf-8", "replace")
         self._stem = self.name.split(".", 1)[0] or self.name
 
@@ -215,7 +213,7 @@ class MeasuredStream:
         for signal, values in drive.counts.items():
             self._samples[signal] += rows.number_of(signal)
             self._values[signal] += len(values) - values.null_count
-        self._cars.add(rows, drive)
+        self._faults.add(rows, drive)
         self._require_sane_drives()
         return drive
 
@@ -286,10 +284,8 @@ class MeasuredStream:
 
     def suspicions(self) -> tuple[Fault, ...]:
         """Return what looks wrong in the file as a whole, once all pieces were taken."""
-        counts, time = self.counts, self.mapping.time
-        found = list(find_refusals(self._refused, counts.rows_read, counts.quarantined))
-        found += [*self._cars.suspicions(), *unmapped_cars(self.file, self.mapping, counts.drives)]
-        return (*found, *assumed_rate(time.rate_hz if time.assumed else None))
+        counts = self.counts
+        return tuple(self._faults.find(self._refused, counts.rows_read, counts.quarantined))
 
 
 @contextmanager

@@ -6,7 +6,6 @@ with the figure that shows it, and what to try. Axes and signs are ISO 8855.
 """
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
@@ -530,51 +529,3 @@ def _lever(signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool)
     elif abs(zero) > LARGEST_ZERO_RAD:
         figure = f"on a straight it is {np.degrees(zero):+.2f} deg, should be 0"
         yield Fault("biased", (label,), figure, f"Write offset = {-zero:.4f} (rad).")
-
-
-# What looks wrong in a file as a whole: many rows refused, and times that are assumed.
-
-LARGEST_REFUSED, FEWEST_REFUSED = 0.1, 10
-_REFUSED = {
-    "out_of_range": ("scaled", "Check its unit."),
-    "not_a_number": ("texts", "Name those that mean no value under missing."),
-    "not_finite": ("values", 'Write missing = ["nan"] if they mean no value.'),
-}
-_OF_TIME = ("time", "isolated", "too_short", "not_a_time")
-
-
-def find_refusals(
-    refused: Mapping[tuple[str, str], int], rows: int, reasons: Mapping[str, int]
-) -> Iterator[Fault]:
-    """Yield each signal for which more than a tenth of a file's rows were refused, and all others.
-
-    `refused` are rows by signal and reason, `reasons` all refused rows by reason.
-    """
-    most = max(rows * LARGEST_REFUSED, FEWEST_REFUSED)
-    several = {key: count for key, count in refused.items() if count > most}
-    for (name, reason), count in several.items():
-        kind, remedy = _REFUSED.get(reason, ("values", "Look at the column."))
-        figure = f"{count:,} of {rows:,} rows are refused for it, {reason}"
-        yield Fault(kind, (name,), figure, remedy)
-    others = Counter(reasons)
-    for (_, reason), count in several.items():
-        others[reason] -= count
-    if others.total() <= most:
-        return
-    ((reason, count),) = others.most_common(1)
-    figure = f"{others.total():,} of {rows:,} rows are refused, {count:,} as {reason}"
-    if reason.startswith(_OF_TIME):
-        remedy = "Check the column of times, its unit and its format"
-        if reason in {"time_duplicate", "time_backwards"}:
-            remedy += ", and map the column that tells cars or trips apart if there are several"
-        yield Fault("values", ("time",), figure, f"{remedy}.")
-    else:
-        yield Fault("values", ("rows",), figure, "Look at the view quarantine.")
-
-
-def assumed_rate(rate_hz: float | None) -> Iterator[Fault]:
-    """Yield that a log has no times, and that its mapping assumes a rate; None: it does not."""
-    if rate_hz is not None:
-        figure = f"the log has no times, and {rate_hz:g} Hz are assumed"
-        remedy = "Find out, correct rate_hz, and remove assumed = true."
-        yield Fault("time", ("rate_hz",), figure, remedy)
