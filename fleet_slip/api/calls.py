@@ -73,6 +73,7 @@ def record_call(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[
         with recording(self.root, method.__name__, _as_typed(arguments, options)):
             return method(self, *arguments, **options)
 
+    call.recorded = True  # type: ignore[attr-defined]
     return call
 
 
@@ -89,8 +90,7 @@ def takes(
         own = inspect.signature(method)
         first = next(iter(own.parameters.values()))
         given = inspect.signature(options).parameters.values()
-        plain = [one.replace(annotation=type_of(one.annotation)) for one in given]
-        signature = own.replace(parameters=[first, *plain])
+        signature = own.replace(parameters=[first, *given])
         call.__signature__ = signature  # type: ignore[attr-defined]
         told = (f"    {name}: {text}" for name, text in documented(options).items())
         call.__doc__ = "\n".join([inspect.getdoc(method) or "", "", "Args:", *told])
@@ -104,12 +104,13 @@ def documented(options: Any) -> dict[str, str]:
 
     Commands take the same fields and texts: there, a field in backticks is an option.
     """
-    return {
-        one.name: note.documentation
-        for one in fields(options)
-        for note in getattr(one.type, "__metadata__", ())
-        if isinstance(note, Doc)
-    }
+    return {one.name: text for one in fields(options) if (text := doc_of(one.type))}
+
+
+def doc_of(annotation: Any) -> str | None:
+    """Return what is said of a parameter, if anything is: then it is an option of a command."""
+    notes = getattr(annotation, "__metadata__", ())
+    return next((one.documentation for one in notes if isinstance(one, Doc)), None)
 
 
 def type_of(annotation: Any) -> Any:

@@ -1,13 +1,13 @@
 """A fleet's warehouse in Python."""
 
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from fleet_slip.api.calls import of_step, open_workers, record_call, takes
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.logs import LogsAndGrams
 from fleet_slip.api.operations import HealthAndUpkeep
-from fleet_slip.api.requests import NightRequest, RunRequest
+from fleet_slip.api.requests import COHORT, UNEXAMINED, NightRequest, RunRequest
 from fleet_slip.catalogue.facts import CALIBRATION, DELAY, TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.models.manifest import require_model_name
@@ -63,11 +63,13 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
 
         return Session(connect_unlocked(self.root, query, scenarios=scenarios), any_statement)
 
-    def cohort(self, condition: str = TRAINING_DRIVES, *, unexamined: bool = False) -> FleetCohort:
-        """Return the drives of an SQL condition, by default all but evaluation scenarios.
-
-        Measured drives whose sensors are not in order train no model, unless `unexamined`.
-        """
+    def cohort(
+        self,
+        condition: Annotated[str, COHORT] = TRAINING_DRIVES,
+        *,
+        unexamined: Annotated[bool, UNEXAMINED] = False,
+    ) -> FleetCohort:
+        """Return the drives of an SQL condition, by default all but evaluation scenarios."""
         return FleetCohort(self.warehouse, condition, unexamined)
 
     @record_call
@@ -100,9 +102,11 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
                     days=request.days,
                     through=request.through,
                     workers=executor,
-                    progress=of_step(request.progress, "simulate"),
+                    progress=of_step(request.progress, f"simulate {chosen.name}"),
                 )
-                gram = self.gram(workers=executor, progress=of_step(request.progress, "gram"))
+                gram = self.gram(
+                    workers=executor, progress=of_step(request.progress, f"gram {PLAIN}")
+                )
                 feature_set = load_model_list(request.models).features
                 wide = None
                 if feature_set != PLAIN:

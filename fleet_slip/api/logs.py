@@ -4,7 +4,9 @@ from collections.abc import Callable, Iterable
 from datetime import date
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from typing_extensions import Doc
 
 from fleet_slip.api.calls import (
     Rooted,
@@ -16,7 +18,9 @@ from fleet_slip.api.calls import (
     unless_local,
     within_reach,
 )
+from fleet_slip.api.requests import CAMPAIGN, DAYS, THROUGH
 from fleet_slip.base import Progress, last_day, no_progress
+from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import InputError
 from fleet_slip.storage.runs import step
 
@@ -40,19 +44,17 @@ class LogsAndGrams(Rooted):
     @record_call
     def simulate(
         self,
-        campaign: "str | Campaign",
+        campaign: Annotated["str | Campaign", CAMPAIGN],
         *,
-        days: int | None = None,
-        through: date | str | None = None,
+        days: Annotated[int | None, DAYS] = None,
+        through: Annotated[date | str | None, THROUGH] = None,
         workers: Workers = None,
         progress: ShowProgress | None = None,
     ) -> "SimulationReport":
         """Simulate what is missing of a campaign and write it to the logs.
 
-        `campaign` is a name, the path of a TOML file, or a `Campaign`; of its days the first
-        `days`, up to `through`. Progress is in rows. Raises `ConfigError` for an invalid campaign,
-        `UsageError` if it has no such days, `RefusedError` for one changed since it was written,
-        and `ClusterError`.
+        Progress is in rows. Raises `ConfigError` for an invalid campaign, `UsageError` if it has no
+        such days, `RefusedError` for one changed since it was written, and `ClusterError`.
         """
         from fleet_slip.simulation.campaign import load_campaign
         from fleet_slip.simulation.job import simulate_campaign
@@ -187,18 +189,28 @@ class LogsAndGrams(Rooted):
     @record_call
     def gram(
         self,
-        features: str = "signals",
+        features: Annotated[
+            str,
+            Doc(
+                "A feature set of configs/features.toml; signals is the logged signals themselves."
+            ),
+        ] = PLAIN,
         *,
-        cohort: str | None = None,
+        cohort: Annotated[
+            str | None,
+            Doc(
+                "Read only the log files that have a drive of this cohort, an SQL condition on the "
+                "view drives. Default: all."
+            ),
+        ] = None,
         workers: Workers = None,
         progress: ShowProgress | None = None,
     ) -> "GramReport":
         """Reduce new log files to Gram rows, and drop the rows of files that are gone.
 
-        `features` is a feature set of `configs/features.toml`; `signals` are the logged ones. A
-        set's first time costs a pass over the logs. With a `cohort`, only files with a drive of it
-        are read, as the Gram rows of `signals` tell. Progress is in rows. Raises `QuestionError`
-        for an unknown set, `StorageError`, `ConflictError` and `ClusterError`.
+        A set's first time costs a pass over the logs. Which files have a cohort's drives is known
+        from the Gram rows of `signals`. Progress is in rows. Raises `QuestionError` for an unknown
+        set, `StorageError`, `ConflictError` and `ClusterError`.
         """
         from fleet_slip.grams.job import update_grams
         from fleet_slip.grams.reader import cohort_files

@@ -3,13 +3,17 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from typing_extensions import Doc
 
 from fleet_slip.api.calls import Rooted, ShowProgress, count_from_start, open_workers, record_call
 from fleet_slip.api.cohort import FleetCohort
+from fleet_slip.api.requests import ALIAS, MODEL, VERSION
 from fleet_slip.base import needed
 from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import RefusedError, UsageError
+from fleet_slip.export.program import Target
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 
@@ -18,7 +22,6 @@ if TYPE_CHECKING:
 
     from fleet_slip.evaluation.blind import BlindRow
     from fleet_slip.evaluation.report import Written
-    from fleet_slip.export.program import Target
     from fleet_slip.export.stepping import Estimator
     from fleet_slip.models.diff import Difference
     from fleet_slip.models.manifest import Manifest
@@ -55,22 +58,24 @@ class PublishedModels(Rooted):
             "trained_on_forgotten", [[f"{name}@{version}" in marked for name, version in pairs]]
         )
 
-    def model(self, reference: str | None = None) -> ModelVersion:
-        """Return the version that a reference names, by default the only model.
+    def model(self, model: Annotated[str | None, MODEL] = None) -> ModelVersion:
+        """Return the version that a reference names.
 
         Raises `QuestionError` for an unknown one, `StorageError` for one that was changed, and
         `RefusedError` for one without a required signature.
         """
-        return self.registry().resolve(reference)
+        return self.registry().resolve(model)
 
     @record_call
     def publish(
         self,
-        name: str,
+        name: Annotated[str, Doc("Name of the model, such as sideslip.")],
         choice: "RequestedSelection | FleetCohort | None" = None,
         *,
-        force: bool = False,
-        candidate: bool = False,
+        force: Annotated[bool, Doc("Publish even what is worse than the champion.")] = False,
+        candidate: Annotated[
+            bool, Doc("Publish as a candidate, which becomes champion by promote.")
+        ] = False,
     ) -> "Publication":
         """Make a selection's winner the next version of a model, and its champion.
 
@@ -154,12 +159,19 @@ class PublishedModels(Rooted):
 
     @record_call
     def promote(
-        self, reference: str, alias: str = CHAMPION, *, previous: bool = False
+        self,
+        reference: Annotated[
+            str, Doc("NAME@VERSION to point the alias at; with `previous` NAME alone.")
+        ],
+        alias: Annotated[str, ALIAS] = CHAMPION,
+        *,
+        previous: Annotated[
+            bool, Doc("Roll back to the version that the alias had before, and pin it.")
+        ] = False,
     ) -> ModelVersion:
         """Point an alias at a version; return the version. Raises `UsageError`, and as `model`.
 
-        `previous` points it back at the version before, and pins it there; the reference is a name
-        alone then. Raises `QuestionError`, and `RefusedError` if it never had another.
+        With `previous`, raises `QuestionError`, and `RefusedError` if it never had another.
         """
         registry = self.registry()
         if previous:
@@ -173,12 +185,22 @@ class PublishedModels(Rooted):
         return version
 
     @record_call
-    def pin(self, name: str, alias: str = CHAMPION, *, off: bool = False) -> ModelVersion:
+    def pin(
+        self,
+        name: Annotated[str, Doc("Name of the model.")],
+        alias: Annotated[str, ALIAS] = CHAMPION,
+        *,
+        off: Annotated[bool, Doc("Let publications move the alias again.")] = False,
+    ) -> ModelVersion:
         """Keep an alias where it is until `promote` or `off`; return its version, as `model`."""
         registry = self.registry()
         return registry.load(name, registry.hold(name, alias, "unpin" if off else "pin"))
 
-    def diff(self, one: str | ModelVersion, other: str | ModelVersion) -> "Difference":
+    def diff(
+        self,
+        one: Annotated[str | ModelVersion, VERSION],
+        other: Annotated[str | ModelVersion, VERSION],
+    ) -> "Difference":
         """Tell two versions apart: data, signals, coefficients, figures. Raises as `model`."""
         from fleet_slip.models.diff import compare_versions
 
@@ -211,19 +233,22 @@ class PublishedModels(Rooted):
 
     def export(
         self,
-        model: str | ModelVersion | None,
-        to: "Target",
-        output: Path,
+        model: Annotated[str | ModelVersion | None, MODEL],
+        to: Annotated[Target, Doc("What to export to.")],
+        output: Annotated[
+            Path, Doc("Folder to write into; files of the same names are replaced.")
+        ] = Path(),
         *,
-        with_gram: bool = False,
+        with_gram: Annotated[
+            bool, Doc("With C: also what counts Gram rows in the car, for ingest.")
+        ] = False,
     ) -> list[Path]:
         """Write a version as a program for elsewhere into a folder; return the files.
 
-        `with_gram` adds to C what counts Gram rows in the car, for `ingest`. Exports carry the
-        version's checksum, the hash of its drives, and checks of made-up inputs; no tick of a log.
-        Raises `RefusedError` if the angle's error has no bound or counts mean something else now,
-        `UsageError` for an unknown target, `ConfigError` without what it needs, and what `model`
-        raises.
+        Exports carry the version's checksum, the hash of its drives, and checks of made-up inputs;
+        no tick of a log. Raises `RefusedError` if the angle's error has no bound or counts mean
+        something else now, `UsageError` for an unknown target, `ConfigError` without what it needs,
+        and what `model` raises.
         """
         from fleet_slip.export.files import export_files
         from fleet_slip.storage.local import LocalFolder

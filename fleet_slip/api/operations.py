@@ -1,8 +1,11 @@
 """The part of a `Fleet` that watches the warehouse and looks after it."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import date
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from typing_extensions import Doc
 
 from fleet_slip.api.calls import (
     ShowProgress,
@@ -15,8 +18,8 @@ from fleet_slip.api.calls import (
     within_reach,
 )
 from fleet_slip.api.models import JudgedModels
-from fleet_slip.api.requests import ForgetRequest
-from fleet_slip.base import date_of
+from fleet_slip.api.requests import COHORT, MODEL, ForgetRequest
+from fleet_slip.base import Record, date_of
 from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.storage.runs import step
@@ -34,29 +37,44 @@ if TYPE_CHECKING:
     from fleet_slip.operations.verify import Verification
 
 
+@dataclass(frozen=True)
+class Compacted(Record):
+    """What `Fleet.compact` did, or, of a dry run, which files it would remove."""
+
+    compacted: "CompactionReport | None"
+    vacuumed: "VacuumReport"
+
+
 class HealthAndUpkeep(JudgedModels):
     """Health, quality and drift; checking, compacting, forgetting. Answers say what is wrong."""
 
-    def status(self, max_age_hours: float | None = None) -> "WarehouseStatus":
-        """Return the warehouse's health: freshness, backlog, last runs, disk, champions.
-
-        Data, or a backlog, older than `max_age_hours` is among its `problems`.
-        """
+    def status(
+        self,
+        max_age_hours: Annotated[
+            float | None, Doc("Data, or a backlog, older than this is a problem.")
+        ] = None,
+    ) -> "WarehouseStatus":
+        """Return the warehouse's health: freshness, backlog, last runs, disk, champions."""
         from fleet_slip.operations.status import status_of
 
         return status_of(self.warehouse, max_age_hours)
 
-    def quality(self, cohort: str = TRAINING_DRIVES) -> "QualityReport":
+    def quality(
+        self,
+        cohort: Annotated[
+            str, Doc("SQL condition on the view drives: which drives to examine together.")
+        ] = TRAINING_DRIVES,
+    ) -> "QualityReport":
         """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors by drive.
 
-        The drives of `cohort` are compared with each other, by Gram rows alone; `findings` are
-        those not in order. Raises what `FleetCohort` raises.
+        Drives are compared with each other, by Gram rows alone; `findings` are those not in order.
+        Raises what `FleetCohort` raises.
         """
         from fleet_slip.operations.quality import examine_drives
 
         return examine_drives(self.warehouse, cohort)
 
-    def calibrate(self, cohort: str = ALL_DRIVES) -> "Calibration":
+    def calibrate(self, cohort: Annotated[str, COHORT] = ALL_DRIVES) -> "Calibration":
         """Return how the sensors of every car are off, and what else its drives tell of it.
 
         Offsets of gyroscope, accelerometer and steering with uncertainties, label or not, from the
@@ -70,16 +88,21 @@ class HealthAndUpkeep(JudgedModels):
 
     def monitor(
         self,
-        model: "str | ModelVersion | None" = None,
-        cohort: str | None = None,
+        model: Annotated["str | ModelVersion | None", MODEL] = None,
+        cohort: Annotated[
+            str | None,
+            Doc("SQL condition on the view drives. Default: the condition of its training."),
+        ] = None,
         *,
-        since: date | str | None = None,
+        since: Annotated[
+            date | str | None,
+            Doc("First new day, YYYY-MM-DD. Default: the one after the days it was trained on."),
+        ] = None,
     ) -> "Chart":
         """Chart a model's error on each day since it was trained, with control limits, in degrees.
 
-        `cohort` is by default that of its training, `since` the day after its data. `alarms` are
-        the new days beyond the limits. Raises `DataError` for too few training days, `UsageError`
-        for another text than a date such as 2024-05-01, and as `Fleet.model`.
+        `alarms` are the new days beyond the limits. Raises `DataError` for too few training days,
+        `UsageError` for another text than a date such as 2024-05-01, and as `Fleet.model`.
         """
         from fleet_slip.operations.monitor import monitor
 
@@ -115,41 +138,36 @@ class HealthAndUpkeep(JudgedModels):
 
     @record_call
     def compact(
-        self, target_rows: int | None = None, *, progress: ShowProgress | None = None
-    ) -> "CompactionReport":
-        """Turn the small log files of each day into large ones, of `target_rows` or fewer.
+        self,
+        target_rows: Annotated[
+            int | None, Doc("Rows of a file after it, or fewer. Default: 2,000,000.")
+        ] = None,
+        *,
+        retention_hours: Annotated[
+            float | None,
+            Doc("Keep what a version of the last hours refers to. Default: 168, a week."),
+        ] = None,
+        dry_run: Annotated[bool, Doc("List the files to be removed, and change nothing.")] = False,
+        progress: ShowProgress | None = None,
+    ) -> "Compacted":
+        """Turn the small log files of each day into large ones, and remove files out of use.
 
-        Progress is in days. Raises `StorageError`, and `ConflictError` if others keep changing
-        files.
+        These are replaced files and leftovers of killed jobs. Progress is in days. Raises
+        `StorageError`, and `ConflictError` if others keep changing files.
         """
+        from fleet_slip.operations.find_drives import RETENTION_HOURS, preview_vacuum, vacuum
         from fleet_slip.operations.rewriting import TARGET_ROWS, compact
 
-        told = count_from_start(progress)
+        hours = RETENTION_HOURS if retention_hours is None else retention_hours
+        if dry_run:
+            return Compacted(None, preview_vacuum(self.warehouse, hours))
         with step("compact") as figures:
-            report = compact(self.warehouse, target_rows or TARGET_ROWS, told)
+            report = compact(self.warehouse, target_rows or TARGET_ROWS, count_from_start(progress))
             figures.rows, figures.size_bytes = report.rows_rewritten, report.size_bytes_after
-        return report
-
-    @record_call
-    def vacuum(self, retention_hours: float | None = None) -> "VacuumReport":
-        """Remove replaced files and leftovers of killed jobs that are older than `retention_hours`.
-
-        By default a week. Raises `StorageError`.
-        """
-        from fleet_slip.operations.find_drives import RETENTION_HOURS, vacuum
-
-        hours = RETENTION_HOURS if retention_hours is None else retention_hours
         with step("vacuum") as figures:
-            report = vacuum(self.warehouse, hours)
-            figures.size_bytes = report.size_bytes
-        return report
-
-    def preview_vacuum(self, retention_hours: float | None = None) -> "VacuumReport":
-        """Return what `vacuum` would remove. Raises `StorageError`."""
-        from fleet_slip.operations.find_drives import RETENTION_HOURS, preview_vacuum
-
-        hours = RETENTION_HOURS if retention_hours is None else retention_hours
-        return preview_vacuum(self.warehouse, hours)
+            removed = vacuum(self.warehouse, hours)
+            figures.size_bytes = removed.size_bytes
+        return Compacted(report, removed)
 
     @record_call
     @takes(ForgetRequest)

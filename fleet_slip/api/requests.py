@@ -25,6 +25,19 @@ if TYPE_CHECKING:
     from fleet_slip.simulation.campaign import Campaign
 
 Subject = Literal["vehicle", "drive", "drive_name", "source_file"]
+COHORT = Doc("SQL condition on the view drives, such as \"track = 'waterford_hills'\".")
+UNEXAMINED = Doc(
+    "Take drives whose sensors are not in order, too. As a rule all are examined first."
+)
+MODEL = Doc(
+    "NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. Default: "
+    "the only one that there is."
+)
+VERSION = Doc("NAME, NAME@VERSION or NAME@ALIAS. NAME alone is its champion.")
+ALIAS = Doc("The alias to move.")
+CAMPAIGN = Doc("A campaign of configs/campaigns, or the path of a TOML file.")
+DAYS = Doc("Simulate the first N days only. Default: all.")
+THROUGH = Doc("Last day to simulate, YYYY-MM-DD or today. Default: all days.")
 MODELS = Doc("A model list of configs/models, or a TOML file.")
 
 
@@ -32,14 +45,10 @@ MODELS = Doc("A model list of configs/models, or a TOML file.")
 class RunRequest:
     """What `Fleet.run` takes."""
 
-    campaign: Annotated[
-        "str | Campaign", Doc("A campaign of configs/campaigns, or the path of a TOML file.")
-    ] = "waterford"
+    campaign: Annotated["str | Campaign", CAMPAIGN] = "waterford"
     _: KW_ONLY
-    days: Annotated[int | None, Doc("Simulate the first N days only. Default: all.")] = None
-    through: Annotated[
-        date | str | None, Doc("Last day to simulate, YYYY-MM-DD or today. Default: all days.")
-    ] = None
+    days: Annotated[int | None, DAYS] = None
+    through: Annotated[date | str | None, THROUGH] = None
     name: Annotated[str | None, Doc("Name of the model. Default: the campaign's.")] = None
     models: Annotated[str, MODELS] = DEFAULT_MODELS
     worth: Annotated[str | None, WORTH] = None

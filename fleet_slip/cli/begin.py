@@ -5,49 +5,38 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from fleet_slip.api.calls import open_workers
+from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.api.requests import RunRequest
 from fleet_slip.api.session import RunReport
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.facts import TRAINING_DRIVES
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.cli.app import record_run
 from fleet_slip.cli.options import (
     RESAMPLING,
-    Cluster,
-    Cohort,
-    Threads,
     Unexamined,
-    complete_model,
-    request_options,
+    command,
 )
 from fleet_slip.cli.output import All, Json, print_json, say
-from fleet_slip.cli.progress import progress_of_steps
 from fleet_slip.cli.selection import print_selection, say_examined
 from fleet_slip.errors import FleetSlipError, RefusedError
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import DryRun, Publication, recipe_for
 from fleet_slip.models.request import SelectionRequest
+from fleet_slip.models.select import RequestedSelection
 from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.runs import step
 
 # The command that publishes the model that a selection chose.
 
 
-@record_run
-@request_options(SelectionRequest, without=RESAMPLING)
+@command(Fleet.publish, FleetCohort.select, arguments=["name"], without=RESAMPLING)
 def publish(
-    context: typer.Context,
-    name: Annotated[
-        str,
-        typer.Argument(help="Name of the model, such as sideslip.", autocompletion=complete_model),
-    ],
-    request: SelectionRequest,
+    fleet: Fleet,
+    name: str,
+    force: bool,
+    candidate: bool,
     cohort: Annotated[
         str | None,
         typer.Option(
@@ -56,15 +45,6 @@ def publish(
         ),
     ] = None,
     unexamined: Unexamined = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Publish even what is worse than the champion.")
-    ] = False,
-    candidate: Annotated[
-        bool,
-        typer.Option(
-            "--candidate", help="Publish as a candidate, which becomes champion by promote."
-        ),
-    ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be published, and publish nothing.")
     ] = False,
@@ -73,6 +53,7 @@ def publish(
     ] = None,
     everything: All = False,
     json: Json = False,
+    **asked: Any,
 ) -> None:
     """Select on a cohort and make the winner the next version of a model, and its champion.
 
@@ -84,15 +65,15 @@ def publish(
     Example: **fleet-slip publish wet --cohort "adhesion < 0.8"**
     """
     require_model_name(name)
-    recipe = recipe_for(context.obj.registry(), name, request, cohort)
+    recipe = recipe_for(fleet.registry(), name, SelectionRequest(**asked), cohort)
     if recipe.told:
         say(f"{name}: {recipe.told}")
-    drives = context.obj.cohort(recipe.cohort, unexamined=unexamined)
+    drives = fleet.cohort(recipe.cohort, unexamined=unexamined)
     with step("select"):
         selection = drives.select(**vars(recipe.request))
     say_examined(selection.examined)
     if dry_run:
-        told = context.obj.would_publish(name, selection, force=force, candidate=candidate)
+        told = fleet.would_publish(name, selection, force=force, candidate=candidate)
         if json:
             print_json(told)
         else:
@@ -102,8 +83,8 @@ def publish(
         if not json:
             _print_dry_run(told)
         return
-    publication = context.obj.publish(name, selection, force=force, candidate=candidate)
-    number = context.obj.log_to_mlflow(publication.version, mlflow) if mlflow else None
+    publication = fleet.publish(name, selection, force=force, candidate=candidate)
+    number = fleet.log_to_mlflow(publication.version, mlflow) if mlflow else None
     if json:
         print_json(publication)
     else:
@@ -125,16 +106,8 @@ def print_publication(publication: Publication) -> None:
     say(f"{done} {publication.version.reference}. {publication.reason}")
 
 
-@record_run
-@request_options(RunRequest)
-def run(
-    context: typer.Context,
-    request: RunRequest,
-    threads: Threads = None,
-    cluster: Cluster = None,
-    everything: All = False,
-    json: Json = False,
-) -> None:
+@command(Fleet.run, progress=("", "rows"))
+def run(report: RunReport, fleet: Fleet, everything: All = False, json: Json = False) -> None:
     """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
 
     It can be repeated at any time, and after any interruption: what is done is not done again. A
@@ -143,38 +116,15 @@ def run(
 
     Example: **fleet-slip run --campaign smoke**
     """
-    from fleet_slip.simulation.campaign import load_campaign  # noqa: PLC0415 - the simulator takes a while
-
-    fleet: Fleet = context.obj
-    plan = load_campaign(str(request.campaign))
-    doing = {"simulate": f"simulate {plan.name}", "gram": f"gram {PLAIN}"}
-
-    def tell(name: str, done: int, total: int) -> None:
-        show(doing.get(name, name), done, total)
-
-    with (
-        open_workers(fleet.root, cluster or threads) as executor,
-        progress_of_steps("rows", executor) as show,
-    ):
-        options = {
-            **vars(request),
-            "campaign": plan,
-            "workers": executor,
-            "progress": tell,
-            "waiting": lambda: say(f"{plan.name}: waiting for another run"),
-        }
-        report = fleet.run(**options)
     if json:
-        print_json(report)
-    else:
-        _print_report(report, everything)
-        if not ((made := report.publication) and made.new):
-            return
-        model = made.version.reference.partition("@")[0]
-        _say_of_lost(fleet, plan.name, model)
+        return print_json(report)
+    _print_report(report, everything)
+    if (made := report.publication) and made.new:
+        model = made.version.manifest.name
+        _say_of_lost(fleet, report.campaign, model)
         if made.version.version == 1:
             say("next:")
-            for line in next_steps(fleet, plan.name, model):
+            for line in next_steps(fleet, report.campaign, model):
                 say(f"  {line}")
 
 
@@ -255,15 +205,8 @@ def _faster_half(fleet: Fleet, campaign: str) -> str | None:
 # The command that compares models on a cohort.
 
 
-@request_options(SelectionRequest)
-def select(
-    context: typer.Context,
-    request: SelectionRequest,
-    cohort: Cohort = TRAINING_DRIVES,
-    unexamined: Unexamined = False,
-    everything: All = False,
-    json: Json = False,
-) -> None:
+@command(Fleet.cohort, FleetCohort.select)
+def select(selection: RequestedSelection, everything: All = False) -> None:
     """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only.
 
     Compare a list of models: **fleet-slip select --models table1**
@@ -274,14 +217,5 @@ def select(
 
     Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
     """
-    from fleet_slip.cli.selection import (  # noqa: PLC0415
-        print_selection,
-        say_examined,
-    )
-
-    selection = context.obj.cohort(cohort, unexamined=unexamined).select(**vars(request))
     say_examined(selection.examined)
-    if json:
-        print_json(selection)
-    else:
-        print_selection(selection, everything)
+    print_selection(selection, everything)

@@ -13,12 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.api.requests import RunRequest
-from fleet_slip.base import last_day, number_of
-from fleet_slip.cli.app import record_run
-from fleet_slip.cli.options import Cluster, Threads, complete_config, option
+from fleet_slip.base import number_of
+from fleet_slip.cli.options import Cluster, command
 from fleet_slip.cli.output import Json, print_json, print_table, print_text, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.errors import AlarmError, UsageError
@@ -30,59 +27,25 @@ if TYPE_CHECKING:
     from fleet_slip.ingest.draft import Draft
     from fleet_slip.ingest.load import IngestReport
     from fleet_slip.ingest.preview import Preview
+    from fleet_slip.simulation.job import SimulationReport
 
 
-@record_run
-def simulate(
-    context: typer.Context,
-    campaign: Annotated[
-        str,
-        typer.Argument(
-            help="A campaign of configs/campaigns, or the path of a TOML file.",
-            autocompletion=complete_config("campaigns"),
-        ),
-    ],
-    days: Annotated[int | None, option(RunRequest, "days")] = None,
-    through: Annotated[str | None, option(RunRequest, "through")] = None,
-    threads: Threads = None,
-    cluster: Cluster = None,
-    json: Json = False,
-) -> None:
+@command(Fleet.simulate, arguments=["campaign"], progress=("simulate {campaign}", "rows"))
+def simulate(report: "SimulationReport", campaign: str) -> None:
     """Simulate what is missing of a campaign and write it to the logs.
 
     Example: **fleet-slip simulate waterford --days 2**
     """
-    from fleet_slip.simulation.campaign import load_campaign  # noqa: PLC0415 - takes a while
-
-    fleet: Fleet = context.obj
-    plan, last = load_campaign(campaign), last_day(through)
-    with (
-        open_workers(fleet.root, cluster or threads) as executor,
-        progress(f"simulate {plan.name}", "rows", executor) as show,
-    ):
-        report = fleet.simulate(plan, days=days, through=last, workers=executor, progress=show)
-    if json:
-        print_json(report)
-    elif report.changed:
-        written = (
-            f"{plan.name}: {number_of(report.drives, 'drive')}, {number_of(report.rows, 'row')} in "
-            f"{number_of(report.batches_written, 'file')}, "
-            f"{report.size_bytes / max(report.rows, 1):.1f} bytes a row"
-        )
-        say(_joined(written, forgotten=report.drives_forgotten))
-        seconds = report.seconds
-        shares = ", ".join(
-            f"{name} {getattr(seconds, name) / seconds.tasks:.0%}"
-            for name in ("simulate", "encode", "write")
-        )
-        say(
-            f"{seconds.elapsed:.1f} s, {report.rows / seconds.elapsed:,.0f} rows/s: "
-            f"{seconds.tasks / seconds.elapsed:.1f} workers busy ({shares}), commits "
-            f"{seconds.commit:.1f} s"
-        )
-    else:
-        chosen = plan.chosen_days(days, last)
-        say(f"{plan.name}: nothing to do, {number_of(len(chosen), 'day')} done before")
+    if not report.changed:
+        return say(f"{campaign}: nothing to do")
+    written = (
+        f"{campaign}: {number_of(report.drives, 'drive')}, {number_of(report.rows, 'row')} in "
+        f"{number_of(report.batches_written, 'file')}, "
+        f"{report.size_bytes / max(report.rows, 1):.1f} bytes a row"
+    )
+    say(_joined(written, forgotten=report.drives_forgotten))
+    seconds = report.seconds
+    say(f"{seconds.elapsed:.1f} s, {report.rows / seconds.elapsed:,.0f} rows/s")
 
 
 def _joined(*parts: str, replaced: int = 0, forgotten: int = 0) -> str:

@@ -11,8 +11,7 @@ from fleet_slip.base import number_of
 from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, FeatureSet
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.cli.app import record_run
-from fleet_slip.cli.options import Cluster, complete_feature_set
+from fleet_slip.cli.options import command
 from fleet_slip.cli.output import All, Json, print_json, print_table, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.columns.sql import column_query
@@ -27,28 +26,14 @@ ALL_SETS = "all"
 """Instead of the name of a feature set: every one."""
 
 
-@record_run
+@command(Fleet.gram)
 def gram(
-    context: typer.Context,
-    feature_set: Annotated[
-        str,
-        typer.Option(
-            "--features",
-            autocompletion=complete_feature_set,
-            help="A feature set of configs/features.toml; signals is the logged signals "
-            "themselves, all is every set.",
-        ),
-    ] = PLAIN,
-    cohort: Annotated[
-        str | None,
-        typer.Option(
-            help="Read only the log files that have a drive of this cohort, an SQL condition on "
-            "the view drives. Default: all.",
-            show_default=False,
-        ),
-    ] = None,
+    fleet: Fleet,
+    features: str,
+    cohort: str | None,
+    threads: int | None,
+    cluster: str | None,
     sql: Annotated[bool, typer.Option("--sql", help="Print the statement and do nothing.")] = False,
-    cluster: Cluster = None,
     json: Json = False,
 ) -> None:
     """Reduce new log files to Gram rows, and drop the rows of files that are gone.
@@ -56,20 +41,21 @@ def gram(
     A feature set that is asked for the first time costs one pass over the logs; from then on only
     new files are read.
 
+    Every set: **fleet-slip gram --features all**
+
     Example: **fleet-slip gram --features windows**
     """
-    names = (PLAIN, *known_features().sets) if feature_set == ALL_SETS else (feature_set,)
+    names = (PLAIN, *known_features().sets) if features == ALL_SETS else (features,)
     if sql:
         for name in names:
             typer.echo(gram_statement(catalogue(), name))
         return
-    fleet: Fleet = context.obj
-    with open_workers(fleet.root, cluster) as executor:
+    with open_workers(fleet.root, cluster or threads) as executor:
         if cohort:  # which files have its drives is known from the logged signals' Gram rows
             _run_gram(fleet, executor, PLAIN, None)
         reports = [_run_gram(fleet, executor, name, cohort) for name in names]
     if json:
-        print_json(reports if feature_set == ALL_SETS else reports[0])
+        print_json(reports if features == ALL_SETS else reports[0])
         return
     for report in reports:
         _say_gram(report)

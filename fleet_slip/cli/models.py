@@ -9,27 +9,16 @@ import typer
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.definitions import Definition
-from fleet_slip.cli.app import record_run
-from fleet_slip.cli.options import OnlyModel, complete_model
+from fleet_slip.cli.options import command
 from fleet_slip.cli.output import All, Json, print_json, print_records, print_table, print_text, say
 from fleet_slip.errors import UsageError
-from fleet_slip.export.program import Target
 from fleet_slip.models.manifest import CrossValidated, LearnedFrom, ModelTerm
-from fleet_slip.models.registry import CHAMPION, ModelVersion
+from fleet_slip.models.registry import ModelVersion
 from fleet_slip.warehouse.condition import Condition, parse_condition, row_columns
 from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
     from fleet_slip.models.diff import Difference, Term
-
-Reference = Annotated[
-    str,
-    typer.Argument(
-        help="NAME, NAME@VERSION or NAME@ALIAS. NAME alone is its champion.",
-        autocompletion=complete_model,
-    ),
-]
-Alias = Annotated[str, typer.Option(help="The alias to move.")]
 
 
 def models(
@@ -105,16 +94,14 @@ def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> Non
     say(f"{version.reference}: {came}. To use it: fleet-slip promote {version.reference}")
 
 
-def show(
-    context: typer.Context, model: OnlyModel = None, everything: All = False, json: Json = False
-) -> None:
+@command(Fleet.model, arguments=["model"])
+def show(version: ModelVersion, everything: All = False, json: Json = False) -> None:
     """Show one model version: figures, the data that made it, and coefficients.
 
     With --all, coefficients to the last digit, and what each column is.
 
     Example: **fleet-slip show waterford**
     """
-    version: ModelVersion = context.obj.model(model)
     if json:
         from fleet_slip.export.costs import costs_content  # noqa: PLC0415 - compiled code
 
@@ -230,29 +217,12 @@ def _label_noise(figures: CrossValidated) -> str:
     return f"{figures.label_noise_deg:.4f} deg, without which the RMSE is {left:.4f} deg"
 
 
-@record_run
-def promote(
-    context: typer.Context,
-    reference: Annotated[
-        str,
-        typer.Argument(
-            help="NAME@VERSION to point the alias at; with --previous NAME alone.",
-            autocompletion=complete_model,
-        ),
-    ],
-    alias: Alias = CHAMPION,
-    previous: Annotated[
-        bool,
-        typer.Option(
-            "--previous", help="Roll back to the version that the alias had before, and pin it."
-        ),
-    ] = False,
-) -> None:
+@command(Fleet.promote, arguments=["reference"], without=["json"])
+def promote(version: ModelVersion, alias: str, previous: bool) -> None:
     """Point an alias, the champion unless told otherwise, at a version.
 
     Example: **fleet-slip promote waterford@2**
     """
-    version = context.obj.promote(reference, alias, previous=previous)
     name = version.manifest.name
     say(
         f"{name}@{alias} is version {version.version} again, and stays so until: fleet-slip "
@@ -262,41 +232,25 @@ def promote(
     )
 
 
-@record_run
-def pin(
-    context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_model)],
-    alias: Alias = CHAMPION,
-    off: Annotated[
-        bool, typer.Option("--off", help="Let publications move the alias again.")
-    ] = False,
-) -> None:
+@command(Fleet.pin, arguments=["name"], without=["json"])
+def pin(version: ModelVersion, name: str, alias: str, off: bool) -> None:
     """Keep an alias where it is: publications become candidates, until promote or pin --off.
 
     Example: **fleet-slip pin waterford**
     """
-    version = context.obj.pin(name, alias, off=off)
-    told = "is" if off else "is pinned to"
-    more = "; the next publication may move it" if off else ""
-    say(f"{name}@{alias} {told} version {version.version}{more}")
+    done = "is pinned to version {}" if not off else "is version {}; publications may move it"
+    say(f"{name}@{alias} {done.format(version.version)}")
 
 
 # Two model versions beside each other: the command diff, and score --against.
 
 
-def diff(context: typer.Context, one: Reference, other: Reference, json: Json = False) -> None:
+@command(Fleet.diff, arguments=["one", "other"])
+def diff(found: "Difference") -> None:
     """Tell two model versions apart: their data, signals, coefficients and figures.
 
     Example: **fleet-slip diff waterford@1 waterford@2**
     """
-    found = context.obj.diff(one, other)
-    if json:
-        print_json(found)
-    else:
-        _print_difference(found)
-
-
-def _print_difference(found: "Difference") -> None:
     one, other = found.one.reference, found.other.reference
     if not found.facts and all(term.same for term in found.terms):
         say(f"{one} and {other} are the same estimator from the same data")
@@ -373,26 +327,14 @@ def score_against(
 # The command that brings a published version into other programs: export.
 
 
-def export(
-    context: typer.Context,
-    to: Annotated[Target, typer.Option(help="What to export to.")],
-    model: OnlyModel = None,
-    output: Annotated[
-        Path, typer.Option(help="Folder to write into; files of the same names are replaced.")
-    ] = Path(),
-    with_gram: Annotated[
-        bool,
-        typer.Option("--with-gram", help="With --to c: also what counts Gram rows in the car."),
-    ] = False,
-    json: Json = False,
-) -> None:
+@command(Fleet.export, arguments=["model"])
+def export(files: Sequence[Path], json: Json = False) -> None:
     """Write a version as a program for elsewhere, with checks: vectors of inputs and angles.
 
     Example: **fleet-slip export waterford --to c --output export**
     """
-    written = context.obj.export(model, to, output, with_gram=with_gram)
     if json:
-        print_json({"files": [str(path) for path in written]})
+        print_json({"files": [str(path) for path in files]})
         return
-    for path in written:
+    for path in files:
         say(f"{path}: {path.stat().st_size:,} bytes")

@@ -9,13 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.api.requests import NightRequest
 from fleet_slip.base import date_of, needed, number_of
-from fleet_slip.catalogue.facts import ALL_DRIVES, CAR_NUMBERS, TRAINING_DRIVES, NumberName
-from fleet_slip.cli.app import record_run
-from fleet_slip.cli.options import Cluster, Cohort, OnlyModel, Threads, request_options
+from fleet_slip.catalogue.facts import CAR_NUMBERS, NumberName
+from fleet_slip.cli.options import command
 from fleet_slip.cli.output import (
     Json,
     cell,
@@ -25,7 +22,6 @@ from fleet_slip.cli.output import (
     print_text,
     say,
 )
-from fleet_slip.cli.progress import progress_of_steps
 from fleet_slip.cli.selection import say_without_log
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.grams.calibration import SURE_ERRORS, Calibration, ChangedNumber
@@ -34,14 +30,13 @@ from fleet_slip.operations.status import WarehouseStatus
 
 if TYPE_CHECKING:
     from fleet_slip.operations.monitor import Chart
+    from fleet_slip.operations.night import NightReport
     from fleet_slip.operations.quality import QualityReport
 
 
+@command(Fleet.status)
 def status(
-    context: typer.Context,
-    max_age_hours: Annotated[
-        float | None, typer.Option(min=0, help="Data, or a backlog, older than this is a problem.")
-    ] = None,
+    found: WarehouseStatus,
     prometheus: Annotated[
         bool,
         typer.Option("--prometheus", help="Print metrics, for the textfile collector of a node."),
@@ -56,7 +51,6 @@ def status(
     """
     if json and prometheus:
         raise UsageError("give one of --json and --prometheus.")
-    found: WarehouseStatus = context.obj.status(max_age_hours)
     if prometheus:
         from fleet_slip.operations.metrics import as_openmetrics  # noqa: PLC0415 - seldom asked
 
@@ -65,15 +59,10 @@ def status(
         print_json(found)
     else:
         _print_status(found)
-    _complain(found.problems)
-
-
-def _complain(problems: Sequence[str]) -> None:
-    """Say what calls for attention, a line each, if anything does."""
-    for problem in problems:
+    for problem in found.problems:
         say(f"- {problem}", logging.ERROR)
-    if problems:
-        raise AlarmError(f"{number_of(len(problems), 'matter')}, above, to be looked after.")
+    if found.problems:
+        raise AlarmError(f"{number_of(len(found.problems), 'matter')}, above, to be looked after.")
 
 
 def _print_status(found: WarehouseStatus) -> None:
@@ -115,13 +104,13 @@ def _print_status(found: WarehouseStatus) -> None:
 # How the sensors of cars are off: the command calibrate.
 
 
+@command(Fleet.calibrate)
 def calibrate(
-    context: typer.Context,
+    found: Calibration,
     car: Annotated[
         str | None,
         typer.Option(help="Show this car's numbers, and how they go on board.", show_default=False),
     ] = None,
-    cohort: Cohort = ALL_DRIVES,
     since: Annotated[
         str | None,
         typer.Option(
@@ -140,7 +129,6 @@ def calibrate(
     Example: **fleet-slip calibrate**
     """
     day = date_of(since, "--since")
-    found: Calibration = context.obj.calibrate(cohort)
     if car is not None:
         found.car(car)  # that there is such a car
     changed = [one for one in found.changed(day) if car in (None, one.car)] if day else []
@@ -250,21 +238,9 @@ def _median(values: Sequence[float | None]) -> float | None:
 # The command that charts a model's error by day: monitor.
 
 
+@command(Fleet.monitor, arguments=["model"])
 def monitor(
-    context: typer.Context,
-    model: OnlyModel = None,
-    cohort: Annotated[
-        str | None,
-        typer.Option(
-            help="SQL condition on the view drives. Default: the condition of its training."
-        ),
-    ] = None,
-    since: Annotated[
-        str | None,
-        typer.Option(
-            help="First new day, YYYY-MM-DD. Default: the one after the days it was trained on."
-        ),
-    ] = None,
+    chart: "Chart",
     plot: Annotated[
         Path | None, typer.Option(help="Draw the chart to an SVG, PDF or PNG file.")
     ] = None,
@@ -276,7 +252,6 @@ def monitor(
 
     Example: **fleet-slip monitor waterford --since 2024-05-03**
     """
-    chart: Chart = context.obj.monitor(model, cohort, since=date_of(since, "--since"))
     if plot:
         with needed("report", "a chart"):
             from fleet_slip.operations.monitor import save_chart  # noqa: PLC0415
@@ -316,11 +291,9 @@ def _print_chart(chart: "Chart") -> None:
 # The command of every night with real cars.
 
 
-@record_run
-@request_options(NightRequest, name="--model")
+@command(Fleet.nightly, progress=("", "rows"), name="--model")
 def nightly(
-    context: typer.Context,
-    request: NightRequest,
+    report: "NightReport",
     output: Annotated[
         Path | None,
         typer.Option(
@@ -329,8 +302,6 @@ def nightly(
             show_default=False,
         ),
     ] = None,
-    threads: Threads = None,
-    cluster: Cluster = None,
     json: Json = False,
 ) -> None:
     """Do all of a night with real cars: ingest what is new, examine it, train again, verify.
@@ -341,18 +312,6 @@ def nightly(
 
     Example: **fleet-slip nightly --landing /srv/logs --mapping logger.toml --model fleet**
     """
-    fleet: Fleet = context.obj
-    with (
-        open_workers(fleet.root, cluster or threads) as executor,
-        progress_of_steps("rows", executor) as show,
-    ):
-        options = {
-            **vars(request),
-            "workers": executor,
-            "progress": show,
-            "waiting": lambda: say(f"{request.name}: waiting for another night"),
-        }
-        report = fleet.nightly(**options)
     if output is not None:
         with needed("report", "a summary in files"):
             from fleet_slip.operations.night import write_summary  # noqa: PLC0415 - draws
@@ -370,40 +329,28 @@ def nightly(
 # The command that finds faulty sensors: quality.
 
 
-def quality(
-    context: typer.Context,
-    cohort: Annotated[
-        str,
-        typer.Option(help="SQL condition on the view drives: which drives to examine together."),
-    ] = TRAINING_DRIVES,
-    json: Json = False,
-) -> None:
+@command(Fleet.quality)
+def quality(found: "QualityReport", json: Json = False) -> None:
     """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors, drive by drive.
 
     Reads Gram rows only. Exit code 10 if a drive's sensors are not in order.
 
     Example: **fleet-slip quality --cohort "day >= '2024-05-02'"**
     """
-    found: QualityReport = context.obj.quality(cohort)
+    peers = "other" if found.compared else "too few"
+    examined = (
+        f"{number_of(found.drives, 'drive')} examined, {found.compared:,} of them beside their "
+        f"peers ({peers} drives of a car or vehicle model)"
+    )
     if json:
         print_json(found)
+    elif found.findings:
+        header = "drive|car|fault|signals|what shows it"
+        row = "{drive_id}|{vehicle_id}|{fault.kind}|{fault.signals}|{fault.figure}"
+        print_records(examined, header, row, found.findings, left=5)
     else:
-        _print_quality(found)
+        print_text(f"{examined}: {'all are in order' if found.drives else 'none is long enough'}")
     if found.findings:
         raise AlarmError(
             f"{len(found.findings)} of {number_of(found.drives, 'drive')} are not in order"
         )
-
-
-def _print_quality(found: "QualityReport") -> None:
-    examined = (
-        f"{number_of(found.drives, 'drive')} examined, {found.compared:,} of them beside their "
-        f"peers ({'other' if found.compared else 'too few'} drives of a car or vehicle model)"
-    )
-    if not found.findings:
-        order = "all are in order" if found.drives else "none is long enough"
-        print_text(f"{examined}: {order}")
-        return
-    header = "drive|car|fault|signals|what shows it"
-    row = "{drive_id}|{vehicle_id}|{fault.kind}|{fault.signals}|{fault.figure}"
-    print_records(examined, header, row, found.findings, left=5)

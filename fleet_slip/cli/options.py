@@ -4,17 +4,20 @@ import functools
 import inspect
 import os
 import re
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import MISSING, fields
+import sys
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, get_args
 
 import typer
 
-from fleet_slip.api.calls import documented, type_of
-from fleet_slip.base import date_of, last_day
+from fleet_slip.api.calls import doc_of, open_workers, type_of
+from fleet_slip.base import date_of, document_of, last_day
+from fleet_slip.cli.output import Json, print_json
 from fleet_slip.errors import FleetSlipError, UsageError
 from fleet_slip.resources import CONFIG_VARIABLE, config_names
+from fleet_slip.storage.runs import recording
 
 # What Tab completes in a shell of the system: names of models, campaigns, lists and feature sets.
 #
@@ -75,101 +78,184 @@ def _lay_over_configs(context: typer.Context) -> None:
         os.environ[CONFIG_VARIABLE] = str(Path(own).absolute())
 
 
-R = TypeVar("R")
-
 DETAILS: dict[str, dict[str, Any]] = {
+    "bootstrap": {"min": 100},
     "campaign": {"autocompletion": complete_config("campaigns")},
     "days": {"min": 1},
     "features": {"autocompletion": complete_feature_set},
     "folds": {"metavar": "NUMBER|each"},
     "mapping": {"autocompletion": complete_config("mappings")},
+    "max_age_hours": {"min": 0},
     "models": {"autocompletion": complete_config("models")},
     "most": {"min": 1, "max": 200},
     "repeat": {"min": 2},
-    "bootstrap": {"min": 100},
+    "retention_hours": {"min": 1, "max": 168},
+    "target_rows": {"min": 1},
 }
-"""What options need on the command line beside what is said of the fields of requests."""
+"""What options need on the command line beside what is said of them in the API."""
+
+NAMES = {"condition": "--cohort", "everything": "--all"}
+"""Parameters that every command calls otherwise than the API."""
+
+MODELS = ("model", "reference", "name", "one", "other")
+"""Parameters that are completed by published models where they are arguments."""
 
 READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
-    "campaign": (str, str),
     "bias": (list[str] | None, lambda values: quantities(values, "--bias")),
+    "campaign": (str, str),
     "folds": (str | None, lambda folds: folds),
     "landing": (str, str),
     "model": (str | None, lambda model: model),
     "night": (str | None, lambda night: date_of(night, "--night")),
     "noise": (list[str] | None, lambda values: quantities(values, "--noise")),
+    "one": (str, str),
+    "other": (str, str),
     "over": (str | None, lambda over: [one.strip() for one in over.split(",")] if over else ()),
+    "since": (str | None, lambda since: date_of(since, "--since")),
     "through": (str | None, last_day),
 }
-"""Fields of other types on the command line, and what reads them."""
+"""Parameters of other types on the command line, and what reads them."""
 
 RESAMPLING = ("repeat", "bootstrap")
-"""Fields that tell more of a winner and choose none."""
-
-
-def option(request: type, name: str, *names: str, argument: bool = False) -> Any:
-    """Return the option for a field of a request, under other names if these are given.
-
-    As an `argument` it is a published model.
-    """
-    told = documented(request)
-    text = _NAMED.sub(lambda one: "--" + one[1].replace("_", "-"), told[name])
-    if argument:
-        return typer.Argument(metavar="MODEL", help=text, autocompletion=complete_model)
-    default = next(one.default for one in fields(request) if one.name == name)
-    alone = (f"--{name.replace('_', '-')}",) if default is False else ()
-    return typer.Option(*(names or alone), help=text, **DETAILS.get(name, {}))
-
+"""Options that tell more of a winner and choose none."""
 
 _NAMED = re.compile("`([a-z_]+)`")
 
 
-def request_options(
-    request: type, *, without: Collection[str] = (), argument: str = "", **names: str
-) -> Callable[[Callable[..., R]], Callable[..., R]]:
-    """Give a command the options of a request in place of its parameter of that type.
+def command(
+    *calls: Callable[..., Any],
+    arguments: Collection[str] = (),
+    without: Collection[str] = (),
+    progress: tuple[str, str] = ("", ""),
+    echo: Collection[str] = (),
+    **names: str,
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a function that prints an answer the command that asks for it.
 
-    `names` are options that are called otherwise than their fields; the `argument` names a model.
+    The answer is that of `calls`, methods of a `Fleet` and then of the answer before. Their
+    parameters with a `Doc` are options of the command, or `arguments`, but for those `without`;
+    `names` says which are called otherwise. Where their tasks run, are options if calls ask for it.
+    With `--json` the document of the answer is printed, with the options of `echo` beside it,
+    instead of calling the function, unless that has a parameter `json`. Its other parameters are
+    options of its own, values of options, or `fleet`. While calls work their `progress` is shown:
+    what is done, with options in braces, and its unit. What changes the warehouse leaves a record.
+
+    A function whose first parameter is `fleet` makes the calls by itself, and prints JSON, too.
     """
-    given = [
-        inspect.Parameter(
-            one.name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default={MISSING: inspect.Parameter.empty, (): None}.get(one.default, one.default),
-            annotation=Annotated[
-                READ[one.name][0] if one.name in READ else type_of(one.type),
-                option(
-                    request,
-                    one.name,
-                    *filter(None, [names.get(one.name)]),
-                    argument=one.name == argument,
-                ),
-            ],
-        )
-        for one in fields(request)
-        if one.name in documented(request) and one.name not in without
-    ]
+    names = NAMES | names
+    asked = {
+        name: one
+        for call in calls
+        for name, one in inspect.signature(call).parameters.items()
+        if name not in without
+    }
+    given = {
+        name: _parameter(one, name in arguments, names.get(name))
+        for name, one in asked.items()
+        if doc_of(one.annotation)
+    }
+    if "workers" in asked or "threads" in asked:
+        given["threads"] = _plain("threads", Threads)
+    if "workers" in asked:
+        given["cluster"] = _plain("cluster", Cluster)
 
-    def expand(command: Callable[..., R]) -> Callable[..., R]:
-        own = inspect.signature(command).parameters.values()
-        taken = next(one.name for one in own if one.annotation is request)
-        parameters = [
-            each.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-            for one in own
-            for each in (given if one.name == taken else [one])
-        ]
+    def expand(show: Callable[..., None]) -> Callable[..., None]:
+        first, *others = inspect.signature(show).parameters.values()
+        rest = {one.name for one in others if one.kind is inspect.Parameter.VAR_KEYWORD}
+        own = {one.name for one in others} - rest
+        beside = {
+            one.name: one.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            for one in others
+            if one.name not in {"fleet", "json", *rest, *given}
+        }
+        context = _plain("context", typer.Context, inspect.Parameter.empty)
+        parameters = [context, *given.values(), *beside.values()]
+        if "json" not in without:
+            parameters.append(_plain("json", Json, False))
 
-        @functools.wraps(command)
-        def run(**values: Any) -> R:
-            chosen = {one.name: values.pop(one.name) for one in given}
-            read = {name: READ[name][1](chosen[name]) for name in chosen.keys() & READ.keys()}
-            return command(**values, **{taken: request(**chosen | read)})
+        @functools.wraps(show)
+        def run(context: typer.Context, *, json: bool = False, **typed: Any) -> None:
+            fleet = context.obj
+            values = {
+                name: READ[name][1](one) if name in READ and name in asked else one
+                for name, one in typed.items()
+            }
+            recorded = any(hasattr(call, "recorded") for call in calls)
+            record = recording(fleet.root, show.__name__, sys.argv[1:]) if recorded else None
+            known = {**values, "fleet": fleet, "json": json}
+            known = {name: one for name, one in known.items() if name in own or rest}
+            with record or nullcontext():
+                if first.name == "fleet":
+                    return show(**known | {"fleet": fleet})
+                with _doing(fleet, asked, typed, *progress) as working:
+                    answer = fleet
+                    for call in calls:
+                        taken = inspect.signature(call).parameters.keys()
+                        options = {**values, **working}
+                        answer = getattr(answer, call.__name__)(
+                            **{name: one for name, one in options.items() if name in taken}
+                        )
+                if json and "json" not in own:
+                    print_json(
+                        {names.get(one, one).strip("-"): values[one] for one in echo}
+                        | document_of(answer)
+                        if echo
+                        else answer
+                    )
+                    return
+                show(answer, **known)
 
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {one.name: one.annotation for one in parameters}
         return run
 
     return expand
+
+
+@contextmanager
+def _doing(
+    fleet: Any, asked: Collection[str], typed: Mapping[str, Any], doing: str, unit: str
+) -> Iterator[dict[str, Any]]:
+    """Yield what calls need while they work: where tasks run, what shows how far they are."""
+    found: dict[str, Any] = {}
+    with ExitStack() as stack:
+        executor = None
+        if "workers" in asked:
+            where = typed.get("cluster") or typed.get("threads")
+            executor = stack.enter_context(open_workers(fleet.root, where))
+            found["workers"] = executor
+        if doing:
+            from fleet_slip.cli.progress import progress  # noqa: PLC0415 - others wait for no bar
+
+            found["progress"] = stack.enter_context(progress(doing.format(**typed), unit, executor))
+        yield found
+
+
+def _parameter(one: inspect.Parameter, argument: bool, name: str | None) -> inspect.Parameter:
+    """Return a parameter of the API as the command line has it."""
+    text = _NAMED.sub(lambda found: "--" + found[1].replace("_", "-"), doc_of(one.annotation) or "")
+    details: dict[str, Any] = {"help": text, **DETAILS.get(one.name, {})}
+    if one.default is None or one.default is inspect.Parameter.empty:
+        details["show_default"] = False
+    if argument:
+        if one.name in MODELS:
+            details["autocompletion"] = complete_model
+        if one.name == "model":
+            details["metavar"] = "MODEL"
+        said: Any = typer.Argument(**details)
+    else:
+        alone = (f"--{one.name.replace('_', '-')}",) if one.default is False else ()
+        said = typer.Option(*((name,) if name else alone), **details)
+    kind = READ[one.name][0] if one.name in READ else type_of(one.annotation)
+    left_out = one.default is inspect.Parameter.empty and type(None) in get_args(kind)
+    default = None if left_out or one.default == () else one.default
+    return _plain(one.name, Annotated[kind, said], default)
+
+
+def _plain(name: str, annotation: Any, default: Any = None) -> inspect.Parameter:
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
+    )
 
 
 Cohort = Annotated[

@@ -2,28 +2,24 @@
 
 import math
 
-import typer
-
-from fleet_slip.api.requests import DiagnosisRequest, RegimesRequest, WhatIfRequest
+from fleet_slip.api.cohort import FleetCohort
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.cli.options import Cohort, request_options
-from fleet_slip.cli.output import Json, figures_cells, print_json, print_line, print_table, say
+from fleet_slip.cli.options import command
+from fleet_slip.cli.output import figures_cells, print_line, print_table, say
 from fleet_slip.cli.selection import say_influential
 from fleet_slip.models.diagnose import CohortComparison, Diagnosis, WhatIf
 from fleet_slip.models.regimes import RegimeComparison
 from fleet_slip.regression.inference import INTERCEPT, Estimate
 
+SOUND = ("unexamined",)
+"""Not an option of what trains no model."""
 
-@request_options(DiagnosisRequest, argument="model")
-def diagnose(
-    context: typer.Context,
-    request: DiagnosisRequest,
-    cohort: Cohort = TRAINING_DRIVES,
-    json: Json = False,
-) -> None:
+
+@command(Fleet.cohort, FleetCohort.diagnose, arguments=["model"], without=SOUND, echo=["condition"])
+def diagnose(result: Diagnosis) -> None:
     """Fit a model's signals to a cohort and examine the fit, from Gram rows.
 
     Standard errors by drives, or by cars where there are several, are the ones to believe: at
@@ -31,14 +27,6 @@ def diagnose(
 
     Example: **fleet-slip diagnose waterford**
     """
-    result = context.obj.cohort(cohort).diagnose(**vars(request))
-    if json:
-        print_json({"cohort": cohort, **result.as_dict()})
-    else:
-        _print_diagnosis(result)
-
-
-def _print_diagnosis(result: Diagnosis) -> None:
     coefficients = _coefficients(result)
     print_table(
         f"{number_of(result.drives, 'drive')}, {number_of(result.fitted.gram.n, 'row')}, worth "
@@ -119,13 +107,8 @@ def _standardised(here: Estimate, there: Estimate) -> float:
 # The command that shows a model's error by regime: regimes.
 
 
-@request_options(RegimesRequest, argument="model")
-def regimes(
-    context: typer.Context,
-    request: RegimesRequest,
-    cohort: Cohort = TRAINING_DRIVES,
-    json: Json = False,
-) -> None:
+@command(Fleet.cohort, FleetCohort.regimes, arguments=["model"], without=SOUND, echo=["condition"])
+def regimes(result: RegimeComparison, by: str) -> None:
     """Show a model's error by speed and lateral acceleration, and whether to split it there.
 
     One model for all rows is cross-validated against one for each regime. Needs Gram rows by
@@ -133,14 +116,6 @@ def regimes(
 
     Example: **fleet-slip regimes --over speed**
     """
-    result: RegimeComparison = context.obj.cohort(cohort).regimes(**vars(request))
-    if json:
-        print_json({"cohort": cohort, **result.as_dict()})
-    else:
-        _print_regimes(result, request.by)
-
-
-def _print_regimes(result: RegimeComparison, by: str) -> None:
     print_table(
         f"{number_of(result.drives, 'drive')}, {number_of(result.folds, 'fold')} by {by}: "
         f"{' '.join(result.signals)}",
@@ -174,28 +149,20 @@ def _print_regimes(result: RegimeComparison, by: str) -> None:
 # The command that predicts a model's error with worse sensors: what-if.
 
 
-@request_options(WhatIfRequest, argument="model")
-def what_if(
-    context: typer.Context,
-    request: WhatIfRequest,
-    cohort: Cohort = TRAINING_DRIVES,
-    json: Json = False,
-) -> None:
+@command(
+    Fleet.cohort,
+    FleetCohort.what_if,
+    arguments=["model"],
+    without=SOUND,
+    echo=["condition", "noise", "bias"],
+)
+def what_if(result: WhatIf) -> None:
     """Predict a model's error with worse sensors, in closed form; nothing is simulated.
 
     Bias and noise come on top of what the logs have. Shown too: the best model for such sensors.
 
     Example: **fleet-slip what-if waterford --noise ay=0.2 --bias yaw_rate=0.02**
     """
-    result: WhatIf = context.obj.cohort(cohort).what_if(**vars(request))
-    if json:
-        added = {"noise": request.noise, "bias": request.bias}
-        print_json({"cohort": cohort, **added, **result.as_dict()})
-    else:
-        _print_what_if(result)
-
-
-def _print_what_if(result: WhatIf) -> None:
     print_table(
         f"{number_of(result.drives, 'drive')}, {number_of(result.before.rows, 'row')}",
         ["", "correlation", "RMSE deg", "mean deg", "std deg"],

@@ -10,17 +10,16 @@ import typer
 
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.api.requests import ForgetRequest
+from fleet_slip.api.operations import Compacted
 from fleet_slip.base import number_of
-from fleet_slip.cli.app import record_run
-from fleet_slip.cli.options import Cluster, request_options
+from fleet_slip.cli.options import Cluster, command
 from fleet_slip.cli.output import Json, print_json, print_table, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.errors import DamageError, PendingError, UsageError
 from fleet_slip.grams.check import CheckReport
-from fleet_slip.operations.find_drives import RETENTION_HOURS, VacuumReport
+from fleet_slip.operations.find_drives import VacuumReport
 from fleet_slip.operations.forget import ForgetReport
-from fleet_slip.operations.rewriting import TARGET_ROWS
+from fleet_slip.operations.migration import MigrationReport
 from fleet_slip.operations.verify import Verification
 from fleet_slip.storage.runs import recording
 
@@ -133,23 +132,8 @@ def _print_ways(report: CheckReport) -> None:
     print_table("", ["way", "drives", "equal"], rows)
 
 
-@record_run
-def compact(
-    context: typer.Context,
-    target_rows: Annotated[
-        int, typer.Option(min=1, help="Rows of a file after it, or fewer.")
-    ] = TARGET_ROWS,
-    retention_hours: Annotated[
-        int,
-        typer.Option(
-            min=1, max=RETENTION_HOURS, help="Keep what a version of the last hours refers to."
-        ),
-    ] = RETENTION_HOURS,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="List the files to be removed, and change nothing.")
-    ] = False,
-    json: Json = False,
-) -> None:
+@command(Fleet.compact, progress=("compact", "days"))
+def compact(done: Compacted) -> None:
     """Turn the small log files of each day into large ones, and remove files out of use.
 
     Replaced files and leftovers of killed jobs go when they are old enough. Readers and jobs are
@@ -157,16 +141,7 @@ def compact(
 
     Example: **fleet-slip compact**
     """
-    fleet: Fleet = context.obj
-    if dry_run:
-        compacted, vacuumed = None, fleet.preview_vacuum(retention_hours)
-    else:
-        with progress("compact", "days") as show:
-            compacted = fleet.compact(target_rows, progress=show)
-        vacuumed = fleet.vacuum(retention_hours)
-    if json:
-        print_json({"compacted": compacted, "vacuumed": vacuumed})
-        return
+    compacted, vacuumed = done.compacted, done.vacuumed
     if compacted is None:
         if vacuumed.files:
             print_table("", ["would be removed"], ([file] for file in vacuumed.files))
@@ -187,19 +162,17 @@ def _vacuumed(report: VacuumReport) -> str:
     return f"{number_of(len(report.files), 'file')} with {report.size_bytes:,} bytes {done}"
 
 
-@record_run
-@request_options(ForgetRequest)
+@command(Fleet.forget)
 def forget(
-    context: typer.Context,
-    request: ForgetRequest,
+    fleet: Fleet,
+    now: bool,
     allow: Annotated[
-        bool, typer.Option("--allow", help="Let it come back: land its new rows again from now on.")
+        bool, typer.Option("--allow", help="Let it come back: take its new rows again from now on.")
     ] = False,
     expired: Annotated[
         bool,
         typer.Option(
-            "--expired",
-            help="Forget drives older than the retention says, for a schedule.",
+            "--expired", help="Forget drives older than the retention says, for a schedule."
         ),
     ] = False,
     retention: Annotated[
@@ -207,6 +180,7 @@ def forget(
         typer.Option(help="With --expired: a TOML file. Default: retention.toml of the configs."),
     ] = None,
     json: Json = False,
+    **subject: str | None,
 ) -> None:
     """Forget a vehicle or drives: in logs, Gram rows and quarantine; mark the models they trained.
 
@@ -216,38 +190,32 @@ def forget(
     Example: **fleet-slip forget --vehicle car-7 --now**
     """
     if expired or retention is not None:
-        if not expired or request != ForgetRequest() or allow:
+        if not expired or allow or now or any(subject.values()):
             raise UsageError("give --expired alone, or with --retention.")
-        _forget_expired(context.obj, retention, json)
-        return
-    name, value = request.subject
-    if allow and name == "drive_name":
-        raise UsageError("give --allow with --vehicle, --drive or --source-file.")
-    if allow and request.now:
-        raise UsageError("give one of --allow and --now.")
-    fleet: Fleet = context.obj
-    if allow:
-        changed = fleet.allow(**{name: value})
+        _forget_expired(fleet, retention, json)
+    elif allow:
+        if now:
+            raise UsageError("give one of --allow and --now.")
+        if subject.pop("drive_name") is not None:
+            raise UsageError("give --allow with --vehicle, --drive or --source-file.")
+        changed = fleet.allow(**subject)
         if json:
             print_json({"allowed": True, "changed": changed})
         else:
-            say(
-                "its new rows are landed again from now on; what was forgotten stays forgotten"
-                + (" until the file is ingested again" if name == "source_file" else "")
-            )
-        return
-    with progress("forget", "files") as show:
-        report = fleet.forget(**{**vars(request), "progress": show})
-    if json:
-        print_json(report)
+            say("its new rows are taken again from now on; what was forgotten stays forgotten")
     else:
-        _say_forgotten(report)
-    if request.now and report.pending:
-        raise PendingError(
-            f"{len(report.pending)} may still have its rows, in files that no reader sees: "
-            f"{', '.join(report.pending[:PENDING_SHOWN])}. Repeat this command when they have "
-            "ended, or for files of killed jobs after an hour."
-        )
+        with progress("forget", "files") as show:
+            report = fleet.forget(**subject, now=now, progress=show)
+        if json:
+            print_json(report)
+        else:
+            _say_forgotten(report)
+        if now and report.pending:
+            raise PendingError(
+                f"{len(report.pending)} may still have its rows, in files that no reader sees: "
+                f"{', '.join(report.pending[:PENDING_SHOWN])}. Repeat this command when they have "
+                "ended, or for files of killed jobs after an hour."
+            )
 
 
 def _say_forgotten(report: ForgetReport) -> None:
@@ -279,7 +247,7 @@ def _forget_expired(fleet: Fleet, retention: str | None, json: bool) -> None:
     if report.forgotten.changed:
         _say_forgotten(report.forgotten)
         say(
-            "their files do not land again; drives as old that come in other files do, until the "
+            "their files are not read again; drives as old that come in other files do, until the "
             "next forget --expired"
         )
     else:
@@ -290,19 +258,14 @@ def _forget_expired(fleet: Fleet, retention: str | None, json: bool) -> None:
 # The command that brings the logs to the signal catalogue: migrate.
 
 
-@record_run
-def migrate(context: typer.Context, json: Json = False) -> None:
+@command(Fleet.migrate, progress=("migrate", "rows"))
+def migrate(report: MigrationReport) -> None:
     """Bring the logs to the signal catalogue: add columns, convert counts to other scales.
 
     See docs/configuration.md before widening a scale. It can be repeated after any interruption.
 
     Example: **fleet-slip migrate**
     """
-    with progress("migrate", "rows") as show:
-        report = context.obj.migrate(progress=show)
-    if json:
-        print_json(report)
-        return
     if not report.changed:
         say("migrate: nothing to do, the logs agree with the signal catalogue")
     if report.added:

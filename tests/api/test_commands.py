@@ -83,7 +83,7 @@ def test_a_notebook_does_what_the_command_line_does(filled: Fleet) -> None:
     assert filled.status().tables["logs"].rows == log.height
     assert not filled.verify().damage
     assert not filled.quality().findings
-    assert filled.preview_vacuum().dry_run
+    assert filled.compact(dry_run=True).vacuumed.dry_run
 
 
 def test_a_call_that_changes_the_warehouse_is_in_the_history_of_runs(filled: Fleet) -> None:

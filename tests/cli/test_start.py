@@ -6,22 +6,15 @@ import os
 import re
 import shlex
 import sys
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
-from fleet_slip.api.calls import documented
+from fleet_slip.api.calls import doc_of
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.api.requests import (
-    DiagnosisRequest,
-    ForgetRequest,
-    NightRequest,
-    RegimesRequest,
-    RunRequest,
-    WhatIfRequest,
-)
 from fleet_slip.cli.app import COMMANDS, GROUPS, CommandGroup, load_command
 from fleet_slip.cli.options import RESAMPLING
 from fleet_slip.models.request import SelectionRequest
@@ -111,24 +104,21 @@ def test_a_selections_options_stand_once_and_are_those_of_the_api() -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "request_type", "owner"),
+    ("command", "method"),
     [
-        ("run", RunRequest, Fleet),
-        ("nightly", NightRequest, Fleet),
-        ("forget", ForgetRequest, Fleet),
-        ("diagnose", DiagnosisRequest, FleetCohort),
-        ("what-if", WhatIfRequest, FleetCohort),
-        ("regimes", RegimesRequest, FleetCohort),
+        ("run", Fleet.run),
+        ("nightly", Fleet.nightly),
+        ("forget", Fleet.forget),
+        ("monitor", Fleet.monitor),
+        ("diagnose", FleetCohort.diagnose),
+        ("what-if", FleetCohort.what_if),
     ],
 )
-def test_options_are_the_fields_of_a_request_with_their_words(
-    command: str, request_type: type, owner: type
+def test_options_are_the_parameters_of_a_method_with_their_words(
+    command: str, method: Callable[..., object]
 ) -> None:
-    method = getattr(owner, command.replace("-", "_"))
-    in_python = set(inspect.signature(method).parameters) - {"self"}
-    assert in_python == {field.name for field in fields(request_type)}
+    parameters = inspect.signature(method).parameters
+    told = {name: text for name, one in parameters.items() if (text := doc_of(one.annotation))}
     taken = {one.name: one.help for one in load_command(command).params}
-    told = documented(request_type)
     assert told
     assert {name: taken[name].replace("--signals", "`signals`") for name in told} == told
-    assert all(text in method.__doc__ for text in told.values())
