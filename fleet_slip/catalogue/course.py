@@ -29,6 +29,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.arithmetic import nearest_sql
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S, catalogue
+from fleet_slip.resources import read_sql
 
 COURSE, YAW_RATE = "course", "yaw_rate"
 TURNED = "turned"
@@ -55,11 +56,8 @@ of the SQL statement that tells it of each car."""
 
 OVER = "hidden_over"
 """Column of changes: the place of their time among those of the set."""
-HIDDEN = ("hidden_course", "hidden_turned", "hidden_rest", "hidden_rate")
-HIDDEN_LATE = "hidden_late"
 WHOLE_TICKS = (
-    f"(({HIDDEN_LATE} + {LATE_PARTS // 2 - LATE_PARTS * MOST_EARLY}) // {LATE_PARTS} "
-    f"+ {MOST_EARLY})"
+    f"((hidden_late + {LATE_PARTS // 2 - LATE_PARTS * MOST_EARLY}) // {LATE_PARTS} + {MOST_EARLY})"
 )
 """Whole ticks in SQL, whose division is towards zero."""
 
@@ -104,91 +102,46 @@ def split_late(late: int) -> tuple[int, int]:
     return whole, (late - whole * LATE_PARTS) * 4 * HALF_TURN // LATE_PARTS
 
 
-def _in_time(rows: str) -> str:
-    """Return a subquery: each course on the tick that it is of, but for a rest, and `HIDDEN_LATE`.
-
-    The variable `course_late` is a map from cars to the delays of their receivers.
-    """
-    after, before = f"greatest({WHOLE_TICKS}, 0)", f"greatest(-{WHOLE_TICKS}, 0)"
-    course = f"max({COURSE}) OVER (PARTITION BY drive_id ORDER BY tick RANGE BETWEEN "
-    return f"""(
-            SELECT * REPLACE (CASE WHEN {HIDDEN_LATE} < 0
-                THEN {course}{before} PRECEDING AND {before} PRECEDING)
-                ELSE {course}{after} FOLLOWING AND {after} FOLLOWING) END AS {COURSE})
-            FROM (
-                SELECT *, coalesce(getvariable('{COURSE_LATE}')[vehicle_id], 0) AS {HIDDEN_LATE}
-                FROM {rows}
-            )
-        )"""
-
-
-def _as_logged(rows: str) -> str:
-    return f"(SELECT *, 0 AS {HIDDEN_LATE} FROM {rows})"
-
-
 def with_changes(
     rows: str, columns: tuple[str, ...], times: tuple[int, ...], *, in_time: bool
 ) -> str:
     """Return a subquery of the changes over each of some numbers of ticks, `OVER` which it is.
 
     `rows` has the columns, course and yaw rate, `vehicle_id` and the column `clipped`. With
-    `in_time` the course is moved by what the variable `course_late` says of the car.
+    `in_time` the course is moved by what the variable `course_late`, a map from cars to the delays
+    of their receivers, says of the car.
     """
-    moved = _in_time(rows) if in_time else _as_logged(rows)
+    if in_time:
+        statement = read_sql("jobs", "course_in_time.sql")
+        moved = f"({statement.format(rows=rows, whole_ticks=WHOLE_TICKS)})"
+    else:
+        moved = f"(SELECT *, 0 AS hidden_late FROM {rows})"
+    units, label = course_units(), catalogue().label
+    left = f"({units.turn} * hidden_course - {2 * HALF_TURN} * hidden_turned + hidden_rest)"
+    whole = 2 * HALF_TURN * units.turn
+    slow = f"hidden_rate <= {units.slow} AND abs(hidden_turned) <= {units.unturned}"
+    parts = {
+        "rows": moved,
+        "label": label,
+        "left": left,
+        "whole": whole,
+        "turns": nearest_sql(left, str(whole)),
+        "change": nearest_sql(label, str(units.divisor)),
+        "coarser": nearest_sql("hidden_turned", str(COARSER)),
+        "straight": f"CASE WHEN hidden_turned IS NOT NULL THEN ({slow})::BIGINT END",
+        "gain": f"(hidden_late - {WHOLE_TICKS} * {LATE_PARTS}) * {4 * HALF_TURN // LATE_PARTS}",
+        "largest": units.largest,
+        "changes": ",\n            ".join(
+            f"{name}::BIGINT - (max({name}) OVER ago)::BIGINT AS {name}" for name in columns
+        ),
+    }
+    statement = read_sql("jobs", "course_changes.sql")
     changes = [
-        f"SELECT *, {number} AS {OVER} FROM {_changes(moved, columns, ticks)}"
+        f"SELECT *, {number} AS {OVER} FROM "
+        f"({statement.format(**parts, ticks=ticks, since=ticks - 1)})"
         for number, ticks in enumerate(times)
     ]
     return f"({' UNION ALL '.join(changes)})"
-
-
-def _changes(rows: str, columns: tuple[str, ...], ticks: int) -> str:
-    """Return a subquery: columns less what they were so many ticks ago, `BESIDE` and the label.
-
-    Only rows that have a fix now and had one then, and the yaw rate all the time between; and the
-    first of a drive, which has no change, so that a drive without a course is known to have none.
-    `rows` has the columns, course and yaw rate, the column `clipped` and `HIDDEN_LATE`.
-    """
-    units, label = course_units(), catalogue().label
-    ago = {name: f"(max({name}) OVER ago)::BIGINT" for name in (*columns, COURSE, YAW_RATE)}
-    changes = ",\n            ".join(f"{name}::BIGINT - {ago[name]} AS {name}" for name in columns)
-    turned = (
-        f"CASE WHEN (count({YAW_RATE}) OVER since) = {ticks} THEN "
-        f"2 * (sum({YAW_RATE}) OVER since)::BIGINT - {YAW_RATE} + {ago[YAW_RATE]} END"
-    )
-    left = f"({units.turn} * {HIDDEN[0]} - {2 * HALF_TURN} * {HIDDEN[1]} + {HIDDEN[2]})"
-    gain = f"({HIDDEN_LATE} - {WHOLE_TICKS} * {LATE_PARTS}) * {4 * HALF_TURN // LATE_PARTS}"
-    whole = 2 * HALF_TURN * units.turn
-    near = f"({left} - {whole} * ({nearest_sql(left, str(whole))}))"
-    change = nearest_sql(label, str(units.divisor))
-    slow = f"{HIDDEN[3]} <= {units.slow} AND abs({HIDDEN[1]}) <= {units.unturned}"
-    straight = f"CASE WHEN {HIDDEN[1]} IS NOT NULL THEN ({slow})::BIGINT END"
-    hidden = ", ".join((*HIDDEN, HIDDEN_LATE))
-    return f"""(
-        SELECT * EXCLUDE ({hidden}) REPLACE ({change} AS {label}),
-            {nearest_sql(HIDDEN[1], str(COARSER))} AS {TURNED},
-            {straight} AS {STRAIGHT},
-            {straight} * ({change}) AS {STRAIGHT_COURSE}
-        FROM (
-            SELECT * REPLACE ({near} AS {label})
-            FROM (
-                SELECT * REPLACE (
-            {changes},
-            0::BIGINT AS {label}
-                ),
-                    {COURSE}::BIGINT - {ago[COURSE]} AS {HIDDEN[0]},
-                    {turned} AS {HIDDEN[1]},
-                    {gain} * ({YAW_RATE}::BIGINT - {ago[YAW_RATE]}) AS {HIDDEN[2]},
-                    greatest(abs({YAW_RATE}), abs({ago[YAW_RATE]})) AS {HIDDEN[3]}
-                FROM {rows}
-                WINDOW ago AS (PARTITION BY drive_id ORDER BY tick
-                        RANGE BETWEEN {ticks} PRECEDING AND {ticks} PRECEDING),
-                    since AS (PARTITION BY drive_id ORDER BY tick
-                        RANGE BETWEEN {ticks - 1} PRECEDING AND CURRENT ROW)
-            )
-        )
-        WHERE abs({label}) <= {units.largest} OR tick = 0
-    )"""
 
 
 # What changes of the course tell of a car: a few figures, whose usual values are known.
