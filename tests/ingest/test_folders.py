@@ -99,10 +99,11 @@ def test_what_lands_does_not_depend_on_batches_or_order(
     assert drives(folder) == together
 
 
-def test_without_the_cache_nothing_lands_twice(folder: Path) -> None:
+@pytest.mark.parametrize("content", ["[damaged", "[]", '{"files": {}}', '{"files": 1}'])
+def test_without_the_cache_nothing_lands_twice(folder: Path, content: str) -> None:
     ingest(folder)
-    for cache in (folder.parent / "cache").rglob("*.json"):
-        cache.write_text("[damaged")
+    (cache,) = (folder.parent / "cache").rglob("*.json")
+    cache.write_text(content)
     assert [report["new"] for report in ingest(folder)] == [False] * 5
     assert ingest(folder) == []
     assert len(drives(folder)) == 5
@@ -126,14 +127,6 @@ def test_a_root_that_was_restored_from_a_backup_is_asked_for_all(folder: Path) -
     write_log(folder.parent / "other.csv", rows=50)
     ingest(folder, folder.parent / "other.csv")  # as many commits as before, and others
     assert [report["file"] for report in ingest(folder) if report["new"]] == [str(new)]
-
-
-@pytest.mark.parametrize("content", ["{}", "[]", '{"files": {}}', '{"files": 1, "landed": 2}', "x"])
-def test_a_cache_that_is_none_costs_time_and_no_more(folder: Path, content: str) -> None:
-    ingest(folder)
-    (cache,) = (folder.parent / "cache").rglob("*.json")
-    cache.write_text(content)
-    assert not any(report["new"] for report in ingest(folder))
 
 
 def test_a_file_of_another_time_and_the_same_content_is_not_new(folder: Path) -> None:

@@ -33,16 +33,6 @@ def test_shipped_mappings_load() -> None:
     assert [load_mapping(name).name for name in names] == names
 
 
-def test_gain_and_bias_apply_sign_then_offset_then_unit(tmp_path: Path) -> None:
-    gain, bias = load(tmp_path, GOOD).signals["ax"].linear("m/s^2")
-    assert (gain, bias) == pytest.approx((-9.80665, 0.5 * 9.80665))
-
-
-def test_a_speed_over_its_radius_is_a_wheel_speed(tmp_path: Path) -> None:
-    mapping = load(tmp_path, GOOD.replace(STEER, WHEEL))
-    assert mapping.signals["wheel_fl"].linear("rad/s") == pytest.approx((1 / 3.6 / 0.3, 0))
-
-
 def test_a_mapping_without_a_radius_says_nothing_of_one(tmp_path: Path) -> None:
     """Its text names the drives, and they must keep the names that they had before."""
     assert "radius" not in load(tmp_path, GOOD).canonical_json()

@@ -78,14 +78,6 @@ def test_a_corrected_mapping_replaces_what_came_through_the_old_one(
     assert not again.new
 
 
-def test_the_old_mapping_can_come_back(fleet: Fleet, tmp_path: Path) -> None:
-    before = drives(fleet)
-    fleet.ingest(tmp_path / "monday.csv", corrected(), replace="all")
-    fleet.ingest(tmp_path / "monday.csv", a_mapping(), replace="all")
-    assert drives(fleet) == before
-    assert not fleet.verify().damage
-
-
 def with_more(file: Path) -> Path:
     """Let a file end in an empty line: its bytes are others, its counts are not."""
     file.write_text(f"{file.read_text()}\n")

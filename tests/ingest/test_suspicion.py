@@ -265,14 +265,6 @@ def test_files_that_land_together_say_it_once(tmp_path: Path) -> None:
         call(tmp_path / "root", "ingest", str(logs), "--mapping", mapping, "--dry-run")
 
 
-def test_a_dry_run_of_what_looks_wrong_calls_for_attention(tmp_path: Path) -> None:
-    car = a_car()
-    file, mapping = write_car(tmp_path, {**car, "ay": -car["ay"]})
-    with pytest.raises(AlarmError, match="1 thing to look at before ingesting") as caught:
-        call(tmp_path / "root", "ingest", file, "--mapping", mapping, "--dry-run", "--json")
-    assert caught.value.exit_code == 10
-
-
 def test_rows_that_are_refused_for_their_time_call_for_attention(tmp_path: Path) -> None:
     columns = {name: [f"{v}" for v in values] for name, values in good_columns(300).items()}
     columns["t"] = [f"{i // 3 / 100:.2f}" for i in range(300)]
