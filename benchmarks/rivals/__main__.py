@@ -41,13 +41,12 @@ from fleet_slip.evaluation.drives import simulate_drives
 from fleet_slip.evaluation.filters import (
     FILTERS,
     TABLE_ONE,
-    Estimate,
     Filter,
     FilterEstimate,
     TuningDrives,
     published_estimate,
 )
-from fleet_slip.evaluation.scenarios import evaluate_drive
+from fleet_slip.evaluation.judge import Estimate, evaluate_drive
 from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import Manifest

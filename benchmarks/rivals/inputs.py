@@ -15,8 +15,7 @@ from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts, as_count
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.drives import EvaluatedDrive
-from fleet_slip.evaluation.filters import Signals
-from fleet_slip.evaluation.scenarios import ErrorFigures, error_figures
+from fleet_slip.evaluation.judge import ErrorFigures, Signals, error_figures
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.compute import read_drives
 from fleet_slip.grams.expansion import CarCounts

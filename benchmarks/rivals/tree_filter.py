@@ -23,8 +23,9 @@ from fleet_slip.config import Config
 from fleet_slip.evaluation import ekf
 from fleet_slip.evaluation.belief import belief_of
 from fleet_slip.evaluation.drives import EvaluatedDrive
-from fleet_slip.evaluation.filters import FilterEstimate, Signals, seen
+from fleet_slip.evaluation.filters import FilterEstimate, seen
 from fleet_slip.evaluation.identify import tune
+from fleet_slip.evaluation.judge import Signals
 from fleet_slip.evaluation.single_track import (
     STEP_S,
     Axles,

@@ -20,7 +20,6 @@ from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from fleet_slip.evaluation.blind import BlindRow
     from fleet_slip.evaluation.report import Written
     from fleet_slip.export.stepping import Estimator
     from fleet_slip.models.diff import Difference
@@ -348,8 +347,8 @@ class JudgedModels(PublishedModels):
         `RefusedError` for one that changed since it was simulated, `DataError`, and what `model`
         raises.
         """
+        from fleet_slip.evaluation.drives import simulate_scenarios
         from fleet_slip.evaluation.evaluate import evaluate, evaluations_of, keep
-        from fleet_slip.evaluation.scenarios import simulate_scenarios
         from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
         from fleet_slip.storage.documents import Document
 
@@ -381,15 +380,14 @@ class JudgedModels(PublishedModels):
         Raises `DataError` without a label, `ConfigError` for an unknown
         car, and what `model` raises.
         """
-        from fleet_slip.evaluation.evaluate import keep
-        from fleet_slip.evaluation.own_car import evaluate_own_car, own_car_evaluations
+        from fleet_slip.evaluation.evaluate import evaluations_of, keep
+        from fleet_slip.evaluation.measured import evaluate_measured
         from fleet_slip.storage.documents import Document
 
         versions = [self.resolve(one) for one in (model, *others)]
         with open_workers(self.root, threads) as executor:
-            found = evaluate_own_car(self.warehouse, versions, cohort, vehicle, executor)
-        content = found.as_dict()
-        kept = keep(own_car_evaluations(self.warehouse), content)
+            content = evaluate_measured(self.warehouse, versions, cohort, vehicle, executor)
+        kept = keep(evaluations_of(self.warehouse, "measured"), content)
         return Document(kept.number, content, kept.sha256)
 
     def evaluate_blind(
@@ -398,20 +396,18 @@ class JudgedModels(PublishedModels):
         others: Sequence[str | ModelVersion] = (),
         *,
         threads: int | None = None,
-    ) -> "tuple[BlindRow, ...]":
-        """Judge models, and all that `evaluate` trains beside them, on drives of the first.
+    ) -> dict[str, Any]:
+        """Evaluate models, and all that `evaluate` trains beside them, on drives of the first.
 
         Roads, cars, weather and noise are drawn from its version's hash, unknown before it was
-        published (`configs/blind.toml`). Nothing is written. Returns figures over all drives, by
-        class of road, by weather and by drive. Raises as `evaluate`.
+        published (`configs/blind.toml`). Nothing is written. Returns a document as `evaluate`
+        does: over all drives, by class of road, by weather and by drive. Raises as `evaluate`.
         """
-        from fleet_slip.evaluation.blind import judge_blindly
-        from fleet_slip.evaluation.evaluate import train_competitors
+        from fleet_slip.evaluation.evaluate import evaluate_blindly
 
         first, *rest = [self.resolve(one) for one in (model, *others)]
         with open_workers(self.root, threads) as executor:
-            trained = train_competitors(self.warehouse, first, rest, executor)
-        return judge_blindly(first.sha256, trained.estimators)
+            return evaluate_blindly(self.warehouse, first, rest, executor)
 
     def report(
         self, model: str | ModelVersion | None = None, output: Path | None = None

@@ -3,7 +3,7 @@
 import os
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,9 +16,7 @@ from fleet_slip.cli.models import score_against
 from fleet_slip.cli.options import Cohort, OnlyModel, Threads, Unexamined, complete_config
 from fleet_slip.cli.output import (
     Json,
-    cell,
     print_json,
-    print_line,
     print_records,
     print_table,
     print_text,
@@ -33,89 +31,92 @@ from fleet_slip.resources import folder
 from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
-    from fleet_slip.evaluation.blind import BlindRow
     from fleet_slip.evaluation.identify import Identified
-    from fleet_slip.evaluation.scenarios import ErrorFigures
 
 
-# What `evaluate` prints for people: who wins each test drive, and all tables of its document.
-
-PLACES = ("inside", "outside")
-"""Of an unstable section."""
+# What `evaluate` prints for people: a screen, and with --all the errors of all on every drive.
 
 
-def print_evaluation(content: dict[str, Any]) -> None:
-    """Print the tables of an evaluation."""
-    groups: dict[str, list[str]] = {}
-    for name, about in content["estimators"].items():
-        groups.setdefault(about["group"], []).append(name)
-    for group, names in groups.items():
-        if content["estimators"][names[0]]["kind"] == "regression":
-            title = f"{group}: RMSE, standard deviation and mean of the error in deg, correlation"
-            _print_group(content, title, names, _full_cell, 25)
-        else:
-            _print_group(content, f"{group}: RMSE in deg", names, _rmse_cell, 12)
-    print_ranking(content["ranking"])
-    _print_gps_noise(content["gps_noise"])
-    _print_sections(content)
-    _print_checks(content["checks"])
-    _print_comparisons(content["comparisons"])
+def print_evaluation(content: Mapping[str, Any], everything: bool) -> None:
+    """Print the summary of an evaluation's document, with `everything` its one table besides."""
+    names = list(content["estimators"])
+    if "scenarios" in content:
+        drives, title = content["scenarios"], "Test drives: RMSE in deg"
+        print_ranking(content["ranking"])
+        print_text("\n".join(["", *_extremes(drives, content["ranking"]["estimator"])]))
+    elif "cohort" in content:
+        drives, title = content["drives"], "RMSE in deg by drive"
+        _print_measured(content)
+    else:
+        drives, title = content["drives"], "Blind drives: RMSE in deg against the exact angle"
+        names = _best_first(content, everything)
+        if not everything:
+            groups = [one for one in drives if one["drives"] > 1]
+            print_errors(title, groups, names[:BLIND_NAMES])
+        for name in names:
+            if drives[0]["results"][name]["rmse_deg"] is None:
+                print_text(
+                    f"{name} has no estimate on any of them: it may need calibration parameters "
+                    "of a car from its own drives, and these cars have none."
+                )
+    if everything:
+        print_errors(f"\n{title}", drives, names)
+    else:
+        print_text("Every drive, and all estimators: --all; for machines --json.")
 
 
-def _print_group(
-    content: dict[str, Any],
-    title: str,
-    names: Sequence[str],
-    figures: Callable[[dict[str, Any]], str],
-    width: int,
-) -> None:
-    """Print a table of estimators; as many tables as the terminal's width makes of it."""
-    at_once = max(1, (stdout().width - NAMES_WIDTH) // (width + 2))
+def print_errors(title: str, drives: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
+    """Print RMSE by drive and estimator; as many tables as the terminal's width makes of it."""
+    at_once = max(1, (stdout().width - NAMES_WIDTH) // ESTIMATOR_WIDTH)
     for first in range(0, len(names), at_once):
         shown = names[first : first + at_once]
-        print_table(
-            f"\n{title}{', continued' if first else ''}",
-            ["scenario", "side-slip", *(heading(name) for name in shown)],
+        rows = [
             [
-                [
-                    one["name"],
-                    f"{one['truth']['sideslip_std_deg']:.2f}",
-                    *(figures(one["results"][name]) for name in shown),
-                ]
-                for one in content["scenarios"]
-            ],
-        )
+                one["name"].replace("_", " "),
+                f"{one.get('truth', one)['sideslip_std_deg']:.2f}",
+                *(_error_cell(one["results"][name]) for name in shown),
+            ]
+            for one in drives
+        ]
+        titled = f"{title}, continued" if first else title
+        print_table(titled, ["drive", "side-slip std", *map(_heading, shown)], rows)
 
 
-NAMES_WIDTH = 33
-"""Of the columns with a scenario's name and its side-slip."""
+NAMES_WIDTH, ESTIMATOR_WIDTH = 33, 14
+"""Of the columns with a drive's name and its side-slip, and of an estimator's."""
+
+BLIND_NAMES = 5
+"""Estimators of the table that is printed first: published models, then the best of the others."""
 
 
-def heading(name: str) -> str:
+def _error_cell(found: Mapping[str, Any]) -> str:
+    if found["rmse_deg"] is None:
+        return "none"
+    covered = found["coverage"]
+    return f"{found['rmse_deg']:.3f}" + ("" if covered == 1 else f" ({covered:.0%})")
+
+
+def _heading(name: str) -> str:
     """Return an estimator's name in words, which a heading can wrap."""
     return name.rpartition("/")[2].replace("_", " ")
 
 
-def _full_cell(result: dict[str, Any]) -> str:
-    if result["error_std_deg"] is None:
-        return "no estimate"
-    figures = (
-        f"{result['rmse_deg']:.3f} {result['error_std_deg']:.3f} {result['error_mean_deg']:+.3f}"
+def _best_first(content: Mapping[str, Any], everything: bool) -> list[str]:
+    """Return published models, then who has the least error over all drives together."""
+    results = content["drives"][0]["results"]
+    errors = {name: one["rmse_deg"] for name, one in results.items()}
+    published = {name for name in errors if "@" in name.rpartition("/")[2]}
+    return sorted(
+        (
+            name
+            for name, rmse_deg in errors.items()
+            if name in published or (rmse_deg is not None and (everything or "/" not in name))
+        ),
+        key=lambda name: (name not in published, errors[name] is None, errors[name]),
     )
-    if result["correlation"] is not None:
-        figures += f" {result['correlation']:.3f}"
-    covered = result["coverage"]
-    return figures if covered == 1 else f"{figures} ({covered:.0%})"
 
 
-def _rmse_cell(result: dict[str, Any]) -> str:
-    if result["rmse_deg"] is None:
-        return "none"
-    covered = result["coverage"]
-    return f"{result['rmse_deg']:.3f}" + ("" if covered == 1 else f" ({covered:.0%})")
-
-
-def print_ranking(ranking: dict[str, Any]) -> None:
+def print_ranking(ranking: Mapping[str, Any]) -> None:
     """Print who wins each test drive."""
     least, ours = ranking["least_coverage"], ranking["estimator"]
     print_records(
@@ -128,114 +129,6 @@ def print_ranking(ranking: dict[str, Any]) -> None:
         (one for one in ranking["standings"] if one["same_as"] is None),
         left=2,
     )
-
-
-def _print_gps_noise(sweep: dict[str, Any] | None) -> None:
-    if sweep is None:
-        return
-    names = list(sweep["levels"][0]["rmse_deg"])
-    print_table(
-        f"\n{sweep['scenario']}: RMSE in deg over the noise of GPS velocity, m/s, without outages",
-        ["GPS noise", *map(heading, names)],
-        [
-            [
-                f"{level['velocity_std_mps']:.3f}",
-                *(cell(level["rmse_deg"][n], ".3f") for n in names),
-            ]
-            for level in sweep["levels"]
-        ],
-    )
-    for regression, error in sweep["regressions"].items():
-        equal = {name: sweep["equal_at_mps"][name][regression] for name in names}
-        reached = ", ".join(f"{name} {at:.3f}" for name, at in equal.items() if at is not None)
-        told = (
-            f"which the filters reach at {reached} m/s" if reached else "reached at no such noise"
-        )
-        print_line(f"{regression}: {error:.3f}, {told}")
-
-
-def _print_sections(content: dict[str, Any]) -> None:
-    for one in content["scenarios"]:
-        for section in one["sections"]:
-            if section["name"] != "unstable":
-                continue
-            where = ", ".join(
-                f"{s['from_s']:.1f}-{s['until_s']:.1f} s" for s in section["stretches"]
-            )
-            print_table(
-                f"\n{one['name']}: unstable at {where}: {section['criterion']}",
-                [
-                    "estimator",
-                    *(f"{name} {at}" for name in ("RMSE", "std", "corr.") for at in PLACES),
-                ],
-                [
-                    [
-                        name,
-                        *(
-                            cell(result[place]["unstable"][figure], ".3f")
-                            for figure in ("rmse_deg", "error_std_deg", "correlation")
-                            for place in PLACES
-                        ),
-                    ]
-                    for name, result in one["results"].items()
-                ],
-            )
-
-
-def _print_checks(checks: Sequence[dict[str, Any]]) -> None:
-    if not checks:
-        return
-    header = "requirement|estimator|found|limit|"
-    row = "{requirement}|{estimator}|{found:.4f}|{limit:.4f}|{missed}"
-    rows = ({**check, "missed": None if check["reached"] else "missed"} for check in checks)
-    print_records("\nwhat the paper's scenarios ask for", header, row, rows, left=2)
-    for check in checks:
-        if not check["reached"]:
-            print_line(
-                f"missed: {check['requirement']}, {check['estimator']}. {check['explanation']}"
-            )
-
-
-def _print_comparisons(comparisons: Sequence[dict[str, Any]]) -> None:
-    for fleet in dict.fromkeys(row["fleet"].rpartition("/")[0] for row in comparisons):
-        rows = [row for row in comparisons if row["fleet"].startswith(f"{fleet}/")]
-        errors = {(row["scenario"], row["model"]): row for row in rows}
-        models = list(dict.fromkeys(row["model"] for row in rows))
-        one_car = rows[0]["one_car"].rpartition("/")[0]
-        print_table(
-            f"\nroot mean square error in deg, trained as {one_car} and as {fleet}; * the better",
-            ["scenario", *models],
-            [
-                [name, *(_pair(errors.get((name, model))) for model in models)]
-                for name in dict.fromkeys(row["scenario"] for row in rows)
-            ],
-        )
-
-
-def _pair(row: dict[str, Any] | None) -> str:
-    if row is None:
-        return ""
-    first, second = f"{row['one_car_rmse_deg']:.3f}", f"{row['fleet_rmse_deg']:.3f}"
-    better = row["better"] == row["one_car"]
-    return f"{first}* {second} " if better else f"{first}  {second}*"
-
-
-def print_summary(content: Mapping[str, Any], model: str) -> None:
-    """Print a screen: a row a test drive, what stands out, and where the rest is."""
-    print_ranking(content["ranking"])
-    print_text("")
-    ours = content["ranking"]["estimator"]
-    for line in _extremes(content["scenarios"], ours):
-        print_text(line)
-    if checks := content["checks"]:
-        missed = sum(not check["reached"] for check in checks)
-        asked = number_of(len(checks), "requirement")
-        print_text(f"Of {asked} of the paper's scenarios, its own models miss {missed}.")
-    print_text(
-        f"All estimators, sections and requirements: fleet-slip evaluate "
-        f"{shlex.quote(model)} --all; for machines --json."
-    )
-    print_text(f"Pictures: fleet-slip report {shlex.quote(model)}")
 
 
 def _extremes(scenarios: Sequence[Mapping[str, Any]], ours: str) -> list[str]:
@@ -256,82 +149,25 @@ def _extremes(scenarios: Sequence[Mapping[str, Any]], ours: str) -> list[str]:
     ]
     if partial:
         lines.append(f"A sensor fails it on part of the rows; estimated: {', '.join(partial)}.")
+    lines.append(f"Pictures: fleet-slip report {shlex.quote(ours)}")
     return lines
 
 
-# What `evaluate` prints of drives that nobody tuned to: blind ones, and measured ones left out.
-
-
-def print_blind(rows: Sequence["BlindRow"], everything: bool) -> None:
-    """Print how far estimators are off on blind drives: published models and filters, or all."""
-    errors = {name: one.rmse_deg for name, one in rows[0].figures.items()}
-    names = [
-        name
-        for name, rmse_deg in errors.items()
-        if "@" in name.rpartition("/")[2]
-        or (rmse_deg is not None and (everything or "/" not in name))
-    ]
-    names.sort(key=lambda name: ("@" not in name, errors[name] is None, errors[name]))
-    shown = names if everything else names[:BLIND_NAMES]
-    print_table(
-        "Blind drives: RMSE in deg against the exact angle",
-        ["drives", "m/s", "side-slip std", *map(heading, shown)],
-        [
-            [
-                row.name.replace("_", " "),
-                f"{row.speed_mps[0]:.0f} to {row.speed_mps[1]:.0f}",
-                f"{row.sideslip_std_deg:.2f}",
-                *(_blind_cell(row.figures[name]) for name in shown),
-            ]
-            for row in rows
-            if everything or row.drives > 1
-        ],
-    )
-    for name in names:
-        if errors[name] is None:
-            print_text(
-                f"{name} has no estimate on any of them: it may need what a car's own drives tell, "
-                "and nobody knows these cars."
-            )
-    if not everything:
-        print_text("Every drive, and all estimators: --all; for machines --json.")
-
-
-BLIND_NAMES = 5
-"""Estimators of the table that is printed first: published models, then the best of the others."""
-
-
-def _blind_cell(one: "ErrorFigures") -> str:
-    if one.rmse_deg is None:
-        return "none"
-    return f"{one.rmse_deg:.3f}" + ("" if one.coverage == 1 else f" ({one.coverage:.0%})")
-
-
-def print_own_car(content: Mapping[str, Any], everything: bool) -> None:
-    """Print figures on measured drives, the best estimator first; with all of them by drive."""
-    estimators = content["estimators"]
+def _print_measured(content: Mapping[str, Any]) -> None:
+    """Print figures on measured drives, the best estimator first."""
     print_records(
         f"{content['cohort']}: each quarter of the {content['parts_of']} left out in turn, "
         f"{number_of(len(content['drives']), 'drive')}",
         "estimator|knows|RMSE deg|mean|std|correlation|rows",
         "{name}|{told}|{rmse_deg:.3f}|{error_mean_deg:+.3f}|{error_std_deg:.3f}|"
         "{correlation:.3f}|{coverage:.0%}",
-        ({**one, "name": name} for name, one in estimators.items()),
+        ({**one, "name": name} for name, one in content["estimators"].items()),
         left=2,
     )
     if content["vehicle"] is None:
         print_text(
             "No filter competes: no vehicle file is known. Make one: fleet-slip identify, and name "
             "it with --vehicle."
-        )
-    if everything:
-        print_table(
-            "RMSE in deg by drive",
-            ["drive", *map(heading, estimators)],
-            [
-                [drive, *(cell(found[name], ".3f") for name in estimators)]
-                for drive, found in content["drives"].items()
-            ],
         )
 
 
@@ -450,7 +286,7 @@ def evaluate(
     ] = None,
     threads: Threads = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="Print all estimators, sections and requirements.")
+        bool, typer.Option("--all", help="Print the errors of all estimators on every drive.")
     ] = False,
     json: Json = False,
 ) -> None:
@@ -458,53 +294,40 @@ def evaluate(
 
     Beside the model, those of Table I are evaluated, trained on its cohort.
 
-    Prints who wins each test drive; all of it with --all. The results are kept as a JSON document
-    below evaluations/ in the data root.
+    Prints who wins each test drive. The results are kept as a JSON document below evaluations/ in
+    the data root; --json prints it.
 
     Example: **fleet-slip evaluate waterford --scenario nominal**
     """
-    model = model or context.obj.registry().only()
-    if cohort is not None or vehicle is not None:
-        if scenario or blind or cohort is None:
-            raise UsageError(
-                "--cohort judges measured drives, for filters in the car of --vehicle: leave out "
-                "--scenario and --blind, and name a cohort."
-            )
-        measured = context.obj.evaluate_measured(
-            model, cohort, fleet or (), vehicle=vehicle, threads=threads
+    model, others = model or context.obj.registry().only(), fleet or ()
+    if (cohort is None and vehicle) or (cohort is not None and (scenario or blind)):
+        raise UsageError(
+            "--cohort judges measured drives, for filters in the car of --vehicle: leave out "
+            "--scenario and --blind, and name a cohort."
         )
-        if json:
-            print_json({"number": measured.number, "sha256": measured.sha256, **measured.content})
-        else:
-            print_own_car(measured.content, everything)
-            say(f"kept as evaluations/measured/{measured.number}.json")
-        return
+    if blind and scenario:
+        raise UsageError("--blind has drives of its own: leave out --scenario.")
     if blind:
-        if scenario:
-            raise UsageError("--blind has drives of its own: leave out --scenario.")
-        rows = context.obj.evaluate_blind(model, fleet or (), threads=threads)
+        content = context.obj.evaluate_blind(model, others, threads=threads)
         if json:
-            print_json({"blind": [row.as_dict() for row in rows]})
+            print_json(content)
         else:
-            print_blind(rows, everything)
+            print_evaluation(content, everything)
         return
-    with progress("simulate scenarios", "rows") as show:
-        kept = context.obj.evaluate(
-            model,
-            fleet or (),
-            scenarios=scenario or (),
-            threads=threads,
-            progress=show,
+    if cohort is not None:
+        kept = context.obj.evaluate_measured(
+            model, cohort, others, vehicle=vehicle, threads=threads
         )
-    content = dict(kept.content)
-    if json:
-        print_json({"number": kept.number, "sha256": kept.sha256, **content})
     else:
-        if everything:
-            print_evaluation(content)
-        else:
-            print_summary(content, model)
-        say(f"kept as evaluations/{kept.number}.json")
+        with progress("simulate scenarios", "rows") as show:
+            kept = context.obj.evaluate(
+                model, others, scenarios=scenario or (), threads=threads, progress=show
+            )
+    if json:
+        print_json({"number": kept.number, "sha256": kept.sha256, **kept.content})
+    else:
+        print_evaluation(kept.content, everything)
+        say(f"kept as evaluations/{'' if cohort is None else 'measured/'}{kept.number}.json")
 
 
 # The command that identifies a car from labelled drives: identify.

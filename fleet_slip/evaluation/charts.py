@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.drives import EvaluatedDrive, find_stretches
+from fleet_slip.evaluation.judge import EvaluatedScenario
 from fleet_slip.evaluation.kept import DRAWN_FILTERS, ReportData
-from fleet_slip.evaluation.scenarios import EvaluatedScenario
 from fleet_slip.pages.drawing import Picture, Size, colour
 from fleet_slip.pages.page import degrees, listed, number
 

@@ -10,14 +10,15 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined, meta
 
+from fleet_slip.evaluation.judge import ErrorFigures
 from fleet_slip.evaluation.kept import (
     BLOCK_S,
     DRAWN_FILTERS,
+    PAPER_TABLE_TWO,
     ReportData,
     blocks_won,
     difference,
 )
-from fleet_slip.evaluation.scenarios import PAPER_TABLE_TWO, ErrorFigures
 from fleet_slip.export.costs import describe_costs
 from fleet_slip.pages import page
 from fleet_slip.pages.page import degrees, listed
@@ -87,7 +88,7 @@ class Facts:
             raise NotEvaluatedError("nominal drive")
         rows = [
             row
-            for row in self._evaluated.rows("comparisons")
+            for row in self._evaluated.comparisons
             if scenarios[row["scenario"]]["vehicle_model"] != scenarios["nominal"]["vehicle_model"]
         ]
         if not rows:

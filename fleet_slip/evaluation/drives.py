@@ -1,6 +1,7 @@
 """Reads the drives of scenarios: what estimators see, and the truth."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
@@ -11,11 +12,20 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray, FloatArray, float_column
+from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.facts import SCENARIO
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError, RefusedError
+from fleet_slip.grams.job import update_grams
 from fleet_slip.resources import read_sql
-from fleet_slip.simulation.job import MOTION, DriveLog, exact_motion, simulate_logs
+from fleet_slip.simulation.job import (
+    MOTION,
+    DriveLog,
+    SimulationReport,
+    exact_motion,
+    simulate_batches,
+    simulate_logs,
+)
 from fleet_slip.simulation.scenario import Failure, Scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
@@ -77,6 +87,20 @@ class EvaluatedDrive:
 def visible_signals() -> tuple[str, ...]:
     """Return the names of the signals that an estimator may see: never a truth."""
     return (*catalogue().inputs, *GPS_SIGNALS)
+
+
+def simulate_scenarios(
+    warehouse: Warehouse,
+    scenarios: Sequence[Scenario],
+    executor: Executor,
+    progress: Progress = no_progress,
+) -> SimulationReport:
+    """Write drives that are missing, and update Gram rows. Raises `RefusedError` if changed."""
+    batches = {scenario.drive_id: scenario.batch() for scenario in scenarios}
+    report = simulate_batches(warehouse, list(batches.values()), executor, progress)
+    if report.changed:
+        update_grams(warehouse)
+    return report
 
 
 def load_drives(warehouse: Warehouse, scenarios: Sequence[Scenario]) -> tuple[EvaluatedDrive, ...]:

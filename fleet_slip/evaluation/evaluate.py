@@ -1,182 +1,128 @@
-"""An evaluation from end to end, and the JSON document that keeps it, `evaluations/1.json`."""
+"""An evaluation from end to end: who competes, on which drives, and the document of the result."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version as package_version
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from fleet_slip.evaluation.blind import sweep_gps_noise
-from fleet_slip.evaluation.drives import EvaluatedDrive, find_stretches, rear_compliance
+from fleet_slip.arrays import FloatArray
+from fleet_slip.evaluation.blind import judge_blindly
+from fleet_slip.evaluation.drives import (
+    EvaluatedDrive,
+    find_stretches,
+    load_drives,
+    rear_compliance,
+)
 from fleet_slip.evaluation.filters import (
-    Estimate,
     FilterEstimate,
     TrainedModels,
     TuningDrives,
     filter_bank,
     train_models,
 )
-from fleet_slip.evaluation.own_car import NAME as IDENTIFIED
-from fleet_slip.evaluation.own_car import identified_estimate
-from fleet_slip.evaluation.scenarios import (
+from fleet_slip.evaluation.judge import (
+    Estimate,
     EvaluatedScenario,
-    check_filter_targets,
-    check_targets,
-    run_all,
+    compare_models,
+    error_figures,
+    evaluate_drive,
+    rank,
 )
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.simulation.scenario import Failure, Scenario, load_scenario
-from fleet_slip.simulation.sensors import GPS_SIGNALS
+from fleet_slip.simulation.scenario import Scenario, load_scenario
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import Document, DocumentFolder, checksum
 from fleet_slip.warehouse.tables import Warehouse
 
-# Who wins a test drive, and whether a fleet-trained model beats the one-car model there.
-
-LEAST_COVERAGE = 0.99
-"""Share of a drive's rows that a competitor must have estimates for: who skips rows cannot win."""
-
-CLOSE = 1.25
-"""Ratio to the winner's RMSE up to which a lost drive counts as close."""
-
 
 @dataclass(frozen=True)
-class Standing:
-    """How one estimator stands on one test drive against the others.
+class Competitors:
+    """All estimators that compete, by name, and what a document says of each."""
 
-    Attributes:
-        scenario: name of the test drive.
-        winner, winner_rmse_deg: who has the smallest RMSE; None where nobody competes.
-        rmse_deg: of the one estimator; None where it has too few estimates to compete.
-        best_other, best_other_rmse_deg: the best of the others.
-        same_as: an earlier test drive that differs from this one in satellite navigation alone, so
-            that nobody who competes tells them apart.
-    """
-
-    scenario: str
-    winner: str | None
-    winner_rmse_deg: float | None
-    rmse_deg: float | None
-    best_other: str | None
-    best_other_rmse_deg: float | None
-    same_as: str | None = None
-
-    @property
-    def won(self) -> bool:
-        """Whether the one estimator wins the drive."""
-        return self.winner is not None and self.winner != self.best_other
-
-    @property
-    def ratio(self) -> float | None:
-        """RMSE over that of the winner: 1 where it wins."""
-        if self.rmse_deg is None or not self.winner_rmse_deg:
-            return None
-        return self.rmse_deg / self.winner_rmse_deg
+    one_car: TrainedModels
+    fleets: tuple[TrainedModels, ...]
+    estimators: Mapping[str, Estimate]
+    descriptions: Mapping[str, Mapping[str, Any]]
 
 
-@dataclass(frozen=True)
-class Ranking:
-    """How one estimator stands on all test drives; those that are the same count once."""
-
-    estimator: str
-    standings: tuple[Standing, ...]
-
-    @property
-    def counted(self) -> tuple[Standing, ...]:
-        """The standings on drives that are not the same as one before."""
-        return tuple(one for one in self.standings if one.same_as is None)
-
-    @property
-    def won(self) -> int:
-        """Number of drives that it wins."""
-        return sum(one.won for one in self.counted)
-
-    @property
-    def close(self) -> int:
-        """Number of drives that it loses with at most `CLOSE` times the winner's RMSE."""
-        return sum(
-            one.ratio is not None and one.ratio <= CLOSE and not one.won for one in self.counted
-        )
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
-        return {
-            "estimator": self.estimator,
-            "least_coverage": LEAST_COVERAGE,
-            "close_ratio": CLOSE,
-            "drives": len(self.counted),
-            "won": self.won,
-            "close": self.close,
-            "standings": [
-                {**asdict(one), "won": one.won, "ratio": one.ratio} for one in self.standings
-            ],
-        }
-
-
-def rank(runs: Sequence[EvaluatedScenario], estimator: str, gps: Collection[str]) -> Ranking:
-    """Rank an estimator on every drive against all that use no GPS; it wins a tie."""
-    return Ranking(
-        estimator,
-        tuple(
-            replace(_stand(run, estimator, gps), same_as=_same_as(run.scenario, runs[:number]))
-            for number, run in enumerate(runs)
-        ),
+def train_competitors(
+    warehouse: Warehouse,
+    one_car: ModelVersion,
+    fleets: Sequence[ModelVersion],
+    executor: Executor,
+) -> Competitors:
+    """Fit and tune all that compete; filters get the one-car model's drives."""
+    first, *others = (train_models(warehouse, version) for version in (one_car, *fleets))
+    estimators: dict[str, Estimate] = {}
+    descriptions: dict[str, Mapping[str, Any]] = {}
+    for trained in (first, *others):
+        estimators |= trained.estimators()
+        descriptions |= trained.descriptions()
+    weighed = "mass_kg" in Predictor.of(one_car.manifest).plan.facts
+    drives = TuningDrives.of(warehouse, first.selection.cohort, weighed=weighed)
+    bank = filter_bank(drives, load_scenario("nominal").car, executor, weighed=weighed)
+    return Competitors(
+        first,
+        tuple(others),
+        estimators | {name: one for name, (one, _) in bank.items()},
+        descriptions | {name: about for name, (_, about) in bank.items()},
     )
 
 
-def _stand(run: EvaluatedScenario, estimator: str, gps: Collection[str]) -> Standing:
-    errors = {
-        name: result.whole.rmse_deg
-        for name, result in run.results.items()
-        if name not in gps
-        and result.whole.rmse_deg is not None
-        and result.whole.coverage >= LEAST_COVERAGE
+def evaluate(
+    warehouse: Warehouse,
+    scenarios: Sequence[Scenario],
+    one_car: ModelVersion,
+    fleets: Sequence[ModelVersion],
+    executor: Executor,
+) -> dict[str, Any]:
+    """Evaluate a model and all that competes with it on scenarios that are in the logs.
+
+    Returns the evaluation's document: of logs, models and program alone.
+    """
+    trained = train_competitors(warehouse, one_car, fleets, executor)
+    about, first = trained.descriptions, trained.one_car
+    runs = [evaluate_drive(one, trained.estimators) for one in load_drives(warehouse, scenarios)]
+    gps = {name for name, one in about.items() if one.get("gps")}
+    filters = {name: trained.estimators[name] for name in about if name in gps}
+    cohort = first.selection.cohort
+    return {
+        "format": 1,
+        "package_version": package_version("fleet-slip"),
+        "estimators": {name: dict(one) for name, one in about.items()},
+        "scenarios": [_run(one) for one in runs],
+        "logs_version": cohort.logs_version,
+        "grams_version": cohort.grams_version,
+        "comparisons": [
+            row
+            for fleet in trained.fleets
+            for row in compare_models(runs, first.table_one, fleet.table_one)
+        ],
+        "ranking": rank(runs, first.version.reference, gps),
+        "gps_noise": sweep_gps_noise(runs, filters, list(first.estimators())),
     }
-    ours = errors.pop(estimator, None)
-    other = min(errors, key=lambda name: errors[name], default=None)
-    others = None if other is None else errors[other]
-    winner, least = other, others
-    if ours is not None and (others is None or ours <= others):
-        winner, least = estimator, ours
-    return Standing(run.scenario.name, winner, least, ours, other, others)
 
 
-def _same_as(scenario: Scenario, runs: Sequence[EvaluatedScenario]) -> str | None:
-    """Return the first of some drives that is the same for whoever does not see GPS."""
-    seen = _without_gps(scenario)
-    return next((r.scenario.name for r in runs if _without_gps(r.scenario) == seen), None)
-
-
-def _without_gps(scenario: Scenario) -> tuple[str, tuple[Failure, ...]]:
-    """Return what of a scenario matters to who does not see GPS."""
-    sensors = scenario.sensors.model_copy(update={"gps": load_scenario("nominal").sensors.gps})
-    drive = scenario.model_copy(update={"drive": "any", "sensors": sensors}).batch()
-    failures = tuple(f for f in scenario.failures if not set(f.signals) <= set(GPS_SIGNALS))
-    return drive.digest, failures
-
-
-def compare_fleets(
-    runs: Sequence[EvaluatedScenario], one_car: TrainedModels, fleet: TrainedModels
-) -> Iterator[dict[str, Any]]:
-    """Compare the models of Table I that both cohorts can serve, wherever both have estimates."""
-    for run in runs:
-        for number, one in one_car.table_one.items():
-            other = fleet.table_one.get(number)
-            if other is None:
-                continue
-            ours, theirs = (run.results[name].whole.rmse_deg for name in (one, other))
-            if ours is not None and theirs is not None:
-                yield {
-                    "scenario": run.scenario.name,
-                    "model": number,
-                    "one_car": one,
-                    "fleet": other,
-                    "one_car_rmse_deg": ours,
-                    "fleet_rmse_deg": theirs,
-                    "better": one if ours <= theirs else other,
-                }
+def evaluate_blindly(
+    warehouse: Warehouse,
+    model: ModelVersion,
+    others: Sequence[ModelVersion],
+    executor: Executor,
+) -> dict[str, Any]:
+    """Evaluate the same on drives that follow from the model's hash; nothing is written."""
+    trained = train_competitors(warehouse, model, others, executor)
+    return {
+        "format": 1,
+        "package_version": package_version("fleet-slip"),
+        "model": model.reference,
+        "estimators": {name: dict(one) for name, one in trained.descriptions.items()},
+        "drives": judge_blindly(model.sha256, trained.estimators),
+    }
 
 
 def _run(one: EvaluatedScenario) -> dict[str, Any]:
@@ -229,9 +175,10 @@ def _truth(drive: EvaluatedDrive) -> dict[str, Any]:
     }
 
 
-def evaluations_of(warehouse: Warehouse) -> DocumentFolder:
-    """Return where a data root keeps its evaluations."""
-    return DocumentFolder(warehouse.root / "evaluations")
+def evaluations_of(warehouse: Warehouse, kind: str = "") -> DocumentFolder:
+    """Return where a data root keeps its evaluations; `measured` are those on measured drives."""
+    folder = warehouse.root / "evaluations"
+    return DocumentFolder(folder / kind if kind else folder)
 
 
 def keep(documents: DocumentFolder, content: Mapping[str, Any]) -> Document:
@@ -245,79 +192,91 @@ def keep(documents: DocumentFolder, content: Mapping[str, Any]) -> Document:
     return documents.after_newest(attempt)
 
 
-@dataclass(frozen=True)
-class Competitors:
-    """All estimators that compete, by name, and what a document says of each."""
+# Below which noise of satellite navigation the paper's filter is better than a regression.
+#
+# The GPS velocity of the nominal drive is drawn again from the true one, without outages, with
+# white noise of several sizes, each of which the filter knows. The regression uses no GPS.
 
-    one_car: TrainedModels
-    fleets: tuple[TrainedModels, ...]
-    estimators: Mapping[str, Estimate]
-    descriptions: Mapping[str, Mapping[str, Any]]
+GPS_SCENARIO = "nominal"
+LEVELS_MPS = (0.01, 0.015, 0.02, 0.025, 0.03, 0.035, 0.04, 0.05, 0.06, 0.08, 0.1)
+"""Standard deviations of the GPS velocity, along and across."""
 
+DRAWS = 5
+"""Draws of the noise at each level; the same ones, scaled, at all levels."""
 
-def train_competitors(
-    warehouse: Warehouse,
-    one_car: ModelVersion,
-    fleets: Sequence[ModelVersion],
-    executor: Executor,
-) -> Competitors:
-    """Fit and tune all that compete; filters get the one-car model's drives."""
-    first, *others = (train_models(warehouse, version) for version in (one_car, *fleets))
-    estimators: dict[str, Estimate] = {}
-    descriptions: dict[str, Mapping[str, Any]] = {}
-    for trained in (first, *others):
-        estimators |= trained.estimators()
-        descriptions |= trained.descriptions()
-    weighed = "mass_kg" in Predictor.of(one_car.manifest).plan.facts
-    drives = TuningDrives.of(warehouse, first.selection.cohort, weighed=weighed)
-    bank, tuned_on = filter_bank(
-        warehouse, drives, load_scenario("nominal").car, executor, weighed=weighed
-    )
-    identified = identified_estimate(warehouse, drives, executor)
-    if identified is not None:
-        estimators[IDENTIFIED] = identified
-        descriptions[IDENTIFIED] = identified.description()
-    filters = {name: {**one.description(), **tuned_on.get(name, {})} for name, one in bank.items()}
-    return Competitors(first, tuple(others), estimators | bank, descriptions | filters)
+SEED = 8
+STATED = ("gps_vx_std_mps", "gps_vy_std_mps")
+"""The filter's parameters that say how noisy GPS is."""
 
 
-def evaluate(
-    warehouse: Warehouse,
-    scenarios: Sequence[Scenario],
-    one_car: ModelVersion,
-    fleets: Sequence[ModelVersion],
-    executor: Executor,
-) -> dict[str, Any]:
-    """Evaluate a model and all that competes with it on scenarios that are in the logs.
+def sweep_gps_noise(
+    runs: Sequence[EvaluatedScenario],
+    filters: Mapping[str, Estimate],
+    regressions: Sequence[str],
+) -> dict[str, Any] | None:
+    """Return the RMSE in deg of filters by GPS noise, and where they equal regressions.
 
-    Returns the evaluation's document: of logs, models and program alone.
+    None if the nominal drive is not among the runs.
     """
-    competitors = train_competitors(warehouse, one_car, fleets, executor)
-    estimators, about = competitors.estimators, competitors.descriptions
-    runs = run_all(warehouse, scenarios, estimators)
-    first = competitors.one_car
-    gps = {name for name, one in about.items() if one.get("gps")}
-    filters = {
-        name: one
-        for name, one in estimators.items()
-        if name in gps and isinstance(one, FilterEstimate)
+    run = next((run for run in runs if run.name == GPS_SCENARIO), None)
+    if run is None:
+        return None
+    known = {name: one for name, one in filters.items() if isinstance(one, FilterEstimate)}
+    by_filter = {
+        name: [rmse_deg(run.drive, one, std) for std in LEVELS_MPS] for name, one in known.items()
     }
-    sweep = sweep_gps_noise(runs, filters, list(first.estimators()))
-    checks = (
-        *check_targets(runs, first.table_one, first.linear_estimators()),
-        *check_filter_targets(runs, first.table_one),
-    )
-    comparisons = [row for one in competitors.fleets for row in compare_fleets(runs, first, one)]
-    cohort = first.selection.cohort
+    whole = {name: run.results[name].whole.rmse_deg for name in regressions}
+    errors = {name: error for name, error in whole.items() if error is not None}
     return {
-        "format": 1,
-        "package_version": package_version("fleet-slip"),
-        "estimators": {name: dict(one) for name, one in about.items()},
-        "scenarios": [_run(one) for one in runs],
-        "logs_version": cohort.logs_version,
-        "grams_version": cohort.grams_version,
-        "checks": [asdict(check) for check in checks],
-        "comparisons": comparisons,
-        "ranking": rank(runs, first.version.reference, gps).as_dict(),
-        "gps_noise": sweep.as_dict() if sweep else None,
+        "scenario": GPS_SCENARIO,
+        "rate_hz": run.scenario.sensors.gps.rate_hz,
+        "draws": DRAWS,
+        "levels": [
+            {
+                "velocity_std_mps": std,
+                "rmse_deg": {name: found[level] for name, found in by_filter.items()},
+            }
+            for level, std in enumerate(LEVELS_MPS)
+        ],
+        "regressions": errors,
+        "equal_at_mps": {
+            name: {regression: equal_at_mps(found, error) for regression, error in errors.items()}
+            for name, found in by_filter.items()
+        },
+    }
+
+
+def equal_at_mps(errors_deg: Sequence[float], rmse_deg: float) -> float | None:
+    """Return the noise at which a filter's errors by `LEVELS_MPS` reach a value; else None."""
+    by_level = zip(LEVELS_MPS, errors_deg, strict=True)
+    for (low, below), (high, above) in pairwise(by_level):
+        if below <= rmse_deg <= above and below < above:
+            return low + (rmse_deg - below) / (above - below) * (high - low)
+    return None
+
+
+def rmse_deg(drive: EvaluatedDrive, one: FilterEstimate, velocity_std_mps: float) -> float:
+    """Return a filter's RMSE in deg over all draws; it believes as much more noise as there is."""
+    stated = drive.scenario.sensors.gps.velocity_std_mps
+    believed = {name: getattr(one.parameters, name) * velocity_std_mps / stated for name in STATED}
+    noisier = replace(one, parameters=one.parameters.model_copy(update=believed)).in_drive(drive)
+    generator = np.random.default_rng(SEED)
+    squares = []
+    for _ in range(DRAWS):
+        estimate = noisier({**drive.signals, **drawn_gps(drive, velocity_std_mps, generator)})
+        figures = error_figures(estimate, drive.sideslip_rad, drive.evaluated)
+        squares.append(np.nan if figures.rmse_deg is None else figures.rmse_deg**2)
+    return float(np.sqrt(np.mean(squares)))
+
+
+def drawn_gps(
+    drive: EvaluatedDrive, velocity_std_mps: float, generator: np.random.Generator
+) -> dict[str, FloatArray]:
+    """Return the true velocity with white noise at every fix, NaN between them."""
+    every = SAMPLE_RATE_HZ // drive.scenario.sensors.gps.rate_hz
+    fixes = np.arange(len(drive.time_s)) % every == 0
+    noise = velocity_std_mps * generator.standard_normal((2, len(fixes)))
+    return {
+        "gps_vx_mps": np.where(fixes, drive.vx_mps + noise[0], np.nan),
+        "gps_vy_mps": np.where(fixes, drive.vy_mps + noise[1], np.nan),
     }

@@ -1,13 +1,14 @@
 """The Kalman filters as rivals of the regression, as they are and tuned.
 
 All know the sensors' stated noise, and the class of the car that they are in, by its file; they
-take the road for dry and the load for the usual one. `ekf_told` is told the very car and the road.
+take the road for dry and the load for the usual one. `ekf_told` knows the very car and the road.
 The tuned ones have the parameters that suit drives which the regression was trained on best.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,7 +21,15 @@ from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.evaluation import ekf, kalman
 from fleet_slip.evaluation.drives import EvaluatedDrive
-from fleet_slip.evaluation.identify import Tuned, checksum_of_sources, tune
+from fleet_slip.evaluation.identify import (
+    Identified,
+    Measured,
+    Tuned,
+    checksum_of_sources,
+    identify,
+    tune,
+)
+from fleet_slip.evaluation.judge import Estimate, Signals
 from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive, read_drive
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.models.manifest import Manifest
@@ -35,14 +44,6 @@ from fleet_slip.storage.runs import LOGGER
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-
-# What is evaluated: anything that turns a drive's signals into side-slip angles.
-
-Signals = Mapping[str, FloatArray]
-"""One drive at 100 Hz: an array of shape (ticks,) for each SI column; NaN where null."""
-
-Estimate = Callable[[Signals], FloatArray]
-"""Side-slip angle in rad at every tick, shape (ticks,); NaN where there is no estimate."""
 
 TABLE_ONE = "table1"
 """The model list with the paper's five sets of signals."""
@@ -135,15 +136,11 @@ class TrainedModels:
         """Return the estimator's name of each model of Table I that the cohort can serve."""
         return {one.name: f"{self.version.reference}/{one.name}" for one in self.selection.models}
 
-    def linear_estimators(self) -> dict[str, LinearEstimate]:
-        """Return the models of Table I by name."""
-        models = zip(self.table_one.values(), self.selection.models, strict=True)
-        return {name: LinearEstimate.of(one.model) for name, one in models}
-
     def estimators(self) -> dict[str, LinearEstimate | ColumnEstimate]:
         """Return the models of Table I, then the published one, by name."""
-        published = published_estimate(self.version.manifest)
-        return {**self.linear_estimators(), self.version.reference: published}
+        models = zip(self.table_one.values(), self.selection.models, strict=True)
+        fitted = {name: LinearEstimate.of(one.model) for name, one in models}
+        return {**fitted, self.version.reference: published_estimate(self.version.manifest)}
 
     def descriptions(self) -> dict[str, dict[str, Any]]:
         """Return what a JSON document says of each estimator."""
@@ -195,7 +192,7 @@ class Filter:
         name: among the estimators.
         module: whose it is; filters of one module share what is tuned.
         gps: whether it needs satellite navigation.
-        told: whether it knows the scenario's own load, tyres and road.
+        informed: whether it knows the scenario's own load, tyres and road.
     """
 
     name: str
@@ -204,7 +201,7 @@ class Filter:
     parameters: Config
     tunable: tuple[str, ...]
     gps: bool = False
-    told: bool = False
+    informed: bool = False
     other_starts: tuple[Config, ...] = ()
     """Where the search for parameters begins besides."""
 
@@ -232,7 +229,7 @@ FILTERS = (
         "ekf_class", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, other_starts=(LOOSE_EKF,)
     ),
     Filter(
-        "ekf_told", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, told=True,
+        "ekf_told", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, informed=True,
         other_starts=(LOOSE_EKF,),
     ),
 )  # fmt: skip
@@ -249,14 +246,15 @@ class FilterEstimate:
     """Whether it knows a car's mass, as the model that it competes with does."""
 
     def in_drive(self, drive: EvaluatedDrive) -> "FilterEstimate":
-        """Return the filter as it is told of the car, and of the road if it is told everything."""
+        """Return the filter with what it knows of the car, and of the road if it is informed."""
         scenario = drive.scenario
-        if not self.filter.told:
-            mass_kg = drive.facts["mass_kg"] if self.weighed else None
-            car = scenario.vehicle
-            return replace(self, car=car if mass_kg is None else car.with_sprung_mass(mass_kg))
-        told = self.parameters.model_copy(update={"adhesion": scenario.adhesion})
-        return replace(self, car=scenario.car, parameters=told)
+        if self.filter.informed:
+            parameters = self.parameters.model_copy(update={"adhesion": scenario.adhesion})
+            return replace(self, car=scenario.car, parameters=parameters)
+        car = scenario.vehicle
+        if self.weighed:
+            car = car.with_sprung_mass(scenario.car.body.sprung_mass_kg)
+        return replace(self, car=car)
 
     def __call__(self, signals: Signals) -> FloatArray:
         """Return the estimate at each tick."""
@@ -268,7 +266,7 @@ class FilterEstimate:
             "kind": "filter",
             "group": GROUP,
             "gps": self.filter.gps,
-            "told": "everything" if self.filter.told else "class",
+            "told": "everything" if self.filter.informed else "class",
             "weighed": self.weighed,
             "parameters": self.parameters.model_dump(mode="json"),
         }
@@ -286,49 +284,38 @@ def rebuild(name: str, about: Mapping[str, Any], car: VehicleParameters) -> Filt
     return FilterEstimate(one, parameters, car, about.get("weighed", False))
 
 
+Bank = dict[str, tuple[Estimate, dict[str, Any]]]
+"""Estimators by name, and what a document says of each."""
+
+
 def filter_bank(
-    warehouse: Warehouse,
-    drives: "TuningDrives",
-    car: VehicleParameters,
-    executor: Executor,
-    *,
-    weighed: bool = False,
-) -> tuple[dict[str, FilterEstimate], dict[str, dict[str, list[str]]]]:
-    """Return each filter as it is and tuned on drives, each in the car that made it.
+    drives: "TuningDrives", car: VehicleParameters, executor: Executor, *, weighed: bool = False
+) -> Bank:
+    """Return each filter as it is and tuned on drives, and the one in a car identified from them.
 
-    Beside them stands what each tuned one was `tuned_on`.
-
-    A filter that the drives lack something for is tuned on none, and a remark says so. Tuned
-    parameters are kept below `tuned/` in the data root, and sought again only for other
-    drives, another car or another program. The best that any start leads to is taken.
+    A filter that the drives lack something for is not tuned, and a remark says so.
     """
-    bank: dict[str, FilterEstimate] = {}
-    tuned_on: dict[str, dict[str, list[str]]] = {}
+    bank: Bank = {}
+    cars = _identified_cars(drives, executor)
+    if cars:
+        identified = IdentifiedEstimate(cars, next(iter(cars)))
+        bank[IDENTIFIED_NAME] = identified, identified.description()
     before: dict[str, Config] = {}
     for one in FILTERS:
-        key = _key(one, drives, car)
-        kept = DocumentFolder(warehouse.root / "tuned" / one.module)
-        found = find_kept(kept, key)
-        if found is None:
-            LOGGER.info("tuning %s on %s, once", one.name, number_of(len(drives.names), "drive"))
-            try:
-                best = one.tune(drives.read(), car, executor)
-                found = {
-                    "key": key,
-                    "parameters": best.parameters.model_dump(mode="json"),
-                    "rmse_deg": float(np.degrees(best.rmse_rad)),
-                    "evaluations": best.evaluations,
-                }
-                kept.append(found)
-            except DataError as error:  # its drives have no fix, no wheel speeds, no steering
-                LOGGER.warning("%s competes as it is, for it cannot be tuned: %s", one.name, error)
+        found = drives.kept_or_found(
+            one.module,
+            _key(one, drives, car),
+            partial(_tuned, one, drives, car, executor),
+            f"{one.name} competes as it is, for it cannot be tuned",
+        )
         if found:
             before[one.module] = type(one.parameters).model_validate(found["parameters"])
-        tuned = before.get(one.module, one.parameters)
-        bank[one.name] = FilterEstimate(one, one.parameters, car, weighed)
-        bank[f"{one.name}_tuned"] = FilterEstimate(one, tuned, car, weighed)
-        tuned_on[f"{one.name}_tuned"] = {"tuned_on": drives.names if found else []}
-    return bank, tuned_on
+        plain = FilterEstimate(one, one.parameters, car, weighed)
+        tuned = replace(plain, parameters=before.get(one.module, one.parameters))
+        tuned_on = {"tuned_on": drives.names if found else []}
+        bank[one.name] = plain, plain.description()
+        bank[f"{one.name}_tuned"] = tuned, {**tuned.description(), **tuned_on}
+    return bank
 
 
 def _key(one: Filter, drives: "TuningDrives", car: VehicleParameters) -> dict[str, Any]:
@@ -343,10 +330,74 @@ def _key(one: Filter, drives: "TuningDrives", car: VehicleParameters) -> dict[st
     }
 
 
-def find_kept(kept: DocumentFolder, key: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """Return the newest document about what was asked; None if there is none."""
-    documents = (kept.read(number).content for number in reversed(kept.numbers()))
-    return next((content for content in documents if content["key"] == key), None)
+def _tuned(
+    one: Filter, drives: "TuningDrives", car: VehicleParameters, executor: Executor
+) -> dict[str, Any]:
+    LOGGER.info("tuning %s on %s, once", one.name, number_of(len(drives.names), "drive"))
+    best = one.tune(drives.read(), car, executor)
+    return {
+        "parameters": best.parameters.model_dump(mode="json"),
+        "rmse_deg": float(np.degrees(best.rmse_rad)),
+        "evaluations": best.evaluations,
+    }
+
+
+# The extended Kalman filter in a car that was identified from the drives a model learned from, as a
+# department would build it that has scales, a tape measure and labelled drives.
+
+IDENTIFIED_NAME = "ekf_identified"
+
+DRIVES_OF_A_CLASS = 12
+"""Of each class of cars a dozen tell as much, in half the time."""
+
+
+@dataclass(frozen=True)
+class IdentifiedEstimate:
+    """The filter in the identified car of a class; in the first of another class that it knows."""
+
+    cars: Mapping[str, Identified]
+    driven: str
+
+    def in_drive(self, drive: EvaluatedDrive) -> "IdentifiedEstimate":
+        """Return the filter in the car of a drive."""
+        known = drive.scenario.vehicle.name
+        return replace(self, driven=known) if known in self.cars else self
+
+    def __call__(self, signals: Signals) -> FloatArray:
+        """Return the estimate at each tick."""
+        return self.cars[self.driven].estimate(seen(signals))
+
+    def description(self) -> dict[str, Any]:
+        """Return what a JSON document says of it."""
+        return {
+            "kind": "filter",
+            "group": GROUP,
+            "gps": False,
+            "told": "labelled drives",
+            "parameters": {name: one.dump() for name, one in self.cars.items()},
+        }
+
+
+def _identified_cars(drives: "TuningDrives", executor: Executor) -> dict[str, Identified]:
+    """Identify each class of cars among drives; none where the drives do not allow it."""
+
+    def find() -> dict[str, Any]:
+        LOGGER.info("identifying the car, once")
+        of_class: dict[str, list[LabelledDrive]] = {}
+        for (_, model, _), drive in zip(drives.known, drives.read(), strict=True):
+            if drive.car is not None:
+                of_class.setdefault(model, []).append(replace(drive, car=None))
+        cars = {
+            model: identify(
+                Measured.of(load_vehicle(model)), choose_evenly(own, DRIVES_OF_A_CLASS), executor
+            )
+            for model, own in sorted(of_class.items())
+        }
+        return {"cars": {model: one.dump() for model, one in cars.items()}}
+
+    key = {"drives": drives.key(), "program": checksum_of_sources()}
+    found = drives.kept_or_found("identified", key, find, "no car can be identified")
+    return {model: Identified.load(one) for model, one in found["cars"].items()} if found else {}
 
 
 T = TypeVar("T")
@@ -395,6 +446,25 @@ class TuningDrives:
     def key(self) -> list[Any]:
         """Return what tells these from others, for a JSON document."""
         return [TUNING_S, *(list(known) for known in self.known)]
+
+    def kept_or_found(
+        self, name: str, key: Mapping[str, Any], find: Callable[[], Mapping[str, Any]], failing: str
+    ) -> Mapping[str, Any] | None:
+        """Return what was kept for a key below `tuned/` in the data root, else find and keep it.
+
+        Where the drives lack what that needs, a remark says what is `failing`, and it is None.
+        """
+        folder = DocumentFolder(self.warehouse.root / "tuned" / name)
+        documents = (folder.read(number).content for number in reversed(folder.numbers()))
+        found = next((content for content in documents if content["key"] == key), None)
+        if found is None:
+            try:
+                found = {"key": key, **find()}
+            except DataError as error:  # no fix, no wheel speeds, no steering, no label
+                LOGGER.warning("%s: %s", failing, error)
+                return None
+            folder.append(found)
+        return found
 
     def read(self) -> Sequence[LabelledDrive]:
         """Return the beginning of each drive, as filters meet it: they know no bias yet."""

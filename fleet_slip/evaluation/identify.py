@@ -8,7 +8,7 @@ drives' labels. As a vehicle file the car serves every filter here.
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -353,6 +353,21 @@ class Identified:
     held_out_rad: float | None = None
     drives: int = 0
 
+    def estimate(self, signals: DriveSignals) -> FloatArray:
+        """Return what the filter in the car estimates of a drive."""
+        return ekf.estimate(signals, self.car, self.noise)
+
+    def dump(self) -> dict[str, Any]:
+        """Return what is kept of it."""
+        content = {name: getattr(self, name).model_dump(mode="json") for name in ("car", "noise")}
+        return {**content, "fit_rad": self.fit_rad}
+
+    @classmethod
+    def load(cls, content: Mapping[str, Any]) -> Self:
+        """Return what was kept."""
+        car = VehicleParameters.model_validate(content["car"])
+        return cls(car, ekf.EkfNoise.model_validate(content["noise"]), content["fit_rad"])
+
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document says: what was found, and errors in degrees."""
         car = self.car
@@ -406,12 +421,8 @@ def identify_held_out(
         out = drives[fold::FOLDS]
         others = [one for place, one in enumerate(drives) if place % FOLDS != fold]
         other = identify(measured, others, executor)
-
-        def estimate(drive: LabelledDrive, of: Identified = other) -> FloatArray:
-            return ekf.estimate(drive.signals, of.car, of.noise)
-
         try:
-            error_rad = rmse_rad(estimate, out, executor)
+            error_rad = rmse_rad(lambda one, of=other: of.estimate(one.signals), out, executor)
         except DataError:  # none of these has a row with a label
             continue
         squares.append(error_rad**2)

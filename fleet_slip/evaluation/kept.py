@@ -14,16 +14,14 @@ from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.evaluate import evaluations_of
 from fleet_slip.evaluation.filters import (
     TABLE_ONE,
-    Estimate,
     LinearEstimate,
     TrainedModels,
     rebuild,
     train_models,
 )
-from fleet_slip.evaluation.own_car import own_car_evaluations
-from fleet_slip.evaluation.scenarios import (
-    THE_PAPERS_CHOICE,
+from fleet_slip.evaluation.judge import (
     ErrorFigures,
+    Estimate,
     EvaluatedScenario,
     run_all,
 )
@@ -42,6 +40,18 @@ from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import Document
 from fleet_slip.warehouse.tables import Warehouse
+
+PAPER_TABLE_TWO = {
+    "1": (0.0135, 0.3018),
+    "2": (-0.0146, 0.1754),
+    "3": (-0.0209, 0.1556),
+    "4": (-0.0060, 0.1549),
+    "5": (-0.0079, 0.1505),
+}
+"""Mean and standard deviation of the error in deg on the paper's nominal drive, Table II."""
+
+THE_PAPERS_CHOICE = "4"
+"""The model of Table I that the paper compares with the Kalman filter."""
 
 SAME = 1e-6
 """Relative difference below which two figures of the same estimates are the same."""
@@ -65,9 +75,10 @@ class Evaluated:
         """What the document says of each scenario, by name, in its order."""
         return {one["name"]: one for one in self.document.content["scenarios"]}
 
-    def rows(self, key: Literal["checks", "comparisons"]) -> Sequence[Mapping[str, Any]]:
-        """Return one of the document's lists."""
-        rows: Sequence[Mapping[str, Any]] = self.document.content[key]
+    @property
+    def comparisons(self) -> Sequence[Mapping[str, Any]]:
+        """How the models of other cohorts compare with those of its own."""
+        rows: Sequence[Mapping[str, Any]] = self.document.content["comparisons"]
         return rows
 
     @cached_property
@@ -287,7 +298,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     evaluated.require_figures(runs)
     cohort, models = trained.selection.cohort, trained.selection.models
     signals = tuple(dict.fromkeys(models[-1].signals))
-    measured = own_car_evaluations(warehouse)
+    measured = evaluations_of(warehouse, "measured")
     documents = (measured.read(number).content for number in reversed(measured.numbers()))
     return ReportData(
         version=version,

@@ -3,14 +3,12 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from fleet_slip.base import number_of
 from fleet_slip.evaluation.charts import draw_pictures
 from fleet_slip.evaluation.claims import Status, judge_claims
-from fleet_slip.evaluation.evaluate import LEAST_COVERAGE
-from fleet_slip.evaluation.kept import ReportData, gather
-from fleet_slip.evaluation.scenarios import FILTER_SCENARIOS, PAPER_TABLE_TWO
+from fleet_slip.evaluation.judge import LEAST_COVERAGE
+from fleet_slip.evaluation.kept import PAPER_TABLE_TWO, ReportData, gather
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.drawing import Picture, draw, png_file, svg_file
 from fleet_slip.pages.page import (
@@ -127,49 +125,6 @@ def distances(data: ReportData) -> list[ReportTable]:
     ]  # fmt: skip
 
 
-def targets(data: ReportData) -> list[ReportTable]:
-    """Return what the paper's scenarios ask of Table I, and of it against the Kalman filter."""
-    checks = data.evaluated.rows("checks")
-    against = [one for one in checks if "below that of" in one["requirement"]]
-    paper = [one for one in against if one["scenario"] not in FILTER_SCENARIOS[1:]]
-    plain = [one for one in checks if one not in against]
-    by_place = {(one["requirement"], one["estimator"]): one for one in plain}
-    tables = []
-    if plain:
-        rows: list[list[str | Cell]] = []
-        for requirement in dict.fromkeys(one["requirement"] for one in plain):
-            found = [by_place.get((requirement, one)) for one in data.evaluated.models.values()]
-            rows.append([requirement.replace("_", " ")])
-            rows[-1] += [
-                _marked(number(one["found"], 4), one["reached"], not one["reached"])
-                if one
-                else number(None)
-                for one in found
-            ]
-        head = ["requirement", *(f"model {name}" for name in data.evaluated.models)]
-        caption = "What the paper's scenarios ask for, by model of Table I"
-        tables.append(table("targets", caption, head, rows, note=_misses(plain)))
-    if paper:
-        rows = [
-            [
-                one["requirement"].removesuffix(", deg").replace("_", " "),
-                _marked(degrees(one["found"], 4), one["reached"], not one["reached"]),
-                degrees(one["limit"], 4),
-            ]
-            for one in paper
-        ]
-        caption = "What the comparison with the Kalman filter asks for"
-        head = ["requirement", "regression", "filter"]
-        tables.append(table("targets-filter", caption, head, rows, note=_misses(paper)))
-    return tables
-
-
-def _misses(checks: Sequence[Mapping[str, Any]]) -> str:
-    missed = [one for one in checks if not one["reached"]]
-    told = [f"Missed by {o['estimator']} ({o['requirement']}): {o['explanation']}" for o in missed]
-    return " ".join([f"{len(checks) - len(missed)} of {len(checks)} reached.", *told])
-
-
 def standings(data: ReportData) -> ReportTable:
     """Return every estimator's error on every test drive; of Table I the paper's choice alone."""
     evaluated = data.evaluated
@@ -207,7 +162,7 @@ def standings(data: ReportData) -> ReportTable:
     )
 
 
-def own_car(data: ReportData) -> list[ReportTable]:
+def measured_drives(data: ReportData) -> list[ReportTable]:
     """Return the errors on measured drives, if there were any."""
     found = data.on_measured
     if found is None:
@@ -246,8 +201,8 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         version=data.version,
         evaluation=data.evaluated.document,
         paper=[draw(one) for one in shown],
-        tables=[table_one(data), table_two(data), *distances(data), *targets(data)],
-        further=[*own_car(data), standings(data)],
+        tables=[table_one(data), table_two(data), *distances(data)],
+        further=[*measured_drives(data), standings(data)],
         tiles=_tiles(data, counted),
         claims=claims,
         tally={status: counted[status] for status in Status},
@@ -303,7 +258,7 @@ def _provenance(data: ReportData) -> list[tuple[str, str]]:
 
 def _commands(data: ReportData) -> list[str]:
     reference, campaigns = data.version.reference, data.trained.selection.cohort.drives["campaign"]
-    rows = data.evaluated.rows("comparisons")
+    rows = data.evaluated.comparisons
     fleets = dict.fromkeys(row["fleet"].rpartition("/")[0] for row in rows)
     return [
         *(f"fleet-slip run --campaign {name}" for name in sorted({*campaigns.to_pylist()})),

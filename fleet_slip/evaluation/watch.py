@@ -17,12 +17,13 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, as_counts
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, QuestionError, UsageError
-from fleet_slip.evaluation.drives import load_drives
+from fleet_slip.evaluation.drives import load_drives, simulate_scenarios
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import fill_in
 from fleet_slip.resources import config_names
 from fleet_slip.simulation.roads import load_track
+from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
@@ -270,9 +271,6 @@ def scenario_frames(
     warehouse: Warehouse, name: str, version: ModelVersion, executor: Executor
 ) -> DriveFrames:
     """Return the frames of a test drive, simulated if missing. Raises `ConfigError`."""
-    from fleet_slip.evaluation.scenarios import simulate_scenarios  # noqa: PLC0415 - a simulator
-    from fleet_slip.simulation.scenario import load_scenario  # noqa: PLC0415
-
     scenario = load_scenario(name)
     simulate_scenarios(warehouse, [scenario], executor)
     (drive,) = load_drives(warehouse, [scenario])

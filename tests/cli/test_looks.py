@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.text import Text
 
-from fleet_slip.cli.accuracy import print_summary
+from fleet_slip.cli.accuracy import print_evaluation
 from fleet_slip.cli.app import app
 from fleet_slip.cli.output import print_table, print_text
 from fleet_slip.errors import AlarmError
@@ -133,17 +133,14 @@ def test_an_evaluation_is_a_screen(shown: Shown) -> None:
         "truth": {"sideslip_std_deg": 0.7},
         "results": {"ours@1": result},
     }
-    content = {
-        "ranking": ranking,
-        "scenarios": [scenario],
-        "checks": [{"reached": False}, {"reached": True}],
-    }
-    text = " ".join(" ".join(shown(lambda: print_summary(content, "ours"))).split())
+    content = {"estimators": {"ours@1": {}}, "ranking": ranking, "scenarios": [scenario]}
+    text = " ".join(" ".join(shown(lambda: print_evaluation(content, False))).split())
     assert "nominal ekf 0.100 0.200 2.00" in text
     assert "furthest from it on nominal: 0.200 deg, where the side-slip varies by 0.70 deg" in text
     assert "on part of the rows; estimated: nominal 35%." in text
-    assert "Of 2 requirements of the paper's scenarios, its own models miss 1." in text
-    assert "fleet-slip evaluate ours --all" in text
+    assert "Every drive, and all estimators: --all" in text
+    whole = " ".join(" ".join(shown(lambda: print_evaluation(content, True))).split())
+    assert "nominal 0.70 0.200 (35%)" in whole
 
 
 @pytest.mark.parametrize("command", ["select", "models", "show smoke"])

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.cli.accuracy import print_blind
+from fleet_slip.cli.accuracy import print_evaluation
 from fleet_slip.errors import UsageError
 from fleet_slip.evaluation import blind
 from fleet_slip.evaluation.blind import blind_scenarios, judge_blindly
 from fleet_slip.evaluation.drives import simulate_drives
-from fleet_slip.evaluation.filters import Signals
+from fleet_slip.evaluation.judge import Signals
 from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.scenario import load_scenario
 from tests.support.commands import run_on
@@ -76,14 +76,15 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
     def silent(signals: Signals) -> np.ndarray:
         return np.full_like(signals["ay_mps2"], np.nan)
 
-    judged = judge_blindly(HASH, {"right": right, "zero": zero, "silent@1": silent})
-    rows = {row.name: row for row in judged}
-    assert rows["all"].drives == 24
-    assert sum(rows[name].drives for name in ("dry", "wet", "ice")) == 24
-    assert all(row.figures["right"].rmse_deg == 0 for row in rows.values())
-    whole = rows["all"].figures["zero"]
-    assert whole.error_std_deg == pytest.approx(rows["all"].sideslip_std_deg, rel=1e-4)
-    print_blind(judged, everything=False)
+    estimators = {"right": right, "zero": zero, "silent@1": silent}
+    judged = judge_blindly(HASH, estimators)
+    rows = {row["name"]: row for row in judged}
+    assert rows["all"]["drives"] == 24
+    assert sum(rows[name]["drives"] for name in ("dry", "wet", "ice")) == 24
+    assert all(row["results"]["right"]["rmse_deg"] == 0 for row in rows.values())
+    whole = rows["all"]["results"]["zero"]
+    assert whole["error_std_deg"] == pytest.approx(rows["all"]["sideslip_std_deg"], rel=1e-4)
+    print_evaluation({"estimators": estimators, "drives": judged}, everything=False)
     told = capsys.readouterr().out
     assert "switchback" in told
     assert "0.000" in told
@@ -98,7 +99,7 @@ def test_the_command_judges_and_writes_nothing(
     shutil.copytree(tuned, root / "tuned")
     before = {path for path in root.rglob("*") if "runs" not in path.parts}
     told = json.loads(call(root, "evaluate", "smoke", "--blind", "--json"))
-    rows = {row["name"]: row["figures"] for row in told["blind"]}
+    rows = {row["name"]: row["results"] for row in told["drives"]}
     assert rows["all"]["smoke@1"]["coverage"] > 0.95
     assert rows["all"]["smoke@1"]["rmse_deg"] > rows["all"]["smoke@1"]["error_std_deg"] > 0
     assert {path for path in root.rglob("*") if "runs" not in path.parts} == before

@@ -9,8 +9,8 @@ from hypothesis.extra.numpy import arrays
 from fleet_slip.errors import QuestionError
 from fleet_slip.evaluation.drives import apply_failure, join, peak_slip
 from fleet_slip.evaluation.filters import LinearEstimate
-from fleet_slip.evaluation.scenarios import error_figures, passed_noise_deg
-from fleet_slip.simulation.scenario import Failure, load_scenario
+from fleet_slip.evaluation.judge import error_figures
+from fleet_slip.simulation.scenario import Failure
 from fleet_slip.vehicle.parameters import constants, load_vehicle
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
@@ -104,15 +104,3 @@ def test_joining_fills_short_gaps_and_nothing_else(mask: np.ndarray, gap: int) -
         ends = np.flatnonzero(mask)[[0, -1]]
         assert not joined[: ends[0]].any()
         assert not joined[ends[1] + 1 :].any()
-
-
-def test_noise_reaches_an_estimate_as_the_simulated_noise_does() -> None:
-    model = LinearEstimate(0.0, {"ay_mps2": 0.02, "yaw_rate_rad_s": -0.3})
-    sensors = load_scenario("noise_doubled").sensors
-    generator = np.random.default_rng(7)
-    drawn = {
-        "ay_mps2": 0.3 + 0.2 * generator.standard_normal(200_000),
-        "yaw_rate_rad_s": 0.02 + 0.02 * generator.standard_normal(200_000),
-    }
-    measured = np.degrees(model(drawn).std())
-    assert passed_noise_deg(model, sensors) == pytest.approx(measured, rel=0.01)

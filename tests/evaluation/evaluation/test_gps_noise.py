@@ -5,17 +5,16 @@ import pytest
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation import kalman
-from fleet_slip.evaluation.blind import (
+from fleet_slip.evaluation.drives import EvaluatedDrive, visible_signals
+from fleet_slip.evaluation.evaluate import (
     LEVELS_MPS,
-    GpsLevel,
-    GpsSweep,
     drawn_gps,
+    equal_at_mps,
     rmse_deg,
     sweep_gps_noise,
 )
-from fleet_slip.evaluation.drives import EvaluatedDrive, visible_signals
 from fleet_slip.evaluation.filters import FILTERS, FilterEstimate
-from fleet_slip.evaluation.scenarios import evaluate_drive
+from fleet_slip.evaluation.judge import evaluate_drive
 from fleet_slip.simulation.scenario import load_scenario
 from tests.support.drives import noisy, slalom
 
@@ -63,21 +62,21 @@ def test_a_filter_that_is_told_the_noise_is_better_than_one_that_is_not() -> Non
 
 
 def test_filter_and_regression_are_equal_where_the_line_between_levels_is() -> None:
-    levels = tuple(GpsLevel(std, {"kalman": 10 * std**2}) for std in (0.01, 0.02, 0.04))
-    sweep = GpsSweep("nominal", 10, levels, {"model": 0.01})
-    assert sweep.equal_at_mps("kalman", 0.01) == pytest.approx(0.02 + 0.02 * 0.006 / 0.012)
-    assert sweep.equal_at_mps("kalman", 0.0009) is None
-    assert sweep.equal_at_mps("kalman", 0.017) is None
-    assert sweep.as_dict()["equal_at_mps"]["kalman"]["model"] == pytest.approx(0.03)
+    errors = [10 * std**2 for std in LEVELS_MPS]
+    at_two, at_three = 10 * 0.02**2, 10 * 0.025**2
+    expected = 0.02 + 0.005 * (0.005 - at_two) / (at_three - at_two)
+    assert equal_at_mps(errors, 0.005) == pytest.approx(expected)
+    assert equal_at_mps(errors, 0.0009) is None
+    assert equal_at_mps(errors, 0.17) is None
 
 
 def test_the_sweep_is_of_the_nominal_drive_and_the_same_every_time() -> None:
     run = evaluate_drive(drive(), {"model": lambda signals: 0 * signals["ay_mps2"]})
     sweep = sweep_gps_noise([run], {"kalman": FILTER}, ["model"])
     assert sweep is not None
-    assert [level.velocity_std_mps for level in sweep.levels] == list(LEVELS_MPS)
+    assert [level["velocity_std_mps"] for level in sweep["levels"]] == list(LEVELS_MPS)
     expected = np.degrees(np.sqrt(np.mean(run.drive.sideslip_rad**2)))
-    assert sweep.regressions["model"] == pytest.approx(expected)
+    assert sweep["regressions"]["model"] == pytest.approx(expected)
     again = sweep_gps_noise([run], {"kalman": FILTER}, ["model"])
     assert again == sweep
     assert sweep_gps_noise([], {"kalman": FILTER}, ["model"]) is None

@@ -24,10 +24,10 @@ from fleet_slip.evaluation.claims import (
     judge,
     judge_claims,
 )
-from fleet_slip.evaluation.evaluate import LEAST_COVERAGE, evaluations_of, keep
-from fleet_slip.evaluation.kept import ReportData, blocks_won, difference
+from fleet_slip.evaluation.evaluate import evaluations_of, keep
+from fleet_slip.evaluation.judge import LEAST_COVERAGE
+from fleet_slip.evaluation.kept import PAPER_TABLE_TWO, ReportData, blocks_won, difference
 from fleet_slip.evaluation.report import distances, render, standings, table_one, table_two
-from fleet_slip.evaluation.scenarios import PAPER_TABLE_TWO
 from fleet_slip.models.request import CandidateModel
 from fleet_slip.models.select import validate
 from fleet_slip.pages.drawing import png_file, svg_file

@@ -12,9 +12,9 @@ import pytest
 import fleet_slip
 from fleet_slip.arrays import FloatArray
 from fleet_slip.columns.plan import ColumnPlan
-from fleet_slip.evaluation import ekf, filters, own_car
+from fleet_slip.evaluation import ekf, filters, measured
 from fleet_slip.evaluation.identify import Fitted, Identified, Tuned
-from fleet_slip.evaluation.own_car import Design, OwnDrive, accelerated, fit_left_out
+from fleet_slip.evaluation.measured import Design, MeasuredDrive, accelerated, fit_left_out
 from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.commands import done_on, run_on
@@ -26,12 +26,12 @@ LINE = Design(ColumnPlan.of(("ay",), {}, {}), (1.0,))
 NO_SIGNALS = DriveSignals(*[np.full(ROWS, np.nan)] * 11)
 
 
-def a_drive(number: int, part: int, *, shifted_rad: float = 0.0) -> OwnDrive:
+def a_drive(number: int, part: int, *, shifted_rad: float = 0.0) -> MeasuredDrive:
     ay = np.sin(np.arange(ROWS) / (20 + number))
     label: FloatArray = -ay / 200 + shifted_rad
     columns = {"line": ay[:, None]}
     drive = LabelledDrive(f"drive-{number}", NO_SIGNALS, label)
-    return OwnDrive(drive, columns, np.full(ROWS, part))
+    return MeasuredDrive(drive, columns, np.full(ROWS, part))
 
 
 def test_a_drive_is_estimated_by_what_never_saw_it() -> None:
@@ -45,7 +45,7 @@ def test_a_part_of_a_single_drive_is_estimated_by_the_others() -> None:
     whole = a_drive(0, 0)
     part = np.arange(ROWS) * 4 // ROWS
     label = np.where(part == 1, 1.0, whole.drive.sideslip_rad)
-    drive = OwnDrive(LabelledDrive("one", NO_SIGNALS, label), whole.columns, part)
+    drive = MeasuredDrive(LabelledDrive("one", NO_SIGNALS, label), whole.columns, part)
     (estimate,) = fit_left_out([drive], "line", LINE)
     assert np.abs((estimate - whole.drive.sideslip_rad)[part == 1]).max() < 1e-9
     assert np.isnan(drive.without(1).sideslip_rad).sum() == ROWS // 4
@@ -66,7 +66,7 @@ def test_an_acceleration_that_is_not_logged_is_made_of_the_wheels() -> None:
 @pytest.fixture(scope="module")
 def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data root with drives that no filter can serve, and a model of some of them."""
-    folder = tmp_path_factory.mktemp("own_car")
+    folder = tmp_path_factory.mktemp("measured")
     root = folder / "data"
     ingest_own(root, folder, cars=6)
     done_on(root, "publish", "own", "--cohort", "vehicle_id < 'car-4'")
@@ -112,7 +112,7 @@ def test_filters_compete_in_the_car_of_a_file_and_in_one_that_is_identified(
 
     monkeypatch.setattr(filters, "tune", untuned)
     monkeypatch.setattr(
-        own_car,
+        measured,
         "identify",
         lambda measured, *_: Identified(measured.car(Fitted()), ekf.EkfNoise(), 0.0),
     )
