@@ -43,8 +43,8 @@ from fleet_slip.evaluation.filters import (
     TABLE_ONE,
     Filter,
     FilterEstimate,
+    PublishedEstimate,
     TuningDrives,
-    published_estimate,
 )
 from fleet_slip.evaluation.judge import Estimate, evaluate_drive
 from fleet_slip.grams.calibration import calibrate
@@ -110,7 +110,7 @@ def train(
     fleet: fleet_slip.Fleet, manifest: Manifest, rows: int, wanted: Callable[[str], bool]
 ) -> Iterator[tuple[str, Rival]]:
     """Yield each rival by name."""
-    yield manifest.name, Rival(published_estimate(manifest), 8 * (len(manifest.terms) + 1))
+    yield manifest.name, Rival(PublishedEstimate.of(manifest), 8 * (len(manifest.terms) + 1))
     cohort = load_cohort(fleet.warehouse, manifest.trained_on.cohort)
     windows = Inputs.of_model(manifest, all_signals())
     numbers = calibrate(fleet.warehouse).counts() if windows.plan.numbers else None

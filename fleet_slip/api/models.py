@@ -434,25 +434,26 @@ class JudgedModels(PublishedModels):
         *,
         from_s: float = 0.0,
         until_s: float | None = None,
-        threads: int | None = None,
     ) -> Path:
         """Write a drive as a page that plays, `.html`; return the file.
 
-        `what` is a scenario's name or path, simulated if missing, or a drive of the logs, shown
+        `what` is a scenario's name or path, which is simulated, or a drive of the logs, shown
         from `from_s` until `until_s`. Raises `UsageError` for another suffix or an empty part,
         `QuestionError` for an unknown drive, `ExtraError` without the extra `watch`, and what
         `model` raises.
         """
         with needed("watch", "a page of a drive"):
-            from fleet_slip.evaluation.watch import drive_frames, is_scenario, write_page
+            from fleet_slip.evaluation.watch import (
+                drive_frames,
+                is_scenario,
+                scenario_frames,
+                write_page,
+            )
         if output.suffix != ".html":
             raise UsageError(f"{output}: a drive is shown as a page, which ends with .html.")
         version = self.resolve(model)
         if is_scenario(what):
-            from fleet_slip.evaluation.watch import scenario_frames
-
-            with open_workers(self.root, threads) as executor:
-                frames = scenario_frames(self.warehouse, what, version, executor)
+            frames = scenario_frames(what, version)
         else:
             frames = drive_frames(self.warehouse, what, version)
         write_page(frames.part(from_s, until_s), output)

@@ -442,7 +442,6 @@ def watch(
     until: Annotated[
         float | None, typer.Option(help="Last second. Default: the last.", show_default=False)
     ] = None,
-    threads: Threads = None,
 ) -> None:
     """Show a drive: the car on its track, its true and its estimated angle, wheels and gates.
 
@@ -450,7 +449,7 @@ def watch(
 
     Example: **fleet-slip watch adhesion_0_4 --output slippery.html**
     """
-    file = context.obj.watch(what, model, output, from_s=begin, until_s=until, threads=threads)
+    file = context.obj.watch(what, model, output, from_s=begin, until_s=until)
     from fleet_slip.pages.page import size  # noqa: PLC0415 - of the extra, which is there now
 
     say(f"{file}: {size(file.stat().st_size)}")

@@ -46,6 +46,10 @@ class Facts:
         """Take what the report knows."""
         self.data = data
         self._evaluated = data.evaluated
+        self.scenarios = data.evaluated.scenarios
+        self.models = data.evaluated.models
+        self.ordering = data.ordering
+        self.block_s = f"{BLOCK_S:g}"
 
     def __getitem__(self, name: str) -> Any:
         """Return a fact, or a scenario's figures of the choice. Raises `NotEvaluatedError`."""
@@ -54,7 +58,7 @@ class Facts:
         if name not in NAMES:
             raise KeyError(f"claims.toml names {name!r}, which is neither a fact nor a scenario")
         fact = getattr(self, name)
-        return fact if name in FUNCTIONS else fact()
+        return fact if name in AS_THEY_ARE else fact()
 
     def figures(self, scenario: str, estimator: str) -> Any:
         """Return the error figures of an estimator over a whole drive, all of which are there."""
@@ -65,25 +69,9 @@ class Facts:
         found = self._evaluated.stretches(scenario, "unstable")
         return [f"{begin:.0f}\N{EN DASH}{end:.0f} s" for begin, end in found]
 
-    def scenarios(self) -> Mapping[str, Mapping[str, Any]]:
-        """Return what the evaluation says of each scenario."""
-        return self._evaluated.scenarios
-
-    def models(self) -> Mapping[str, str]:
-        """Return the estimator's name of each model of Table I."""
-        return self._evaluated.models
-
-    def ordering(self) -> Any:
-        """Return what the order of the variables is worth."""
-        return self.data.ordering
-
-    def block_s(self) -> str:
-        """Return the length of a block of a drive."""
-        return f"{BLOCK_S:g}"
-
     def fleets(self) -> dict[str, Any]:
         """Compare the models of a fleet with those of one car on cars of other classes."""
-        scenarios = self._evaluated.scenarios
+        scenarios = self.scenarios
         if "nominal" not in scenarios:
             raise NotEvaluatedError("nominal drive")
         rows = [
@@ -120,7 +108,7 @@ class Facts:
 
     def table_two(self) -> dict[str, Any]:
         """Compare the models' errors on the nominal drive with Table II."""
-        models = self._evaluated.models.items()
+        models = self.models.items()
         errors = {name: self.figures("nominal", one).rmse_deg for name, one in models}
         near = [error for name, error in errors.items() if name != "1"]
         return {
@@ -131,7 +119,7 @@ class Facts:
 
     def blocks_won(self) -> dict[str, int]:
         """Return in how many blocks of the nominal drive each model is best."""
-        models = self._evaluated.models
+        models = self.models
         for estimator in models.values():
             self.figures("nominal", estimator)
         won = blocks_won(self.data.runs["nominal"], list(models.values()))
@@ -155,7 +143,7 @@ class Facts:
         """Return the RMSE over the angle's std in each drive beyond the paper without a failure."""
         shares = {
             one["description"]: self[name].rmse_deg / one["truth"]["sideslip_std_deg"]
-            for name, one in self._evaluated.scenarios.items()
+            for name, one in self.scenarios.items()
             if one["paper"] is None and not one["failures"]
         }
         if not shares:
@@ -166,7 +154,7 @@ class Facts:
         """Return the largest error in the paper's drives, and where it is."""
         errors = [
             (self[name].error_max_deg, one["description"])
-            for name, one in self._evaluated.scenarios.items()
+            for name, one in self.scenarios.items()
             if one["paper"]
         ]
         if not errors:
@@ -209,10 +197,10 @@ class Facts:
         return told
 
 
-FUNCTIONS = ("figures", "unstable")
-"""Facts that a claim calls itself."""
+AS_THEY_ARE = ("figures", "unstable", "scenarios", "models", "ordering", "block_s")
+"""Facts that a claim calls itself, or that the evaluation has."""
 
-NAMES = frozenset(name for name in vars(Facts) if not name.startswith("_"))
+NAMES = frozenset({*AS_THEY_ARE, *(name for name in vars(Facts) if not name.startswith("_"))})
 
 
 def _smallest(winner: Winner) -> str:

@@ -1,28 +1,23 @@
-"""Reads the drives of scenarios: what estimators see, and the truth."""
+"""The drives of scenarios: what estimators see, and the truth."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 
-from fleet_slip.arrays import BoolArray, FloatArray, float_column
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.base import Progress, no_progress
-from fleet_slip.catalogue.facts import SCENARIO
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import DataError, QuestionError, RefusedError
+from fleet_slip.errors import QuestionError
 from fleet_slip.grams.job import update_grams
-from fleet_slip.resources import read_sql
 from fleet_slip.simulation.job import (
     MOTION,
     DriveLog,
     SimulationReport,
-    exact_motion,
     simulate_batches,
     simulate_logs,
 )
@@ -30,8 +25,6 @@ from fleet_slip.simulation.scenario import Failure, Scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import brush_force
-from fleet_slip.views import connect
-from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse
 
 SLOWEST_MPS = 2.0
@@ -103,94 +96,32 @@ def simulate_scenarios(
     return report
 
 
-def load_drives(warehouse: Warehouse, scenarios: Sequence[Scenario]) -> tuple[EvaluatedDrive, ...]:
-    """Read the drives of scenarios, failures applied; the truth is the simulator's, not the log's.
-
-    A log keeps vy in steps of 0.005 m/s, which at 25 m/s is half of what good estimates err. Raises
-    `DataError` if a drive is not there, and `RefusedError` if this program drives it otherwise.
-    """
-    signals = catalogue().signals
-    names = [name for name in signals if name != catalogue().label]
-    statement = read_sql("jobs", "scenario.sql").format(
-        columns=",\n    ".join(signals[name].column for name in names), source=SCENARIO
-    )
-    drives = sorted({scenario.drive_id for scenario in scenarios})
-    with (
-        connect(warehouse.root, query=statement) as database,
-        reading_files(database, "reading the drives of scenarios"),
-    ):
-        rows = database.sql(statement, params={"drives": drives}).to_arrow_table()
-    logged = [_drive(scenario, rows) for scenario in scenarios]
-    once = {one.scenario.drive_id: one.scenario for one in logged}
-    motions = exact_motion([scenario.batch().drives[0] for scenario in once.values()])
-    exact = dict(zip(once, motions, strict=True))
-    return tuple(_exact(one, exact[one.scenario.drive_id]) for one in logged)
-
-
-def _exact(drive: EvaluatedDrive, truth: Mapping[str, FloatArray]) -> EvaluatedDrive:
-    """Return a logged drive with the exact truth, from which the log may differ by its rounding."""
-    for name, exact in truth.items():
-        logged, signal = getattr(drive, name), catalogue()[name.rpartition("_")[0]]
-        seen = np.clip(exact, float(signal.min), float(signal.max))
-        if len(logged) != len(exact) or np.abs(logged - seen).max() > float(signal.scale):
-            raise RefusedError(
-                f"the drive {drive.scenario.drive_id} of the logs is not the one that this version "
-                "of the program drives, so that its exact angle is not known. Evaluate in another "
-                "data root, or forget the drive."
-            )
-    vx_mps, vy_mps, station_m, lateral_offset_m = (truth[name] for name in MOTION)
-    return replace(
-        drive, vx_mps=vx_mps, vy_mps=vy_mps, station_m=station_m, lateral_offset_m=lateral_offset_m
-    )
-
-
 def simulate_drives(scenarios: Sequence[Scenario]) -> tuple[EvaluatedDrive, ...]:
-    """Simulate the drives of scenarios for this evaluation alone: nothing is written.
+    """Simulate the drives of scenarios, failures applied; nothing is written.
 
-    Estimators see what the log would hold; the truth is exact.
+    Estimators see what the log holds; the truth is exact. A log keeps vy in steps of 0.005 m/s,
+    which at 25 m/s is half of what good estimates err.
     """
-    specs = [scenario.batch().drives[0] for scenario in scenarios]
-    logs, truths = simulate_logs(specs), exact_motion(specs)
-    return tuple(
-        _measured(scenario, log, truth)
-        for scenario, log, truth in zip(scenarios, logs, truths, strict=True)
-    )
+    once = {scenario.drive_id: scenario.batch().drives[0] for scenario in scenarios}
+    logs = dict(zip(once, simulate_logs(list(once.values()), MOTION), strict=True))
+    return tuple(_measured(scenario, logs[scenario.drive_id]) for scenario in scenarios)
 
 
-def _measured(scenario: Scenario, log: DriveLog, truth: Mapping[str, FloatArray]) -> EvaluatedDrive:
+def _measured(scenario: Scenario, log: DriveLog) -> EvaluatedDrive:
+    time_s = np.arange(log.rows) / SAMPLE_RATE_HZ
     signals = {}
     for name in visible_signals():
         values = log.measurement.counts[name] * float(catalogue()[name].scale)
         missing = name in GPS_SIGNALS and ~log.measurement.gps_fix
-        signals[catalogue()[name].column] = np.where(missing, np.nan, values)
-    return EvaluatedDrive(
-        scenario=scenario,
-        time_s=np.arange(log.rows) / SAMPLE_RATE_HZ,
-        signals=signals,
-        **truth,
-        lost_control_s=log.lost_control_s,
-    )
-
-
-def _drive(scenario: Scenario, all_rows: pa.Table) -> EvaluatedDrive:
-    rows = all_rows.filter(pc.equal(all_rows["drive_id"], scenario.drive_id))
-    if not rows.num_rows:
-        raise DataError(
-            f"the drive {scenario.drive_id} is not in the logs. Run: fleet-slip evaluate"
-        )
-    time_s = float_column(rows, "time_s")
-    measured = {name: float_column(rows, catalogue()[name].column) for name in visible_signals()}
+        signals[name] = np.where(missing, np.nan, values)
     for failure in scenario.failures:
-        measured = apply_failure(measured, time_s, failure)
+        signals = apply_failure(signals, time_s, failure)
     return EvaluatedDrive(
         scenario=scenario,
         time_s=time_s,
-        signals={catalogue()[name].column: values for name, values in measured.items()},
-        vx_mps=float_column(rows, "vx_mps"),
-        vy_mps=float_column(rows, "vy_mps"),
-        station_m=float_column(rows, "station_m"),
-        lateral_offset_m=float_column(rows, "lateral_offset_m"),
-        lost_control_s=rows["lost_control_s"][0].as_py(),
+        signals={catalogue()[name].column: values for name, values in signals.items()},
+        **log.motion,
+        lost_control_s=log.lost_control_s,
     )
 
 

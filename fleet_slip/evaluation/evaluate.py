@@ -14,8 +14,8 @@ from fleet_slip.evaluation.blind import judge_blindly
 from fleet_slip.evaluation.drives import (
     EvaluatedDrive,
     find_stretches,
-    load_drives,
     rear_compliance,
+    simulate_drives,
 )
 from fleet_slip.evaluation.filters import (
     FilterEstimate,
@@ -81,13 +81,13 @@ def evaluate(
     fleets: Sequence[ModelVersion],
     executor: Executor,
 ) -> dict[str, Any]:
-    """Evaluate a model and all that competes with it on scenarios that are in the logs.
+    """Evaluate a model and all that competes with it on scenarios.
 
     Returns the evaluation's document: of logs, models and program alone.
     """
     trained = train_competitors(warehouse, one_car, fleets, executor)
     about, first = trained.descriptions, trained.one_car
-    runs = [evaluate_drive(one, trained.estimators) for one in load_drives(warehouse, scenarios)]
+    runs = [evaluate_drive(one, trained.estimators) for one in simulate_drives(scenarios)]
     gps = {name for name, one in about.items() if one.get("gps")}
     filters = {name: trained.estimators[name] for name in about if name in gps}
     cohort = first.selection.cohort

@@ -62,11 +62,6 @@ class LinearEstimate:
         weights = model.weights
         return cls(model.offset, {catalogue()[name].column: weights[name] for name in weights})
 
-    @classmethod
-    def published(cls, manifest: Manifest) -> "LinearEstimate":
-        """Return the estimator that a manifest of logged signals publishes."""
-        return cls(manifest.intercept, {term.column: term.coefficient for term in manifest.terms})
-
     def __call__(self, signals: Signals) -> FloatArray:
         """Return intercept + sum of coefficient times signal."""
         terms = [weight * signals[column] for column, weight in self.coefficients.items()]
@@ -79,22 +74,23 @@ class LinearEstimate:
 
 
 @dataclass(frozen=True)
-class ColumnEstimate:
-    """A published model with features or columns over time, sample by sample as a car drives.
+class PublishedEstimate:
+    """A published model, sample by sample as a car drives.
 
     It sees counts, as an ECU does: the columns are the integers that its Gram rows are made of.
-
-    Attributes:
-        manifest: what was published.
-        predictor: what computes it.
-        facts: what the car knows of itself.
+    `facts` are what the car knows of itself.
     """
 
     manifest: Manifest
     predictor: Predictor
     facts: Mapping[str, Any] = field(default_factory=dict)
 
-    def in_drive(self, drive: EvaluatedDrive) -> "ColumnEstimate":
+    @classmethod
+    def of(cls, manifest: Manifest) -> "PublishedEstimate":
+        """Return the estimator that a manifest publishes. Raises `RefusedError` as `Predictor`."""
+        return cls(manifest, Predictor.of(manifest))
+
+    def in_drive(self, drive: EvaluatedDrive) -> "PublishedEstimate":
         """Return the estimator in the car of a drive, which knows its facts."""
         return replace(self, facts=drive.facts)
 
@@ -117,13 +113,6 @@ class ColumnEstimate:
         }
 
 
-def published_estimate(manifest: Manifest) -> LinearEstimate | ColumnEstimate:
-    """Return the estimator that a manifest publishes. Raises `RefusedError` if counts changed."""
-    if all(term.logged for term in manifest.terms):
-        return LinearEstimate.published(manifest)
-    return ColumnEstimate(manifest, Predictor.of(manifest))
-
-
 @dataclass(frozen=True)
 class TrainedModels:
     """A published model, and the five models of Table I on the cohort that it was trained on."""
@@ -136,11 +125,11 @@ class TrainedModels:
         """Return the estimator's name of each model of Table I that the cohort can serve."""
         return {one.name: f"{self.version.reference}/{one.name}" for one in self.selection.models}
 
-    def estimators(self) -> dict[str, LinearEstimate | ColumnEstimate]:
+    def estimators(self) -> dict[str, LinearEstimate | PublishedEstimate]:
         """Return the models of Table I, then the published one, by name."""
         models = zip(self.table_one.values(), self.selection.models, strict=True)
         fitted = {name: LinearEstimate.of(one.model) for name, one in models}
-        return {**fitted, self.version.reference: published_estimate(self.version.manifest)}
+        return {**fitted, self.version.reference: PublishedEstimate.of(self.version.manifest)}
 
     def descriptions(self) -> dict[str, dict[str, Any]]:
         """Return what a JSON document says of each estimator."""

@@ -12,13 +12,14 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from pydantic import Field, FiniteFloat
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.base import sha256_of
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config
@@ -67,19 +68,37 @@ def checksum_of_sources(folder: Path = Path(__file__).parent) -> str:
     return sha256_of("\0".join(module.read_text(encoding="utf-8") for module in modules))
 
 
+def errors_rad(
+    estimate: Callable[[LabelledDrive], FloatArray],
+    drives: Sequence[LabelledDrive],
+    executor: Executor,
+    every: int = 1,
+) -> FloatArray:
+    """Return the errors on every so many-th row of each drive; NaN without estimate or truth."""
+    estimates = executor.map(estimate, drives)
+    errors = [
+        found[::every] - drive.sideslip_rad[::every]
+        for found, drive in zip(estimates, drives, strict=True)
+    ]
+    return np.concatenate(errors) if errors else np.empty(0)
+
+
+def finite(errors: FloatArray) -> BoolArray:
+    """Return which errors there are. Raises `DataError` if there is none."""
+    there: BoolArray = np.isfinite(errors)
+    if not there.any():
+        raise DataError("no row has both an estimate and a label. Choose other drives.")
+    return there
+
+
 def rmse_rad(
     estimate: Callable[[LabelledDrive], FloatArray],
     drives: Sequence[LabelledDrive],
     executor: Executor,
 ) -> float:
     """Return the RMSE over rows with estimate and truth. Raises `DataError` if no row has both."""
-    estimates = executor.map(estimate, drives)
-    errors = [found - drive.sideslip_rad for found, drive in zip(estimates, drives, strict=True)]
-    error = np.concatenate(errors) if errors else np.empty(0)
-    error = error[np.isfinite(error)]
-    if not len(error):
-        raise DataError("no row has both an estimate and a label. Choose other drives.")
-    return float(np.sqrt(np.mean(error**2)))
+    errors = errors_rad(estimate, drives, executor)
+    return float(np.sqrt(np.mean(errors[finite(errors)] ** 2)))
 
 
 def tune(
@@ -95,127 +114,109 @@ def tune(
     Each estimator's module lists its own as `TUNABLE`; "yaw_rate.gyro_std_rad_s" is a nested one.
     A compass finds the right valley, derivatives its bottom. Raises as `rmse_rad`.
     """
-
-    def rmse(found: Tuned[P]) -> float:
-        return found.rmse_rad
-
-    first = descend(estimator, start, names, drives, car, executor)
-    wide = search(estimator, start, names, drives, car, executor)
-    last = descend(estimator, wide.parameters, names, drives, car, executor)
+    search = Search(estimator, names, drives, car, executor)
+    first, wide = search.descend(start), search.compass(start)
+    last = search.descend(wide.parameters)
     evaluations = sum(one.evaluations for one in (first, wide, last))
-    return replace(min(first, wide, last, key=rmse), evaluations=evaluations)
+    best = min(first, wide, last, key=lambda one: one.rmse_rad)
+    return replace(best, evaluations=evaluations)
 
 
-def search(
-    estimator: Estimator[P],
-    start: P,
-    names: Sequence[str],
-    drives: Sequence[LabelledDrive],
-    car: VehicleParameters,
-    executor: Executor,
-) -> Tuned[P]:
-    """Search the positive parameters `names` by compass search in their logarithms.
+@dataclass(frozen=True)
+class Search(Generic[P]):
+    """Two ways to the positive parameters `names` with which an estimator errs least on drives."""
 
-    Each in turn is multiplied and divided by a factor and keeps what lowers the error; when none
-    does, the factor becomes its square root (Kolda, Lewis and Torczon, "Optimization by direct
-    search", SIAM Review 45, 2003). Values that the parameters' model refuses are passed over.
-    """
+    estimator: Estimator[P]
+    names: Sequence[str]
+    drives: Sequence[LabelledDrive]
+    car: VehicleParameters
+    executor: Executor
 
-    def cost(parameters: P) -> float:
-        def estimate(drive: LabelledDrive) -> FloatArray:
-            return estimator(drive.signals, drive.car or car, parameters)
+    def _estimate(self, parameters: P, drive: LabelledDrive) -> FloatArray:
+        return self.estimator(drive.signals, drive.car or self.car, parameters)
 
-        return rmse_rad(estimate, drives, executor)
+    def rmse_rad(self, parameters: P) -> float:
+        """Return the RMSE over all rows. Raises as `rmse_rad`."""
+        return rmse_rad(partial(self._estimate, parameters), self.drives, self.executor)
 
-    best, lowest, evaluations = start, cost(start), 1
-    factor = FIRST_FACTOR
-    while factor > LAST_FACTOR:
-        improved = False
-        for name in names:
-            for candidate in _neighbours(best, name, factor):
-                found = cost(candidate)
-                evaluations += 1
-                if found < lowest * (1 - LEAST_GAIN):
-                    best, lowest, improved = candidate, found, True
+    def compass(self, start: P) -> Tuned[P]:
+        """Search along each parameter's logarithm in turn.
+
+        Each in turn is multiplied and divided by a factor and keeps what lowers the error; when
+        none does, the factor becomes its square root (Kolda, Lewis and Torczon, "Optimization by
+        direct search", SIAM Review 45, 2003). Values that their model refuses are passed over.
+        """
+        best, lowest, evaluations = start, self.rmse_rad(start), 1
+        factor = FIRST_FACTOR
+        while factor > LAST_FACTOR:
+            improved = False
+            for name in self.names:
+                for candidate in _neighbours(best, name, factor):
+                    found = self.rmse_rad(candidate)
+                    evaluations += 1
+                    if found < lowest * (1 - LEAST_GAIN):
+                        best, lowest, improved = candidate, found, True
+                        break
+            if not improved:
+                factor **= 0.5
+        return Tuned(best, lowest, evaluations)
+
+    def descend(self, start: P) -> Tuned[P]:
+        """Search by Levenberg's method in the parameters' logarithms.
+
+        Several parameters do nearly the same, such as the stiffness of two axles, so that to change
+        one after the other creeps along a valley; the derivatives of the errors show its direction
+        (Levenberg, "A method for the solution of certain non-linear problems in least squares",
+        Quarterly of Applied Mathematics 2, 1944). A parameter without effect stays, and so does one
+        where its model refuses the next value. Raises as `rmse_rad`.
+        """
+        names, evaluations = self.names, 0
+
+        def errors(parameters: P) -> FloatArray:
+            nonlocal evaluations
+            evaluations += 1
+            estimate = partial(self._estimate, parameters)
+            return errors_rad(estimate, self.drives, self.executor, EVERY)
+
+        best, found = start, errors(start)
+        there = finite(found)
+        lowest, damping = float(np.mean(found[there] ** 2)), 1e-3
+        for _ in range(ROUNDS):
+            slopes = np.zeros((len(names), int(there.sum())))
+            for place, name in enumerate(names):
+                for change in (STEP, -STEP):
+                    try:
+                        moved = errors(_scaled(best, name, float(np.exp(change))))
+                    except ValueError:
+                        continue
+                    slopes[place] = (moved[there] - found[there]) / change
                     break
-        if not improved:
-            factor **= 0.5
-    return Tuned(best, lowest, evaluations)
+            normal, slope = slopes @ slopes.T, slopes @ found[there]
+            gained = False
+            while not gained and damping < 1e4:
+                damped = normal + damping * np.trace(normal) / len(names) * np.eye(len(names))
+                step = np.clip(-np.linalg.solve(damped, slope), -LONGEST, LONGEST)
+                damping *= 4
+                candidate = best
+                for name, change in zip(names, step, strict=True):
+                    with suppress(ValueError):  # beyond what it may be: it stays
+                        candidate = _scaled(candidate, name, float(np.exp(change)))
+                tried = errors(candidate)
+                mean = float(np.mean(tried[there] ** 2))
+                if mean < lowest:
+                    gain, gained = 1 - mean / lowest, True
+                    best, found, lowest, damping = candidate, tried, mean, damping / 16
+            if not gained or gain < LEAST_GAIN:
+                break
+        return Tuned(best, self.rmse_rad(best), evaluations)
 
 
 def _neighbours(parameters: P, name: str, factor: float) -> list[P]:
     neighbours = []
     for change in (factor, 1 / factor):
-        try:
+        with suppress(ValueError):
             neighbours.append(_scaled(parameters, name, change))
-        except ValueError:
-            continue
     return neighbours
-
-
-def descend(
-    estimator: Estimator[P],
-    start: P,
-    names: Sequence[str],
-    drives: Sequence[LabelledDrive],
-    car: VehicleParameters,
-    executor: Executor,
-) -> Tuned[P]:
-    """Search the positive parameters `names` by Levenberg's method in their logarithms.
-
-    Several parameters do nearly the same, such as the stiffness of two axles, so that to change one
-    after the other creeps along a valley; the derivatives of the errors show its direction
-    (Levenberg, "A method for the solution of certain non-linear problems in least squares",
-    Quarterly of Applied Mathematics 2, 1944). A parameter without effect stays, and so does one
-    where its model refuses the next value. Raises as `rmse_rad`.
-    """
-    labels = np.concatenate([drive.sideslip_rad[::EVERY] for drive in drives])
-    evaluations = 0
-
-    def errors(parameters: P) -> FloatArray:
-        nonlocal evaluations
-        evaluations += 1
-
-        def estimate(drive: LabelledDrive) -> FloatArray:
-            return estimator(drive.signals, drive.car or car, parameters)[::EVERY]
-
-        off: FloatArray = np.concatenate(list(executor.map(estimate, drives))) - labels
-        return off
-
-    best, found = start, errors(start)
-    there = np.isfinite(found)
-    if not there.any():
-        raise DataError("no row has both an estimate and a label. Choose other drives.")
-    lowest, damping = float(np.mean(found[there] ** 2)), 1e-3
-    for _ in range(ROUNDS):
-        slopes = np.zeros((len(names), int(there.sum())))
-        for place, name in enumerate(names):
-            for change in (STEP, -STEP):
-                try:
-                    moved = errors(_scaled(best, name, float(np.exp(change))))
-                except ValueError:
-                    continue
-                slopes[place] = (moved[there] - found[there]) / change
-                break
-        normal, slope = slopes @ slopes.T, slopes @ found[there]
-        gained = False
-        while not gained and damping < 1e4:
-            damped = normal + damping * np.trace(normal) / len(names) * np.eye(len(names))
-            step = np.clip(-np.linalg.solve(damped, slope), -LONGEST, LONGEST)
-            damping *= 4
-            candidate = best
-            for name, change in zip(names, step, strict=True):
-                with suppress(ValueError):  # beyond what it may be: it stays
-                    candidate = _scaled(candidate, name, float(np.exp(change)))
-            tried = errors(candidate)
-            mean = float(np.mean(tried[there] ** 2))
-            if mean < lowest:
-                gain, gained = 1 - mean / lowest, True
-                best, found, lowest, damping = candidate, tried, mean, damping / 16
-        if not gained or gain < LEAST_GAIN:
-            break
-    every_row = rmse_rad(lambda one: estimator(one.signals, one.car or car, best), drives, executor)
-    return Tuned(best, every_row, evaluations)
 
 
 def _scaled(parameters: P, name: str, factor: float) -> P:
@@ -403,7 +404,7 @@ def identify(measured: Measured, drives: Sequence[LabelledDrive], executor: Exec
 
     start = Fitted()
     car = measured.car(start)
-    found = descend(estimate, start, (*CAR, *NOISE), drives, car, executor)
+    found = Search(estimate, (*CAR, *NOISE), drives, car, executor).descend(start)
     car = measured.car(found.parameters)
     return Identified(car, found.parameters.noise, found.rmse_rad, drives=len(drives))
 
@@ -415,17 +416,13 @@ def identify_held_out(
     found = identify(measured, drives, executor)
     if len(drives) < 2:
         return found
-    squares: list[float] = []
-    rows: list[int] = []
+    errors: list[FloatArray] = []
     for fold in range(min(FOLDS, len(drives))):
-        out = drives[fold::FOLDS]
         others = [one for place, one in enumerate(drives) if place % FOLDS != fold]
         other = identify(measured, others, executor)
-        try:
-            error_rad = rmse_rad(lambda one, of=other: of.estimate(one.signals), out, executor)
-        except DataError:  # none of these has a row with a label
-            continue
-        squares.append(error_rad**2)
-        rows.append(sum(int(np.isfinite(one.sideslip_rad).sum()) for one in out))
-    held_out = float(np.sqrt(np.average(squares, weights=rows))) if rows else None
-    return replace(found, held_out_rad=held_out)
+        left_out = drives[fold::FOLDS]
+        estimates = executor.map(other.estimate, [one.signals for one in left_out])
+        errors += [e - one.sideslip_rad for e, one in zip(estimates, left_out, strict=True)]
+    error = np.concatenate(errors)
+    error = error[np.isfinite(error)]
+    return replace(found, held_out_rad=float(np.sqrt(np.mean(error**2))) if len(error) else None)

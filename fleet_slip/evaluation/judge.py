@@ -1,17 +1,16 @@
 """Judges estimators on drives: how far each is off, where, and who wins."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.evaluation.drives import CRITERION, EvaluatedDrive, find_unstable, load_drives
+from fleet_slip.evaluation.drives import CRITERION, EvaluatedDrive, find_unstable
 from fleet_slip.simulation.scenario import Failure, Scenario, load_scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
-from fleet_slip.warehouse.tables import Warehouse
 
 Signals = Mapping[str, FloatArray]
 """One drive at 100 Hz: an array of shape (ticks,) for each SI column; NaN where null."""
@@ -194,13 +193,6 @@ def sections(drive: EvaluatedDrive) -> tuple[Section, ...]:
     return tuple(section for section in found if section.rows.any())
 
 
-def run_all(
-    warehouse: Warehouse, scenarios: Sequence[Scenario], estimators: Mapping[str, Estimate]
-) -> tuple[EvaluatedScenario, ...]:
-    """Evaluate estimators on scenarios whose drives are in the logs."""
-    return tuple(evaluate_drive(drive, estimators) for drive in load_drives(warehouse, scenarios))
-
-
 # Who wins a test drive.
 
 LEAST_COVERAGE = 0.99
@@ -210,79 +202,51 @@ CLOSE = 1.25
 """Ratio to the winner's RMSE up to which a lost drive counts as close."""
 
 
-@dataclass(frozen=True)
-class Standing:
-    """How one estimator stands on one test drive against the others.
-
-    Attributes:
-        scenario: name of the test drive.
-        winner, winner_rmse_deg: who has the smallest RMSE; None where nobody competes.
-        rmse_deg: of the one estimator; None where it has too few estimates to compete.
-        best_other, best_other_rmse_deg: the best of the others.
-        same_as: an earlier test drive that differs from this one in satellite navigation alone, so
-            that nobody who competes tells them apart.
-    """
-
-    scenario: str
-    winner: str | None
-    winner_rmse_deg: float | None
-    rmse_deg: float | None
-    best_other: str | None
-    best_other_rmse_deg: float | None
-    same_as: str | None = None
-
-    @property
-    def won(self) -> bool:
-        """Whether the one estimator wins the drive."""
-        return self.winner is not None and self.winner != self.best_other
-
-    @property
-    def ratio(self) -> float | None:
-        """RMSE over that of the winner: 1 where it wins."""
-        if self.rmse_deg is None or not self.winner_rmse_deg:
-            return None
-        return self.rmse_deg / self.winner_rmse_deg
-
-
 def rank(runs: Sequence[EvaluatedScenario], estimator: str, gps: Collection[str]) -> dict[str, Any]:
     """Rank an estimator on every drive against all that use no GPS; it wins a tie.
 
-    Returns what a document says. Drives that are the same count once.
+    Returns what a document says. Drives that differ in satellite navigation alone, which nobody who
+    competes tells apart, count once: `same_as` names the first.
     """
-    found = [
-        _stand(run, estimator, gps, _same_as(run.scenario, runs[:number]))
+    standings = [
+        {
+            "scenario": run.name,
+            **_stand(run, estimator, gps),
+            "same_as": _same_as(run.scenario, runs[:number]),
+        }
         for number, run in enumerate(runs)
     ]
-    counted = [one for one in found if one.same_as is None]
-    lost = [one.ratio for one in counted if one.ratio is not None and not one.won]
+    counted = [one for one in standings if one["same_as"] is None]
+    lost = [one["ratio"] for one in counted if one["ratio"] is not None and not one["won"]]
     return {
         "estimator": estimator,
         "least_coverage": LEAST_COVERAGE,
         "close_ratio": CLOSE,
         "drives": len(counted),
-        "won": sum(one.won for one in counted),
+        "won": sum(one["won"] for one in counted),
         "close": sum(ratio <= CLOSE for ratio in lost),
-        "standings": [{**asdict(one), "won": one.won, "ratio": one.ratio} for one in found],
+        "standings": standings,
     }
 
 
-def _stand(
-    run: EvaluatedScenario, estimator: str, gps: Collection[str], same_as: str | None
-) -> Standing:
+def _stand(run: EvaluatedScenario, estimator: str, gps: Collection[str]) -> dict[str, Any]:
+    """Return who wins a drive, None where nobody competes, and how the one estimator stands."""
+    whole = {name: result.whole for name, result in run.results.items() if name not in gps}
     errors = {
-        name: result.whole.rmse_deg
-        for name, result in run.results.items()
-        if name not in gps
-        and result.whole.rmse_deg is not None
-        and result.whole.coverage >= LEAST_COVERAGE
+        name: one.rmse_deg
+        for name, one in whole.items()
+        if one.rmse_deg is not None and one.coverage >= LEAST_COVERAGE
     }
-    ours = errors.pop(estimator, None)
-    other = min(errors, key=lambda name: errors[name], default=None)
-    others = None if other is None else errors[other]
-    winner, least = other, others
-    if ours is not None and (others is None or ours <= others):
-        winner, least = estimator, ours
-    return Standing(run.name, winner, least, ours, other, others, same_as)
+    ours = errors.get(estimator)
+    winner = min(errors, key=lambda name: (errors[name], name != estimator), default=None)
+    least = errors[winner] if winner else None
+    return {
+        "winner": winner,
+        "winner_rmse_deg": least,
+        "rmse_deg": ours,
+        "won": winner == estimator,
+        "ratio": ours / least if ours is not None and least else None,
+    }
 
 
 def _same_as(scenario: Scenario, runs: Sequence[EvaluatedScenario]) -> str | None:

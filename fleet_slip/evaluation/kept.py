@@ -10,10 +10,10 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.errors import DataError
+from fleet_slip.evaluation.drives import simulate_drives
 from fleet_slip.evaluation.evaluate import evaluations_of
 from fleet_slip.evaluation.filters import (
-    TABLE_ONE,
     LinearEstimate,
     TrainedModels,
     rebuild,
@@ -23,17 +23,12 @@ from fleet_slip.evaluation.judge import (
     ErrorFigures,
     Estimate,
     EvaluatedScenario,
-    run_all,
+    evaluate_drive,
 )
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.grams.folding import BANDS, Folding
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.models.request import SelectionRequest, load_model_list
-from fleet_slip.models.search import try_distances
-from fleet_slip.models.select import Selection, select
-from fleet_slip.regression.choice import NestedDistances, nested_fits
+from fleet_slip.regression.choice import nested_fits
 from fleet_slip.regression.figures import student_t_two_sided
-from fleet_slip.regression.folds import CrossValidation
 from fleet_slip.regression.orders import RANKINGS, rank
 from fleet_slip.regression.subsets import best_subsets
 from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
@@ -252,10 +247,6 @@ class ReportData:
         trained: its cohort, and the models of Table I on it.
         runs: drives of the evaluation's scenarios with the estimates that figures show.
         ordering: what the order of the signals is worth.
-        by_speed: the models of Table I with whole bands of speed left out, by name; empty where all
-            drives are of one speed.
-        distances: of the nested models of all signals in their declared order, or why there are
-            none.
         on_measured: its latest evaluation on measured drives; None if there is none.
         shipped: names of all shipped scenarios, evaluated or not.
     """
@@ -265,8 +256,6 @@ class ReportData:
     trained: TrainedModels
     runs: Mapping[str, EvaluatedScenario]
     ordering: Ordering
-    by_speed: Mapping[str, CrossValidation]
-    distances: NestedDistances | str
     on_measured: Mapping[str, Any] | None
     shipped: tuple[str, ...]
 
@@ -294,7 +283,8 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     shipped = shipped_scenarios()
     drawn = [one for one in shipped if one.name in evaluated.scenarios]
     drawn = [one for one in drawn if one.name in DRAWN_SCENARIOS]
-    runs = {run.scenario.name: run for run in run_all(warehouse, drawn, _drawn(evaluated))}
+    estimators = _drawn(evaluated)
+    runs = {one.scenario.name: evaluate_drive(one, estimators) for one in simulate_drives(drawn)}
     evaluated.require_figures(runs)
     cohort, models = trained.selection.cohort, trained.selection.models
     signals = tuple(dict.fromkeys(models[-1].signals))
@@ -306,8 +296,6 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
         trained=trained,
         runs=runs,
         ordering=compare_orders(cohort, signals),
-        by_speed=_by_speed(trained.selection),
-        distances=try_distances(cohort, signals, trained.selection.folds, SelectionRequest()),
         on_measured=next((one for one in documents if one["model"] == version.reference), None),
         shipped=tuple(one.name for one in shipped),
     )
@@ -322,13 +310,3 @@ def _drawn(evaluated: Evaluated) -> dict[str, Estimate]:
     }
     filters = {name: rebuild(name, about[name], car) for name in DRAWN_FILTERS if name in about}
     return {**models, **filters}
-
-
-def _by_speed(selection: Selection) -> dict[str, CrossValidation]:
-    """Return the same models with as many whole bands of speed left out, one after another."""
-    bands = Folding(by=BANDS, count=selection.folds.count)
-    try:
-        found = select(selection.cohort, load_model_list(TABLE_ONE).model, bands)
-    except (DataError, QuestionError):
-        return {}
-    return {model.name: model for model in found.models}

@@ -34,7 +34,7 @@ def _marked(text: str, good: bool, miss: bool = False) -> Cell:
 
 
 def table_one(data: ReportData) -> ReportTable:
-    """Return Table I: the models with folds by drive and, where there are such, by speed."""
+    """Return Table I."""
     head = ["model", "signals", "paper", "ours", "standard error", "RMSE"]
     rows: list[list[str | Cell]] = []
     for one in data.trained.selection.models:
@@ -42,12 +42,6 @@ def table_one(data: ReportData) -> ReportTable:
         ours = _marked(number(one.correlation, 4), paper is not None and one.correlation >= paper)
         error, rmse = f"± {number(one.standard_error, 4)}", degrees(one.pooled.rmse_deg)
         rows.append([one.name, ", ".join(one.signals), number(paper, 4), ours, error, rmse])
-        if data.by_speed:
-            band = data.by_speed.get(one.name)
-            rows[-1] += [
-                number(band.correlation if band else None, 4),
-                degrees(band.pooled.rmse_deg if band else None),
-            ]
     selection = data.trained.selection
     noise = data.version.manifest.cross_validation.label_noise_deg
     note = (
@@ -58,13 +52,6 @@ def table_one(data: ReportData) -> ReportTable:
         note += "How noisy the label is, is not known: every RMSE here has its noise in it."
     else:
         note += f"Every RMSE here has the label's own noise in it, {degrees(noise, 4)}."
-    if data.by_speed:
-        head += ["by speed", "RMSE by speed"]
-        note += (
-            " By speed: whole bands of the drives' speed are left out one after another, so that "
-            "no model has seen the speeds it is tested at. Folds by drive interpolate between "
-            "neighbours."
-        )
     caption = "Table I. Properties of the estimation models: cross-validated correlation"
     return table("table-1", caption, head, rows, left=2, note=note)
 
@@ -90,39 +77,6 @@ def table_two(data: ReportData) -> ReportTable:
     head = ["model", "mean, paper", "mean, ours", "std, paper", "std, ours", "correlation, ours"]
     caption = "Table II. Predictive accuracy on the nominal test drive: error in degrees"
     return table("table-2", caption, head, rows)
-
-
-def distances(data: ReportData) -> list[ReportTable]:
-    """Return the paper's distance D of the nested models, if there are enough drives for it."""
-    found = data.distances
-    if isinstance(found, str):
-        return []
-    evidence = found.evidence
-    expected = [float(one) for one in evidence.distances()]
-    rows: list[list[str | Cell]] = [
-        [
-            str(size),
-            found.order[size - 1] if size else "none",
-            number(evidence.contributions[size - 1] if size else None, 1),
-            number(evidence.excess()[size], 1),
-            _marked(number(one, 1), one == min(expected)),
-        ]
-        for size, one in enumerate(expected)
-    ]
-    return [
-        table(
-            "distances",
-            "Distance D of equation (2) of the nested models, all signals in their declared order",
-            ["signals", "added", "contribution A", "D from the full model",
-             "expected D from the true"],
-            rows,
-            left=2,
-            note=f"In units of the noise, taking {evidence.kind} for independent: the rows are "
-            f"worth {count(round(evidence.rows))}. A is what a signal adds; without any effect it "
-            "is 1 on average. Green: the smallest expected distance, which is the smallest C_p. "
-            f"Without any signal the RMSE is {degrees(found.null.pooled.rmse_deg)}.",
-        )
-    ]  # fmt: skip
 
 
 def standings(data: ReportData) -> ReportTable:
@@ -201,7 +155,7 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         version=data.version,
         evaluation=data.evaluated.document,
         paper=[draw(one) for one in shown],
-        tables=[table_one(data), table_two(data), *distances(data)],
+        tables=[table_one(data), table_two(data)],
         further=[*measured_drives(data), standings(data)],
         tiles=_tiles(data, counted),
         claims=claims,

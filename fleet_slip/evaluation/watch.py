@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,12 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, as_counts
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, QuestionError, UsageError
-from fleet_slip.evaluation.drives import load_drives, simulate_scenarios
+from fleet_slip.evaluation.drives import simulate_drives
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import fill_in
 from fleet_slip.resources import config_names
+from fleet_slip.simulation.job import MOTION
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.storage.local import LocalFolder
@@ -264,24 +264,11 @@ def _listed(values: FloatArray, digits: int) -> list[float | None]:
     return [round(value, digits) if np.isfinite(value) else None for value in values.tolist()]
 
 
-# What is to be seen of a test drive, which is simulated if it is missing.
-
-
-def scenario_frames(
-    warehouse: Warehouse, name: str, version: ModelVersion, executor: Executor
-) -> DriveFrames:
-    """Return the frames of a test drive, simulated if missing. Raises `ConfigError`."""
+def scenario_frames(name: str, version: ModelVersion) -> DriveFrames:
+    """Return the frames of a test drive, which is simulated. Raises `ConfigError`."""
     scenario = load_scenario(name)
-    simulate_scenarios(warehouse, [scenario], executor)
-    (drive,) = load_drives(warehouse, [scenario])
-    columns = {
-        **drive.signals,
-        "sideslip_rad": drive.sideslip_rad,
-        "vx_mps": drive.vx_mps,
-        "vy_mps": drive.vy_mps,
-        "station_m": drive.station_m,
-        "lateral_offset_m": drive.lateral_offset_m,
-    }
+    (drive,) = simulate_drives([scenario])
+    motion = {column: getattr(drive, column) for column in ("sideslip_rad", *MOTION)}
     facts = {**drive.facts, "track": scenario.track.name, "drive_id": scenario.drive_id}
     title = f"{scenario.name}: {scenario.description}"
-    return frames_of(title, columns, facts, drive.time_s, version)
+    return frames_of(title, {**drive.signals, **motion}, facts, drive.time_s, version)

@@ -6,7 +6,7 @@ Units of work, their version made of what defines them: a changed campaign is no
 """
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from datetime import date
@@ -49,6 +49,8 @@ class DriveLog:
     lost_control_s: float | None
     fixes: ReceiverFixes | None = None
     """What its satellite receiver logged, if the campaign has receivers."""
+    motion: Mapping[str, FloatArray] = field(default_factory=dict)
+    """The channels of `MOTION` at 100 Hz, not rounded to counts, if they were asked for."""
 
     @property
     def signals(self) -> set[str]:
@@ -110,15 +112,25 @@ def simulate_batch(batch: Batch) -> pa.Table:
     return tabulate(batch, logs)
 
 
-def simulate_logs(specs: Sequence[DriveSpec]) -> list[DriveLog]:
-    """Simulate drives together, each measured block by block by its own sensors and generator."""
+MOTION = ("vx_mps", "vy_mps", "station_m", "lateral_offset_m")
+"""What of the truth an evaluation needs, as no sensor measures it."""
+
+
+def simulate_logs(specs: Sequence[DriveSpec], channels: Sequence[str] = ()) -> list[DriveLog]:
+    """Simulate drives together, each measured block by block by its own sensors and generator.
+
+    Of the truth itself only the named channels are kept.
+    """
     recorders = [Recorder(s.sensors, s.generator(), s.distortion()) for s in specs]
     receivers = [
         ReceiverLog(s.receiver, s.satellite_generator()) if s.receiver else None for s in specs
     ]
+    motions: list[dict[str, list[FloatArray]]] = [{name: [] for name in channels} for _ in specs]
     logs: dict[int, DriveLog] = {}
     for block in simulate_blocks([lane_drive(spec) for spec in specs]):
         recorder, receiver = recorders[block.drive], receivers[block.drive]
+        for name, parts in motions[block.drive].items():
+            parts.append(block.channels[name].copy())
         recorder.record(block.channels)
         if receiver:
             receiver.record(block.channels)
@@ -129,23 +141,9 @@ def simulate_logs(specs: Sequence[DriveSpec]) -> list[DriveLog]:
                 recorder.measurement(),
                 None if lost is None else lost / SAMPLE_RATE_HZ,
                 receiver.fixes() if receiver else None,
+                {name: np.concatenate(parts) for name, parts in motions[block.drive].items()},
             )
     return [logs[drive] for drive in range(len(specs))]
-
-
-MOTION = ("vx_mps", "vy_mps", "station_m", "lateral_offset_m")
-"""What of the truth an evaluation needs, as no sensor measures it."""
-
-
-def exact_motion(specs: Sequence[DriveSpec]) -> list[dict[str, FloatArray]]:
-    """Return the channels of `MOTION` of each drive at 100 Hz, not rounded to counts."""
-    blocks: list[list[dict[str, FloatArray]]] = [[] for _ in specs]
-    for block in simulate_blocks([lane_drive(spec) for spec in specs]):
-        blocks[block.drive].append({name: block.channels[name].copy() for name in MOTION})
-    return [
-        {name: np.concatenate([part[name] for part in parts]) for name in MOTION}
-        for parts in blocks
-    ]
 
 
 def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:

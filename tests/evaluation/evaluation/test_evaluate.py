@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,19 +10,15 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError, RefusedError
-from fleet_slip.evaluation import drives as evaluated_drives
 from fleet_slip.evaluation import kalman
-from fleet_slip.evaluation.drives import load_drives
+from fleet_slip.evaluation.drives import simulate_drives
 from fleet_slip.evaluation.evaluate import keep
-from fleet_slip.evaluation.filters import FILTERS, FilterEstimate, class_car, published_estimate
+from fleet_slip.evaluation.filters import FILTERS, FilterEstimate, PublishedEstimate, class_car
 from fleet_slip.evaluation.identify import checksum_of_sources
 from fleet_slip.evaluation.single_track import read_drive
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.score import score
-from fleet_slip.simulation.campaign import DriveSpec
-from fleet_slip.simulation.job import exact_motion
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
@@ -146,24 +141,13 @@ def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path) -> No
 
 
 def test_the_truth_is_the_simulators_and_not_the_logs(root: Path) -> None:
-    (drive,) = load_drives(Warehouse(LocalFolder(root)), [load_scenario("nominal")])
+    (drive,) = simulate_drives([load_scenario("nominal")])
     with connect(root, scenarios=True) as database:
         logged = database.sql(
             "SELECT vy_mps FROM log WHERE drive_id = 'scenario-nominal' ORDER BY time_s"
         ).fetchnumpy()["vy_mps"]
     off = np.abs(drive.vy_mps - logged)
     assert 0.002 < off.max() <= 0.0025 + 1e-9, "half a count of 0.005 m/s"
-
-
-def test_a_drive_that_this_program_drives_otherwise_has_no_exact_truth(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def faster(specs: Sequence[DriveSpec]) -> list[dict[str, FloatArray]]:
-        return [{**one, "vx_mps": one["vx_mps"] + 0.1} for one in exact_motion(specs)]
-
-    monkeypatch.setattr(evaluated_drives, "exact_motion", faster)
-    with pytest.raises(RefusedError, match="exact angle is not known"):
-        load_drives(Warehouse(LocalFolder(root)), [load_scenario("nominal")])
 
 
 def test_stability_is_lost_on_the_slippery_road_alone(root: Path) -> None:
@@ -189,10 +173,10 @@ def test_a_missing_signal_costs_the_models_that_need_it(root: Path) -> None:
 
 
 def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
-    (drive,) = load_drives(Warehouse(LocalFolder(root)), [load_scenario("nominal")])
+    (drive,) = simulate_drives([load_scenario("nominal")])
     assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.signals)
     manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
-    estimate = published_estimate(manifest)(drive.signals)
+    estimate = PublishedEstimate.of(manifest)(drive.signals)
     assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
 
 
@@ -218,8 +202,8 @@ def test_a_car_identified_from_the_same_drives_competes(root: Path) -> None:
     assert results["ekf_identified"]["rmse_deg"] < 1.5 * results["ekf_class_tuned"]["rmse_deg"]
 
 
-def test_filters_know_the_mass_where_the_model_does(root: Path) -> None:
-    (drive,) = load_drives(Warehouse(LocalFolder(root)), [load_scenario("adhesion_0_4")])
+def test_filters_know_the_mass_where_the_model_does() -> None:
+    (drive,) = simulate_drives([load_scenario("adhesion_0_4")])
     scenario = drive.scenario.model_copy(update={"sprung_mass_kg": 1500.0})
     heavy = replace(drive, scenario=scenario)
     for weighed, kg in ((False, drive.scenario.vehicle.body.sprung_mass_kg), (True, 1500.0)):
@@ -231,9 +215,9 @@ def test_filters_know_the_mass_where_the_model_does(root: Path) -> None:
 
 def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None:
     scenario = load_scenario("nominal")
-    (drive,) = load_drives(Warehouse(LocalFolder(root)), [scenario])
+    (drive,) = simulate_drives([scenario])
     with connect(root, scenarios=True) as database:
         alone = read_drive(database, scenario.drive_id)
     expected = kalman.estimate(alone.signals, scenario.car, kalman.FilterNoise())
     found = FilterEstimate(FILTERS[0], FILTERS[0].parameters, scenario.car)(drive.signals)
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)

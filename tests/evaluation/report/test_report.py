@@ -27,11 +27,9 @@ from fleet_slip.evaluation.claims import (
 from fleet_slip.evaluation.evaluate import evaluations_of, keep
 from fleet_slip.evaluation.judge import LEAST_COVERAGE
 from fleet_slip.evaluation.kept import PAPER_TABLE_TWO, ReportData, blocks_won, difference
-from fleet_slip.evaluation.report import distances, render, standings, table_one, table_two
-from fleet_slip.models.request import CandidateModel
-from fleet_slip.models.select import validate
+from fleet_slip.evaluation.report import render, standings, table_two
 from fleet_slip.pages.drawing import png_file, svg_file
-from fleet_slip.pages.page import degrees, number
+from fleet_slip.pages.page import number
 from fleet_slip.resources import config_names
 from fleet_slip.storage.documents import Document
 from fleet_slip.storage.local import LocalFolder
@@ -104,35 +102,6 @@ def test_the_same_data_give_the_same_bytes(reported: Reported, data: ReportData)
     assert render(data, shown) == reported.page.read_text(encoding="utf-8")
     assert png_file(shown[0]) == (reported.figures / "figure-1a.png").read_bytes()
     assert svg_file(shown[0]) == (reported.figures / "figure-1a.svg").read_text(encoding="utf-8")
-
-
-def test_table_one_shows_folds_by_drive_and_by_whole_bands_of_speed(data: ReportData) -> None:
-    selection = data.trained.selection
-    bands = selection.cohort.folds("speed", selection.folds.count)
-    table = table_one(data)
-    assert table.head[-2:] == ["by speed", "RMSE by speed"]
-    for row, model in zip(table.rows, selection.models, strict=True):
-        again = validate(CandidateModel(name="x", signals=model.signals), bands)
-        assert row[3].text == number(model.correlation, 4)
-        assert [cell.text for cell in row[-2:]] == [
-            number(again.correlation, 4),
-            degrees(again.pooled.rmse_deg),
-        ]
-        assert row[-1].text != row[-3].text
-    bare = table_one(replace(data, by_speed={}))
-    assert {len(row) for row in bare.rows} == {len(bare.head)} == {len(table.head) - 2}
-
-
-def test_the_distances_are_those_of_every_nested_model_and_the_null_one(data: ReportData) -> None:
-    (table,) = distances(data)
-    assert [row[0].text for row in table.rows] == [str(j) for j in range(len(table.rows))]
-    assert len(table.rows) == 1 + len(data.trained.selection.models[-1].signals)
-    assert table.rows[0][1].text == "none"
-    assert table.rows[-1][3].text == "0.0"
-    expected = [float(row[4].text.replace(MINUS, "-")) for row in table.rows]
-    (least,) = [j for j, row in enumerate(table.rows) if row[4].mark == "good"]
-    assert expected[least] == min(expected)
-    assert not distances(replace(data, distances="too few drives"))
 
 
 def test_table_two_has_the_evaluations_numbers(data: ReportData) -> None:
