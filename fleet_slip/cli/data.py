@@ -44,8 +44,7 @@ def simulate(report: "SimulationReport", campaign: str) -> None:
         f"{report.size_bytes / max(report.rows, 1):.1f} bytes a row"
     )
     say(_joined(written, forgotten=report.drives_forgotten))
-    seconds = report.seconds
-    say(f"{seconds.elapsed:.1f} s, {report.rows / seconds.elapsed:,.0f} rows/s")
+    say(f"{report.seconds:.1f} s, {report.rows / report.seconds:,.0f} rows/s")
 
 
 def _joined(*parts: str, replaced: int = 0, forgotten: int = 0) -> str:

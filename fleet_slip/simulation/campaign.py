@@ -22,7 +22,7 @@ from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import find_config
 from fleet_slip.simulation.imperfections import NONE, Imperfections
-from fleet_slip.simulation.plan import FleetPlan, GridPlan, TrialPlan
+from fleet_slip.simulation.plan import Drawn, FleetPlan, GridPlan, TrialPlan
 from fleet_slip.simulation.receivers import Receiver, Receivers
 from fleet_slip.simulation.roads import (
     Manoeuvre,
@@ -211,16 +211,15 @@ class Campaign(Config):
         of_day, of_plan = f"-{day.isoformat()}-{index:04d}", f"-{plan.car(number):04d}"
         drive_id, vehicle_id = self.name + of_day, self.name + of_plan
         drawn_as = self.base or self.name
-        if isinstance(plan, GridPlan):
-            assignment = plan.assignment(number, self.sensors)
-        else:
-            of_car = random_generator(self.seed, "car", drawn_as + of_plan)
-            of_drive = random_generator(self.seed, "drive", drawn_as + of_day)
-            if isinstance(plan, TrialPlan):
-                assignment = plan.assignment(number, self.sensors, of_car, of_drive)
-            else:
-                days = (day - self.first_day).days
-                assignment = plan.assignment(self.sensors, of_car, of_drive, days)
+        assignment = plan.assignment(
+            Drawn(
+                number,
+                self.sensors,
+                random_generator(self.seed, "car", drawn_as + of_plan),
+                random_generator(self.seed, "drive", drawn_as + of_day),
+                (day - self.first_day).days,
+            )
+        )
         receiver = None
         if self.receivers:
             receiver = self.receivers.draw(

@@ -11,7 +11,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from datetime import date
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 import pyarrow as pa
@@ -221,26 +220,6 @@ def day_units(campaign: Campaign, days: Iterable[date]) -> Iterator[tuple[Unit, 
 
 
 @dataclass
-class Seconds:
-    """Where the time went; tasks run side by side and may add up to more than `elapsed`."""
-
-    elapsed: float = 0.0
-    simulate: float = 0.0
-    """Driving, measuring and tabulating, summed over tasks."""
-    encode: float = 0.0
-    """Parquet and its checksum, summed over tasks."""
-    write: float = 0.0
-    """Writing and flushing files, summed over tasks."""
-    commit: float = 0.0
-    """Committing to the Delta log, which the coordinator does."""
-
-    @property
-    def tasks(self) -> float:
-        """Time of all tasks."""
-        return self.simulate + self.encode + self.write
-
-
-@dataclass
 class SimulationReport:
     """What a run of the job did."""
 
@@ -255,7 +234,7 @@ class SimulationReport:
     rows: int = 0
     size_bytes: int = 0
     logs_version: int | None = None
-    seconds: Seconds = field(default_factory=Seconds)
+    seconds: float = 0.0
 
     @property
     def changed(self) -> bool:
@@ -271,9 +250,6 @@ class _Written:
     action: AddAction | None
     """What adds their file; None without drives."""
     rows: int
-    simulate_s: float
-    encode_s: float
-    write_s: float
 
 
 def simulate_campaign(
@@ -350,27 +326,17 @@ def _simulate(
     backlog = _Backlog(warehouse.logs.snapshot(), plan, days)
     report = SimulationReport()
     for _, result in run_tasks(executor, partial(_write, warehouse), backlog, _name):
-        before_s = time.perf_counter()
-        landed = _land(warehouse, result)
-        if landed:
-            _count(report, landed)
-        report.seconds.commit += time.perf_counter() - before_s
+        if landed := _land(warehouse, result):
+            report.batches_written += 1
+            report.drives += len(landed.drives)
+            report.drives_forgotten += len(landed.batch.drives) - len(landed.drives)
+            report.rows += landed.rows
+            report.size_bytes += landed.action.size if landed.action else 0
         progress(result.rows, backlog.expected_rows)
     report.batches_present = backlog.present
     report.logs_version = warehouse.logs.snapshot().version
-    report.seconds.elapsed = time.perf_counter() - start
+    report.seconds = time.perf_counter() - start
     return report
-
-
-def _count(report: SimulationReport, result: _Written) -> None:
-    report.batches_written += 1
-    report.drives += len(result.drives)
-    report.drives_forgotten += len(result.batch.drives) - len(result.drives)
-    report.rows += result.rows
-    report.size_bytes += result.action.size if result.action else 0
-    report.seconds.simulate += result.simulate_s
-    report.seconds.encode += result.encode_s
-    report.seconds.write += result.write_s
 
 
 class _Backlog:
@@ -405,16 +371,10 @@ def _name(batch: Batch) -> str:
 def _write(warehouse: Warehouse, batch: Batch) -> _Written:
     drives = _not_forgotten(warehouse, batch.drives)
     if not drives:
-        return _Written(batch, (), None, 0, 0.0, 0.0, 0.0)
-    times = [time.perf_counter()]
+        return _Written(batch, (), None, 0)
     rows = simulate_batch(replace(batch, drives=drives))
-    times.append(time.perf_counter())
-    content = warehouse.logs.encode(rows)
-    times.append(time.perf_counter())
-    action = warehouse.logs.put(file_name(batch), content, batch.day)
-    times.append(time.perf_counter())
-    simulate_s, encode_s, write_s = (b - a for a, b in pairwise(times))
-    return _Written(batch, drives, action, rows.num_rows, simulate_s, encode_s, write_s)
+    action = warehouse.logs.put(file_name(batch), warehouse.logs.encode(rows), batch.day)
+    return _Written(batch, drives, action, rows.num_rows)
 
 
 def _not_forgotten(warehouse: Warehouse, drives: tuple[DriveSpec, ...]) -> tuple[DriveSpec, ...]:

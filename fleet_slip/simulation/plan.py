@@ -72,6 +72,20 @@ class CarOnRoad:
     flaws: Imperfections = NONE
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """From what a plan makes a drive: its number, its car's sensors, and generators of both.
+
+    Since the campaign's beginning so many `days` have passed.
+    """
+
+    number: int
+    sensors: Sensors
+    of_car: np.random.Generator
+    of_drive: np.random.Generator
+    days: int = 0
+
+
 class Plan(Config):
     """What every kind of plan states. The limits of speed are those on a road with μ = 1."""
 
@@ -127,15 +141,17 @@ class GridPlan(Plan):
         """Return the car that drives the drive of this number: one for each vehicle and mass."""
         return self._combination(number) // math.prod(map(len, self._axes[2:]))
 
-    def assignment(self, number: int, sensors: Sensors) -> CarOnRoad:
+    def assignment(self, drawn: Drawn) -> CarOnRoad:
         """Return what the drive of this number is to be."""
-        index = np.unravel_index(self._combination(number), [len(axis) for axis in self._axes])
+        index = np.unravel_index(
+            self._combination(drawn.number), [len(axis) for axis in self._axes]
+        )
         vehicle, mass_kg, track, adhesion, lateral_mps2, speed_factor = (
             axis[i] for axis, i in zip(self._axes, index, strict=True)
         )
         return CarOnRoad(
             vehicle=vehicle.with_sprung_mass(mass_kg),
-            sensors=sensors,
+            sensors=drawn.sensors,
             track=track,
             adhesion=adhesion,
             limits=self.limits(lateral_mps2),
@@ -193,18 +209,13 @@ class FleetPlan(DrawnPlan):
         """Return the car that drives the drive of this number."""
         return number % self.cars
 
-    def assignment(
-        self,
-        sensors: Sensors,
-        of_car: np.random.Generator,
-        of_drive: np.random.Generator,
-        days: int = 0,
-    ) -> CarOnRoad:
-        """Draw a car, its tyres `days` worn, from one generator, and its drive from another."""
+    def assignment(self, drawn: Drawn) -> CarOnRoad:
+        """Draw a car with worn tyres from one generator, and its drive from another."""
+        of_car, of_drive = drawn.of_car, drawn.of_drive
         vehicle = self.vehicles[of_car.integers(len(self.vehicles))]
         mass_kg = vehicle.body.sprung_mass_kg * self.load.draw(of_car)
         stiffness, radius = self.tyre_stiffness.draw(of_car), self.tyre_radius.draw(of_car)
-        sensors = self.sensor_bias_std.draw(sensors, of_car)
+        sensors = self.sensor_bias_std.draw(drawn.sensors, of_car)
         track = self.tracks[of_drive.integers(len(self.tracks))]
         adhesion = self.adhesion.draw(of_drive)
         lateral_mps2 = self.friction_use.draw(of_drive) * adhesion * GRAVITY_MPS2
@@ -212,7 +223,7 @@ class FleetPlan(DrawnPlan):
         ranges = self.imperfections or ImperfectionRanges()
         vehicle = ranges.loaded(vehicle, mass_kg, of_car)
         flaws = ranges.draw(of_car, of_drive)
-        stiffer, smaller = ranges.wear(of_car, days)
+        stiffer, smaller = ranges.wear(of_car, drawn.days)
         return CarOnRoad(
             vehicle=vehicle.with_tyres(
                 stiffness_factor=stiffness * stiffer, rolling_radius_factor=radius * smaller
@@ -352,16 +363,11 @@ class TrialPlan(DrawnPlan):
         turn, within = divmod(number, self.other_every)
         return TESTED if within < self.other_every - 1 else 1 + turn % self.others
 
-    def assignment(
-        self,
-        number: int,
-        sensors: Sensors,
-        of_car: np.random.Generator,
-        of_drive: np.random.Generator,
-    ) -> CarOnRoad:
+    def assignment(self, drawn: Drawn) -> CarOnRoad:
         """Draw a car from one generator and its drive from another, in a fixed order."""
+        sensors, of_car, of_drive = drawn.sensors, drawn.of_car, drawn.of_drive
         vehicle = self.vehicles[0]
-        if self.car(number) != TESTED:
+        if self.car(drawn.number) != TESTED:
             vehicle = self.vehicles[of_car.integers(len(self.vehicles))]
             sensors = self.sensor_bias_std.draw(sensors, of_car)
         track = self.tracks[of_drive.integers(len(self.tracks))]
