@@ -132,15 +132,6 @@ def test_uneven_pulses_repeat_with_every_turn() -> None:
     assert np.corrcoef(error[10:], error[:-10])[0, 1] > 0.99
 
 
-def test_the_heading_s_error_turns_the_velocity_and_lasts() -> None:
-    of = truth(vx_mps=np.full(TICKS, 20.0))
-    found = seen(of, gps_heading_std_deg=0.2, gps_correlation_s=2.0)["gps_vy_mps"]
-    error_deg = np.degrees(-found / 20.0)
-    assert np.std(error_deg) == pytest.approx(0.2, rel=0.5)
-    near = np.corrcoef(error_deg[:-10], error_deg[10:])[0, 1]
-    assert near == pytest.approx(np.exp(-0.1 / 2.0), abs=0.03)
-
-
 def test_a_drive_in_two_blocks_is_the_drive_in_one() -> None:
     wave = np.sin(TIME_S)
     of = truth(

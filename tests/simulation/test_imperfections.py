@@ -120,12 +120,6 @@ def test_load_in_the_boot_moves_the_centre_of_gravity_as_statics_asks() -> None:
     assert loaded.sprung_yaw_inertia_kgm2 == pytest.approx(inertia)
 
 
-def test_load_at_the_centre_of_gravity_moves_nothing() -> None:
-    loaded = SEDAN.with_sprung_mass(1500.0, 0.0).body
-    assert loaded.front_axle_m == SEDAN.body.front_axle_m
-    assert loaded.sprung_yaw_inertia_kgm2 == SEDAN.body.sprung_yaw_inertia_kgm2
-
-
 def roughness(**road: float) -> list[np.ndarray]:
     track = load_track("waterford_hills")
     station_m, _ = track.grid(1.0)
@@ -138,12 +132,6 @@ def roughness(**road: float) -> list[np.ndarray]:
     )
     assert found is not None
     return list(found)
-
-
-def test_a_perfect_road_has_no_surface() -> None:
-    track = load_track("waterford_hills")
-    generators = [np.random.default_rng(i) for i in range(2)]
-    assert surface(RoadImperfections(), track, track.grid(1.0)[0], *generators) is None
 
 
 def test_slopes_pull_downhill_and_bends_lean_inwards() -> None:
@@ -191,13 +179,6 @@ def test_shipped_scenarios_with_imperfections_are_driven_and_measured(name: str)
         one, other = (drive.measurement.counts[signal][:rows] for drive in (log, plain))
         assert np.corrcoef(one, other)[0, 1] > 0.9, signal
         assert not np.array_equal(one, other), signal
-
-
-def test_the_parts_of_a_scenario_are_those_of_the_whole() -> None:
-    whole = load_scenario("imperfect").imperfections
-    assert load_scenario("imperfect_car").imperfections.car == whole.car
-    assert load_scenario("imperfect_sensors").imperfections.sensors == whole.sensors
-    assert load_scenario("imperfect_road").imperfections.road == whole.road
 
 
 def test_the_realistic_fleet_s_cars_understeer_as_cars_do() -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError
 from fleet_slip.evaluation.blind import blind_scenarios
 from fleet_slip.resources import find_config
@@ -96,13 +95,6 @@ def test_load_behind_the_rear_axle_takes_understeer_away() -> None:
     }
     assert more[1620.0] < 0.7 * more[1320.0]
     assert fast[1620.0]["sideslip"].mean() < fast[1320.0]["sideslip"].mean()
-
-
-def test_a_bank_is_in_ay() -> None:
-    """A car going straight on a road that falls by 4 % feels the weight that it holds."""
-    flat, banked = (steady(SEDAN, "straight", 20.0, 1.0, fall)["ay"] for fall in (0.0, 4.0))
-    assert flat.mean() == pytest.approx(0.0, abs=2)
-    assert banked.mean() * float(catalogue()["ay"].scale) == pytest.approx(9.81 * 0.04, rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError
 from fleet_slip.simulation.campaign import Campaign, load_campaign
-from fleet_slip.simulation.imperfections import Range
 from fleet_slip.simulation.job import simulate_logs
-from fleet_slip.simulation.receivers import Receiver, ReceiverFixes, ReceiverLog, Receivers
+from fleet_slip.simulation.receivers import Receiver, ReceiverFixes, ReceiverLog
 
 TICK_S = 0.01
 RAD = 2 * np.pi / 65536
@@ -131,14 +129,6 @@ def test_a_campaign_with_receivers_has_the_drives_of_its_base(received: Campaign
     assert np.abs(speed - true)[after.fixes.fix].max() < 0.5
 
 
-def test_receivers_are_drawn_car_by_car() -> None:
-    types = (EXACT, EXACT.model_copy(update={"delay_s": 0.1}))
-    some = Receivers(types=types, delay_error_s=Range(min=0, max=0.01))
-    drawn = [some.draw(np.random.default_rng(seed)) for seed in range(20)]
-    assert {one.delay_s < 0.05 for one in drawn} == {True, False}
-    assert len({one.delay_s for one in drawn}) == 20
-
-
 def test_a_base_has_none_itself_and_exists(tmp_path: Path) -> None:
     file = tmp_path / "further.toml"
     file.write_text('name = "further"\nbase = "waterford_course"\ndescription = "x"\n')
@@ -147,9 +137,3 @@ def test_a_base_has_none_itself_and_exists(tmp_path: Path) -> None:
     file.write_text('name = "further"\nbase = "nowhere"\ndescription = "x"\n')
     with pytest.raises(ConfigError, match="nothing is called 'nowhere'"):
         load_campaign(str(file))
-
-
-def test_a_count_of_the_course_is_a_turn_over_65536() -> None:
-    course = catalogue()["course"]
-    assert course.cyclic and (course.min_count, course.max_count) == (-(2**15), 2**15 - 1)
-    assert float(course.scale) == pytest.approx(2 * np.pi / 2**16, rel=1e-16)

@@ -5,9 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet_slip.config import load_toml
-from fleet_slip.evaluation.blind import BlindSet
-from fleet_slip.resources import config_file
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.imperfections import Imperfections
 from fleet_slip.simulation.job import simulate_logs
@@ -126,9 +123,3 @@ def test_a_log_of_several_rates_holds_noise_too() -> None:
     wheel = log.measurement.counts["wheel_rl"][: log.rows // 5 * 5].reshape(-1, 5)
     assert (wheel == wheel[:, :1]).all()
     assert len(np.unique(wheel)) > 50
-
-
-def test_blind_drives_can_be_of_another_campaign() -> None:
-    content = load_toml(config_file("blind.toml"))
-    rough = BlindSet.model_validate({**content, "campaign": "fleet_rough"}).scenarios(7)
-    assert all(one.imperfections.road.roughness_cm3 > 0 for one in rough)

@@ -89,14 +89,6 @@ def test_gps_has_its_own_rate_noise_and_outages() -> None:
         assert not measured.counts[name][~measured.gps_fix].any()
 
 
-def test_same_generator_same_counts_and_another_one_others() -> None:
-    truth = constant_truth(1000)
-    first, again, other = (measure(truth, SENSORS, generator(seed)) for seed in (7, 7, 8))
-    for name in catalogue().signals:
-        assert np.array_equal(first.counts[name], again.counts[name])
-    assert not np.array_equal(first.counts["ax"], other.counts["ax"])
-
-
 def test_outages_and_fixes_go_on_from_block_to_block() -> None:
     recorder = Recorder(SENSORS, generator())
     lengths = [12_347, 1, 9, 70_003, 20_000]
@@ -111,24 +103,6 @@ def test_outages_and_fixes_go_on_from_block_to_block() -> None:
     for name, counts in measured.counts.items():
         assert len(counts) == sum(lengths), name
     assert not measured.counts["gps_vx"][~measured.gps_fix].any()
-
-
-def test_blocks_do_not_repeat_their_noise() -> None:
-    recorder = Recorder(SENSORS, generator())
-    for _ in range(2):
-        recorder.record(constant_truth(20_000))
-    ax = recorder.measurement().counts["ax"].astype(float)
-    assert abs(np.corrcoef(ax[:20_000], ax[20_000:])[0, 1]) < 0.04
-
-
-def test_more_noise_scales_the_same_draws() -> None:
-    truth = constant_truth(1000)
-    double = SENSORS.model_copy(update={"acceleration_std_mps2": 0.2})
-    single, doubled = (measure(truth, s, generator()).counts for s in (SENSORS, double))
-    centre = (truth["ax_mps2"][0] + 0.15) / 0.001
-    assert np.allclose(doubled["ax"] - centre, 2 * (single["ax"] - centre), atol=1.6)
-    assert np.array_equal(single["ay"].shape, doubled["ay"].shape)
-    assert np.array_equal(single["yaw_rate"], doubled["yaw_rate"])
 
 
 def test_values_out_of_range_saturate_and_are_counted() -> None:

@@ -100,29 +100,6 @@ def test_some_limit_is_reached_everywhere(name: str) -> None:
     assert np.mean(saturated) > 0.97
 
 
-def test_profile_of_a_closed_track_has_no_seam() -> None:
-    plan = SpeedLimits(
-        lateral_mps2=5.0, acceleration_mps2=2.0, braking_mps2=3.0, top_speed_mps=60.0
-    )
-    track = TRACKS["waterford_hills"]
-    half = len(track.segments) // 2
-    turned = Track(
-        name="turned",
-        description="the same lap from another start",
-        closed=True,
-        segments=track.segments[half:] + track.segments[:half],
-    )
-    shift = sum(s.length_m for s in track.segments[:half])
-    here, there = speed_profile(track, plan, 0.5), speed_profile(turned, plan, 0.5)
-    moved = np.interp(
-        np.mod(here.station_m - shift, track.length_m),
-        there.station_m,
-        there.speed_mps,
-        period=track.length_m,
-    )
-    assert np.allclose(here.speed_mps, moved, rtol=0, atol=0.05)
-
-
 def test_skid_pad_is_driven_at_the_root_of_lateral_acceleration_times_radius() -> None:
     plan = SpeedLimits(
         lateral_mps2=4.5, acceleration_mps2=2.0, braking_mps2=2.0, top_speed_mps=60.0
@@ -131,16 +108,6 @@ def test_skid_pad_is_driven_at_the_root_of_lateral_acceleration_times_radius() -
     assert np.allclose(profile.speed_mps, np.sqrt(4.5 * 50.0))
     for laps in (0.25, 1, 2.5):
         assert profile.time_s(laps) == pytest.approx(laps * 314.159265 / 15.0)
-
-
-def test_time_of_a_run_from_slow_to_fast_is_that_of_constant_acceleration() -> None:
-    plan = SpeedLimits(
-        lateral_mps2=6.0, acceleration_mps2=2.0, braking_mps2=3.0, top_speed_mps=100.0
-    )
-    profile = speed_profile(S_BEND, plan, 1.0)
-    first, last = profile.speed_mps[[-201, -1]]
-    part = 1 - 200.0 / S_BEND.length_m
-    assert profile.time_s(1) - profile.time_s(part) == pytest.approx((last - first) / 2.0)
 
 
 def test_braking_into_a_bend_is_a_parabola_in_speed() -> None:

@@ -9,7 +9,6 @@ from scipy.integrate import quad
 from scipy.special import fresnel
 
 from fleet_slip.errors import ConfigError
-from fleet_slip.resources import config_names
 from fleet_slip.simulation.roads import Segment, Track, load_track
 from tests.support.evidence import EVIDENCE
 
@@ -21,11 +20,6 @@ def make_track(*segments: tuple[float, float, float], closed: bool = False) -> T
         closed=closed,
         segments=tuple(Segment(length_m=s[0], curvature_1pm=s[1:]) for s in segments),
     )
-
-
-@pytest.mark.parametrize("name", config_names("tracks"))
-def test_shipped_tracks_are_named_after_their_file(name: str) -> None:
-    assert load_track(name).name == name
 
 
 @pytest.mark.parametrize(
@@ -87,13 +81,6 @@ def test_heading_integrates_curvature() -> None:
         assert integral == pytest.approx(change, abs=1e-12)
 
 
-def test_centre_line_does_not_depend_on_spacing() -> None:
-    track = load_track("melbourne")
-    coarse, fine = track.centre_line(track.length_m / 4), track.centre_line(track.length_m / 4000)
-    assert np.allclose(coarse.x_m, fine.x_m[::1000], rtol=0, atol=1e-9)
-    assert np.allclose(coarse.y_m, fine.y_m[::1000], rtol=0, atol=1e-9)
-
-
 def test_curvature_wraps_on_a_closed_track_and_stays_on_an_open_one() -> None:
     circuit = load_track("waterford_hills")
     station = np.array([0.0, 100.0, 2000.0])
@@ -141,8 +128,3 @@ def test_faults_are_named_by_file_and_key(tmp_path: Path, text: str, complaint: 
         load_track(str(file))
     assert str(file) in str(error.value)
     assert complaint in str(error.value)
-
-
-def test_unknown_track_names_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match="waterford_hills"):
-        load_track("nurburgring")

@@ -8,7 +8,6 @@ import pytest
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
-from fleet_slip.simulation.job import lane_drive
 from fleet_slip.simulation.plan import TrialPlan
 from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, road_with
 from fleet_slip.simulation.scenario import shipped_scenarios
@@ -89,11 +88,6 @@ def test_faults_in_a_plan_are_named(tmp_path: Path, old: str, new: str) -> None:
         load_campaign(str(file))
 
 
-def test_without_a_script_a_road_is_what_it_was() -> None:
-    road = straight()
-    assert road_with(road, ()) is road
-
-
 def test_a_step_turns_to_its_side_and_back() -> None:
     road = road_with(straight(), [Manoeuvre("step", 100.0, 2.0, 3.0, 1.0)])
     assert road.curvature_1pm[99] == 0.0
@@ -132,9 +126,3 @@ def test_a_car_drives_the_lateral_acceleration_of_a_slalom() -> None:
     assert np.abs(plain.ay_mps2).max() < 0.01
     assert 1.6 < np.abs(swung.ay_mps2).max() < 2.8
     assert swung.lost_control_tick is None
-
-
-def test_a_scripted_drive_takes_its_road(drives: tuple[DriveSpec, ...]) -> None:
-    spec = next(d for d in drives if any(m.kind == "step" for m in d.script))
-    plain = spec.track.curvature(spec.profile.station_m)
-    assert not np.array_equal(lane_drive(spec).road.curvature_1pm, plain)

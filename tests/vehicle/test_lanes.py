@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
@@ -153,24 +152,6 @@ def test_a_long_drive_comes_in_blocks_that_fit_together() -> None:
     np.testing.assert_allclose(heading_rate, heading_rate.mean(), rtol=1e-3)
 
 
-def test_a_drive_does_not_depend_on_threads() -> None:
-    drives = [LaneDrive(SEDAN, road("waterford_hills", 3.0 + i / 4), 1.0, 0.5) for i in range(8)]
-    alone = [simulate_drives([d])[0] for d in drives]
-    with ThreadPoolExecutor(4) as pool:
-        threaded = list(pool.map(lambda d: simulate_drives([d])[0], drives))
-    for one, other in zip(alone, threaded, strict=True):
-        assert_same_bits(one, other)
-
-
-def test_mirrored_roads_give_mirrored_drives() -> None:
-    on = road("waterford_hills", 5.0)
-    image = drive(SEDAN, on._replace(curvature_1pm=-on.curvature_1pm))
-    truth = drive(SEDAN, on)
-    np.testing.assert_array_equal(image.sideslip_rad, -truth.sideslip_rad)
-    np.testing.assert_array_equal(image.wheel_rl_rad_s, truth.wheel_rr_rad_s)
-    np.testing.assert_array_equal(image.steer_fl_rad, -truth.steer_fr_rad)
-
-
 def test_steady_circle_is_kinematics() -> None:
     """r = v / R, ay = r vx, Ackermann: cot δ_left − cot δ_right = − track / wheelbase."""
     truth = drive(SEDAN, circle(80.0, 18.0), laps=3.0)
@@ -239,10 +220,6 @@ def test_a_drive_that_gets_nowhere_ends() -> None:
     truth = drive(feeble, on, laps=3.0)
     planned_s = 3 * on.length_m / 50.0
     assert len(truth.vx_mps) == pytest.approx((1.25 * planned_s + 5.0) * 100, abs=2)
-
-
-def test_nothing_to_simulate() -> None:
-    assert simulate_drives([]) == []
 
 
 @pytest.mark.parametrize(

@@ -20,10 +20,6 @@ def test_shipped_cars_are_named_after_their_file_and_plausible(name: str) -> Non
     )
 
 
-def test_the_sedan_has_the_paper_s_sprung_mass() -> None:
-    assert SEDAN.body.sprung_mass_kg == 1320
-
-
 @pytest.mark.parametrize("mass_kg", [1000.0, 1740.0])
 def test_a_load_changes_inertia_and_wheel_loads_in_proportion(mass_kg: float) -> None:
     loaded = SEDAN.with_sprung_mass(mass_kg)

@@ -88,19 +88,6 @@ def test_derivatives_are_those_of_finite_differences(
         assert yaw_slope == pytest.approx((above.yaw - below.yaw) / (2 * h), rel=1e-4, abs=1e-3)
 
 
-def test_small_slip_gives_the_cornering_stiffness_and_large_slip_the_grip() -> None:
-    slope = lateral_force(20.0, 0.0, 0.0, 0.0, 0.0, 9e4, 7e3).per_vy
-    assert slope == pytest.approx(-9e4 / 20, rel=1e-9)
-    assert lateral_force(20.0, -15.0, 0.0, 0.0, 0.0, 9e4, 7e3).force == pytest.approx(7e3)
-
-
-def test_axles_at_rest_are_those_of_the_single_track_model() -> None:
-    still = np.zeros(5)
-    found = loaded_axles(CAR, still, still, adhesion=1.0)
-    for each, expected in zip(found, AT_REST, strict=True):
-        np.testing.assert_allclose(each, expected, rtol=1e-12)
-
-
 def test_load_makes_axles_softer_in_bends_and_moves_grip_forward_in_braking() -> None:
     held = np.ones(500)
     bend = loaded_axles(CAR, 0 * held, 6 * held, adhesion=1.0)[:, -1]
@@ -115,13 +102,6 @@ def test_load_makes_axles_softer_in_bends_and_moves_grip_forward_in_braking() ->
     moved = mass * height * 4 / CAR.body.wheelbase_m
     flat = CAR.tyre.friction * 1.2
     assert brake.grip_front_n - AT_REST.grip_front_n < flat * moved
-
-
-def test_slippery_road_takes_grip_and_leaves_stiffness() -> None:
-    still = np.zeros(3)
-    icy = Axles(*loaded_axles(CAR, still, still, adhesion=0.4)[:, 0].tolist())
-    assert icy.grip_front_n == pytest.approx(0.4 * AT_REST.grip_front_n)
-    assert icy.stiffness_rear_n == pytest.approx(AT_REST.stiffness_rear_n)
 
 
 def test_prediction_and_measurement_are_the_textbook_algebra() -> None:
