@@ -43,26 +43,27 @@ def print_evaluation(content: Mapping[str, Any], everything: bool) -> None:
     if "scenarios" in content:
         drives, title = content["scenarios"], "Test drives: RMSE in deg"
         print_ranking(content["ranking"])
-        print_text("\n".join(["", *_extremes(drives, content["ranking"]["estimator"])]))
+        ours = content["ranking"]["estimator"]
+        print_text(f"Pictures: fleet-slip report {shlex.quote(ours)}")
     elif "cohort" in content:
         drives, title = content["drives"], "RMSE in deg by drive"
         _print_measured(content)
     else:
         drives, title = content["drives"], "Blind drives: RMSE in deg against the exact angle"
-        names = _best_first(content, everything)
+        errors = {name: one["rmse_deg"] for name, one in drives[0]["results"].items()}
+        names.sort(key=lambda name: ("@" not in name, errors[name] is None, errors[name]))
         if not everything:
             groups = [one for one in drives if one["drives"] > 1]
-            print_errors(title, groups, names[:BLIND_NAMES])
-        for name in names:
-            if drives[0]["results"][name]["rmse_deg"] is None:
-                print_text(
-                    f"{name} has no estimate on any of them: it may need calibration parameters "
-                    "of a car from its own drives, and these cars have none."
-                )
+            shown = [name for name in names if "/" not in name]
+            print_errors(title, groups, shown[:BLIND_NAMES])
     if everything:
         print_errors(f"\n{title}", drives, names)
     else:
         print_text("Every drive, and all estimators: --all; for machines --json.")
+
+
+BLIND_NAMES = 5
+"""Estimators of the table that is printed first: published models, then the best of the others."""
 
 
 def print_errors(title: str, drives: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
@@ -79,14 +80,12 @@ def print_errors(title: str, drives: Sequence[Mapping[str, Any]], names: Sequenc
             for one in drives
         ]
         titled = f"{title}, continued" if first else title
-        print_table(titled, ["drive", "side-slip std", *map(_heading, shown)], rows)
+        words = [name.replace("_", " ") for name in shown]  # which a heading can wrap
+        print_table(titled, ["drive", "side-slip std", *words], rows)
 
 
-NAMES_WIDTH, ESTIMATOR_WIDTH = 33, 14
+NAMES_WIDTH, ESTIMATOR_WIDTH = 33, 15
 """Of the columns with a drive's name and its side-slip, and of an estimator's."""
-
-BLIND_NAMES = 5
-"""Estimators of the table that is printed first: published models, then the best of the others."""
 
 
 def _error_cell(found: Mapping[str, Any]) -> str:
@@ -94,26 +93,6 @@ def _error_cell(found: Mapping[str, Any]) -> str:
         return "none"
     covered = found["coverage"]
     return f"{found['rmse_deg']:.3f}" + ("" if covered == 1 else f" ({covered:.0%})")
-
-
-def _heading(name: str) -> str:
-    """Return an estimator's name in words, which a heading can wrap."""
-    return name.rpartition("/")[2].replace("_", " ")
-
-
-def _best_first(content: Mapping[str, Any], everything: bool) -> list[str]:
-    """Return published models, then who has the least error over all drives together."""
-    results = content["drives"][0]["results"]
-    errors = {name: one["rmse_deg"] for name, one in results.items()}
-    published = {name for name in errors if "@" in name.rpartition("/")[2]}
-    return sorted(
-        (
-            name
-            for name, rmse_deg in errors.items()
-            if name in published or (rmse_deg is not None and (everything or "/" not in name))
-        ),
-        key=lambda name: (name not in published, errors[name] is None, errors[name]),
-    )
 
 
 def print_ranking(ranking: Mapping[str, Any]) -> None:
@@ -129,28 +108,6 @@ def print_ranking(ranking: Mapping[str, Any]) -> None:
         (one for one in ranking["standings"] if one["same_as"] is None),
         left=2,
     )
-
-
-def _extremes(scenarios: Sequence[Mapping[str, Any]], ours: str) -> list[str]:
-    """Return where our estimator is closest to the truth, furthest from it, and silent."""
-    results = {one["name"]: one["results"][ours] for one in scenarios}
-    sizes = {one["name"]: one["truth"]["sideslip_std_deg"] for one in scenarios}
-    errors = {n: one["rmse_deg"] for n, one in results.items() if one["rmse_deg"] is not None}
-    lines = []
-    if errors:
-        best, worst = min(errors, key=errors.__getitem__), max(errors, key=errors.__getitem__)
-        lines.append(f"{ours} is closest to the truth on {best}: {errors[best]:.3f} deg.")
-        lines.append(
-            f"It is furthest from it on {worst}: {errors[worst]:.3f} deg, where the side-slip "
-            f"varies by {sizes[worst]:.2f} deg."
-        )
-    partial = [
-        f"{name} {one['coverage']:.0%}" for name, one in results.items() if one["coverage"] < 1
-    ]
-    if partial:
-        lines.append(f"A sensor fails it on part of the rows; estimated: {', '.join(partial)}.")
-    lines.append(f"Pictures: fleet-slip report {shlex.quote(ours)}")
-    return lines
 
 
 def _print_measured(content: Mapping[str, Any]) -> None:

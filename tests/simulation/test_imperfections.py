@@ -154,12 +154,6 @@ def test_a_lap_goes_as_far_up_as_down() -> None:
     assert abs(along[-1] - along[0]) < 0.03  # the lap closes
 
 
-def test_the_wind_blows_from_one_side_and_then_from_the_other() -> None:
-    wind = roughness(wind_mps=8.0)[4]
-    assert wind.min() == pytest.approx(-8.0, abs=0.3)
-    assert wind.max() == pytest.approx(8.0, abs=0.3)
-
-
 def test_adhesion_differs_along_the_road_and_across_it() -> None:
     _, _, left, right, _ = roughness(adhesion_std=0.05, adhesion_split_std=0.1)
     assert np.std((left + right) / 2) == pytest.approx(0.05 * np.sqrt(2 / 3), rel=0.3)

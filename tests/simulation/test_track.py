@@ -81,15 +81,6 @@ def test_heading_integrates_curvature() -> None:
         assert integral == pytest.approx(change, abs=1e-12)
 
 
-def test_curvature_wraps_on_a_closed_track_and_stays_on_an_open_one() -> None:
-    circuit = load_track("waterford_hills")
-    station = np.array([0.0, 100.0, 2000.0])
-    assert np.allclose(circuit.curvature(station), circuit.curvature(station + circuit.length_m))
-    assert np.allclose(circuit.curvature(-10.0), circuit.curvature(circuit.length_m - 10.0))
-    clothoid = make_track((100.0, 0.0, 0.01))
-    assert clothoid.curvature([-5.0, 50.0, 200.0]).tolist() == pytest.approx([0.0, 0.005, 0.01])
-
-
 def test_grid_of_a_closed_track_leaves_out_its_end() -> None:
     station, spacing = load_track("skid_pad").grid(1.0)
     assert len(station) == 314

@@ -36,11 +36,6 @@ def test_arctangent_over_a_million_ratios() -> None:
         assert np.abs(arctangents(y, x) - np.arctan2(y, x)).max() < 1e-12
 
 
-@given(SIZES, SIZES, st.sampled_from([1.0, -1.0]), st.sampled_from([1.0, -1.0]))
-def test_arctangent_of_any_vector(y: float, x: float, up: float, right: float) -> None:
-    assert abs(arctan2(up * y, right * x) - math.atan2(up * y, right * x)) < 1e-12
-
-
 @given(st.floats(1.0, 60_000.0), st.sampled_from(CARS))
 def test_cornering_stiffness_without_sine_is_an_identity(load: float, name: str) -> None:
     c = constants(load_vehicle(name), adhesion=1.0)

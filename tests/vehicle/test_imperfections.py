@@ -197,13 +197,6 @@ def test_the_thrust_angle_is_side_slip_of_a_car_going_straight() -> None:
     assert np.degrees(end(found.steer_fl_rad)) == pytest.approx(0.3, abs=0.03)
 
 
-def test_toe_turns_the_wheels_against_each_other() -> None:
-    found = drive(straight(20.0), CarImperfections(toe_front_deg=0.2))
-    assert np.degrees(end(found.steer_fl_rad)) == pytest.approx(-0.2, abs=0.01)
-    assert np.degrees(end(found.steer_fr_rad)) == pytest.approx(0.2, abs=0.01)
-    assert abs(end(found.sideslip_rad)) < 1e-4
-
-
 @pytest.mark.parametrize("length_m", [0.2, 0.6])
 def test_a_tyre_follows_its_slip_after_the_relaxation_length(length_m: float) -> None:
     """A step of the wheel's lateral velocity has built up to 63 % after L metres."""

@@ -1,12 +1,9 @@
 """The integration scheme: its order, its stability, and that nothing is lost at rest."""
 
-import math
-
 import numpy as np
 import pytest
 
 from fleet_slip.vehicle.parameters import Controls
-from fleet_slip.vehicle.tyre import arctan2
 from tests.support.rolling import Run, rolling
 
 
@@ -35,16 +32,3 @@ def test_slow_cars_do_not_oscillate(vx: float) -> None:
     run = Run(rolling(vx, vy=0.1), Controls(0.5, 0.0), seconds=4.0)
     curvature = np.diff(run.states[1500:, :3], n=2, axis=0)
     assert np.abs(curvature).max() < 1e-5
-
-
-@pytest.mark.parametrize(
-    ("y", "x", "angle"),
-    [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, math.pi / 2), (-1.0, 0.0, -math.pi / 2)],
-)
-def test_arctangent_on_the_axes(y: float, x: float, angle: float) -> None:
-    assert arctan2(y, x) == pytest.approx(angle, abs=1e-15)
-
-
-def test_arctangent_is_odd() -> None:
-    for ratio in np.geomspace(1e-6, 1e6, 101):
-        assert arctan2(-ratio, 1.0) == -arctan2(ratio, 1.0)

@@ -27,14 +27,6 @@ LOADS = st.floats(1.0, 15000.0)
 SPEEDS = st.floats(-70.0, 70.0)
 
 
-@given(load=LOADS)
-def test_cornering_stiffness_is_the_sine_of_twice_the_arctangent(load: float) -> None:
-    x = load * CAR.inverse_stiffness_load
-    assert cornering_stiffness(load, PEAK, CAR) == pytest.approx(
-        PEAK * math.sin(2 * math.atan(x)), rel=1e-12
-    )
-
-
 @pytest.mark.parametrize("load", [500.0, 3000.0, 8000.0])
 def test_small_slips_meet_the_stiffnesses(load: float) -> None:
     stiffness = cornering_stiffness(load, PEAK, CAR)

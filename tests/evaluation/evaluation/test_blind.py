@@ -88,7 +88,7 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
     told = capsys.readouterr().out
     assert "switchback" in told
     assert "0.000" in told
-    assert "silent@1 has no estimate on any of them" in " ".join(told.split())
+    assert "silent@1" in told and "none" in told
 
 
 @pytest.mark.long

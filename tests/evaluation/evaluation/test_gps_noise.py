@@ -54,13 +54,6 @@ def test_the_error_rises_with_the_noise() -> None:
     assert errors[0] < 0.7 * errors[-1]
 
 
-def test_a_filter_that_is_told_the_noise_is_better_than_one_that_is_not() -> None:
-    deaf = FilterEstimate(
-        KALMAN, kalman.FilterNoise(gps_vx_std_mps=1.0, gps_vy_std_mps=1.0), NOMINAL.car
-    )
-    assert rmse_deg(drive(), FILTER, 0.05) < rmse_deg(drive(), deaf, 0.05)
-
-
 def test_filter_and_regression_are_equal_where_the_line_between_levels_is() -> None:
     errors = [10 * std**2 for std in LEVELS_MPS]
     at_two, at_three = 10 * 0.02**2, 10 * 0.025**2
