@@ -17,6 +17,7 @@ from fleet_slip.base import needed
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.compiling import equation
 from fleet_slip.errors import UsageError
+from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.vehicle.dynamics import (
     Acceleration,
     Derivative,
@@ -107,19 +108,6 @@ LOST_SPEED_MPS = 0.5
 COMFORTABLE_SLIP_RAD = math.radians(5)
 BRAKING_COSTS = 0.05
 
-BIAS_STD = {"ax": 0.15, "ay": 0.15, "yaw_rate": 0.01}
-"""Standard deviation between cars of what a sensor is off by, in SI units."""
-NOISE_STD = {
-    "ax": 0.1,
-    "ay": 0.1,
-    "yaw_rate": 0.01,
-    "steering_wheel": 0.002,
-    "steer_fl": 0.0002,
-    "steer_fr": 0.0002,
-    **{f"wheel_{wheel}": 0.02 for wheel in WHEELS},
-}
-"""The paper's initial noise, section III.A, in SI units."""
-
 
 @dataclass(frozen=True)
 class Trial:
@@ -175,8 +163,9 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
         self.signals = tuple(known.inputs)
         self._scales = np.array([float(known[name].scale) for name in self.signals])
         self._limits = np.array([float(known[name].max) for name in self.signals])
-        self._noise = np.array([NOISE_STD[name] for name in self.signals])
-        self._bias_std = np.array([BIAS_STD.get(name, 0.0) for name in self.signals])
+        # The paper's initial noise, section III.A; from car to car biases are as large as there.
+        errors = load_scenario("nominal").sensors.bias_and_std
+        self._bias_std, self._noise = np.array([errors[name] for name in self.signals]).T
         limits = self._limits.astype(np.float32)
         self.observation_space = Box(-limits, limits, dtype=np.float32)
         self.action_space = Box(0.0, 1.0, (len(WHEELS),), np.float32)

@@ -108,13 +108,3 @@ def test_skid_pad_is_driven_at_the_root_of_lateral_acceleration_times_radius() -
     assert np.allclose(profile.speed_mps, np.sqrt(4.5 * 50.0))
     for laps in (0.25, 1, 2.5):
         assert profile.time_s(laps) == pytest.approx(laps * 314.159265 / 15.0)
-
-
-def test_braking_into_a_bend_is_a_parabola_in_speed() -> None:
-    plan = SpeedLimits(
-        lateral_mps2=6.0, acceleration_mps2=2.0, braking_mps2=3.0, top_speed_mps=100.0
-    )
-    profile = speed_profile(S_BEND, plan, 1.0)
-    at_350, at_390 = profile.speed_mps[[350, 390]]
-    assert at_350**2 - at_390**2 == pytest.approx(2 * 3.0 * 40.0)
-    assert profile.speed_mps[-1] ** 2 - profile.speed_mps[-101] ** 2 == pytest.approx(400.0)

@@ -65,15 +65,6 @@ def test_a_small_sine_of_the_steering_answers_as_the_bicycle(
     assert abs(amplitude / expected - 1) < 0.05
 
 
-def test_the_yaw_gain_is_largest_at_the_characteristic_speed() -> None:
-    gains = {
-        speed: LinearBicycle.of(load_vehicle("suv"), speed).yaw_gain_1ps
-        for speed in np.arange(10.0, 80.0, 0.1)
-    }
-    fastest = LinearBicycle.of(load_vehicle("suv"), 20.0).characteristic_speed_mps
-    assert max(gains, key=lambda speed: gains[speed]) == pytest.approx(fastest, abs=0.1)
-
-
 def test_tyres_that_relax_answer_as_the_bicycle_with_two_more_states() -> None:
     """Each axle follows its lateral velocity u: L ḟ = v (u − f), and its force is −C f / v."""
     car, length_m, v = load_vehicle("d_class_sedan"), 0.5, SPEED_MPS

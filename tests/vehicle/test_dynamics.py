@@ -79,21 +79,6 @@ def test_steady_side_slip_is_that_of_the_rear_axle(vx: float) -> None:
     assert last.vy / last.vx == pytest.approx(expected, rel=0.02, abs=2e-5)
 
 
-def test_yaw_rate_gain_is_greatest_at_the_characteristic_speed() -> None:
-    """r / δ = v / (L + K v²), greatest at v = √(L / K)."""
-    characteristic = math.sqrt(KNOWN.wheelbase / KNOWN.understeer)
-    gains = []
-    for vx in (0.6 * characteristic, characteristic, 1.5 * characteristic):
-        last = steady_corner(vx, 0.02).last
-        gain = last.yaw_rate / (last.steering_wheel / RATIO)
-        assert gain == pytest.approx(
-            last.vx / (KNOWN.wheelbase + KNOWN.understeer * last.vx**2), rel=0.02
-        )
-        gains.append(gain)
-    assert gains[1] > gains[0]
-    assert gains[1] > gains[2]
-
-
 def inverse_brush(force: float, load: float, peak: float) -> float:
     """Return the slip at which F = μ Fz (1 − (1 − C σ / (3 μ Fz))³) is the force."""
     limit = (CAR.friction - CAR.friction_per_load * load) * load
@@ -161,22 +146,6 @@ def test_tyres_never_give_energy(x: State, u: Controls) -> None:
     spins = zip(x[-4:], (d.wheel_fl, d.wheel_fr, d.wheel_rl, d.wheel_rr), strict=True)
     wheels = sum(spin * wheel.rate for spin, wheel in spins) / CAR.inverse_spin_inertia
     assert body + wheels <= 1e-6
-
-
-@pytest.mark.parametrize(
-    "start",
-    [
-        rolling(30.0, steering_wheel=1.0),
-        rolling(25.0, vy=6.0, yaw_rate=-1.5),
-        rolling(15.0, yaw_rate=4.0),
-        rolling(1.5, vy=0.5),
-    ],
-)
-def test_energy_never_grows_in_coasting(start: State) -> None:
-    run = Run(start, Controls(start.steering_wheel, 0.0), seconds=6.0)
-    energy = kinetic_energy(run.states)
-    assert (np.diff(energy) <= 1e-7 * energy[0]).all()
-    assert energy[-1] < energy[0]
 
 
 @settings(max_examples=60)

@@ -152,16 +152,6 @@ def test_a_rack_with_play_rests_until_the_column_has_crossed_it() -> None:
     assert rack[7] == pytest.approx(np.radians(-3.0) + half)
 
 
-def test_lash_lets_the_road_wheels_lag_behind_the_steering_wheel() -> None:
-    bends = np.concatenate([np.sin(np.arange(1201) / 30) / 60])
-    road = Road(1.0, bends, np.full(1201, 15.0), 1200.0, False)
-    loose = drive(road, CarImperfections(steering_lash_deg=6.0))
-    gap = loose.steering_wheel_rad - SEDAN.steering.ratio * np.tan(
-        (loose.steer_fl_rad + loose.steer_fr_rad) / 2
-    )
-    assert np.degrees(np.abs(gap).max()) == pytest.approx(3.0, abs=0.15)
-
-
 @pytest.mark.parametrize("wheel", ["fl", "fr", "rl", "rr"])
 def test_a_larger_wheel_turns_slower(wheel: str) -> None:
     flaws = CarImperfections(**{f"radius_error_{wheel}": 0.003})
@@ -254,15 +244,6 @@ def test_a_side_wind_is_held_by_the_tyres() -> None:
     c = constants(SEDAN, 1.0)
     per_force = handling(SEDAN).rear_slip * GRAVITY_MPS2 / (2 * c.static_rear)
     assert end(found.sideslip_rad) == pytest.approx(rear * per_force, rel=0.05)
-
-
-def test_imperfect_drives_do_not_depend_on_their_neighbours() -> None:
-    flaws = [CarImperfections(relaxation_length_m=0.1 * i) for i in range(6)]
-    drives = [LaneDrive(SEDAN, circle(60.0 + i, 12.0), 1.0, 1.0, f) for i, f in enumerate(flaws)]
-    together = simulate_drives(drives)
-    for i, lane_drive in enumerate(drives):
-        (alone,) = simulate_drives([lane_drive])
-        np.testing.assert_array_equal(alone.sideslip_rad, together[i].sideslip_rad)
 
 
 def test_the_body_s_motion_is_recorded_for_its_sensors() -> None:

@@ -268,23 +268,6 @@ def test_error_grows_in_a_tunnel_and_recovers_after_it() -> None:
     assert begin_s + TUNNEL_S < 100
 
 
-def test_turned_axes_give_turned_velocities() -> None:
-    """Equation (5) has no preferred direction: with equal noises, axes may stand at any angle."""
-    drive = noisy(slalom(CAR, 3000)[0], seed=6)
-    cosine, sine = float(np.cos(0.7)), float(np.sin(0.7))
-
-    def turned(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return cosine * x - sine * y, sine * x + cosine * y
-
-    ax, ay = turned(drive.ax_mps2, drive.ay_mps2)
-    gps = turned(drive.gps_vx_mps, drive.gps_vy_mps)
-    other = replace(drive, ax_mps2=ax, ay_mps2=ay, gps_vx_mps=gps[0], gps_vy_mps=gps[1])
-    found = fuse(drive, drive.yaw_rate_rad_s, FilterNoise())
-    again = fuse(other, drive.yaw_rate_rad_s, FilterNoise())
-    expected = turned(found.vx_mps, found.vy_mps)
-    np.testing.assert_allclose([again.vx_mps, again.vy_mps], expected, rtol=0, atol=1e-10)
-
-
 def test_begins_at_the_first_fix() -> None:
     drive = without_fixes(noisy(slalom(CAR, 500)[0], seed=7), np.arange(500) < 205)
     found = fuse(drive, drive.yaw_rate_rad_s, FilterNoise())
