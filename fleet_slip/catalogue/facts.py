@@ -60,54 +60,30 @@ def round_number(value: Fraction, grain: Fraction) -> int | None:
     return count if abs(count) <= COUNT_MAX else None
 
 
+_NUMBERS: tuple[tuple[NumberName, Unit, str, str], ...] = (
+    ("yaw_rate_offset", "rad/s", "0.00000625",
+     "What the gyroscope says when the car does not turn, by ay over speed"),
+    ("yaw_rate_offset_by_wheels", "rad/s", "0.00000625",
+     "The same by the differences of the wheels: tells whether both agree"),
+    ("ay_offset", "m/s^2", "0.0000625",
+     "What the accelerometer says to the side when the car goes straight"),
+    ("steering_offset", "rad", "0.00000625",
+     "Mean steering angle of the front wheels when the car goes straight"),
+    ("speed_ratio", "1", "0.0005",
+     "Speed over that of wheels of 0.31 m: the tyres' radius"),
+    ("steer_per_curvature", "m", "0.002",
+     "Steering angle for each curvature by wheels of 0.31 m: the wheelbase over speed_ratio"),
+    ("understeer", "rad*s^2/m", "0.00002",
+     "Steering angle that each lateral acceleration takes beyond: the tyres and the load"),
+    ("slip_lever", "m", "0.002",
+     "Slip for each curvature by wheels of 0.31 m: how far the rear axle is behind"),
+    ("slip_compliance", "rad*s^2/m", "0.000002",
+     "Slip that each lateral acceleration adds: the rear tyres and the load"),
+)  # fmt: skip
+
 CAR_NUMBERS: dict[NumberName, CarNumber] = {
-    "yaw_rate_offset": CarNumber(
-        unit="rad/s",
-        grain=Decimal("0.00000625"),
-        description="What the gyroscope says when the car does not turn, by ay over speed",
-    ),
-    "yaw_rate_offset_by_wheels": CarNumber(
-        unit="rad/s",
-        grain=Decimal("0.00000625"),
-        description="The same by the differences of the wheels: tells whether both agree",
-    ),
-    "ay_offset": CarNumber(
-        unit="m/s^2",
-        grain=Decimal("0.0000625"),
-        description="What the accelerometer says to the side when the car goes straight",
-    ),
-    "steering_offset": CarNumber(
-        unit="rad",
-        grain=Decimal("0.00000625"),
-        description="Mean steering angle of the front wheels when the car goes straight",
-    ),
-    "speed_ratio": CarNumber(
-        unit="1",
-        grain=Decimal("0.0005"),
-        description="Speed over that of wheels of 0.31 m: the tyres' radius",
-    ),
-    "steer_per_curvature": CarNumber(
-        unit="m",
-        grain=Decimal("0.002"),
-        description="Steering angle for each curvature by wheels of 0.31 m: the wheelbase over "
-        "speed_ratio",
-    ),
-    "understeer": CarNumber(
-        unit="rad*s^2/m",
-        grain=Decimal("0.00002"),
-        description="Steering angle that each lateral acceleration takes beyond: the tyres and the "
-        "load",
-    ),
-    "slip_lever": CarNumber(
-        unit="m",
-        grain=Decimal("0.002"),
-        description="Slip for each curvature by wheels of 0.31 m: how far the rear axle is behind",
-    ),
-    "slip_compliance": CarNumber(
-        unit="rad*s^2/m",
-        grain=Decimal("0.000002"),
-        description="Slip that each lateral acceleration adds: the rear tyres and the load",
-    ),
+    name: CarNumber(unit=unit, grain=Decimal(grain), description=description)
+    for name, unit, grain, description in _NUMBERS
 }
 """The numbers, in the order in which they are shown."""
 

@@ -87,18 +87,13 @@ class Signal(Config):
         return COUNT_MAX if self.cyclic else int(self.max / self.scale)
 
 
-_ARROW_TYPES = {
-    "string": pa.string(),
-    "double": pa.float64(),
-    "integer": pa.int64(),
-    "timestamp": pa.timestamp("us", tz="UTC"),
+_TYPES = {
+    "string": (pa.string(), "VARCHAR"),
+    "double": (pa.float64(), "DOUBLE"),
+    "integer": (pa.int64(), "BIGINT"),
+    "timestamp": (pa.timestamp("us", tz="UTC"), "TIMESTAMPTZ"),
 }
-_SQL_TYPES = {
-    "string": "VARCHAR",
-    "double": "DOUBLE",
-    "integer": "BIGINT",
-    "timestamp": "TIMESTAMPTZ",
-}
+"""Types of Arrow and of DuckDB."""
 
 
 class DriveColumn(Config):
@@ -112,12 +107,12 @@ class DriveColumn(Config):
     @property
     def arrow_type(self) -> pa.DataType:
         """Arrow type of the column."""
-        return _ARROW_TYPES[self.type]
+        return _TYPES[self.type][0]
 
     @property
     def sql_type(self) -> str:
         """DuckDB's type of the column."""
-        return _SQL_TYPES[self.type]
+        return _TYPES[self.type][1]
 
 
 NEEDED_DRIVE_COLUMNS = (

@@ -3,10 +3,9 @@
 from itertools import pairwise
 from pathlib import Path
 
-import duckdb
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.arrays import FloatArray
@@ -14,7 +13,6 @@ from fleet_slip.catalogue.definitions import WEIGHT, Definition, Gate
 from fleet_slip.catalogue.features import features, load_features_over
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan
-from fleet_slip.columns.sql import with_columns
 from fleet_slip.errors import ConfigError
 from fleet_slip.models.request import load_model_list
 from fleet_slip.resources import folder
@@ -65,19 +63,6 @@ def test_a_weight_changes_by_no_more_than_its_slope(edges: list[int]) -> None:
     steepest = WEIGHT / min(high - low for low, high in pairwise(edges)) + 1
     at = list(range(edges[0] - 3, edges[-1] + 4))
     assert np.abs(np.diff(weights(family(edges), at))).max() <= steepest
-
-
-@settings(max_examples=30)
-@given(knots)
-def test_sql_and_kernel_weigh_alike(edges: list[int]) -> None:
-    at = sorted({edge + shift for edge in edges for shift in (-1, 0, 1, 5)})
-    gates = family(edges)
-    rows = ", ".join(f"({value})" for value in at)
-    columns = columns_of(gates)
-    with duckdb.connect() as database:
-        counts = with_columns(f"(VALUES {rows}) AS t(ay)", {}, columns)
-        found = database.sql(f"SELECT {', '.join(columns)} FROM {counts} ORDER BY ay").fetchall()
-    assert np.array(found).T.tolist() == weights(gates, at).tolist()
 
 
 def test_members_have_the_scale_of_their_column_and_neighbours_share_a_knot() -> None:

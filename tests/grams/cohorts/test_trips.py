@@ -16,7 +16,7 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.folding import EACH, Folding
+from fleet_slip.grams.folding import EACH
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.resources import read_sql
 from tests.support.measured import csv_text
@@ -156,25 +156,6 @@ def test_a_log_that_was_cut_gives_the_folds_of_the_whole(roots: tuple[Fleet, Fle
     assert len(folds[1].names) == 5
     sums = [sorted((gram.n, gram.products) for gram in one.grams) for one in folds]
     assert sums[0] == sums[1]
-
-
-@pytest.mark.parametrize("count", [2, 5, EACH])
-def test_both_ways_to_read_a_cohort_make_the_same_folds(
-    roots: tuple[Fleet, Fleet], count: Any
-) -> None:
-    warehouse = roots[1].warehouse
-    folding = Folding(by="drive", count=count)
-    summed = load_cohort(warehouse, folding=folding).folds("drive", count)
-    loaded = load_cohort(warehouse).folds("drive", count)
-    assert [g.n for t in summed.tables for g in t] == [g.n for t in loaded.tables for g in t]
-    assert summed.names == loaded.names
-
-
-def test_the_selection_is_that_of_the_whole(roots: tuple[Fleet, Fleet]) -> None:
-    whole, cut = (fleet.cohort().select(nested="ay,ax", folds=EACH).winner.model for fleet in roots)
-    assert whole.signals == cut.signals
-    assert whole.sums == cut.sums
-    assert whole.model == cut.model
 
 
 def test_pieces_of_one_undated_file_are_one_trip(tmp_path: Path) -> None:

@@ -2,17 +2,12 @@
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pytest
 
-from fleet_slip.compute.tasks import LocalThreads
-from fleet_slip.errors import StorageError
 from fleet_slip.grams.check import check_grams, differing_drives
-from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.gram_rows import gram_table
 from fleet_slip.grams.job import update_grams
 from fleet_slip.regression.gram import Gram, packed_size
-from fleet_slip.storage.table import Change
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 
@@ -31,16 +26,6 @@ def test_a_drive_that_one_side_lacks_differs() -> None:
     assert differing_drives({("a", KEY): A}, {("a", ("ax",)): A.restrict(("ax",))}) == ["a"]
 
 
-def test_a_missing_gram_row_is_found(warehouse: Warehouse) -> None:
-    rng = np.random.default_rng(1)
-    land(warehouse, "one", *(log_rows(name, random_counts(rng, 20)) for name in "ab"))
-    rows = aggregate(warehouse, warehouse.logs.snapshot().files)
-    action = warehouse.grams.write_file("half", rows.filter(pc.equal(rows["drive_id"], "b")))
-    warehouse.grams.snapshot().commit(Change(add=[action]))
-    with pytest.raises(StorageError, match="the Gram of drive a by SQL and by the stored"):
-        check_grams(warehouse, 1)
-
-
 @pytest.mark.parametrize("drives", [1, 3, 8])
 def test_files_are_chosen_evenly(warehouse: Warehouse, drives: int) -> None:
     rng = np.random.default_rng(2)
@@ -52,24 +37,6 @@ def test_files_are_chosen_evenly(warehouse: Warehouse, drives: int) -> None:
     assert (report.files, report.drives) == (min(drives, 5),) * 2
     assert report.rows == 20 * min(drives, 5)
     assert seen == [(1, min(drives, 5))] * min(drives, 5)
-
-
-def test_tasks_give_the_gram_rows_of_one_query(warehouse: Warehouse) -> None:
-    rng = np.random.default_rng(3)
-    for number in range(5):
-        land(warehouse, f"f{number}", log_rows(f"d{number}", random_counts(rng, 20)))
-    files = warehouse.logs.snapshot().files
-    alone, done = aggregate(warehouse, files), 0
-
-    def progress(more: int, total: int) -> None:
-        nonlocal done
-        done += more
-        assert total == 100
-
-    with LocalThreads(2) as threads:
-        together = aggregate(warehouse, files, progress, executor=threads)
-    assert together.sort_by("drive_id").equals(alone.sort_by("drive_id"))
-    assert done == 100
 
 
 def test_gram_rows_that_came_in_pieces_are_one_table() -> None:
