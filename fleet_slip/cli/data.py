@@ -284,7 +284,7 @@ def mapping(
         Path | None, typer.Option(help="Write the draft to this file instead of printing it.")
     ] = None,
     can: Annotated[
-        Path | None, typer.Option(help="Of a CAN trace, its database: DBC, ARXML, KCD or SYM.")
+        Path | None, typer.Option(help="Of a CAN trace, its database: DBC, KCD or SYM.")
     ] = None,
     table: Annotated[str | None, typer.Option(help="Of a DuckDB file, the table.")] = None,
     json: Json = False,

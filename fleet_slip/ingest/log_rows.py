@@ -155,7 +155,7 @@ def read_batches(log: Path, mapping: Mapping, meter: Meter | None = None) -> Ite
                     meter.expect(source.expected_rows(columns), of=part.stat().st_size)
                 yield from Budget.of(part).metered(source.batches(columns))
     elif len(parts) == 1:
-        with _open_part(log, mapping, meter) as source:
+        with _open_part(log, mapping) as source:
             bases = _bases_of(source, log, mapping, wanted)
             if meter.is_watched:
                 meter.expect(sum(map(source.expected_rows, wanted.values())))
@@ -175,9 +175,9 @@ def _merged(bases: list[Base], mapping: Mapping) -> Iterator[pl.DataFrame]:
 
 
 @contextmanager
-def _open_part(part: Path, mapping: Mapping, meter: Meter | None = None) -> Iterator[Source]:
+def _open_part(part: Path, mapping: Mapping) -> Iterator[Source]:
     """Open a file that says times as the mapping does. Raises `InputError`."""
-    with file_errors(part), open_source(part, mapping.formats, meter) as source:
+    with file_errors(part), open_source(part, mapping.formats) as source:
         if source.has_clock != mapping.time.own_clock:
             raise InputError(
                 f"{shown(part)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "

@@ -1,6 +1,5 @@
 """CAN traces: written by python-can, with databases and payloads by cantools."""
 
-import re
 from collections import Counter
 from contextlib import closing
 from datetime import UTC, datetime
@@ -9,7 +8,6 @@ from typing import Any
 from unittest import mock
 
 import can
-import canmatrix.formats
 import cantools
 import numpy as np
 import pytest
@@ -280,54 +278,6 @@ def test_bus_logging_says_what_is_not_in_it(tmp_path: Path) -> None:
     with can.MF4Writer(tmp_path / "bus.mf4") as trace:
         trace.on_message_received(mux(0, 0, 1.0))
     assert "the message Motion (0x100) is not in it" in failure(tmp_path / "bus.mf4")
-
-
-def arxml(folder: Path) -> str:
-    """Messages as canmatrix writes them, with the encodings that cantools asks for.
-
-    It rounds factors to tenths.
-    """
-    plain = DBC.partition("BO_ 2566844672")[0].replace("BU_: ECU", "BU_: A ECU")
-    (folder / "plain.dbc").write_text(plain.replace("Motion: 8 ECU", "Motion: 8 A"))
-    matrix = canmatrix.formats.loadp_flat(str(folder / "plain.dbc"))
-    canmatrix.formats.dumpp({"": matrix}, str(folder / "plain.arxml"))
-    text = (folder / "plain.arxml").read_text()
-    for factor in ("0.001", "0.01"):
-        text = re.sub(r"(<V>0.0</V>\s*<V>)0.0<", rf"\g<1>{factor}<", text, count=1)
-    for kind, encoding in (("sint", "2C"), ("uint", "NONE")):
-        size = rf"(<SHORT-NAME>{kind}\d+<.*?)(</SW-BASE-TYPE>)"
-        coded = rf"\1<BASE-TYPE-ENCODING>{encoding}</BASE-TYPE-ENCODING>\2"
-        text = re.sub(size, coded, text, flags=re.DOTALL)
-    return text
-
-
-IN_ARXML = MAPPING.replace("car.dbc", "car.arxml").replace("Motion.", "FRAME_Motion.")
-
-
-def test_an_arxml_database_says_the_same(tmp_path: Path) -> None:
-    file = write_trace(tmp_path, [motion(i) for i in range(50)])
-    log = read(file, IN_ARXML, arxml(tmp_path), "car.arxml")
-    assert log.drives["ax"].to_pylist() == AX_COUNTS
-    assert log.drives["sideslip"].to_pylist() == BETA_COUNTS
-
-
-@pytest.mark.parametrize(
-    ("written", "instead"),
-    [
-        (">SCALE_LINEAR<", ">RAT_FUNC<"),
-        (">SCALE_LINEAR<", ">IDENTICAL<"),
-        ("(<COMPU-SCALE>.*?</COMPU-SCALE>)", r"\1\1"),
-        ("COMPU-INTERNAL-TO-PHYS", "COMPU-PHYS-TO-INTERNAL"),
-        ("COMPU-RATIONAL-COEFFS", "COMPU-RATIONAL"),
-        ("<V>0.001</V>", "<V>0</V>"),
-    ],
-)
-def test_what_cantools_does_not_apply_is_refused(
-    tmp_path: Path, written: str, instead: str
-) -> None:
-    text = re.sub(written, instead, arxml(tmp_path), flags=re.DOTALL)
-    told = failure(write_trace(tmp_path, [motion(0)]), IN_ARXML, text, "car.arxml")
-    assert "car.arxml: the conversion of 'FRAME_Motion.ax' is not applied" in told
 
 
 @given(

@@ -11,10 +11,10 @@ from nptdms import ChannelObject
 import fleet_slip
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import raw_columns, stream
+from fleet_slip.ingest.formats import can as can_frames
 from fleet_slip.ingest.formats import can_files, mdf
 from fleet_slip.ingest.formats import csv as csv_batches
 from fleet_slip.ingest.formats.reading import FileFormats, open_source
-from fleet_slip.ingest.formats.source import Meter
 from fleet_slip.ingest.log_files import size_of
 from fleet_slip.ingest.mapping import Mapping, load_mapping
 from tests.ingest import test_can, test_formats, test_mcap, test_tdms
@@ -94,7 +94,8 @@ def own_clock(folder: Path, name: str) -> tuple[Path, Mapping]:
 def test_a_file_with_a_clock_tells_bytes_too(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(can_files, "TOLD_EVERY", 8)
+    monkeypatch.setattr(can_files, "AT_ONCE", 8)
+    monkeypatch.setattr(can_frames, "PIECE_FRAMES", 8)
     monkeypatch.setattr(mdf, "WINDOW_RECORDS", 10)
     monkeypatch.setattr(raw_columns, "WINDOW_ROWS", 20)
     monkeypatch.setattr(stream, "RATE_ROWS", 20)
@@ -116,20 +117,6 @@ def test_several_files_of_one_log_tell_bytes_of_all(log: Path, tmp_path: Path) -
 def test_of_a_folder_files_are_told(log: Path, tmp_path: Path) -> None:
     told = told_of(log.parent, a_mapping(), tmp_path / "data")
     assert told[-1] == (1, 1)
-
-
-def test_each_pass_before_the_first_row_takes_half_of_what_is_left() -> None:
-    told: list[int] = []
-    meter = Meter(1000, lambda more, _: told.append(more))
-    for _ in range(2):
-        meter.pass_over(50, 100)
-        meter.pass_over(100, 100)
-    assert told == [250, 250, 125, 125]
-    meter.expect(10)
-    meter.count(5)
-    meter.count(20)
-    meter.end()
-    assert told[4:] == [125, 125]
 
 
 def test_a_log_that_cannot_be_read_tells_no_end(tmp_path: Path) -> None:

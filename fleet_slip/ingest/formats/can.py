@@ -5,7 +5,6 @@ it; its own decoder, one frame at a time, is what the tests compare with.
 """
 
 import hashlib
-import importlib
 import pickle
 import re
 from collections import Counter
@@ -14,7 +13,6 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,7 +163,7 @@ class CanFrames:
 
 # What a mapping says of a CAN trace: the database of its messages, and the bus.
 
-FORMATS = {".dbc": "dbc", ".arxml": "arxml", ".kcd": "kcd", ".sym": "sym"}
+FORMATS = {".dbc": "dbc", ".kcd": "kcd", ".sym": "sym"}
 MAX_DATABASE_BYTES = 2**28
 
 
@@ -173,7 +171,7 @@ class CanBus(Config):
     """The database of a CAN trace. Its content, not its path, is part of a mapping's identity."""
 
     database: Name = Field(exclude=True)
-    """Path of a DBC, ARXML, KCD or SYM file, seen from the mapping's own."""
+    """Path of a DBC, KCD or SYM file, seen from the mapping's own."""
     channel: Name | None = None
     """The bus, as the trace calls it; needed where a message occurs on several."""
     text: str = Field(default="", exclude=True, repr=False)
@@ -191,7 +189,10 @@ def read_can_database(bus: CanBus, folder: Path) -> CanBus:
     """Return the bus with the content of its database. Raises `ConfigError`."""
     file = folder / bus.database
     if file.suffix.lower() not in FORMATS:
-        raise ConfigError(f"{file}: a CAN database is a file {', '.join(FORMATS)}.")
+        raise ConfigError(
+            f"{file}: a CAN database is a file {', '.join(FORMATS)}. Of ARXML canconvert, of "
+            "canmatrix, makes one."
+        )
     content = read_named_file(file, MAX_DATABASE_BYTES)
     try:
         text = content.decode("utf-8")
@@ -206,8 +207,6 @@ def parse_database(bus: CanBus) -> Any:
     database = Path(bus.database)
     with reading_with(database, "cantools") as cantools:
         try:
-            if bus.format == "arxml":
-                return _parse_arxml(bus.text)
             return cantools.database.load_string(bus.text, bus.format, strict=False)
         except Exception as error:
             place = re.search(r"line \d+", str(error))
@@ -215,54 +214,3 @@ def parse_database(bus: CanBus) -> Any:
                 f"{shown(database)}: cantools cannot read it as {bus.format.upper()}"
                 f"{f', from {place[0]} on' if place else ''}. Is it the right file, and complete?"
             ) from None
-
-
-def _parse_arxml(text: str) -> Any:
-    """Return the messages of a system description; what is not applied has a factor of NaN."""
-    arxml: Any = importlib.import_module("cantools.database.can.formats.arxml")
-
-    class Loader(arxml.SystemLoader):  # type: ignore[misc]
-        """Where cantools knows no conversion, or several lines, it takes the counts."""
-
-        def _load_signal(self, mapped: Any) -> Any:
-            self._mapped = mapped
-            return super()._load_signal(mapped)
-
-        def _get_compu_method(self, system_signal: Any) -> Any:
-            """Return that of the system's signal, else that of the signal on the bus."""
-            path = ["&I-SIGNAL", "&NETWORK-REPRESENTATION-PROPS", "SW-DATA-DEF-PROPS-VARIANTS"]
-            path += ["&SW-DATA-DEF-PROPS-CONDITIONAL", "&COMPU-METHOD"]
-            found = super()._get_compu_method(system_signal)
-            return self._get_unique_arxml_child(self._mapped, path) if found is None else found
-
-        def _load_system_signal(self, system_signal: Any, is_float: bool) -> Any:
-            method = self._get_compu_method(system_signal)
-            if method is None or self._is_applied(method):
-                return super()._load_system_signal(system_signal, is_float)
-            return None, None, float("nan"), 0.0, None, None, None
-
-        def _is_applied(self, method: Any) -> bool:
-            """Whether cantools applies a conversion; one line is called so after this."""
-            path = ["COMPU-INTERNAL-TO-PHYS", "COMPU-SCALES", "*&COMPU-SCALE"]
-            scales, lines = self._get_arxml_children(method, path), 0
-            for scale in scales:
-                if self._get_unique_arxml_child(scale, ["&COMPU-CONST", "VT"]) is not None:
-                    low, high = self._load_scale_limits(scale)
-                    if low is None or low != high:
-                        return False
-                elif self._get_unique_arxml_child(scale, "&COMPU-RATIONAL-COEFFS") is None:
-                    return False
-                else:
-                    lines += 1
-            category = self._get_unique_arxml_child(method, "CATEGORY")
-            kind = "IDENTICAL" if category is None else str(category.text)
-            if kind == "SCALE_LINEAR":
-                kind = category.text = "LINEAR"
-            if kind == "SCALE_LINEAR_AND_TEXTTABLE":
-                return lines < 2
-            return {"LINEAR": 1, "IDENTICAL": 0, "TEXTTABLE": 0}.get(kind) == lines
-
-    root = ElementTree.fromstring(text)  # noqa: S314 - in the confined reader
-    if arxml.is_ecu_extract(root):
-        raise ValueError("an extract of one ECU has no conversions")
-    return Loader(root, strict=False).load()

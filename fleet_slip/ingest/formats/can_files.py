@@ -114,7 +114,13 @@ def read_blf_frames(budget: Budget, start_s: float) -> Iterator[FrameBlock]:
             if len(begins):
                 yield _frames(content, begins, start_s, budget)
     if _MARK in rest:
-        raise budget.damaged("a last object that ends too early")
+        raise _damaged(budget, "a last object that ends too early")
+
+
+def _damaged(budget: Budget, what: str) -> InputError:
+    return InputError(
+        f"{shown(budget.file)}: {what}, which no trace has: it is damaged. Record or copy it again."
+    )
 
 
 def _containers(stream: BinaryIO, budget: Budget) -> Iterator[bytes]:
@@ -125,25 +131,24 @@ def _containers(stream: BinaryIO, budget: Budget) -> Iterator[bytes]:
     while header := os.pread(stream.fileno(), _CONTAINER_HEADER.size, at):
         mark, size, kind = _OBJECT.unpack_from(header.ljust(_CONTAINER_HEADER.size))
         if mark != _MARK or len(header) < _CONTAINER_HEADER.size:
-            raise budget.damaged(f"no object at byte {at:,}")
+            raise _damaged(budget, f"no object at byte {at:,}")
         if size < len(header):
-            raise budget.damaged(f"an object of {size:,} bytes")
+            raise _damaged(budget, f"an object of {size:,} bytes")
         if kind == _CONTAINER:
             content = os.pread(stream.fileno(), size - len(header), at + len(header))
             if len(content) < size - len(header):
-                raise budget.damaged("a container that ends too early")
+                raise _damaged(budget, "a container that ends too early")
             (method,) = _CONTAINER_HEADER.unpack(header)
             if method not in {_PLAIN, _COMPRESSED}:
-                raise budget.damaged(f"a container compressed by an unknown method, {method}")
+                raise _damaged(budget, f"a container compressed by an unknown method, {method}")
             try:
                 some.append(zlib.decompress(content) if method == _COMPRESSED else content)
             except zlib.error as error:
-                raise budget.damaged(f"a container that zlib cannot unfold ({error})") from None
+                raise _damaged(budget, f"a container that zlib cannot unfold ({error})") from None
         if sum(map(len, some)) >= _AT_ONCE:
             yield b"".join(some)
             some = []
         at += size + size % _PADDING
-        budget.meter.pass_over(at, budget.size)
     yield b"".join(some)
 
 
@@ -156,14 +161,14 @@ def _objects(content: bytes, budget: Budget) -> tuple[IntArray, int]:
             break
         _, size, _ = _OBJECT.unpack_from(content, begin)
         if not _OBJECT.size <= size <= _LARGEST_OBJECT:
-            raise budget.damaged(f"an object of {size:,} bytes")
+            raise _damaged(budget, f"an object of {size:,} bytes")
         if begin + size > len(content):
             break
         begins.append(begin)
         at = begin + size
     left = content[at : at + _REACH]
     if len(left) == _REACH and _MARK not in left:
-        raise budget.damaged("no object where the next should begin")
+        raise _damaged(budget, "no object where the next should begin")
     return np.array(begins, dtype=np.int64), at
 
 
@@ -178,7 +183,7 @@ def _frames(content: bytes, begins: IntArray, start_s: float, budget: Budget) ->
             continue
         least, size = heads["size"][at].min(), header + kind.size
         if least < size:
-            raise budget.damaged(f"a frame of {least} bytes")
+            raise _damaged(budget, f"a frame of {least} bytes")
         fields = {name: (form, header + place) for name, (form, place) in kind.fields.items()}
         found = _read(data, begins[at], _TIMED | fields, size)
         if "data" in fields:
@@ -223,8 +228,8 @@ def _read(
 
 
 SUFFIXES = {".blf", ".asc", ".log", ".trc"}
-TOLD_EVERY = 2**14
-"""Frames of python-can until it is told how far the file is read."""
+AT_ONCE = 2**14
+"""Frames of python-can that are kept together."""
 
 
 _Key = tuple[int, bool]
@@ -375,10 +380,8 @@ class CanSource(FormatSource):
                     self._keep(block)
                 return
             sent = (one for one in trace if not (one.is_error_frame or one.is_remote_frame))
-            while some := list(islice(sent, TOLD_EVERY)):
+            while some := list(islice(sent, AT_ONCE)):
                 self._keep(_block_of(some))
-                if not trace.file.closed:  # which it is at its end
-                    self._budget.meter.pass_over(trace.file.buffer.tell(), self._budget.size)
 
     def _require_whole(self, trace: Any) -> None:
         # A BLF file says how long it is; python-can reads what is there of one that was cut.

@@ -36,7 +36,7 @@ import polars as pl
 from fleet_slip.base import shown
 from fleet_slip.errors import FleetSlipError, is_lack_of_memory
 from fleet_slip.ingest.formats.can import CanBus
-from fleet_slip.ingest.formats.source import Base, Budget, Meter, Source
+from fleet_slip.ingest.formats.source import Base, Budget, Source
 
 FORMATS = {
     "mdf": ("mdf", "asammdf"),
@@ -106,17 +106,6 @@ def serve(control: int) -> None:
             os.close(handle)
 
 
-class _FarMeter(Meter):
-    """Lets the meter of the other process know."""
-
-    def __init__(self, send: Callable[[Any], None]) -> None:
-        super().__init__()
-        self._send = send
-
-    def pass_over(self, at: int, size: int) -> None:
-        self._send({"passed": [at, size]})
-
-
 class _Reader:
     """An open file, who asks for what is in it, and what of it is being read."""
 
@@ -134,7 +123,7 @@ class _Reader:
             os.chdir(job.cwd)
             tempfile.tempdir = job.folder
             confine(parent, job.file, job.folder, *job.limits)
-            budget = Budget(Path(job.file), job.size, _FarMeter(self._send))
+            budget = Budget(Path(job.file), job.size)
 
             def open_it() -> bool:
                 self._source = opened.enter_context(open_here(job.format, job.bus, budget))

@@ -299,7 +299,6 @@ def read_records(budget: Budget) -> Iterator[Any]:
                 record.uncompressed_size = len(others)
                 yield from mcap.breakup_chunk(record)
                 yield block
-                budget.meter.pass_over(file.tell(), budget.size)
             elif kind == "Message":
                 alone.append(record)
             else:

@@ -205,12 +205,28 @@ class MdfSource(FormatSource):
 
     def bases(self, columns: Sequence[str]) -> list[Base]:
         """Return the channel groups that have one of the columns, in the file's order."""
-        return super().bases(sorted(columns, key=lambda name: self._find(name)[0]))
+        return super().bases(sorted(columns, key=lambda name: self.find(name)[1][0]))
 
     def find(self, column: str) -> tuple[str, tuple[int, int]]:
         """Return the group of a channel, and the numbers of both. Raises `InputError`."""
-        number, index = self._find(column)
-        return f"group {number}", (number, index)
+        places, name = self._places(column), column
+        if not places:
+            name, _, group = column.rpartition("@")
+            groups = self._mdf.groups
+            places = [
+                (number, index)
+                for number, index in self._places(name)
+                if group in {str(number), getattr(groups[number].channel_group, "acq_name", "")}
+            ]
+        if not places:
+            raise missing_column(self._file, column, [one.name for one in self.channels()])
+        if len(places) > 1:
+            titles = ", ".join(repr(f"{name}@{number}") for number, _ in places[:5])
+            raise InputError(
+                f"{shown(self._file)}: {len(places)} channels are called {column!r}. Say which: "
+                f"{titles}."
+            )
+        return f"group {places[0][0]}", places[0]
 
     def count(self, _base: str, found: dict[str, tuple[int, int]]) -> int:
         """Return how many samples a group says that it has."""
@@ -341,28 +357,9 @@ class MdfSource(FormatSource):
                 "again."
             )
 
-    def _find(self, name: str) -> tuple[int, int]:
-        places = self._places(name)
-        base, _, group = name.rpartition("@")
-        if not places and base:
-            places = [p for p in self._places(base) if group in {str(p[0]), self._title(p[0])}]
-        if not places:
-            names = [channel.name for channel in self.channels()]
-            raise missing_column(self._file, name, names)
-        if len(places) > 1:
-            titles = ", ".join(repr(f"{base or name}@{number}") for number, _ in places[:5])
-            raise InputError(
-                f"{shown(self._file)}: {len(places)} channels are called {name!r}. Say which: "
-                f"{titles}."
-            )
-        return places[0]
-
     def _places(self, name: str) -> list[tuple[int, int]]:
         places = self._mdf.channels_db.get(name, ())
         return [(n, i) for n, i in places if i != self._mdf.masters_db.get(n)]
-
-    def _title(self, number: int) -> str:
-        return str(getattr(self._mdf.groups[number].channel_group, "acq_name", "") or "")
 
     def _name(self, name: str, number: int) -> str:
         return name if len(self._places(name)) < 2 else f"{name}@{number}"
@@ -411,9 +408,7 @@ class MdfBus(CanSource):
 
     def _read_trace(self) -> None:
         """Keep the frames of the wanted messages, and note the numbers of all."""
-        groups = [*self._mdf.groups_with(f"{_FRAME}ID")]
-        frames, passed = sum(self._mdf.count_records(number) for number, _ in groups), 0
-        for number, places in groups:
+        for number, places in self._mdf.groups_with(f"{_FRAME}ID"):
             names = ("ID", "DataBytes", "DataLength", "IDE", "BusChannel")
             there = {n: places[_FRAME + n] for n in names if _FRAME + n in places}
             if "DataBytes" not in there:
@@ -423,8 +418,6 @@ class MdfBus(CanSource):
                 )
             for window in self._mdf.windows(number, there):
                 self._keep(self._block(dict(zip(there, window, strict=True))))
-                passed += len(window[0])
-                self._budget.meter.pass_over(passed, frames)
         if not self._numbers:
             raise InputError(
                 f"{shown(self._file)}: there is no CAN frame in it ({_FRAME}ID). Map its channels "

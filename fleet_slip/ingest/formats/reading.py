@@ -33,7 +33,7 @@ from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.confined_reader import SIZES, Job
 from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
-from fleet_slip.ingest.formats.source import Base, Budget, Channel, Meter, Source
+from fleet_slip.ingest.formats.source import Base, Budget, Channel, Source
 from fleet_slip.ingest.formats.tables import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.formats.tables import MAGIC_AT as DUCKDB_AT
 from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, DuckdbRows, open_duckdb, open_parquet
@@ -124,13 +124,13 @@ def log_digest(log: Path) -> "hashlib._Hash":
 
 
 @contextmanager
-def open_source(file: Path, formats: FileFormats, meter: Meter | None = None) -> Iterator[Source]:
+def open_source(file: Path, formats: FileFormats) -> Iterator[Source]:
     """Open a file, in the format that its first bytes tell. Raises `InputError`.
 
     Each format makes sure that the file stands for itself: that no value of it is to be fetched
     from another file, or computed, and that it is not far more than its `Budget` once decoded.
     """
-    budget = Budget.of(file, meter)
+    budget = Budget.of(file)
     with file.open("rb") as stream:
         start = stream.read(_HDF5_AT + len(_HDF5))
     for magic, program in _ARCHIVES.items():
@@ -314,24 +314,20 @@ class ConfinedSource(Source):
         return self._receive()
 
     def _receive(self) -> tuple[Any, pa.Buffer]:
-        """Return what the reader says, and rows; how far it is goes to the meter."""
+        """Return what the reader says, and rows."""
         until_s = time.monotonic() + self._budget.seconds
-        while True:
-            text, size = SIZES.unpack(self._take(SIZES.size, until_s))
-            if text > _LARGEST_TEXT or size > self._budget.memory:
-                raise self._budget.crashed()
-            try:
-                said = json.loads(self._take(text, until_s))
-                if isinstance(said, dict) and "passed" in said:
-                    self._budget.meter.pass_over(*map(int, said["passed"]))
-                    continue
-            except (ValueError, TypeError, RecursionError):
-                raise self._budget.crashed() from None
-            # Not the memory itself, which the reader could still change.
-            rows = pa.allocate_buffer(size)
-            if size and os.preadv(self._rows, [memoryview(rows)], 0) != size:
-                raise self._budget.crashed()
-            return self._found(said), rows
+        text, size = SIZES.unpack(self._take(SIZES.size, until_s))
+        if text > _LARGEST_TEXT or size > self._budget.memory:
+            raise self._budget.crashed()
+        try:
+            said = json.loads(self._take(text, until_s))
+        except (ValueError, RecursionError):
+            raise self._budget.crashed() from None
+        # Not the memory itself, which the reader could still change.
+        rows = pa.allocate_buffer(size)
+        if size and os.preadv(self._rows, [memoryview(rows)], 0) != size:
+            raise self._budget.crashed()
+        return self._found(said), rows
 
     def _found(self, said: Any) -> Any:
         if not isinstance(said, dict) or not {"found", "error"} & said.keys():

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -205,45 +205,30 @@ def missing_column(file: object, column: str, names: Sequence[str]) -> InputErro
 
 
 class Meter:
-    """A share of a log's bytes: that of its rows which were read.
-
-    Where all of a file must be passed over before its first row, as with messages in the order of
-    time, each pass counts for half of what is left.
-    """
+    """A share of a log's bytes: that of its rows which were read."""
 
     def __init__(self, size: int = 0, progress: Progress = no_progress) -> None:
-        """Take the bytes of the log, and who is told how many more of them are done."""
+        """Take the bytes of the log, and what to call with how many more of them are done."""
         self._size, self._progress, self.is_watched = size, progress, progress is not no_progress
-        self._told = self._at = self._rows = 0
-        self._share = self._begun = 0.0
-
-    def pass_over(self, at: int, size: int) -> None:
-        """Tell how much of a file was passed over; at an earlier place another pass has begun."""
-        if at < self._at:
-            self._begun = self._share
-        self._at = at
-        self._tell(self._begun + (1 - self._begun) / 2 * at / max(size, 1))
+        self._done = self._rows = 0
 
     def expect(self, rows: int, of: int = 0) -> None:
         """Take about how many rows come, or come of so many bytes; 0 where that is not known."""
         self._rows = rows * self._size // of if of else rows
-        self._begun = self._share
 
     def count(self, rows: int) -> None:
-        """Tell how many rows were read so far."""
+        """Report how many rows were read so far."""
         if self._rows:
-            self._tell(self._begun + (1 - self._begun) * rows / self._rows)
+            self._report(self._size * min(rows, self._rows) // self._rows)
 
     def end(self) -> None:
-        """Tell that all was read."""
-        self._tell(1.0)
+        """Report that all was read."""
+        self._report(self._size)
 
-    def _tell(self, share: float) -> None:
-        self._share = max(self._share, min(share, 1.0))
-        done = int(self._size * self._share)
-        if done > self._told:
-            self._progress(done - self._told, self._size)
-            self._told = done
+    def _report(self, done: int) -> None:
+        if done > self._done:
+            self._progress(done - self._done, self._size)
+            self._done = done
 
 
 # A small file can stand for anything. What it may become while it is decoded follows from its size
@@ -258,8 +243,6 @@ FREE_MEMORY, MEMORY_PER_BYTE = 2**30, 8
 FREE_S, BYTES_PER_S = 60.0, 10**5
 """Seconds in which any file must be decoded, and a speed that no format falls below."""
 
-_WAY_OUT = "Is it damaged? If it was measured so, export it as CSV that is not compressed."
-
 
 @dataclass(frozen=True)
 class Budget:
@@ -268,13 +251,11 @@ class Budget:
     file: Path
     size: int
     """Bytes of the file."""
-    meter: Meter = field(default_factory=Meter, compare=False)
-    """Who is told how much of it was passed over."""
 
     @classmethod
-    def of(cls, file: Path, meter: Meter | None = None) -> "Budget":
+    def of(cls, file: Path) -> "Budget":
         """Return the budget of a file. Raises `OSError`."""
-        return cls(file, file.stat().st_size, meter or Meter())
+        return cls(file, file.stat().st_size)
 
     @property
     def rows(self) -> int:
@@ -299,45 +280,43 @@ class Budget:
     def require_rows(self, rows: int) -> None:
         """Raise `InputError` for more rows than a file of its size can have."""
         if rows > self.rows:
-            raise InputError(
-                f"{shown(self.file)}: {rows:,} rows or more in {self.size:,} bytes; of a file of "
-                f"this size at most {self.rows:,} are read. {_WAY_OUT}"
+            raise self._too_much(
+                f"{rows:,} rows or more in {self.size:,} bytes; of a file of this size at most "
+                f"{self.rows:,} are read"
             )
 
     def require_unfolded(self, size: int) -> None:
         """Raise `InputError` for more bytes than a file of its size can unfold to."""
         if size > self.unfolded:
-            raise InputError(
-                f"{shown(self.file)}: its {self.size:,} bytes unfold to {size:,} or more; of a "
-                f"file of this size at most {self.unfolded:,} are read. {_WAY_OUT}"
+            raise self._too_much(
+                f"its {self.size:,} bytes unfold to {size:,} or more; of a file of this size at "
+                f"most {self.unfolded:,} are read"
             )
 
     def over_memory(self) -> InputError:
-        """Return what to say of a file whose reader asked for more memory, or longer files."""
-        return InputError(
-            f"{shown(self.file)}: its {self.size:,} bytes unfold to more than {self.memory:,} in "
-            f"memory or {self.unfolded:,} in a temporary file. {_WAY_OUT}"
+        """Return the error of a file whose reader asked for more memory, or longer files."""
+        return self._too_much(
+            f"its {self.size:,} bytes unfold to more than {self.memory:,} in memory or "
+            f"{self.unfolded:,} in a temporary file"
         )
 
     def crashed(self) -> InputError:
-        """Return what to say of a file whose reader ended without a word, or talks nonsense."""
-        return InputError(
-            f"{shown(self.file)}: its reader crashed, or was ended because it took more than "
-            f"{self.memory:,} bytes of memory. {_WAY_OUT}"
+        """Return the error of a file whose reader ended without a word, or talks nonsense."""
+        return self._too_much(
+            f"its reader crashed, or was ended because it took more than {self.memory:,} bytes of "
+            "memory"
         )
 
     def over_time(self) -> InputError:
-        """Return what to say of a file that took too long."""
-        return InputError(
-            f"{shown(self.file)}: {self.seconds:,.0f} s did not suffice to decode its "
-            f"{self.size:,} bytes. {_WAY_OUT}"
+        """Return the error of a file that took too long."""
+        return self._too_much(
+            f"{self.seconds:,.0f} s did not suffice to decode its {self.size:,} bytes"
         )
 
-    def damaged(self, what: str) -> InputError:
-        """Return what to say of a file with something that no recorder writes."""
+    def _too_much(self, what: str) -> InputError:
         return InputError(
-            f"{shown(self.file)}: {what}, which no trace has: it is damaged. Record or copy it "
-            "again."
+            f"{shown(self.file)}: {what}. Is it damaged? If it was measured so, export it as CSV "
+            "that is not compressed."
         )
 
     def metered(self, batches: Iterator[pl.DataFrame]) -> Iterator[pl.DataFrame]:
