@@ -1,19 +1,17 @@
 """Writes Gram rows to files: of one feature set each, neither too many nor too large."""
 
-import hashlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from datetime import date
-from itertools import accumulate, pairwise
+from itertools import accumulate
 
 import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.catalogue.facts import RECEIVED_FILES
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.grams.gram_rows import is_received
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot, Table, TableFile
+from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.tables import Warehouse
 
 FILE_ROWS = 100_000
@@ -127,79 +125,22 @@ def read_rows(grams: Table, file: TableFile) -> pa.Table:
     return pa.table(columns, schema=grams.schema)
 
 
-# Which received Gram rows are of drives whose logs are here: the logs count, the rows go.
-#
-# Same is a drive of the same name; or of the same car, day and signals, with exactly the same n,
-# sums and products of logged signals, as its log gives. Rows of other sets go with them.
+_COMPARED = ("drive_id", "feature_set", "vehicle_id", "day", "signals", "n", "sums", "products")
 
 
-@dataclass
-class LoggedDrives:
-    """Drives with logs, by their names and by the content of their Gram rows."""
+def find_superseded(grams: Snapshot, new_rows: Sequence[pa.Table]) -> tuple[set[str], set[str]]:
+    """Return the drives without a log that new rows of logs are of, and the files that have them.
 
-    names: set[str] = field(default_factory=set)
-    contents: set[bytes] = field(default_factory=set)
-    days: set[date] = field(default_factory=set)
-    found: int = 0
-    """Received Gram rows that were found to be of these drives."""
-
-    def add(self, rows: pa.Table) -> None:
-        """Add the drives of Gram rows."""
-        self.names.update(rows["drive_id"].cast(pa.string()).to_pylist())
-        plain = rows.filter(pc.equal(rows["feature_set"], features().identity(PLAIN)))
-        self.contents.update(content_keys(plain))
-        self.days.update(plain["day"].unique().to_pylist())
-
-    def files_with_received(self, grams: Snapshot) -> list[TableFile]:
-        """Return the files that have received Gram rows of these drives."""
-        files = [file for file in grams.files if is_of_received(file)]
-        for file in files:
-            self.names.update(self._sent(file, grams))
-        names = pa.array(sorted(self.names), pa.string())
-        return [file for file in files if pc.any(pc.is_in(_drives(file, grams), names)).as_py()]
-
-    def _sent(self, file: TableFile, grams: Snapshot) -> Iterator[str]:
-        """Yield a file's received drives of the same days that are these under another name."""
-        first, last = file.days or (date.min, date.max)
-        if any(first <= day <= last for day in self.days):
-            rows = grams.table.read(file.path)
-            for drive, key in zip(rows["drive_id"].to_pylist(), content_keys(rows), strict=True):
-                if key in self.contents:
-                    yield drive
-
-    def without_received(self, rows: pa.Table) -> pa.Table:
-        """Return rows of `grams` without the received ones of these drives; count those."""
-        names = pa.array(sorted(self.names), pa.string())
-        mine = pc.and_(is_received(rows), pc.is_in(rows["drive_id"].cast(pa.string()), names))
-        self.found += pc.sum(mine).as_py() or 0
-        return rows.filter(pc.invert(mine))
-
-
-def _drives(file: TableFile, grams: Snapshot) -> pa.ChunkedArray:
-    return grams.table.read(file.path, ["drive_id"])["drive_id"].cast(pa.string())
-
-
-def has_received(grams: Snapshot) -> bool:
-    """Whether any Gram row came without a log."""
-    return any(is_of_received(file) for file in grams.files)
-
-
-def content_keys(rows: pa.Table) -> Iterator[bytes]:
-    """Yield a key for each Gram row: equal keys mean one drive; other feature sets match none."""
-    rows = rows.combine_chunks()
-    names = ("feature_set", "vehicle_id", "day", "signals", "n")
-    told = [rows[name].cast(pa.string()).to_pylist() for name in names]
-    sums, products = (_cells(rows[name]) for name in ("sums", "products"))
-    identity = features().identity(PLAIN)
-    for said, one, other in zip(zip(*told, strict=True), sums, products, strict=True):
-        plain = said[0] == identity
-        text = "\0".join(str(part) for part in said).encode("utf-8", "surrogatepass")
-        yield hashlib.sha256(text + b"\0" + one + other).digest() if plain else b""
-
-
-def _cells(lists: pa.ChunkedArray) -> Iterator[bytes]:
-    for chunk in lists.chunks:
-        offsets = chunk.offsets.to_pylist()
-        values = chunk.values.to_numpy()
-        for first, stop in pairwise(offsets):
-            yield values[first:stop].tobytes()
+    The logs count, and the rows that cars sent go, those of other feature sets with them.
+    """
+    paths = {grams.table.uri(file.path): file.path for file in grams.files if is_of_received(file)}
+    if not paths or not new_rows:
+        return set(), set()
+    statement = read_sql("jobs", "superseded.sql").format(plain=PLAIN)
+    with open_database(reading=grams.table.folder) as database:
+        logged = pa.concat_tables([rows.select(_COMPARED) for rows in new_rows])
+        database.register("logged", logged)
+        database.execute("SET VARIABLE gram_files = $files", {"files": list(paths)})
+        with reading_files(database, "looking for drives whose logs have come"):
+            found = database.execute(statement).fetchall()
+    return {drive for drive, _ in found}, {paths[file] for _, file in found}

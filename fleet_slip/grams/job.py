@@ -21,12 +21,13 @@ from fleet_slip.errors import StorageError
 from fleet_slip.grams.backlog import Backlog, find_backlog, named_files, require_active
 from fleet_slip.grams.compute import aggregate, compute_grams
 from fleet_slip.grams.gram_files import (
-    LoggedDrives,
     files_to_rewrite,
-    has_received,
+    find_superseded,
+    is_of_received,
     rows_to_keep,
     write_rows,
 )
+from fleet_slip.grams.gram_rows import is_received
 from fleet_slip.grams.receiver_delay import course_delays, files_of_other_delay
 from fleet_slip.storage.table import Change, Snapshot, TableFile, Unit, retry_conflicts
 from fleet_slip.warehouse.tables import Warehouse
@@ -145,7 +146,7 @@ def _update_once(
         new_rows = compute_grams(
             warehouse, backlog.missing, progress, None, feature_set, executor, late
         )
-        merged = _Merged(grams, backlog.stale, LoggedDrives(), identity, others)
+        merged = _Merged(grams, backlog.stale, identity, others)
         grams.commit_or_discard(
             Change(
                 add=write_rows(warehouse, merged.parts(new_rows)),
@@ -163,7 +164,7 @@ def _update_once(
         require_active(logs.renewed(), backlog.missing)
         after = warehouse.grams.snapshot()
         version, gram_rows = after.version, after.rows
-        dropped = merged.logged.found
+        dropped = merged.superseded
     return GramReport(
         feature_set=identity,
         files_read=len(backlog.missing),
@@ -182,36 +183,36 @@ class _Merged:
 
     Attributes:
         grams, stale: what there is, and the log files that are gone.
-        logged: the drives of the new rows: what cars sent of them goes.
         identity, again: the feature set, and the log files that it is computed again for.
         replaced: the files that are written again, once all parts were taken.
+        superseded: rows that cars had sent, of drives whose logs have come since.
     """
 
     grams: Snapshot
     stale: frozenset[str]
-    logged: LoggedDrives
     identity: str
     again: frozenset[str]
     replaced: list[TableFile] = field(default_factory=list)
+    superseded: int = 0
 
     def parts(self, new_rows: Iterable[pa.Table]) -> Iterator[pa.Table]:
         """Yield the new rows, then those that stay of the files that are written again."""
-        looked_for = has_received(self.grams)
+        looked_for = any(is_of_received(file) for file in self.grams.files)
+        new: list[pa.Table] = []
         for rows in new_rows:
-            if looked_for:
-                self.logged.add(rows)
+            new += [rows] if looked_for else []
             yield rows
-        paths = {file.path for file in files_to_rewrite(self.grams, self.stale | self.again)}
-        if looked_for:
-            paths.update(file.path for file in self.logged.files_with_received(self.grams))
+        drives, paths = find_superseded(self.grams, new)
+        paths |= {file.path for file in files_to_rewrite(self.grams, self.stale | self.again)}
         self.replaced += [file for file in self.grams.files if file.path in paths]
-        again = pa.array(sorted(self.again), pa.string())
+        gone, again = (pa.array(sorted(some), pa.string()) for some in (drives, self.again))
         for rows in rows_to_keep(self.grams, self.replaced, self.stale):
-            old = pc.and_(
+            dropped = pc.and_(
                 pc.equal(rows["feature_set"], self.identity), pc.is_in(rows["file"], again)
             )
-            kept = rows.filter(pc.invert(old)) if self.again else rows
-            yield self.logged.without_received(kept) if looked_for else kept
+            sent = pc.and_(is_received(rows), pc.is_in(rows["drive_id"].cast(pa.string()), gone))
+            self.superseded += pc.sum(sent).as_py() or 0
+            yield rows.filter(pc.invert(pc.or_(dropped, sent)))
 
 
 # Lands the Gram rows of log files before the files themselves, where others are written again.

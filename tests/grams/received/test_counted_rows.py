@@ -191,3 +191,25 @@ def test_the_command_says_what_landed(run_command: RunCommand, tmp_path: Path) -
     assert f"{path}: 1 Gram row of 1 drive, 500 rows" in done.stderr + done.stdout
     done = run_command("--root", str(tmp_path / "data"), "ingest", str(path))
     assert "nothing to do" in done.stderr + done.stdout
+
+
+def test_rows_of_a_drive_go_when_its_log_comes(smoke_root: Path, tmp_path: Path) -> None:
+    whole = fleet_slip.open(smoke_root)
+    (stored,) = (
+        whole.sql("FROM grams WHERE feature_set = 'signals' ORDER BY drive_id LIMIT 1")
+        .to_arrow_table()
+        .to_pylist()
+    )
+    signals = tuple(stored["signals"].split(","))
+    gram = Gram(signals, stored["n"], tuple(stored["sums"]), tuple(stored["products"]))
+    same = {"vehicle_id": stored["vehicle_id"], "day": stored["day"]}
+    fleet = fleet_slip.open(tmp_path / "data")
+    other = row_of(gram_of(1), drive_id=stored["drive_id"])  # the same name, and other counts
+    rows = [row_of(gram, drive_id="renamed", **same), other, row_of(gram_of(2), "VIN2")]
+    fleet.ingest_counted(write_counted(tmp_path / "rows", rows))
+    shutil.copytree(smoke_root / "logs", tmp_path / "data" / "logs")
+    report = fleet.gram()
+    assert report.received_dropped == 2
+    left = {row["drive_id"] for row in gram_rows(fleet) if row["source"] == "received"}
+    assert len(left) == 1 and left.pop().startswith("VIN2")
+    assert not fleet.gram().changed
