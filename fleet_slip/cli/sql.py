@@ -7,9 +7,6 @@ import re
 import shutil
 import sys
 from collections.abc import Iterator
-from enum import StrEnum
-from itertools import groupby
-from operator import itemgetter
 from pathlib import Path
 from typing import Annotated
 
@@ -22,20 +19,16 @@ from pyarrow.csv import write_csv
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.session import Session
 from fleet_slip.base import number_of
-from fleet_slip.cli.output import Json, cell, json_text, print_json, print_table, say
+from fleet_slip.cli.output import Json, json_text, print_json, say
 from fleet_slip.errors import QuestionError, StorageError, UsageError
 from fleet_slip.warehouse.database import limit_memory, split_statements
 
 ROWS_SHOWN = 40
 ENDLESS = 2**31 - 1
-ROWS_FOLDED = 1000
-"""Of more, --all prints lines as wide as they are: to fold them would take long."""
+FEW_COLUMNS = 3
+"""So many have room side by side, whatever they hold."""
 FORMULA = "^[=+@\\t\\r\\n＝＋－＠-]"
 """What a text begins with that a spreadsheet executes."""
-
-Scenarios = Annotated[
-    bool, typer.Option("--scenarios", help="Show the drives that models are tested on as well.")
-]
 
 
 def sql(
@@ -67,7 +60,9 @@ def sql(
     everything: Annotated[
         bool, typer.Option("--all", help="Print all rows and columns of a table, however wide.")
     ] = False,
-    scenarios: Scenarios = False,
+    scenarios: Annotated[
+        bool, typer.Option("--scenarios", help="Show the drives that models are tested on as well.")
+    ] = False,
     unsafe: Annotated[
         bool,
         typer.Option(
@@ -93,147 +88,63 @@ def sql(
         text = sys.stdin.read() if query == "-" else query
     except UnicodeDecodeError:
         raise QuestionError("the query on stdin is not UTF-8 text.") from None
+    if output is not None and output.suffix not in {".parquet", ".csv", ".json"}:
+        raise UsageError(f"{output}: the suffix says the format: .parquet, .csv or .json.")
     if not unsafe:
         limit_memory()
     opened = (fleet.unlocked_session if unsafe else fleet.session)(text, scenarios=scenarios)
-    with opened as session:
+    with opened as session, _representation_errors():
         if output is not None:
-            _write(session, text, output, limit, exact)
+            _write(_rows(session, text, limit), output, exact)
             return
-        form = Form.JSON if json else Form.CSV if csv else Form.TABLE
         several = query == "-" and not unsafe
         for statement in split_statements(session.database, text) if several else [text]:
-            answer(session, statement, form, exact=exact, limit=limit, everything=everything)
-
-
-class Form(StrEnum):
-    """How an answer is printed."""
-
-    TABLE = "table"
-    CSV = "csv"
-    JSON = "json"
-
-
-def answer(
-    session: Session,
-    text: str,
-    form: Form,
-    *,
-    exact: bool = False,
-    limit: int | None = None,
-    everything: bool = False,
-) -> None:
-    """Print the answer to a query, or `limit` rows; `exact` leaves texts of CSV as they are."""
-    with _representation_errors():
-        if form is Form.TABLE:
-            _show(session, text, limit, everything)
-        elif form is Form.JSON:
-            print_json(_rows(session, text, limit).to_pylist())
-        else:
-            rows = _rows(session, text, limit)
-            sys.stdout.flush()
-            write_csv(rows if exact else _mark_formulas(rows), sys.stdout.buffer)
-            sys.stdout.buffer.flush()
+            if json:
+                print_json(_rows(session, statement, limit).to_pylist())
+            elif csv:
+                rows = _rows(session, statement, limit)
+                sys.stdout.flush()
+                write_csv(rows if exact else _mark_formulas(rows), sys.stdout.buffer)
+                sys.stdout.buffer.flush()
+            else:
+                _show(session, statement, limit, everything)
 
 
 def _rows(session: Session, text: str, limit: int | None) -> pa.Table:
-    if limit is None:
-        return session.table(text)
-    return session.compute(text, lambda answer: answer.limit(limit).to_arrow_table())
+    return session.compute(text, lambda answer: _first(answer, limit).to_arrow_table())
 
 
-def _write(session: Session, text: str, file: Path, limit: int | None, exact: bool) -> None:
-    """Write an answer as the suffix says. Raises `UsageError` for another, and `StorageError`."""
-    if file.suffix not in {".parquet", ".csv", ".json"}:
-        raise UsageError(f"{file}: the suffix says the format: .parquet, .csv or .json.")
-    rows = _rows(session, text, limit)
+def _first(answer: duckdb.DuckDBPyRelation, limit: int | None) -> duckdb.DuckDBPyRelation:
+    return answer if limit is None else answer.limit(limit)
+
+
+def _write(rows: pa.Table, file: Path, exact: bool) -> None:
+    """Write an answer as the suffix says. Raises `StorageError`."""
     try:
-        with _representation_errors():
-            if file.suffix == ".parquet":
-                import pyarrow.parquet as pq  # noqa: PLC0415 - takes a while
+        if file.suffix == ".parquet":
+            import pyarrow.parquet as pq  # noqa: PLC0415 - takes a while
 
-                pq.write_table(rows, file)
-            elif file.suffix == ".csv":
-                write_csv(rows if exact else _mark_formulas(rows), file)
-            else:
-                file.write_text(json_text(rows.to_pylist()), "utf-8")
+            pq.write_table(rows, file)
+        elif file.suffix == ".csv":
+            write_csv(rows if exact else _mark_formulas(rows), file)
+        else:
+            file.write_text(json_text(rows.to_pylist()), "utf-8")
     except OSError as error:
         raise StorageError(f"{file}: {error.strerror or error}.") from None
     say(f"{file}: {number_of(rows.num_rows, 'row')}, {file.stat().st_size:,} bytes")
 
 
+_CUT = re.compile(r"│ … │|\S… │|rows .*shown\)|columns .*shown\)")
+
+
 def _show(session: Session, text: str, limit: int | None, everything: bool) -> None:
-    """Print what fits of an answer, and say what is left out and how to see it."""
-    if limit is None and not everything and _DICTIONARY.fullmatch(text):
-        _print_dictionary(session)
-        return
-    screen = shutil.get_terminal_size((160, 40)).columns
-    width = ENDLESS if everything else screen
+    """Print what fits of an answer, and say if that is not all."""
+    width = ENDLESS if everything else shutil.get_terminal_size((160, 40)).columns
     rows = limit if limit is not None else ENDLESS if everything else ROWS_SHOWN
-    shown, empty = session.compute(
-        text, lambda answer: _fitting(answer if limit is None else answer.limit(limit), width, rows)
-    )
-    wide = shown.index("\n") > screen and shown.count("\n") <= ROWS_FOLDED
-    if everything and sys.stdout.isatty() and wide:
-        _print_folded(session, text, limit)
-        return
+    shown = session.compute(text, lambda answer: _drawn(_first(answer, limit), width, rows))
     typer.echo(shown)
-    if found := _CUT.search(shown):
-        left_out = [f"{int(found[1]) - int(found[2])} of {found[1]} columns do not fit"]
-        left_out += [f"without a value: {', '.join(empty)}"] if empty else []
-        say(f"{'; '.join(left_out)}. Name those to see: SELECT …; all: --all")
-    elif empty:
-        say(f"columns without a value in these rows are left out: {', '.join(empty)}")
-    elif left_out := [what for what, cut in _CUTS.items() if cut.search(shown)]:
-        say(f"{' and '.join(left_out)}; whole: --all")
-
-
-_DICTIONARY = re.compile(r"(?i)\s*from\s+dictionary\s*;?\s*")
-
-
-def _print_dictionary(session: Session) -> None:
-    """Print what every column is, view by view and whole."""
-    rows = session.table('SELECT view, "column", unit, description FROM dictionary').to_pylist()
-    for view, columns in groupby(rows, itemgetter("view")):
-        cells = [[cell(one[key]) for key in ("column", "unit", "description")] for one in columns]
-        print_table(f"{view}:", ["column", "unit", "description"], cells, left=3)
-    say("types, too: fleet-slip sql --all \"FROM dictionary WHERE view = 'log'\"")
-
-
-def _print_folded(session: Session, text: str, limit: int | None) -> None:
-    """Print an answer that is wider than the terminal, with texts of several lines."""
-    rows = session.compute(
-        text,
-        lambda answer: _readable(answer if limit is None else answer.limit(limit)).fetchall(),
-    )
-    names = session.compute(text, lambda answer: answer.columns)
-    print_table("", names, [[cell(value) for value in row] for row in rows], left=len(names))
-
-
-_CUTS = {
-    "not all columns are shown": re.compile(r"│ … │"),  # a narrow table has no room to say so
-    "not all rows are shown": re.compile(r"rows .*shown\)"),
-    "long texts are cut": re.compile(r"\S… │"),
-}
-_CUT = re.compile(r"(\d+) columns \((\d+) shown\)")
-_NOTHING_FITS, _HIDDEN = "┌───┐\n│ … │", "│ … │\n"
-FEW_COLUMNS = 3
-"""So many have room side by side, whatever they hold."""
-
-
-def _fitting(answer: duckdb.DuckDBPyRelation, width: int, rows: int) -> tuple[str, list[str]]:
-    """Return a table, and the columns that it is without: what has no value gives way to others."""
-    answer = _readable(answer)
-    shown = _drawn(answer, width, rows)
-    if not _CUT.search(shown):
-        return shown, []
-    sample = answer.limit(ROWS_SHOWN).to_arrow_table()
-    empty = [name for name in sample.column_names if sample[name].null_count == len(sample)]
-    kept = [name for name in sample.column_names if name not in empty]
-    if not empty or not kept or len(set(sample.column_names)) < len(sample.column_names):
-        return shown, []
-    names = ", ".join('"' + name.replace('"', '""') + '"' for name in kept)
-    return _drawn(answer.project(names), width, rows), empty
+    if _CUT.search(shown):
+        say("not all rows, columns or texts are shown whole. Name those to see: SELECT …; or --all")
 
 
 def _readable(answer: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
@@ -252,13 +163,13 @@ def _readable(answer: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
 
 
 def _drawn(answer: duckdb.DuckDBPyRelation, width: int, rows: int) -> str:
+    answer = _readable(answer)
     # A text as wide as all leaves other columns no room, or has none itself.
     for longest in (width, width // max(2, len(answer.columns)) - 3):
         with contextlib.redirect_stdout(io.StringIO()) as drawn:
             answer.show(max_rows=rows, max_width=width, max_col_width=longest)
-        shown = drawn.getvalue()
-        few = len(answer.columns) <= FEW_COLUMNS and _HIDDEN in shown
-        if not few and not shown.startswith(_NOTHING_FITS):
+        few = len(answer.columns) <= FEW_COLUMNS and "│ … │\n" in drawn.getvalue()
+        if not few and not drawn.getvalue().startswith("┌───┐\n│ … │"):
             break
     return drawn.getvalue().rstrip("\n")
 

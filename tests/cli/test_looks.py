@@ -102,15 +102,6 @@ ours                              0.0302
     ]
 
 
-def test_texts_of_an_answer_that_is_asked_for_whole_take_several_lines(
-    smoke_root: Path, shown: Shown
-) -> None:
-    query = "SELECT 'drive' AS what, trim(repeat('many words ', 20)) AS told"
-    words = ["--root", str(smoke_root), "sql", "--all", query]
-    lines = shown(lambda: app(words, standalone_mode=False), 80)
-    assert " ".join(lines).count("many") == 20
-
-
 def test_prose_breaks_between_words_and_commands_do_not(shown: Shown) -> None:
     lines = shown(lambda: print_text("a model of the fleet " * 20))
     assert " ".join(lines).split() == ("a model of the fleet " * 20).split()
