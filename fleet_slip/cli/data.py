@@ -6,17 +6,16 @@ import re
 import shlex
 import sys
 import tempfile
-from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
 from fleet_slip.cli.options import Cluster, command
-from fleet_slip.cli.output import Json, print_json, print_table, print_text, say
+from fleet_slip.cli.output import Json, print_json, print_records, print_text, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.resources import folder as shipped
@@ -124,7 +123,16 @@ def ingest(
         _show_previews(fleet.preview(files, mapping, as_one=as_one), json)
         return
     folders = any(map(names_several, files)) and not as_one
-    each = remarks(quiet=json or folders)
+    seen: set[tuple[str, tuple[str, ...]]] = set()
+
+    def tell(report: "IngestReport") -> None:
+        if not (json or folders):
+            say(_ingested(report))
+        for one in report.suspicions:
+            if (one.kind, one.signals) not in seen:
+                seen.add((one.kind, one.signals))
+                say(f"{report.file}: looks wrong: {one}", logging.WARNING)
+
     with (
         recording(fleet.root, "ingest", sys.argv[1:]),
         progress(*(("ingest", "files") if folders else ("read", "bytes"))) as show,
@@ -135,7 +143,7 @@ def ingest(
             as_one=as_one,
             replace="all" if replace else "no",
             workers=cluster,
-            each=each,
+            each=tell,
             progress=show,
         )
     if json:
@@ -209,33 +217,18 @@ def _summed_up(reports: "list[IngestReport]") -> str:
     )
 
 
-def remarks(*, quiet: bool) -> "Callable[[IngestReport], None]":
-    """Return what says what became of a file, unless `quiet`, and once what looks wrong in some."""
-    told: set[tuple[str, tuple[str, ...]]] = set()
-
-    def tell(report: "IngestReport") -> None:
-        if not quiet:
-            say(_ingested(report.as_dict()))
-        for one in report.suspicions:
-            if (one.kind, one.signals) not in told:
-                told.add((one.kind, one.signals))
-                say(f"{report.file}: looks wrong: {one}", logging.WARNING)
-
-    return tell
-
-
-def _ingested(report: dict[str, Any]) -> str:
-    if not report["new"] and not report["drives_forgotten"]:
-        return f"{report['file']}: nothing to do, it was ingested before"
-    reasons = ", ".join(f"{n:,} {reason}" for reason, n in report["quarantined"].items())
-    left_out, held = report["rows_left_out"], report["rows_quarantined"]
+def _ingested(report: "IngestReport") -> str:
+    if not report.new and not report.drives_forgotten:
+        return f"{report.file}: nothing to do, it was ingested before"
+    counts = report.counts
+    left_out, refused = counts.rows_left_out, counts.quarantined
+    reasons = ", ".join(f"{n:,} {reason}" for reason, n in refused.items())
     return _joined(
-        f"{report['file']}: {number_of(report['ticks'], 'row')} in "
-        f"{number_of(report['drives'], 'drive')}",
+        f"{report.file}: {number_of(counts.ticks, 'row')} in {number_of(counts.drives, 'drive')}",
         f"not as the mapping's conditions ask: {number_of(left_out, 'row')}" if left_out else "",
-        f"in quarantine: {number_of(held, 'row')} ({reasons})" if reasons else "",
-        replaced=report["drives_replaced"],
-        forgotten=report["drives_forgotten"],
+        f"in quarantine: {number_of(sum(refused.values()), 'row')} ({reasons})" if refused else "",
+        replaced=report.drives_replaced,
+        forgotten=report.drives_forgotten,
     )
 
 
@@ -246,16 +239,14 @@ def _show_previews(previews: "list[Preview]", json: bool) -> None:
     for preview in () if json else previews:
         counts = preview.counts
         rejected = ", ".join(f"{n:,} {reason}" for reason, n in counts.quarantined.items())
-        print_table(
+        print_records(
             f"{preview.file}: {number_of(counts.rows_read, 'row')}; left out by conditions "
             f"{counts.rows_left_out:,}; rejected {sum(counts.quarantined.values()):,}"
             f"{f' ({rejected})' if rejected else ''}; {number_of(counts.drives, 'drive')} of "
             f"{number_of(counts.ticks, 'tick')}",
-            ["signal", "unit", "least", "most", "missing"],
-            [
-                [one.signal, one.unit, f"{one.low:.4g}", f"{one.high:.4g}", f"{one.missing:.1%}"]
-                for one in preview.ranges
-            ],
+            "signal|unit|least|most|missing",
+            "{signal}|{unit}|{low:.4g}|{high:.4g}|{missing:.1%}",
+            preview.ranges,
             left=2,
         )
         for suspicion in preview.suspicions:
@@ -296,42 +287,11 @@ def mapping(
 
     Example: **fleet-slip mapping suggest drive.mf4**
     """
-    from fleet_slip.ingest.draft import (  # noqa: PLC0415
-        draft_mapping,
-        name_of,
-        write_draft,
-    )
-    from fleet_slip.ingest.formats.can import CanBus, read_can_database  # noqa: PLC0415 - takes a while
-    from fleet_slip.ingest.formats.reading import FileFormats  # noqa: PLC0415
-    from fleet_slip.ingest.formats.tables import DuckdbRows  # noqa: PLC0415
-    from fleet_slip.ingest.log_files import find_logs, local_copy  # noqa: PLC0415
-    from fleet_slip.ingest.profile import profile_file  # noqa: PLC0415
-
     if output is not None and output.exists():
         raise UsageError(f"{output}: it exists. Give another name, or remove it.")
-    bus = read_can_database(CanBus(database=str(can.absolute())), can.parent) if can else None
-    formats = FileFormats(can=bus, duckdb=DuckdbRows(table=table) if table else None)
-    logs = find_logs([file])
-    if len(logs) > 1:
-        raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
-    with local_copy(logs[0]) as copy:
-        draft = draft_mapping(copy, profile_file(copy, formats))
-        text = write_draft(draft, name_of(copy.stem), file)
-    if json:
-        print_json({"channels": _channels(draft), "mapping": text})
-    else:
-        _show(file, draft)
-    if output is not None:
-        with storage_errors(output):
-            output.write_text(text, encoding="utf-8")
-        say(f"draft written to {output}")
-    elif not json:
-        print_text("\n" + text)
-
-
-def _channels(draft: "Draft") -> list[dict[str, object]]:
+    draft, text = _draft(file, can, table)
     signals = {guess.profile.channel.name: name for name, guess in draft.guesses.items()}
-    return [
+    channels = [
         {
             "channel": one.channel.name,
             "unit": one.channel.unit,
@@ -344,19 +304,39 @@ def _channels(draft: "Draft") -> list[dict[str, object]]:
         }
         for one in draft.profile.profiles
     ]
+    if json:
+        print_json({"channels": channels, "mapping": text})
+    else:
+        header = "channel|unit|guess|Hz|least|most|missing"
+        row = "{channel}|{unit}|{signal}|{rate_hz:.4g}|{least:.4g}|{most:.4g}|{missing:.1%}"
+        print_records(f"{file}: {len(channels)} channels", header, row, channels, left=3)
+    if output is not None:
+        with storage_errors(output):
+            output.write_text(text, encoding="utf-8")
+        say(f"draft written to {output}")
+    elif not json:
+        print_text("\n" + text)
 
 
-def _show(file: str, draft: "Draft") -> None:
-    rows = []
-    for one in draft.profile.profiles:
-        signal = next((n for n, g in draft.guesses.items() if g.profile is one), "")
-        rate_hz = one.rate_hz or draft.time.rate_hz
-        cells = [f"{value:.4g}" for value in one.range] if one.is_number else ["text", ""]
-        missing = f"{one.missing:.1%}" if one.is_number else ""
-        rate = "" if rate_hz is None else f"{rate_hz:.4g}"
-        rows.append([one.channel.name, one.channel.unit, signal, rate, *cells, missing])
-    header = ["channel", "unit", "guess", "Hz", "least", "most", "missing"]
-    print_table(f"{file}: {len(rows)} channels", header, rows, left=3)
+def _draft(
+    file: str, can: Path | None = None, table: str | None = None, name: str | None = None
+) -> "tuple[Draft, str]":
+    """Return what a log suggests, and that as a mapping."""
+    from fleet_slip.ingest.draft import draft_mapping, name_of, write_draft  # noqa: PLC0415 - takes a while
+    from fleet_slip.ingest.formats.can import CanBus, read_can_database  # noqa: PLC0415
+    from fleet_slip.ingest.formats.reading import FileFormats  # noqa: PLC0415
+    from fleet_slip.ingest.formats.tables import DuckdbRows  # noqa: PLC0415
+    from fleet_slip.ingest.log_files import find_logs, local_copy  # noqa: PLC0415
+    from fleet_slip.ingest.profile import profile_file  # noqa: PLC0415
+
+    bus = read_can_database(CanBus(database=str(can.absolute())), can.parent) if can else None
+    formats = FileFormats(can=bus, duckdb=DuckdbRows(table=table) if table else None)
+    logs = find_logs([file])
+    if len(logs) > 1:
+        raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
+    with local_copy(logs[0]) as copy:
+        draft = draft_mapping(copy, profile_file(copy, formats))
+        return draft, write_draft(draft, name or name_of(copy.stem), file)
 
 
 # The command that writes a project of one's own: init.
@@ -387,7 +367,7 @@ def init(
     """
     if not NAME.fullmatch(model):
         raise UsageError(f"--model {model}: write it in lower-case letters, digits and _.")
-    mapping = _mapping_of(log, model) if log else _template("mapping.toml", model=model)
+    mapping = _draft(str(log), name=model)[1] if log else _template("mapping.toml", model=model)
     whole = folder.absolute()
     with storage_errors(folder):
         if whole.exists() and (not whole.is_dir() or any(whole.iterdir())):
@@ -412,19 +392,6 @@ def _write(draft: Path, whole: Path, model: str, mapping: str) -> None:
     in_cron = {key: text.replace("%", r"\%") for key, text in known.items()}  # else a line's end
     for name, names in (("README.md", known), ("crontab", in_cron)):
         (draft / name).write_text(_template(name, model=model, **names), encoding="utf-8")
-
-
-def _mapping_of(log: Path, model: str) -> str:
-    """Return the mapping that a measured log suggests."""
-    from fleet_slip.ingest.draft import (  # noqa: PLC0415
-        draft_mapping,
-        write_draft,
-    )
-    from fleet_slip.ingest.formats.reading import FileFormats  # noqa: PLC0415
-    from fleet_slip.ingest.profile import profile_file  # noqa: PLC0415
-
-    formats = FileFormats(can=None, duckdb=None)
-    return write_draft(draft_mapping(log, profile_file(log, formats)), model)
 
 
 def _template(name: str, **known: str) -> str:

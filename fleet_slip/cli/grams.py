@@ -1,7 +1,8 @@
 """Reducing logs to Gram rows, and what can be reduced: the commands gram and features."""
 
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,7 +13,7 @@ from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, FeatureSet
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.options import command
-from fleet_slip.cli.output import All, Json, print_json, print_table, say
+from fleet_slip.cli.output import All, Json, print_json, print_records, print_table, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.columns.sql import column_query
 from fleet_slip.config import read_named_file
@@ -71,23 +72,18 @@ def _run_gram(
 
 
 def _say_gram(report: "GramReport") -> None:
-    if report.changed:
+    rows = f"{number_of(report.gram_rows, 'Gram row')} in all"
+    if not report.changed:
+        return say(f"gram {report.feature_set}: nothing to do, {rows} are up to date")
+    say(
+        f"gram {report.feature_set}: {number_of(report.files_read, 'new file')}, "
+        f"{number_of(report.rows_read, 'row')} read, "
+        f"{number_of(report.files_dropped, 'file')} dropped; {rows}"
+    )
+    if dropped := report.received_dropped:
         say(
-            f"gram {report.feature_set}: {number_of(report.files_read, 'new file')}, "
-            f"{number_of(report.rows_read, 'row')} "
-            f"read, {number_of(report.files_dropped, 'file')} dropped; "
-            f"{number_of(report.gram_rows, 'Gram row')} in all"
-        )
-        if report.received_dropped:
-            say(
-                f"{number_of(report.received_dropped, 'Gram row')} that cars had sent dropped: the "
-                "logs of the same drives are here now"
-            )
-    else:
-        say(
-            f"gram {report.feature_set}: nothing to do, {number_of(report.gram_rows, 'Gram row')} "
-            "in all are "
-            "up to date"
+            f"{number_of(dropped, 'Gram row')} that cars had sent dropped: the logs of the same "
+            "drives are here now"
         )
 
 
@@ -121,6 +117,7 @@ def features(
     Example: **fleet-slip features --sql ay_mean_16**
     """
     known = known_features()
+    named = {name: known.feature_set(name) for name in (PLAIN, *known.sets)}
     if sql is not None:
         typer.echo(column_query(known, sql))
     elif files:
@@ -136,79 +133,60 @@ def features(
                     for name, one in known.features.items()
                 },
                 "sets": {
-                    name: {"identity": known.identity(name), **known.feature_set(name).model_dump()}
-                    for name in (PLAIN, *known.sets)
+                    name: {"identity": known.identity(name), **one.model_dump()}
+                    for name, one in named.items()
                 },
             }
         )
     elif sets:
-        print_table(
-            "",
-            ["set", "columns", "rows of a drive", "description"],
-            [
-                [name, " ".join(one.inputs), _parts(one), one.description]
-                for name, one in ((n, known.feature_set(n)) for n in (PLAIN, *known.sets))
-            ],
-            left=4,
-        )
-    elif not everything:
-        _print_families(known)
+        rows = [[n, " ".join(one.inputs), _parts(one), one.description] for n, one in named.items()]
+        print_table("", ["set", "columns", "rows of a drive", "description"], rows, left=4)
     else:
-        print_table(
-            "",
-            ["feature", "unit", "scale", "from", "description"],
-            [
-                [name, one.unit, str(one.scale), " ".join(one.inputs), one.description]
-                for name, one in known.features.items()
-            ],
-            left=5,
-        )
-        print_table(
-            "\ncolumns over time",
-            ["column", "unit", "scale", "of", "description"],
-            [
-                [name, one.unit, str(one.scale), one.definition.of, one.description]
-                for name, one in known.time_columns.items()
-            ],
-            left=5,
-        )
+        header, row = "feature|unit|description", "{name}|{unit}|{description}"
+        if everything:
+            header, row = "feature|unit|scale|description", "{name}|{unit}|{scale}|{description}"
+        print_records("", header, row, _named(known.features), left=4)
+        if everything:
+            title = "\ncolumns over time"
+            print_records(
+                title, header.replace("feature", "column"), row, _named(known.time_columns), left=4
+            )
+        else:
+            _print_families(known)
+
+
+def _named(columns: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    for name, one in columns.items():
+        yield {"name": name, "unit": one.unit, "scale": one.scale, "description": one.description}
 
 
 def _print_families(known: FeatureCatalogue) -> None:
-    """Print features, and columns over time by family: one by one they are hundreds."""
-    print_table(
-        "",
-        ["feature", "unit", "description"],
-        [[name, one.unit, one.description] for name, one in known.features.items()],
-        left=3,
-    )
-    families = {
-        name: (" ".join(map(str, window.members(name).values())), window.description)
-        for name, window in known.windows.items()
-    }
+    """Print columns over time by family: one by one they are hundreds."""
+    families = [
+        [name, " ".join(map(str, one.members(name).values())), one.description]
+        for name, one in known.windows.items()
+    ]
     single = {**known.factors, **known.calibrated}
-    families |= {name: ("", known.time_columns[name].description) for name in single}
-    families |= {f"COLUMN_{name}_…": ("", gate.description) for name, gate in known.gates.items()}
-    print_table(
-        f"\n{number_of(len(known.time_columns), 'column')} over time; one by one: --all",
-        ["column", "over ticks", "description"],
-        [[name, *told] for name, told in families.items()],
-        left=3,
-    )
+    families += [[name, "", known.time_columns[name].description] for name in single]
+    families += [[f"COLUMN_{name}_…", "", gate.description] for name, gate in known.gates.items()]
+    many = number_of(len(known.time_columns), "column")
+    header = ["column", "over ticks", "description"]
+    print_table(f"\n{many} over time; one by one: --all", header, families, left=3)
 
 
 def _print_files(json: bool) -> None:
     own = own_configs()
-    found = {name: file for name, file in config_files().items() if read_named_file(file)}
-    whose = {
-        name: "own" if own and str(file).startswith(str(own)) else "shipped"
-        for name, file in found.items()
+    found = {
+        name: {"from": "own" if own and file.is_relative_to(own) else "shipped", "path": str(file)}
+        for name, file in config_files().items()
+        if read_named_file(file)
     }
     if json:
-        print_json({name: {"from": whose[name], "path": str(file)} for name, file in found.items()})
-        return
-    heading = f"own configs: {own or 'none'}\nshipped ones: {folder('configs')}"
-    print_table(heading, ["file", "from"], [*map(list, whose.items())], left=2)
+        print_json(found)
+    else:
+        heading = f"own configs: {own or 'none'}\nshipped ones: {folder('configs')}"
+        rows = [[name, one["from"]] for name, one in found.items()]
+        print_table(heading, ["file", "from"], rows, left=2)
 
 
 def _parts(one: FeatureSet) -> str:
