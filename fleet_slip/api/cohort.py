@@ -1,22 +1,35 @@
 """Drives that satisfy a condition, and what Gram rows tell of them."""
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated
+
+from typing_extensions import Doc
 
 from fleet_slip.api.calls import Rooted, open_workers, takes
-from fleet_slip.api.requests import DiagnosisRequest, ExaminedRequest, RegimesRequest, WhatIfRequest
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.errors import UsageError
-from fleet_slip.models.request import SelectionRequest
+from fleet_slip.models.registry import ModelVersion, Registry
+from fleet_slip.models.request import CLUSTER, WHOLE_SET, SelectionRequest, inputs_of
+from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
-    from fleet_slip.api.requests import ExaminedModel
     from fleet_slip.evaluation.identify import Identified
     from fleet_slip.grams.cohort import Cohort
     from fleet_slip.models.diagnose import Diagnosis, WhatIf
-    from fleet_slip.models.regimes import RegimeComparison
     from fleet_slip.models.select import RequestedSelection
     from fleet_slip.operations.examined import Examined
+
+OR_SIGNALS = Doc(
+    "NAME, NAME@VERSION or NAME@ALIAS of a published model. Default: the only one that there is, "
+    "unless `signals` is given."
+)
+SIGNALS = Doc(
+    "Instead of a published model: signals to fit, separated by commas; 'catalogue' is all inputs."
+)
+OF_SIGNALS = Doc("Feature set that `signals` are of. Default: the logged signals.")
 
 
 class FleetCohort(Rooted):
@@ -63,26 +76,51 @@ class FleetCohort(Rooted):
             answer = answer_request(self.warehouse, request, examined.cohort)
         return replace(answer, examined=str(examined))
 
-    @takes(DiagnosisRequest)
-    def diagnose(self, request: DiagnosisRequest) -> "Diagnosis":
+    def diagnose(
+        self,
+        model: Annotated["str | ModelVersion | None", OR_SIGNALS] = None,
+        *,
+        signals: Annotated[str | None, SIGNALS] = None,
+        features: Annotated[str | None, OF_SIGNALS] = None,
+        against: Annotated[
+            str | None, Doc("Condition of another cohort: does it have the same coefficients?")
+        ] = None,
+        cluster: Annotated[ClusterUnit | None, CLUSTER] = None,
+    ) -> "Diagnosis":
         """Fit a model's signals to the cohort and examine the fit.
 
         Raises `UsageError` for both a model and signals, and what `Fleet.model` raises.
         """
         from fleet_slip.models.diagnose import diagnose
 
-        examined = self._examined(request)
-        cohort, against = self._load(examined.feature_set), request.against
+        examined = self._examined(model, signals, features)
+        cohort = self._load(examined.feature_set)
         return diagnose(
             cohort,
             examined.inputs(cohort),
             against=self._load(examined.feature_set, against) if against else None,
-            cluster=request.cluster,
+            cluster=cluster,
             intercept=examined.intercept,
         )
 
-    @takes(WhatIfRequest)
-    def what_if(self, request: WhatIfRequest) -> "WhatIf":
+    def what_if(
+        self,
+        model: Annotated["str | ModelVersion | None", OR_SIGNALS] = None,
+        *,
+        signals: Annotated[str | None, SIGNALS] = None,
+        features: Annotated[str | None, OF_SIGNALS] = None,
+        noise: Annotated[
+            Mapping[str, float] | None,
+            Doc(
+                "Standard deviation of white noise that is added, in SI units, such as ay=0.2, "
+                "once for each signal."
+            ),
+        ] = None,
+        bias: Annotated[
+            Mapping[str, float] | None,
+            Doc("Bias that is added, in SI units, such as yaw_rate=0.02, once for each signal."),
+        ] = None,
+    ) -> "WhatIf":
         """Predict a model's error with worse sensors, in closed form, and the best model for these.
 
         Raises `UsageError` if nothing is added or both a model and signals are named,
@@ -93,41 +131,20 @@ class FleetCohort(Rooted):
         from fleet_slip.models.predict import counts_model
         from fleet_slip.regression.least_squares import fit
 
-        noise, bias = request.noise or {}, request.bias or {}
         if not noise and not bias:
             raise UsageError(
                 "say what is added: noise such as ay=0.2, or bias such as yaw_rate=0.02."
             )
-        examined = self._examined(request)
+        examined = self._examined(model, signals, features)
         cohort = self._load(examined.feature_set)
         if examined.version is not None:
             one = counts_model(examined.version.manifest)
         else:
             inputs = examined.inputs(cohort)
             one = fit(cohort.serving(inputs).table.total(), inputs, catalogue().label).model
-        return what_if(cohort, one, bias=bias, noise=noise, intercept=examined.intercept)
-
-    @takes(RegimesRequest)
-    def regimes(self, request: RegimesRequest) -> "RegimeComparison":
-        """Return a model's error by speed and lateral acceleration, and whether to split it there.
-
-        One model for all rows is cross-validated against one a regime, from what
-        `fleet.gram("regimes")` makes. Raises `UsageError` for both a model and signals, and
-        `DataError` for a feature set without such regimes.
-        """
-        from fleet_slip.grams.folding import Folding, make_folding
-        from fleet_slip.models.regimes import compare_regimes, divided_set
-        from fleet_slip.models.request import WHOLE_SET, inputs_of, parse_worth
-
-        gain, signals = parse_worth(request.worth), request.signals
-        if request.model is not None:
-            version = self._examined(ExaminedRequest(request.model, signals=signals)).version
-            signals = ",".join(version.manifest.signals) if version else None
-        features = request.features or divided_set(signals)
-        folding = make_folding(request.by, request.folds, Folding().count)
-        cohort = self._load(features)
-        inputs = inputs_of(cohort, signals or WHOLE_SET)
-        return compare_regimes(cohort, inputs, folding, request.over, gain)
+        return what_if(
+            cohort, one, bias=bias or {}, noise=noise or {}, intercept=examined.intercept
+        )
 
     def identify(self, name: str, *, threads: int | None = None, **measured: float) -> "Identified":
         """Identify the tyres and the yaw inertia of the car that made the cohort's drives.
@@ -157,8 +174,37 @@ class FleetCohort(Rooted):
 
         return load_cohort(self.warehouse, condition or self.condition, feature_set)
 
-    def _examined(self, request: ExaminedRequest) -> "ExaminedModel":
-        from fleet_slip.api.requests import subject_of
-        from fleet_slip.models.registry import Registry
+    def _examined(
+        self, model: str | ModelVersion | None, signals: str | None, features: str | None
+    ) -> "ExaminedModel":
+        """Return what is examined. Raises `UsageError` for both a model and signals."""
+        registry = Registry(self.root / "models")
+        if signals is not None or features is not None:
+            if model is not None:
+                raise UsageError("name a published model or signals (of a feature set), not both.")
+            return ExaminedModel(features or PLAIN, signals, None)
+        if model is None:
+            model = registry.only(", or signals")
+        version = model if isinstance(model, ModelVersion) else registry.resolve(model)
+        identity = version.manifest.trained_on.feature_set
+        return ExaminedModel(known_features().name_of(identity), None, version)
 
-        return subject_of(Registry(self.root / "models"), request)
+
+@dataclass(frozen=True)
+class ExaminedModel:
+    """The inputs of a published model, by default the only one, or named ones."""
+
+    feature_set: str
+    named: str | None
+    version: ModelVersion | None
+
+    @property
+    def intercept(self) -> bool:
+        """Whether the model has one; inputs that are named alone have."""
+        return self.version is None or not self.version.manifest.through_origin
+
+    def inputs(self, cohort: "Cohort") -> tuple[str, ...]:
+        """Return the inputs; all that the cohort has, if that was asked for."""
+        if self.version is not None:
+            return self.version.manifest.signals
+        return inputs_of(cohort, self.named or WHOLE_SET)

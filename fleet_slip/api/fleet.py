@@ -1,16 +1,29 @@
 """A fleet's warehouse in Python."""
 
 import time
+from collections.abc import Callable
+from datetime import date
 from typing import TYPE_CHECKING, Annotated
 
-from fleet_slip.api.calls import of_step, open_workers, record_call, takes
+from typing_extensions import Doc
+
+from fleet_slip.api.calls import ShowStep, Workers, of_step, open_workers, record_call, takes
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.logs import LogsAndGrams
 from fleet_slip.api.operations import HealthAndUpkeep
-from fleet_slip.api.requests import COHORT, UNEXAMINED, NightRequest, RunRequest
+from fleet_slip.api.requests import (
+    CAMPAIGN,
+    COHORT,
+    DAYS,
+    MODELS,
+    THROUGH,
+    UNEXAMINED,
+    NightRequest,
+)
 from fleet_slip.catalogue.facts import CALIBRATION, DELAY, TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.models.manifest import require_model_name
+from fleet_slip.models.request import DEFAULT_MODELS, WORTH
 from fleet_slip.storage.runs import step
 
 if TYPE_CHECKING:
@@ -18,6 +31,7 @@ if TYPE_CHECKING:
 
     from fleet_slip.api.session import RunReport, Session
     from fleet_slip.operations.night import NightReport
+    from fleet_slip.simulation.campaign import Campaign
 
 
 class Fleet(LogsAndGrams, HealthAndUpkeep):
@@ -73,8 +87,19 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         return FleetCohort(self.warehouse, condition, unexamined)
 
     @record_call
-    @takes(RunRequest)
-    def run(self, request: RunRequest) -> "RunReport":
+    def run(
+        self,
+        campaign: Annotated["str | Campaign", CAMPAIGN] = "waterford",
+        *,
+        days: Annotated[int | None, DAYS] = None,
+        through: Annotated[date | str | None, THROUGH] = None,
+        name: Annotated[str | None, Doc("Name of the model. Default: the campaign's.")] = None,
+        models: Annotated[str, MODELS] = DEFAULT_MODELS,
+        worth: Annotated[str | None, WORTH] = None,
+        workers: Workers = None,
+        progress: ShowStep | None = None,
+        waiting: Callable[[], None] = lambda: None,
+    ) -> "RunReport":
         """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
 
         It can be repeated at any time, and after any interruption: what is done is not done again.
@@ -89,39 +114,35 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         from fleet_slip.simulation.campaign import load_campaign
 
         begun = time.monotonic()
-        chosen = request.campaign
-        if isinstance(chosen, str):
-            chosen = load_campaign(chosen)
-        model_name = require_model_name(request.name or chosen.name)
-        parse_worth(request.worth)  # before anything is written
+        chosen = load_campaign(campaign) if isinstance(campaign, str) else campaign
+        model_name = require_model_name(name or chosen.name)
+        parse_worth(worth)  # before anything is written
         condition = f"campaign = '{chosen.name}'"
-        with self.root.exclusive(f".run-{chosen.name}.lock", request.waiting):
-            with open_workers(self.root, request.workers) as executor:
+        with self.root.exclusive(f".run-{chosen.name}.lock", waiting):
+            with open_workers(self.root, workers) as executor:
                 simulation = self.simulate(
                     chosen,
-                    days=request.days,
-                    through=request.through,
+                    days=days,
+                    through=through,
                     workers=executor,
-                    progress=of_step(request.progress, f"simulate {chosen.name}"),
+                    progress=of_step(progress, f"simulate {chosen.name}"),
                 )
-                gram = self.gram(
-                    workers=executor, progress=of_step(request.progress, f"gram {PLAIN}")
-                )
-                feature_set = load_model_list(request.models).features
+                gram = self.gram(workers=executor, progress=of_step(progress, f"gram {PLAIN}"))
+                feature_set = load_model_list(models).features
                 wide = None
                 if feature_set != PLAIN:
                     wide = self.gram(
                         feature_set,
                         cohort=condition,
                         workers=executor,
-                        progress=of_step(request.progress, f"gram {feature_set}"),
+                        progress=of_step(progress, f"gram {feature_set}"),
                     )
                 if features().feature_set(feature_set).change_ticks:
                     # What the intercept follows from, and whether the course came in time.
                     for name_of_set in (CALIBRATION, DELAY):
                         self.gram(name_of_set, cohort=condition, workers=executor)
             refusal, selection = "", None
-            training = Training(model_name, condition, request.models, request.worth)
+            training = Training(model_name, condition, models, worth)
             publication = training.made_already(self)
             if publication is None:
                 with step("select"):

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 from typing_extensions import Doc
 
@@ -13,12 +13,11 @@ from fleet_slip.api.calls import (
     count_from_start,
     open_workers,
     record_call,
-    takes,
     unless_local,
     within_reach,
 )
 from fleet_slip.api.models import JudgedModels
-from fleet_slip.api.requests import COHORT, MODEL, ForgetRequest
+from fleet_slip.api.requests import COHORT, MODEL
 from fleet_slip.base import Record, date_of
 from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from fleet_slip.grams.calibration import Calibration
     from fleet_slip.models.registry import ModelVersion
     from fleet_slip.operations.find_drives import VacuumReport
-    from fleet_slip.operations.forget import ForgetReport
+    from fleet_slip.operations.forget import Calling, ForgetReport
     from fleet_slip.operations.monitor import Chart
     from fleet_slip.operations.quality import QualityReport
     from fleet_slip.operations.retention import RetentionReport
@@ -170,8 +169,20 @@ class HealthAndUpkeep(JudgedModels):
         return Compacted(report, removed)
 
     @record_call
-    @takes(ForgetRequest)
-    def forget(self, request: ForgetRequest) -> "ForgetReport":
+    def forget(
+        self,
+        *,
+        vehicle: Annotated[str | None, Doc("The vehicle_id to forget.")] = None,
+        drive: Annotated[str | None, Doc("The drive_id to forget.")] = None,
+        drive_name: Annotated[
+            str | None, Doc("The drive_name whose drives are to be forgotten.")
+        ] = None,
+        source_file: Annotated[
+            str | None, Doc("The source_file whose drives are to be forgotten.")
+        ] = None,
+        now: Annotated[bool, Doc("Delete the old files at once; compact would later.")] = False,
+        progress: ShowProgress | None = None,
+    ) -> "ForgetReport":
         """Forget a vehicle, a drive, or drives of a name or file; mark their models.
 
         They leave logs, Gram rows and quarantine, and no job brings them back until `allow`. Others
@@ -182,15 +193,17 @@ class HealthAndUpkeep(JudgedModels):
         from fleet_slip.operations.forget import forget, forget_called
         from fleet_slip.warehouse.forgotten import Forgettable
 
-        kind, value = request.subject
-        now, told = request.now, count_from_start(request.progress)
+        kind, value = _only(
+            vehicle=vehicle, drive=drive, drive_name=drive_name, source_file=source_file
+        )
+        shown = count_from_start(progress)
         with step("forget") as figures:
-            match kind:
-                case "drive_name" | "source_file":
-                    report = forget_called(self.warehouse, kind, value, now=now, progress=told)
-                case _:
-                    subject = Forgettable(kind, value)
-                    report = forget(self.warehouse, subject, now=now, progress=told)
+            if kind in ("drive_name", "source_file"):
+                calling = cast("Calling", kind)
+                report = forget_called(self.warehouse, calling, value, now=now, progress=shown)
+            else:
+                subject = Forgettable("drive" if kind == "drive" else "vehicle", value)
+                report = forget(self.warehouse, subject, now=now, progress=shown)
             figures.rows = report.rows
         return report
 
@@ -210,11 +223,7 @@ class HealthAndUpkeep(JudgedModels):
         """
         from fleet_slip.warehouse.forgotten import Audit, Forgettable
 
-        asked = {"vehicle": vehicle, "drive": drive, "source_file": source_file}
-        given = [(kind, name) for kind, name in asked.items() if name is not None]
-        if len(given) != 1:
-            raise UsageError("give one of vehicle, drive and source_file.")
-        [(kind, name)] = given
+        kind, name = _only(vehicle=vehicle, drive=drive, source_file=source_file)
         self.warehouse.require()
         audit, states = Audit(self.root), set[str]()
         if kind == "source_file":
@@ -257,3 +266,11 @@ class HealthAndUpkeep(JudgedModels):
             report = retain(self.warehouse, load_retention(config), date.today(), told)
             figures.rows, figures.size_bytes = report.forgotten.rows, report.vacuumed.size_bytes
         return report
+
+
+def _only(**asked: str | None) -> tuple[str, str]:
+    """Return the one that is given, and its name. Raises `UsageError` for none and for several."""
+    given = [(kind, name) for kind, name in asked.items() if name is not None]
+    if len(given) != 1:
+        raise UsageError(f"give one of {', '.join(asked)}.")
+    return given[0]

@@ -77,7 +77,6 @@ GROUPS = {
         "watch": "accuracy",
         "explore": "accuracy",
         "diagnose": "statistics",
-        "regimes": "statistics",
         "what-if": "statistics",
     },
     "Operations": {

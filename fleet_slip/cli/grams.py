@@ -177,7 +177,10 @@ def _print_families(known: FeatureCatalogue) -> None:
 def _print_files(json: bool) -> None:
     own = own_configs()
     found = {
-        name: {"from": "own" if own and file.is_relative_to(own) else "shipped", "path": str(file)}
+        name: {
+            "from": "own" if own and str(file).startswith(str(own)) else "shipped",
+            "path": str(file),
+        }
         for name, file in config_files().items()
         if read_named_file(file)
     }

@@ -1,7 +1,5 @@
 """The command diagnose: a model's coefficients on a cohort, and how far to trust them."""
 
-import math
-
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
@@ -11,7 +9,6 @@ from fleet_slip.cli.options import command
 from fleet_slip.cli.output import figures_cells, print_line, print_table, say
 from fleet_slip.cli.selection import say_influential
 from fleet_slip.models.diagnose import CohortComparison, Diagnosis, WhatIf
-from fleet_slip.models.regimes import RegimeComparison
 from fleet_slip.regression.inference import INTERCEPT, Estimate
 
 SOUND = ("unexamined",)
@@ -102,48 +99,6 @@ def _degrees(many: float) -> str:
 def _standardised(here: Estimate, there: Estimate) -> float:
     spread = float((here.standard_error**2 + there.standard_error**2) ** 0.5)
     return (there.value - here.value) / spread
-
-
-# The command that shows a model's error by regime: regimes.
-
-
-@command(Fleet.cohort, FleetCohort.regimes, arguments=["model"], without=SOUND, echo=["condition"])
-def regimes(result: RegimeComparison, by: str) -> None:
-    """Show a model's error by speed and lateral acceleration, and whether to split it there.
-
-    One model for all rows is cross-validated against one for each regime. Needs Gram rows by
-    regime: **fleet-slip gram --features regimes**
-
-    Example: **fleet-slip regimes --over speed**
-    """
-    print_table(
-        f"{number_of(result.drives, 'drive')}, {number_of(result.folds, 'fold')} by {by}: "
-        f"{' '.join(result.signals)}",
-        ["regime", "rows", "share", "pooled RMSE deg", "std", "split RMSE deg", "std", ""],
-        [
-            [
-                one.name,
-                f"{one.rows:,}",
-                f"{one.share:.1%}",
-                f"{one.pooled.rmse_deg:.4f}",
-                f"{one.pooled.error_std_deg:.4f}",
-                f"{one.split.rmse_deg:.4f}",
-                f"{one.split.error_std_deg:.4f}",
-                "" if one.own else "too few rows",
-            ]
-            for one in result.regimes
-        ],
-    )
-    one, own = result.pooled, result.split
-    better = "a model for each regime" if result.split_wins else "one model for all"
-    print_line(
-        f"one model: correlation {one.correlation:.4f}, RMSE {one.rmse_deg:.4f} deg; one for each "
-        f"regime: {own.correlation:.4f}, {own.rmse_deg:.4f} deg. Over the folds, splitting adds "
-        f"{result.gain:+.4f} +- {result.gain_standard_error:.4f} to the correlation and takes "
-        f"{math.degrees(result.rmse_gain):.4f} +- "
-        f"{math.degrees(result.rmse_gain_standard_error):.4f} deg from the RMSE; worth having is "
-        f"{result.worth}. Choose {better}."
-    )
 
 
 # The command that predicts a model's error with worse sensors: what-if.

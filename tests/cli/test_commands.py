@@ -220,7 +220,6 @@ FORGED = (
         (["publish", "forged", "--cohort", FORGED], 5, "not valid SQL"),
         (["diagnose", "smoke", "--against", "day < now()"], 5, "must mean the same for ever"),
         (["what-if", "smoke", "--cohort", "EXISTS (FROM log)", "--bias", "ay=1"], 5, "subquery"),
-        (["regimes", "--cohort", "n > 1"], 5, "names the column 'n'"),
         (["quality", "--cohort", "true) OR (true"], 5, "not valid SQL"),
         (["monitor", "smoke", "--cohort", "true UNION SELECT 1"], 5, "not valid SQL"),
         (["score", "smoke", "--cohort", "true) OR (true"], 5, "not valid SQL"),

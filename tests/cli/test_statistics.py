@@ -210,47 +210,6 @@ def test_what_if_agrees_with_a_campaign_of_doubled_noise(
     assert moved == pytest.approx(math.degrees(weight * 0.5), rel=1e-9)
 
 
-def test_regimes_compare_one_model_with_one_for_each(
-    run_command: RunCommand, every_set: Path
-) -> None:
-    arguments = ("regimes", "--over", "speed", "--signals", "ay,steer_fl,yaw_rate")
-    report = run_command(*arguments, "--json", root=every_set).json
-    rows = [one["rows"] for one in report["regimes"]]
-    assert sum(rows) == report["pooled"]["rows"] == report["split"]["rows"]
-    squares = sum(
-        n * one["pooled"]["rmse_deg"] ** 2 for n, one in zip(rows, report["regimes"], strict=True)
-    )
-    assert math.sqrt(squares / sum(rows)) == pytest.approx(report["pooled"]["rmse_deg"], rel=1e-9)
-    whole = run_command(
-        "select", "--nested", "ay,steer_fl,yaw_rate", "--json", root=every_set
-    ).json["models"][-1]
-    assert report["pooled"]["correlation"] == pytest.approx(whole["correlation"], rel=1e-12)
-    gain = report["rmse_gain_deg"]
-    assert gain == pytest.approx(
-        report["pooled"]["rmse_deg"] - report["split"]["rmse_deg"], rel=1e-6
-    )
-    assert report["worth"] == "0.025 deg"
-    asked = run_command(*arguments, "--worth", "2%", "--json", root=every_set).json
-    assert asked["worth"] == "2 % of the best"
-    assert run_command(*arguments, "--worth", "much", root=every_set).exit_code == 2
-    assert "Choose" in run_command(*arguments, root=every_set).stdout
-
-
-@pytest.mark.parametrize(
-    ("signals", "worth", "winner"),
-    [
-        ("ay", "0.025deg", "split"),  # slip per lateral acceleration is another at each speed
-        ("ay", "10deg", "pooled"),  # more than it gains
-        ("ay,steer_fl,yaw_rate", "0.025deg", "pooled"),  # it loses
-    ],
-)
-def test_regimes_are_split_where_that_gains_what_it_is_worth(
-    run_command: RunCommand, every_set: Path, signals: str, worth: str, winner: str
-) -> None:
-    asked = ("regimes", "--over", "speed", "--signals", signals, "--worth", worth, "--json")
-    assert run_command(*asked, root=every_set).json["winner"] == winner
-
-
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "message"),
     [
@@ -268,9 +227,6 @@ def test_regimes_are_split_where_that_gains_what_it_is_worth(
         (["what-if", "smoke", "--noise", "vx=1"], 5, "noise is given for vx"),
         (["what-if", "nothing", "--noise", "ay=1"], 5, "no model is called"),
         (["what-if", "smoke", "--signals", "ay", "--noise", "ay=1"], 2, "not both"),
-        (["regimes", "--over", "mood"], 5, "it has speed, ay"),
-        (["regimes", "--by", "row"], 5, "fold by drive"),
-        (["regimes", "--features", "motion"], 5, "Sets with regimes: regimes"),
         (["diagnose", "--signals", "ay,ay"], 2, "stands twice"),
         (["diagnose", "smoke", "--against", "speed_factor > 0.85"], 5, "AND NOT (speed_factor"),
     ],
@@ -311,7 +267,7 @@ def test_features_are_listed(run_command: RunCommand) -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        *(f"{command} --folds 1001" for command in ("select", "regimes", "publish m")),
+        *(f"{command} --folds 1001" for command in ("select", "publish m")),
         *(f"select --folds {folds}" for folds in ("1", "-3", "few", "each --by row")),
     ],
 )
@@ -415,20 +371,6 @@ def test_a_model_through_the_origin_is_published_as_one(
             f"SELECT degrees(sqrt(avg(({terms} - sideslip_rad) ** 2))) FROM log"
         ).fetchone()
     assert by_hand == (pytest.approx(scored["rmse_deg"], rel=1e-9),)
-
-
-def test_a_cohort_is_divided_whose_files_alone_have_gram_rows_by_regime(
-    run_command: RunCommand, smoke_root: Path, tmp_path: Path
-) -> None:
-    root = tmp_path / "copy"
-    shutil.copytree(smoke_root, root)
-    first = ("--cohort", "day = '2024-05-01'")
-    assert run_command("gram", "--features", "regimes", *first, root=root).exit_code == 0
-    asked = ("regimes", "--signals", "ay,steer_fl", "--json")
-    assert run_command(*asked, *first, root=root).json["drives"] == 4
-    refused = run_command(*asked, root=root)
-    assert refused.exit_code != 0
-    assert "has not been computed for 2 of 4 log files" in refused.stderr
 
 
 def test_a_set_is_not_asked_of_drives_that_no_gram_row_names(
