@@ -88,9 +88,7 @@ def own_clock(folder: Path, name: str) -> tuple[Path, Mapping]:
 
 
 @pytest.mark.usefixtures("in_process")
-@pytest.mark.parametrize(
-    "name", ["log.mf4", "log.tdms", "log.mcap", "log.blf", "log.asc", "log.log"]
-)
+@pytest.mark.parametrize("name", ["log.mf4", "log.tdms", "log.mcap", "log.asc"])
 def test_a_file_with_a_clock_tells_bytes_too(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
