@@ -29,7 +29,7 @@ SUFFIXES = (
 )  # fmt: skip
 
 _HIDDEN = re.compile(r"/\.(?!\.?(/|$))")
-"""A part of a path that begins with a point, and is not `.` or `..`: those are told as faults."""
+"""A part of a path that begins with a point, and is not `.` or `..`: those are faults."""
 
 WILDCARDS = frozenset("*?[")
 
@@ -141,7 +141,7 @@ def parts_of(log: Path) -> list[Path]:
 
 
 def size_of(log: Log) -> int:
-    """Return the bytes of a log, for its progress; 0 of what only reading it would tell."""
+    """Return the bytes of a log, for its progress; 0 where only reading it would show it."""
     if not isinstance(log, Path):
         return getattr(log, "size_bytes", 0)
     try:
@@ -264,6 +264,3 @@ def local_copy(log: Log) -> Iterator[Path]:
     """Give the file to read one log from. Raises what opening it raises."""
     with local_copies([log]) as open_copy, open_copy(log) as file:
         yield file
-
-
-# Files that commands read from an object store: found by URL, and copied to be read.

@@ -155,17 +155,8 @@ def _is_of_parts(copy: Path, tag: str) -> bool:
     """Whether a tag is the MD5 of the MD5s of N parts, of any size that uploaders choose."""
     stated, _, number = tag.partition("-")
     size, parts = copy.stat().st_size, int(number or 0)
-    if not parts:
-        return False
-    for unit in (2**20, 10**6):
-        for length in {_rounded_up(size, parts * unit) * unit, *(n * unit for n in _PART_SIZES)}:
-            if _rounded_up(size, length) == parts and _md5_of_parts(copy, length) == stated:
-                return True
-    return False
-
-
-def _rounded_up(size: int, length: int) -> int:
-    return -(-size // length)
+    lengths = (one * unit for unit in (2**20, 10**6) for one in _PART_SIZES)
+    return any(-(-size // n) == parts and _md5_of_parts(copy, n) == stated for n in lengths)
 
 
 def _md5_of_parts(copy: Path, length: int) -> str:

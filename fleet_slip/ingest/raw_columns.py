@@ -180,16 +180,11 @@ class _Lasting:
 
     def hold(self, rows: pl.DataFrame) -> pl.Series:
         """Return the last value at the place of each row of a window, null if it is too old."""
-        said = rows.filter(self._says).select(_RIGHT, self._name)
-        known = pl.concat([*self._last, said])
+        said = rows.filter(self._says).select(_RIGHT, pl.col(self._name).alias(HELD + self._name))
+        known = pl.concat([*self._last, said]).set_sorted(_RIGHT)
         self._last = [known.tail(1)]
-        if not known.height:
-            return pl.Series(HELD + self._name, [None] * rows.height, known[self._name].dtype)
-        time_s, at_s = known[_RIGHT].to_numpy(), rows[_RIGHT].to_numpy()
-        last = np.searchsorted(time_s, at_s, side="right") - 1
-        lasts = (last >= 0) & (at_s - time_s[np.maximum(last, 0)] <= self._longest_s)
-        held = known[self._name].gather(np.maximum(last, 0)).set(pl.Series(~lasts), None)
-        return held.alias(HELD + self._name)
+        held = rows.select(_RIGHT).join_asof(known, on=_RIGHT, tolerance=self._longest_s)
+        return held[HELD + self._name]
 
 
 RAW = "raw "
@@ -262,8 +257,8 @@ def as_number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr
             number = text.cast(pl.Float64, strict=False)
             if not absent:
                 return raw, number, text.is_not_null()
-            is_told = text.is_not_null() & ~number.is_in(absent).fill_null(value=False)
-            return raw, pl.when(is_told).then(number), is_told
+            is_present = text.is_not_null() & ~number.is_in(absent).fill_null(value=False)
+            return raw, pl.when(is_present).then(number), is_present
         case pl.Float64:
             number = pl.when(~raw.is_in(absent)).then(raw) if absent else raw
             return raw, number, pl.lit(value=False)
@@ -458,10 +453,10 @@ def _signed(
     raw, number, present = as_number(column, schema, mapping)
     if source.sign is None:
         return raw, number, present
-    told = as_text(find_held(source.sign.column, schema), schema, mapping)
-    negative = told == str(source.sign.negative)
-    signed = pl.when(negative).then(-number).when(told.is_not_null()).then(number)
-    return raw, signed, present & told.is_not_null()
+    sign = as_text(find_held(source.sign.column, schema), schema, mapping)
+    negative = sign == str(source.sign.negative)
+    signed = pl.when(negative).then(-number).when(sign.is_not_null()).then(number)
+    return raw, signed, present & sign.is_not_null()
 
 
 def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:

@@ -370,7 +370,7 @@ class CanSource(FormatSource):
         """Keep the frames of the wanted messages, and note the numbers of all."""
         if self._file.suffix.lower() not in SUFFIXES:
             raise InputError(
-                f"{shown(self._file)}: the suffix tells the format of a CAN trace: "
+                f"{shown(self._file)}: the suffix names the format of a CAN trace: "
                 f"{', '.join(sorted(SUFFIXES))}. Name it as what it is."
             )
         with reading_with(self._file, "can") as can, can.LogReader(self._file) as trace:

@@ -29,7 +29,7 @@ from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import polars as pl
 
@@ -38,16 +38,25 @@ from fleet_slip.errors import FleetSlipError, is_lack_of_memory
 from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.source import Base, Budget, Source
 
+
+class Format(NamedTuple):
+    """What a file of a format begins with, which module opens it, and what that imports."""
+
+    begins: tuple[bytes, ...]
+    module: str
+    packages: tuple[str, ...]
+
+
 FORMATS = {
-    "mdf": ("mdf", "asammdf"),
-    "mdf_bus": ("mdf", "asammdf", "cantools"),
-    "mcap": ("mcap", "mcap.stream_reader", "mcap_ros2.decoder"),
-    "tdms": ("tdms", "nptdms"),
-    "mat": ("matlab", "scipy.io"),
-    "mat73": ("matlab", "h5py"),
-    "can_trace": ("can_files", "can", "cantools"),
+    "mdf": Format((b"MDF     ", b"UnFinMF "), "mdf", ("asammdf",)),
+    "mdf_bus": Format((), "mdf", ("asammdf", "cantools")),
+    "mcap": Format((b"\x89MCAP0\r\n",), "mcap", ("mcap.stream_reader", "mcap_ros2.decoder")),
+    "tdms": Format((b"TDSm",), "tdms", ("nptdms",)),
+    "mat": Format((b"MATLAB 5.0 MAT-file",), "matlab", ("scipy.io",)),
+    "mat73": Format((b"\x89HDF\r\n\x1a\n",), "matlab", ("h5py",)),
+    "can_trace": Format((b"LOGG",), "can_files", ("can", "cantools")),
 }
-"""By format the module that has `open_FORMAT`, and what that imports of other people's."""
+"""Each has `open_FORMAT` in its module."""
 SIZES = struct.Struct("<QQ")
 
 
@@ -68,7 +77,7 @@ class Job:
 
 def open_here(name: str, bus: CanBus | None, budget: Budget) -> AbstractContextManager[Source]:
     """Open a file of a format in this process. Raises `InputError`."""
-    module = importlib.import_module(f"{__package__}.{FORMATS[name][0]}")
+    module = importlib.import_module(f"{__package__}.{FORMATS[name].module}")
     given = [budget] if bus is None else [bus, budget]
     source: AbstractContextManager[Source] = getattr(module, f"open_{name}")(*given)
     return source
@@ -83,7 +92,7 @@ def serve(control: int) -> None:
             name, given, *_ = socket.recv_fds(asking, 100, 2)
             if not given:
                 return
-            module, *packages = FORMATS[name.decode()]
+            _, module, packages = FORMATS[name.decode()]
             importlib.import_module(f"{__package__}.{module}")
             for package in packages:
                 with contextlib.suppress(ImportError):  # who reads says which one is missing
@@ -292,7 +301,7 @@ def _close_files(file: str, folder: str) -> None:
 
 
 def _readable() -> Iterator[tuple[str, int]]:
-    """Yield what the libraries may still read, which tells nothing of anybody."""
+    """Yield what the libraries may still read, which says nothing of anybody."""
     code = (sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
     for place in (*code, *_OURS, *_TIME_ZONES):
         yield place, _READ if Path(place).is_dir() else _READ_FILE
@@ -318,8 +327,8 @@ def _forbid_calls() -> None:
             steps += [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, answer)]
     steps.append((_RETURN, 0, 0, _ALLOW))
     program = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *step) for step in steps))
-    told = struct.pack("HxxxxxxP", len(steps), ctypes.addressof(program))
-    _call(_LIBC.prctl(_SECCOMP, _FILTER, told, 0, 0))
+    filters = struct.pack("HxxxxxxP", len(steps), ctypes.addressof(program))
+    _call(_LIBC.prctl(_SECCOMP, _FILTER, filters, 0, 0))
 
 
 def _call(result: int) -> int:

@@ -159,7 +159,7 @@ def open_mat73(budget: Budget) -> Iterator[Vectors]:
     """Open a MATLAB file of version 7.3, or any HDF5 file. Raises `InputError`.
 
     HDF5 can take the values of a dataset out of any other file. That is asked of each dataset
-    before anything else, its size among it: the library opens those files to tell it. Links are
+    before anything else, its size among it: the library opens those files for it. Links are
     not followed.
     """
     file = budget.file

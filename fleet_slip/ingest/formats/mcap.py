@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -63,70 +63,40 @@ class Block:
 
     def one_by_one(self) -> Iterator[tuple[int, bytes, int]]:
         """Yield the channel, the data and the moment of each message."""
-        told = zip(self.heads.tolist(), self.published_ns.tolist(), strict=True)
-        for (channel, begin, end), published_ns in told:
+        heads = zip(self.heads.tolist(), self.published_ns.tolist(), strict=True)
+        for (channel, begin, end), published_ns in heads:
             yield channel, self.content[begin:end], published_ns
 
 
-def stamp_s(message: Any, published_ns: int) -> float:
-    """Return when a message was taken: as its header says, else when it was published."""
-    parts = [field_of(message, name) for name in _stamp_of(message)]
-    if all(isinstance(part, int) for part in parts) and any(parts):
-        return float(parts[0]) + float(parts[1]) * 1e-9
-    return published_ns * 1e-9
-
-
-def _stamp_of(message: Any) -> list[str]:
-    """Return the names of the two fields that would tell when a message was taken."""
-    stamp = "header.stamp" if field_of(message, "header.stamp") else "stamp"
-    return [f"{stamp}.{name}" for name in ("sec", "nanosec")]
-
-
-def field_of(message: Any, path: str) -> Any:
-    """Return a field of a field, or None if there is none; arrays by [number]."""
-    for name in _steps(path):
-        if not name.startswith("["):
-            message = _attribute(message, name)
-        elif name[1:-1].isdecimal() and _is_array(message) and int(name[1:-1]) < len(message):
-            message = message[int(name[1:-1])]
-        else:
-            return None
-    return message
-
-
-@lru_cache(maxsize=10_000)
-def _steps(path: str) -> tuple[str, ...]:
-    return tuple(path.replace("[", ".[").split("."))
-
-
-def _attribute(message: Any, name: str) -> Any:
-    if isinstance(message, dict):
-        return message.get(name)
-    return getattr(message, name, None) if name in _names(message) else None
-
-
-def _names(message: Any) -> Sequence[str]:
-    if isinstance(message, dict):
-        return [str(name) for name in message]
-    names: Sequence[str] = getattr(type(message), "__slots__", ())
-    return names
-
-
-def _is_array(value: Any) -> bool:
-    return isinstance(value, list | tuple | array)
-
-
-def leaves_of(value: Any, path: str = "", depth: int = 0) -> Iterator[str]:
-    """Yield the paths of the numbers and texts in a message."""
+def leaves_of(value: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Yield the numbers and texts in a message, with their paths."""
     if isinstance(value, bool | int | float | str):
-        yield path
-    elif _is_array(value):
-        for number, item in enumerate(list(value)[:_MOST_ITEMS]):
-            yield from leaves_of(item, f"{path}[{number}]", depth + 1) if depth < _DEEPEST else ()
+        yield path, value
     elif depth < _DEEPEST:
-        for name in _names(value):
-            below = f"{path}.{name}" if path else name
-            yield from leaves_of(_attribute(value, name), below, depth + 1)
+        below: list[tuple[str, Any]]
+        if isinstance(value, list | tuple | array):
+            below = [(f"[{number}]", item) for number, item in enumerate(value[:_MOST_ITEMS])]
+        else:
+            names = value if isinstance(value, dict) else getattr(type(value), "__slots__", ())
+            of = value if isinstance(value, dict) else {n: getattr(value, n) for n in names}
+            below = [(f".{name}" if path else str(name), of[name]) for name in names]
+        for name, item in below:
+            yield from leaves_of(item, path + name, depth + 1)
+
+
+def stamp_of(fields: dict[str, Any]) -> list[str]:
+    """Return the paths of seconds and nanoseconds at which a message was taken, if it says so."""
+    for stamp in ("header.stamp", "stamp"):
+        paths = [f"{stamp}.sec", f"{stamp}.nanosec"]
+        if all(isinstance(fields.get(path), int) for path in paths):
+            return paths
+    return []
+
+
+def stamp_s(fields: dict[str, Any], published_ns: int) -> float:
+    """Return when a message was taken: as its header says, else when it was published."""
+    parts = [fields[path] for path in stamp_of(fields)]
+    return float(parts[0]) + float(parts[1]) * 1e-9 if any(parts) else published_ns * 1e-9
 
 
 # Where the numbers of a ROS message are follows from its definition, and from the lengths of the
@@ -158,14 +128,14 @@ class _Layout:
         self._fixed = [0, 1, 2, 3]
         self.numbers: dict[str, tuple[np.dtype[Any], int]] = {}
         self._message(self._types[schema.name], "")
-        message = decode(data)
+        fields = dict(leaves_of(decode(data)))
         if self._at > len(data) or any(
-            repr(field_of(message, path)) != repr(np.frombuffer(data, kind, 1, at)[0].item())
+            repr(fields[path]) != repr(np.frombuffer(data, kind, 1, at)[0].item())
             for path, (kind, at) in self.numbers.items()
+            if path in fields
         ):
             raise ValueError("it is decoded in another way")
-        parts = [field_of(message, name) for name in _stamp_of(message)]
-        self.stamp = _stamp_of(message) if all(isinstance(part, int) for part in parts) else []
+        self.stamp = stamp_of(fields)
         self._lengths = np.frombuffer(data, np.uint8)[self._fixed]
 
     def _message(self, definition: Any, above: str) -> None:
@@ -424,7 +394,7 @@ class McapSource(FormatSource):
                     encodings[number] = channel.encoding
                     _, data, _ = next(block.of([number]).one_by_one())
                     if channel.decode is not None and channel.topic not in found:
-                        found[channel.topic] = list(leaves_of(channel.decode(data)))
+                        found[channel.topic] = list(dict(leaves_of(channel.decode(data))))
         if not found:
             raise InputError(
                 f"{shown(self._file)}: no message in it can be decoded "
@@ -482,9 +452,9 @@ class McapSource(FormatSource):
                     f"decodes ({channel.encoding!r}) beside one that is read. Record it in one "
                     "encoding, or map another topic."
                 )
-            message = channel.decode(data)
+            message = dict(leaves_of(channel.decode(data)))
             times_s.append(stamp_s(message, published_ns))
-            rows.append([field_of(message, path) for path in fields.values()])
+            rows.append([message.get(path) for path in fields.values()])
         columns = zip(fields, zip(*rows, strict=True), strict=True)
         return {OWN_TIME: times_s} | {name: self._column(name, of) for name, of in columns}
 

@@ -31,7 +31,7 @@ from fleet_slip import errors
 from fleet_slip.base import shown
 from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.ingest.formats.can import CanBus
-from fleet_slip.ingest.formats.confined_reader import SIZES, Job
+from fleet_slip.ingest.formats.confined_reader import FORMATS, SIZES, Job
 from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
 from fleet_slip.ingest.formats.source import Base, Budget, Channel, Source
 from fleet_slip.ingest.formats.tables import MAGIC as DUCKDB_MAGIC
@@ -39,18 +39,8 @@ from fleet_slip.ingest.formats.tables import MAGIC_AT as DUCKDB_AT
 from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, DuckdbRows, open_duckdb, open_parquet
 from fleet_slip.ingest.log_files import parts_of
 
-_HDF5, _HDF5_AT = b"\x89HDF\r\n\x1a\n", 512
+[_HDF5], _HDF5_AT = FORMATS["mat73"].begins, 512
 """A MATLAB file of version 7.3 becomes HDF5 there: MATLAB's own header is before it."""
-_CONFINED = {
-    b"MDF     ": "mdf",
-    b"UnFinMF ": "mdf",
-    b"\x89MCAP0\r\n": "mcap",
-    b"TDSm": "tdms",
-    b"MATLAB 5.0 MAT-file": "mat",
-    _HDF5: "mat73",
-    b"LOGG": "can_trace",
-}
-"""Formats that another process reads, by what a file begins with."""
 _ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
 _BINARY = {
     (".parquet", ".pq"): "a Parquet file",
@@ -61,7 +51,7 @@ _BINARY = {
     (".tdms", ".tdms_index"): "a TDMS file",
 }
 
-Told = TypeVar("Told")
+Said = TypeVar("Said")
 
 
 @dataclass(frozen=True)
@@ -125,7 +115,7 @@ def log_digest(log: Path) -> "hashlib._Hash":
 
 @contextmanager
 def open_source(file: Path, formats: FileFormats) -> Iterator[Source]:
-    """Open a file, in the format that its first bytes tell. Raises `InputError`.
+    """Open a file, in the format that its first bytes say. Raises `InputError`.
 
     Each format makes sure that the file stands for itself: that no value of it is to be fetched
     from another file, or computed, and that it is not far more than its `Budget` once decoded.
@@ -145,7 +135,9 @@ def open_source(file: Path, formats: FileFormats) -> Iterator[Source]:
 def _opened(
     file: Path, start: bytes, formats: FileFormats, budget: Budget
 ) -> AbstractContextManager[Source]:
-    suffix, name = file.suffix.lower(), _confined(start)
+    suffix = file.suffix.lower()
+    begun = start[_HDF5_AT:] if start.endswith(_HDF5) else start
+    name = next((name for name, of in FORMATS.items() if begun.startswith(of.begins)), "")
     if formats.can is not None:
         name = "mdf_bus" if name == "mdf" else name or "can_trace"
     elif suffix in {".blf", ".asc"}:
@@ -169,20 +161,14 @@ def _opened(
     return nullcontext(CsvSource(budget, formats.csv, formats.plain_numbers))
 
 
-def _confined(start: bytes) -> str:
-    """Return the format that another process reads, empty for any other."""
-    begun = start[_HDF5_AT:] if start.endswith(_HDF5) else start
-    return next((name for magic, name in _CONFINED.items() if begun.startswith(magic)), "")
-
-
-def _wanted(told: Told | None, file: Path, table: str, key: str, formats: FileFormats) -> Told:
+def _wanted(said: Said | None, file: Path, table: str, key: str, formats: FileFormats) -> Said:
     """Return what the mapping says of a format that needs it. Raises `InputError`."""
-    if told is None:
+    if said is None:
         raise InputError(
             f"{shown(file)}: this format needs [{table}] with {key} in the mapping "
             f"{formats.name!r}."
         )
-    return told
+    return said
 
 
 @contextmanager

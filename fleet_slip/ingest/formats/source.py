@@ -1,7 +1,7 @@
 """What every format is read as: a table of named columns for each time base of a file.
 
 A format whose files say when each sample was taken (MDF, CAN traces) has clocks of its own: its
-times stand in the column `OWN_TIME`, in s, since 1970 where the file tells the date. In all others
+times stand in the column `OWN_TIME`, in s, since 1970 where the file has the date. In all others
 time is a column like any other.
 """
 
@@ -136,7 +136,7 @@ def reading_with(file: Path, package: str) -> Iterator[Any]:
     except (FleetSlipError, MemoryError):
         raise
     except Exception as error:
-        if getattr(error, "errno", 0) == errno.EFBIG:  # who set the limit tells it
+        if getattr(error, "errno", 0) == errno.EFBIG:  # who set the limit reports it
             raise
         reason = shown(str(error).strip().split("\n")[0][:200]) or type(error).__name__
         raise InputError(
