@@ -12,7 +12,7 @@ In 65,536ths of that count
 
 less the nearest multiple of 65536 turn, is the change of the side-slip angle; it is rounded once to
 counts of the label. For T of 10 s at most |J| < 2^27, so that all of it stays below 2^53. A change
-above `LARGEST_RAD` is none: the car spun, or a reflected signal told the course.
+above `LARGEST_RAD` is none: the car spun, or a reflected signal made the course.
 
 Where a car goes straight on at both fixes and has hardly turned between them, its side-slip angle
 is none, and L is what the receiver and the gyroscope are wrong by: columns of their own say it.

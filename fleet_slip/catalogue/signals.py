@@ -232,7 +232,7 @@ BLOCK = 2**14
 """Values that are rounded at once: what is made on the way stays in the processor's cache."""
 
 EVENTFUL_CHANGES = 256
-"""Counts, at least, that differ from the ones before, in a drive that is told by counts alone."""
+"""Counts, at least, that change, in a drive that is recognised by them alone."""
 
 
 def valid_values(values: FloatArray, signal: Signal) -> FloatArray:

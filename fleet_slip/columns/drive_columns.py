@@ -38,7 +38,7 @@ class DriveCounts:
         ticks: rising, shape (rows,).
         counts, present: by signal, shape (rows,); a signal that never is missing has no `present`.
         facts: what the car knows of itself, by drive column.
-        numbers: counts of what the car's drives before told of it; those that are known.
+        numbers: counts of what the car's drives before determined; those that are known.
     """
 
     ticks: NDArray[Any]
@@ -106,13 +106,13 @@ class Workspace:
             if name in drive.present:
                 counts[~drive.present[name]] = np.nan
         self._part(Region.TICK, 0, self.rows)[:] = drive.ticks
-        for number, one in enumerate(program.told):
+        for number, one in enumerate(program.of_car):
             known = (
                 one.count(drive.facts[one.name])
                 if isinstance(one, CarFact)
                 else drive.numbers.get(one.name)
             )
-            self._part(Region.TOLD, number, 1)[:] = np.nan if known is None else known
+            self._part(Region.OF_CAR, number, 1)[:] = np.nan if known is None else known
         self._flags = np.zeros((2, max(program.slots, program.kinds, 1)), dtype=np.bool_)
         self._flags[GAPS] = not drive.whole
 

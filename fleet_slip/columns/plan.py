@@ -69,13 +69,13 @@ second plus the third times n."""
 class Region(IntEnum):
     """Parts of a program's memory.
 
-    The first counts columns clipped by row; `TOLD` is what is known of the car; signals, sums,
+    The first counts columns clipped by row; `OF_CAR` is what is known of the car; signals, sums,
     counts, values, begins and ticks are of all rows (`lookback`).
     """
 
     CLIPPED = 0
     REGISTER = 1
-    TOLD = 2
+    OF_CAR = 2
     SIGNAL = 3
     TICK = 4
     SUM = 5
@@ -120,14 +120,14 @@ class Code:
     """Operations in order, equal ones once, and what they number.
 
     Attributes:
-        signals, told: what the program reads of a drive and its car, with their numbers.
+        signals, of_car: what the program reads of a drive and its car, with their numbers.
         summed, kept: what is summed up, and what is kept, over a drive.
         kinds: windows of different lengths in ticks.
     """
 
     operations: list[VectorOperation] = field(default_factory=list)
     signals: dict[str, int] = field(default_factory=dict)
-    told: dict[CarFact | CarCount, int] = field(default_factory=dict)
+    of_car: dict[CarFact | CarCount, int] = field(default_factory=dict)
     summed: dict[Value, int] = field(default_factory=dict)
     kept: dict[Value, int] = field(default_factory=dict)
     kinds: dict[int, int] = field(default_factory=dict)
@@ -201,9 +201,9 @@ class BlockProgram:
         return tuple(self.code.signals)
 
     @cached_property
-    def told(self) -> tuple[CarFact | CarCount, ...]:
-        """What it is told of a car, in the order of their numbers."""
-        return tuple(self.code.told)
+    def of_car(self) -> tuple[CarFact | CarCount, ...]:
+        """What it reads of a car, in the order of their numbers."""
+        return tuple(self.code.of_car)
 
     @property
     def slots(self) -> int:
@@ -221,7 +221,7 @@ class BlockProgram:
         shapes = {
             Region.CLIPPED: (1, STRIDE),
             Region.REGISTER: (self.registers, STRIDE),
-            Region.TOLD: (len(code.told), 1),
+            Region.OF_CAR: (len(code.of_car), 1),
             Region.SIGNAL: (len(code.signals), rows),
             Region.TICK: (1, rows),
             Region.SUM: (len(code.summed), rows + 1),
@@ -229,7 +229,7 @@ class BlockProgram:
             Region.VALUE: (len(code.kept), rows),
             Region.BEGIN: (len(code.kinds), rows),
         }
-        # Whoever reads what is told as a block must not read beyond the end.
+        # Whoever reads what is of the car as a block must not read beyond the end.
         sizes = [parts * size for parts, size in shapes.values()] + [BLOCK_ROWS]
         begins = np.cumsum([0, *sizes])
         strides = [shapes[region][1] for region in Region] + [0]
@@ -302,7 +302,7 @@ class _Writer:
 
     def __init__(self, counted: CountedColumns) -> None:
         self.code = Code(signals={name: n for n, name in enumerate(counted.lowered.signals)})
-        self._told = [*counted.lowered.facts, *counted.lowered.numbers]
+        self._of_car = [*counted.lowered.facts, *counted.lowered.numbers]
         self._counted, self._steps, self._ranges = counted, counted.steps, counted.ranges
         self._facts = len(counted.lowered.facts)
         self.value = cache(self._value)
@@ -316,7 +316,7 @@ class _Writer:
         if (constant := self._constant(number)) is not None:
             return self._do(FILL, ratio=(float(constant), 1.0, 0.0, inf))
         if name in GIVEN:
-            return self._signal_or_told(name, plain[0])
+            return self._signal_or_car(name, plain[0])
         if self._whole(number):
             found = self._do(TO_BINARY64, self.integers(number, guard))
             return self._do(WHERE, found, self._present(number, guard))
@@ -325,11 +325,11 @@ class _Writer:
             fused = self._fused(number, guard)
         return self._plain(number, guard) if fused is None else fused
 
-    def _signal_or_told(self, name: str, place: int) -> Value:
+    def _signal_or_car(self, name: str, place: int) -> Value:
         if name == "signal":
             return (Region.SIGNAL, place)
-        told = self._told[place + (self._facts if name == "number" else 0)]
-        return self._do(BROADCAST, (Region.TOLD, _number(self.code.told, told)))
+        one = self._of_car[place + (self._facts if name == "number" else 0)]
+        return self._do(BROADCAST, (Region.OF_CAR, _number(self.code.of_car, one)))
 
     def _fused(self, number: int, guard: int | None) -> Value | None:
         """Return what one loop computes of several steps; None if there is no such loop."""
@@ -586,7 +586,7 @@ class ColumnPlan:
 
     @property
     def numbers(self) -> tuple[str, ...]:
-        """What the drives of a car must have told of it, or running means stand for."""
+        """What the drives of a car must have determined, or running means stand for."""
         found = (one.number.name for one in self.windows.values() if one.number)
         return tuple(dict.fromkeys(found))
 

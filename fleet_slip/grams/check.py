@@ -151,9 +151,9 @@ def stored_grams(
     paths = pa.array([file.path for file in files], pa.string())
     found: dict[str, DriveGrams] = defaultdict(dict)
     for path in grams:
-        told = warehouse.grams.read(path, ["feature_set", "file"])
-        names = told["file"].cast(pa.string())
-        mine = pc.and_(pc.equal(told["feature_set"], identity), pc.is_in(names, paths))
+        pairs = warehouse.grams.read(path, ["feature_set", "file"])
+        names = pairs["file"].cast(pa.string())
+        mine = pc.and_(pc.equal(pairs["feature_set"], identity), pc.is_in(names, paths))
         if pc.any(mine).as_py():
             rows = warehouse.grams.read(path).filter(mine)
             for file in rows["file"].unique().to_pylist():

@@ -82,7 +82,7 @@ def counts_of(
 ) -> DriveCounts:
     """Return a drive's rows, in the order of time, as what a plan is computed from.
 
-    Facts are by default the first row's; `numbers` are what the car's drives told of it.
+    Facts are by default the first row's; `numbers` are what the car's drives determined.
     """
     counts, present = {}, {}
     for name in plan.signals:

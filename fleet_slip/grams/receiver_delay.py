@@ -46,9 +46,9 @@ SURE_ERRORS = 5.0
 TINY = 1e-9
 """Share of the sum of squares that a drive's bend has at least: it may tell nothing."""
 FEWEST_DRIVES = 3
+"""Of fewer the uncertainty is that of a usual drive of other cars."""
 WILD = 100.0
 """Variances of half of the cars that a car's drives may differ by."""
-"""Of fewer the uncertainty is that of a usual drive of other cars."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +109,10 @@ def _weights() -> FloatArray:
 def receiver_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> ReceiverDelays:
     """Return the delays of cars and of types that Gram rows of the feature set `delay` tell."""
     found = {}
-    for car, told in _by_car(rows_of_delay).items():
-        one = _delay(np.array(list(told.products.values())), told.rows)
+    for car, own in _by_car(rows_of_delay).items():
+        one = _delay(np.array(list(own.products.values())), own.rows)
         if one is not None:
-            receiver = told.receivers.pop() if len(told.receivers) == 1 else None
+            receiver = own.receivers.pop() if len(own.receivers) == 1 else None
             found[car] = replace(one, receiver=receiver)
     return with_types(with_pooled(found))
 
@@ -124,8 +124,8 @@ def changed_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, Changed
     """
     halves = {
         car: split
-        for car, told in _by_car(rows_of_delay).items()
-        if (split := _best_split(told.products)) is not None
+        for car, own in _by_car(rows_of_delay).items()
+        if (split := _best_split(own.products)) is not None
     }
     squares = [
         one.drives * ((one.uncertainty or 0.0) ** 2 - LASTING_S**2)
@@ -144,7 +144,7 @@ def changed_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, Changed
 
 
 @dataclass
-class _Told:
+class _CarProducts:
     """What one car's drives tell: products about their means, by day and name, and its rows."""
 
     products: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
@@ -152,9 +152,9 @@ class _Told:
     rows: int = 0
 
 
-def _by_car(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, _Told]:
+def _by_car(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, _CarProducts]:
     columns = delay_columns()
-    found: dict[str, _Told] = {}
+    found: dict[str, _CarProducts] = {}
     for batch in rows_of_delay:
         for names, some, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
             if not set(columns) <= set(names.split(",")):
@@ -165,12 +165,12 @@ def _by_car(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, _Told]:
             for (car, day, drive, receiver), about, n in zip(
                 zip(*keys, strict=True), _about_means(table), table.n.tolist(), strict=True
             ):
-                told = found.setdefault(car, _Told())
-                told.products[str(day), drive] = told.products.get((str(day), drive), 0.0) + about
-                told.receivers |= {receiver} - {None}
-                told.rows += n
-    for told in found.values():
-        told.products = dict(sorted(told.products.items()))
+                own = found.setdefault(car, _CarProducts())
+                own.products[str(day), drive] = own.products.get((str(day), drive), 0.0) + about
+                own.receivers |= {receiver} - {None}
+                own.rows += n
+    for own in found.values():
+        own.products = dict(sorted(own.products.items()))
     return dict(sorted(found.items()))
 
 
@@ -322,8 +322,8 @@ _OF_DELAY = ("file", "day", "vehicle_id", "drive_id", "signals", "n", "sums", "p
 
 def course_delays(grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
     """Return each car's course delay in parts of a tick, of Gram rows of the `active` log files."""
-    told = receiver_delays(_of_delay(grams, active)).cars
-    return {car: in_parts(one) for car, one in told.items()}
+    delays = receiver_delays(_of_delay(grams, active)).cars
+    return {car: in_parts(one) for car, one in delays.items()}
 
 
 def in_parts(one: ReceiverDelay) -> int:
@@ -345,24 +345,28 @@ def files_of_other_delay(grams: Snapshot, identity: str, late: Mapping[str, int]
     """Return the log files that have Gram rows of a set with another delay than their cars have."""
     return {
         name
-        for name, car, told in _recorded(grams, identity)
-        if told != late.get(car, 0) and not name.startswith(RECEIVED_FILES)
+        for name, car, recorded in _recorded(grams, identity)
+        if recorded != late.get(car, 0) and not name.startswith(RECEIVED_FILES)
     }
 
 
 def recorded_cars(grams: Snapshot, identity: str, log_file: str) -> dict[str, int]:
     """Return the delays that the Gram rows of a set of one log file were corrected by, by car."""
     return {
-        car: told for name, car, told in _recorded(grams, identity) if name == log_file and told
+        car: recorded
+        for name, car, recorded in _recorded(grams, identity)
+        if name == log_file and recorded
     }
 
 
 def _recorded(grams: Snapshot, identity: str) -> set[tuple[str, str, int]]:
-    """Return each log file, car and delay that Gram rows of a set are of; 0 where none was told."""
+    """Return each log file, car and delay that Gram rows of a set are of; 0 where none is known."""
     found: set[tuple[str, str, int]] = set()
     for rows in _rows_of(grams, identity, "file", "vehicle_id", COURSE_LATE):
-        files, cars, told = (rows[name].to_pylist() for name in ("file", "vehicle_id", COURSE_LATE))
-        found.update(zip(files, cars, (late or 0 for late in told), strict=True))
+        files, cars, recorded = (
+            rows[name].to_pylist() for name in ("file", "vehicle_id", COURSE_LATE)
+        )
+        found.update(zip(files, cars, (late or 0 for late in recorded), strict=True))
     return found
 
 
