@@ -1,6 +1,6 @@
 """Which model versions were trained on drives that were forgotten since."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from functools import cache
 
 import numpy as np
@@ -8,11 +8,9 @@ import pyarrow as pa
 
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.gram_rows import Hashes, hash_numbers
-from fleet_slip.models.manifest import TrainedOn, hash_drives
+from fleet_slip.models.manifest import hash_drives
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder
-from fleet_slip.views import connect
-from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -73,74 +71,17 @@ def _may_have_seen(
 
 
 def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
-    """Return the model versions that were trained on one of the drives.
-
-    Each keeps which; for older ones the cohort is asked again of the Gram rows it could see. Those
-    of which it cannot be told count as trained on them.
-    """
+    """Return the model versions that were trained on one of the drives, or may have been."""
     registry = Registry.of(warehouse)
     hashes = hash_numbers(pa.array(sorted(drives), pa.string()))
-    versions: dict[str, TrainedOn] = {}
-    known: list[str] = []
+    found: list[str] = []
     for name in registry.names():
         for number in registry.versions(name):
-            reference = f"{name}@{number}"
             try:
-                manifest = registry.load(name, number).manifest
-                made = registry.trained_drives(manifest)
-                if made is None:
-                    versions[reference] = manifest.trained_on
-                elif made.among(hashes).any():
-                    known.append(reference)
+                made = registry.trained_drives(registry.load(name, number).manifest)
+                trained = made is None or made.among(hashes).any()
             except FleetSlipError:
-                known.append(reference)
-    return sorted([*known, *_asked_again(warehouse, versions, drives)])
-
-
-def _asked_again(
-    warehouse: Warehouse, versions: Mapping[str, TrainedOn], drives: Collection[str]
-) -> list[str]:
-    """Return the versions that may be made of the drives; each Gram file is read once."""
-    cohorts = {trained.cohort for trained in versions.values()}
-    chosen = _in_cohorts(warehouse, cohorts, drives)
-
-    @cache
-    def drives_in(path: str) -> frozenset[str]:
-        ids = warehouse.grams.read(path, ["drive_id"])["drive_id"].cast(pa.string())
-        return frozenset(drives).intersection(ids.unique().to_pylist())
-
-    @cache
-    def drives_at(version: int) -> frozenset[str]:
-        try:
-            files = warehouse.grams.snapshot(version).files
-            return frozenset().union(*(drives_in(file.path) for file in files))
-        except FleetSlipError:
-            return frozenset(drives)  # that version is gone
-
-    return [
-        reference
-        for reference, trained in versions.items()
-        if (mine := chosen[trained.cohort])
-        and not mine.isdisjoint(drives_at(trained.grams_version))
-    ]
-
-
-def _in_cohorts(
-    warehouse: Warehouse, cohorts: Collection[str], drives: Collection[str]
-) -> dict[str, frozenset[str]]:
-    """Return which of some drives each cohort has; all, of a cohort that cannot be asked for."""
-    found = {}
-    with connect(warehouse.root, query="grams", scenarios=True) as database:
-        database.register(
-            "forgotten", pa.table({"drive_id": pa.array(sorted(drives), pa.string())})
-        )
-        for cohort in cohorts:
-            asked = "SELECT DISTINCT drive_id FROM grams WHERE drive_id IN (FROM forgotten) AND "
-            try:
-                condition = parse_condition(cohort)
-                with asking(database, condition):
-                    rows = database.execute(asked + condition.sql).fetchall()
-                found[cohort] = frozenset(row[0] for row in rows)
-            except FleetSlipError:
-                found[cohort] = frozenset(drives)
-    return found
+                trained = True
+            if trained:
+                found.append(f"{name}@{number}")
+    return sorted(found)

@@ -29,7 +29,7 @@ from obstore.store import from_url
 
 from fleet_slip.base import needed
 from fleet_slip.errors import StorageError
-from fleet_slip.storage.checksums import checksum_in, require_content
+from fleet_slip.storage.checksums import require_content
 from fleet_slip.storage.folder import Content, StoredFile
 from fleet_slip.storage.storage_errors import is_timeout, object_errors
 
@@ -170,7 +170,7 @@ def delta_options(bucket: str) -> dict[str, str]:
 
 # Objects as files that can be read anywhere in them: for DuckDB and for pyarrow.
 #
-# They never change. One whose name tells its checksum is fetched whole, compared and read from
+# They never change. One is fetched whole, compared with the checksum in its name, and read from
 # those bytes. Large ones come in parts within a request's time limit, retried smaller.
 
 FIRST_BYTES, MOST_BYTES, LEAST_BYTES = 2**20, 2**23, 2**15
@@ -219,53 +219,6 @@ def _in_time(answer: Any, *, may_fail: bool = True) -> bytes | None:
         raise
 
 
-class ObjectReader(io.RawIOBase):
-    """An object as a file, a request a call.
-
-    obstore's reader returns less at the ends of its buffer, which DuckDB takes for damage.
-    """
-
-    def __init__(self, store: "ObjectStore", key: str, where: str, size: int | None = None) -> None:
-        self._store, self._key, self._where, self._position = store, key, where, 0
-        if size is None:
-            with object_errors(where):
-                size = obstore.head(store, key)["size"]
-        self._size = size
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._position
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        begin = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._size}[whence]
-        self._position = begin + offset
-        return self._position
-
-    def read(self, size: int = -1) -> bytes:
-        left = max(self._size - self._position, 0)
-        length = left if size is None or size < 0 else min(size, left)
-        if not length:
-            return b""
-        with object_errors(self._where):
-            part = obstore.get_range(self._store, self._key, start=self._position, length=length)
-        self._position += length
-        return bytes(part)
-
-
-def open_object(
-    store: "ObjectStore", key: str, where: str, size: int | None = None
-) -> io.RawIOBase | io.BytesIO:
-    """Open an object. Raises `StorageError` if it is not what its name says."""
-    if checksum_in(key) is None:
-        return ObjectReader(store, key, where, size)
-    return io.BytesIO(_fetch(store, key, where))
-
-
 def _fetch(store: "ObjectStore", key: str, where: str) -> bytes:
     """Return a whole object, compared with its name. DuckDB opens a file twice: some are kept."""
     with _fetching:
@@ -281,7 +234,7 @@ def _fetch(store: "ObjectStore", key: str, where: str) -> bytes:
 
 
 _fetched: dict[str, bytes] = {}
-"""By URL: what a name with a checksum holds is the same wherever it is."""
+"""By URL: a data file never changes."""
 _fetching = threading.Lock()
 
 
@@ -311,10 +264,10 @@ class ObjectFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
     def exists(self, path: str, **_options: Any) -> bool:
         return bool(path)  # that it is not there shows when it is read
 
-    def open(self, path: str, mode: str = "rb", **_options: Any) -> io.RawIOBase | io.BytesIO:
+    def open(self, path: str, mode: str = "rb", **_options: Any) -> io.BytesIO:
         if mode != "rb":
             raise PermissionError(f"{path}: a warehouse is only read through SQL")
-        return open_object(self._store, *self._key(path), self._size(path))
+        return io.BytesIO(_fetch(self._store, *self._key(path)))
 
     def _key(self, path: str) -> tuple[str, str]:
         key = path.removeprefix(f"{self.protocol}://").removeprefix(f"{self._name}/")
@@ -403,8 +356,7 @@ class ObjectFolder:
 
     def open(self, path: str) -> pa.NativeFile:
         """Open a file; raises `StorageError` if the answer is not what the name says."""
-        file = open_object(self._store, self._key(path), f"{self}/{path}")
-        return pa.PythonFile(file, "r")
+        return pa.BufferReader(_fetch(self._store, self._key(path), f"{self}/{path}"))
 
     def put(self, path: str, content: Content) -> None:
         self._put(path, content, "overwrite")
