@@ -1,23 +1,30 @@
 """An executor whose tasks run on the workers of a Dask cluster.
 
-Dask runs a task again where its worker died. Added here: tasks are checked where they run
-(`fleet_slip.compute.cluster_worker`), sent again after the scheduler restarted, and nobody waits
+Dask runs a task again where its worker died. Added here: a task makes sure that its worker has the
+sender's versions, before it is unpickled, and sees the data root of the command; and nobody waits
 for ever.
 """
 
-import asyncio
 import contextlib
 import logging
+import os
+import pickle
+import platform
+import socket
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future, InvalidStateError
 from contextvars import copy_context
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
+from functools import cache, partial
+from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, version
+from importlib.resources.abc import Traversable
+from pathlib import Path
 from threading import Event, Thread
-from typing import Any, TypeVar
+from typing import Any
 
 import dask
 from dask.utils import parse_timedelta
@@ -27,19 +34,27 @@ from distributed.comm.addressing import resolve_address
 from distributed.scheduler import KilledWorker
 from distributed.versions import VersionMismatchWarning
 
-from fleet_slip.compute.cluster_worker import (
-    PACKAGES,
-    Marker,
-    environment,
-    pickled,
-    require_same,
-    versions,
-    work,
-)
 from fleet_slip.compute.tasks import LostTaskError
-from fleet_slip.errors import ClusterError, StorageError
+from fleet_slip.errors import ClusterError, FleetSlipError, RefusedError, StorageError
+from fleet_slip.resources import folder, own_configs
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import log_event
+
+PACKAGES = (
+    "fleet-slip",
+    "numpy",
+    "numba",
+    "llvmlite",
+    "pyarrow",
+    "duckdb",
+    "deltalake",
+    "polars",
+    "distributed",
+)
+"""Packages whose versions must be the same on coordinator and workers."""
+
+SOURCES = "files of fleet-slip"
+SHIPPED = (".py", ".sql", ".toml")
 
 IN_FLIGHT_MIN = 8
 """Tasks that may be under way however few workers there are: more of them may be on their way."""
@@ -50,15 +65,12 @@ PATIENCE_S = 120.0
 
 CONNECT_ATTEMPTS = 5
 FIRST_S = 10.0
-"""How long a scheduler may take to answer at first; later, as long as Dask's own settings allow."""
+"""How long a scheduler may take to answer, or as long as Dask's own settings allow, if shorter."""
 
-ANSWER_S = 20.0
 CLOSE_S = 5.0
 MARKER_FOLDER = ".cluster"
 MARKER_AGE_MAX_H = 7 * 24
 """A marker that is older was left by a killed command."""
-
-Connected = TypeVar("Connected")
 
 
 @contextlib.contextmanager
@@ -66,13 +78,12 @@ def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
     """Connect to the Dask scheduler at an address, such as `tcp://10.0.0.1:8786`.
 
     Workers must see `root` too. Raises `ClusterError` without a scheduler in 10 s (or Dask's own
-    limit), and `RefusedError` for other versions.
+    limit).
     """
     _route_logs()
     try:
         resolve_address(address)
-        _require_same_versions(_connected(lambda: asyncio.run(_versions(address))))
-        client: Client = _connected(lambda: _Client(address))
+        client = _connect(address)
     except (OSError, ValueError, TypeError, ImportError, RuntimeError, AssertionError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ClusterError(
@@ -91,47 +102,42 @@ def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
 class _Client(Client):
     """A client that leaves no thread behind where it cannot begin."""
 
-    def __init__(self, address: str) -> None:
-        Client.__init__(self, address, set_as_default=False, name="fleet-slip")
-
     def start(self, **options: Any) -> None:
         """Connect."""
         try:
             Client.start(self, **options)
-        except AssertionError:
+        except (AssertionError, OSError):
             Client.close(self, timeout=CLOSE_S)
             raise
 
 
-def _connected(connect: Callable[[], Connected]) -> Connected:
+def _connect(address: str) -> Client:
     """Connect, again if Dask takes two first messages that came together for a fault."""
+    usual_s = float(parse_timedelta(dask.config.get("distributed.comm.timeouts.connect")))
+    settings: Any = {"set_as_default": False, "name": "fleet-slip"}
     for _ in range(CONNECT_ATTEMPTS - 1):
         with contextlib.suppress(AssertionError):
-            return connect()
-    return connect()
+            return _Client(address, timeout=min(FIRST_S, usual_s), **settings)
+    return _Client(address, timeout=min(FIRST_S, usual_s), **settings)
 
 
-async def _versions(address: str) -> dict[str, Any]:
-    """Return the versions of scheduler and workers; of none, if one of them does not answer.
+@dataclass(frozen=True)
+class Marker:
+    """A file by which a worker knows that it sees the data root that the command sees."""
 
-    By a client of its own: one that cannot connect leaves a thread behind unless it is a coroutine.
-    """
-    usual_s = float(parse_timedelta(dask.config.get("distributed.comm.timeouts.connect")))
-    first_s = min(FIRST_S, usual_s)
-    async with Client(address, asynchronous=True, set_as_default=False, timeout=first_s) as client:
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(ANSWER_S):
-                found: Any = await client.get_versions(packages=PACKAGES)
-                return {"the scheduler": found["scheduler"], **found["workers"]}
-    return {}
+    folder: Folder
+    name: str
 
-
-def _require_same_versions(found: dict[str, Any]) -> None:
-    """Refuse other versions before any work; a worker that comes later is told by its tasks."""
-    for where, theirs in found.items():
-        packages = {name: theirs["packages"].get(name) or "none" for name in PACKAGES}
-        python = ".".join(theirs["packages"]["python"].split(".")[:3])
-        require_same(where, versions(), {"python": python, **packages})
+    def require_seen(self, where: str) -> None:
+        """Raise `StorageError` if the file is not there."""
+        try:
+            self.folder.read(self.name)
+        except StorageError as error:
+            raise StorageError(
+                f"{where} does not see the data root of this command ({error}). Use a file system "
+                "that all machines share, mounted at the same path, or an object store that all "
+                "may use."
+            ) from None
 
 
 @contextlib.contextmanager
@@ -148,19 +154,10 @@ def _marker(root: Folder) -> Iterator[Marker]:
                     marker.folder.remove(file)
 
 
-@dataclass(eq=False)
-class _Task:
-    content: bytes
-    future: Future[Any] = field(default_factory=Future)
-    sent_by: object = None
-    """The connection by which it was sent; None if it has to be sent."""
-
-
 class ClusterExecutor(Executor):
     """Runs tasks on a Dask cluster. A future raises `LostTaskError` if its workers died.
 
-    After a lost connection a thread sends all tasks again, which are idempotent. If no scheduler or
-    worker comes back, all futures raise `ClusterError`.
+    If the scheduler is lost, or no worker comes, all futures raise `ClusterError`.
     """
 
     def __init__(self, client: Client, address: str, marker: Marker) -> None:
@@ -168,7 +165,7 @@ class ClusterExecutor(Executor):
         self._threads = 0
         self._client, self._address, self._marker = client, address, marker
         self._dask = client.get_executor(pure=False)
-        self._tasks: set[_Task] = set()
+        self._futures: set[Future[Any]] = set()
         self._last_seen_s = time.monotonic()
         self._closing = Event()
         self._count_workers()
@@ -184,64 +181,49 @@ class ClusterExecutor(Executor):
         """Run a function of one argument on a worker."""
         if kwargs or len(args) != 1:
             raise TypeError("a task on a cluster is a function and its one argument")
-        task = _Task(pickled(self._marker, function, args[0]))
-        self._tasks.add(task)
-        self._send(task)
-        return task.future
+        task = pickled(self._marker, function, args[0])
+        future: Future[Any] = Future()
+        self._futures.add(future)
+        with contextlib.suppress(ClosedClientError):  # the watcher fails it
+            theirs = self._dask.submit(work, environment(), task)
+            theirs.add_done_callback(partial(self._settle, future))
+            future.add_done_callback(lambda ours: ours.cancelled() and theirs.cancel())
+        return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: ARG002
         """Forget what is under way: whoever leaves without waiting for it has failed."""
         self._closing.set()
         self._watcher.join()
-        for task in list(self._tasks):
-            task.future.cancel()
+        for future in list(self._futures):
+            future.cancel()
 
-    def _send(self, task: _Task) -> None:
-        if self._client.status != "running":
-            return  # the watcher sends it
-        task.sent_by = self._client.scheduler_comm
-        try:
-            future = self._dask.submit(work, environment(), task.content)
-        except ClosedClientError:
-            return  # the watcher tells it
-        future.add_done_callback(partial(self._settle, task))
-        task.future.add_done_callback(lambda ours: ours.cancelled() and future.cancel())
-
-    def _settle(self, task: _Task, future: Future[Any]) -> None:
-        if future.cancelled():
-            task.sent_by = None
+    def _settle(self, future: Future[Any], theirs: Future[Any]) -> None:
+        if theirs.cancelled():  # with its connection; or by us
+            self._fail(future, "the connection to the Dask scheduler was lost")
             return
-        self._tasks.discard(task)
-        error = future.exception()
-        with contextlib.suppress(InvalidStateError):  # another sending of it was faster
-            if isinstance(error, KilledWorker):
-                log_event("task lost", logging.WARNING, reason=str(error))
-                task.future.set_exception(LostTaskError(str(error)))
-            elif error is not None:
-                task.future.set_exception(error)
+        self._futures.discard(future)
+        error = theirs.exception()
+        if isinstance(error, KilledWorker):
+            log_event("task lost", logging.WARNING, reason=str(error))
+            error = LostTaskError(str(error))
+        with contextlib.suppress(InvalidStateError):  # it was given up
+            if error is not None:
+                future.set_exception(error)
             else:
-                task.future.set_result(future.result())
+                future.set_result(theirs.result())
 
     def _watch(self) -> None:
         while not self._closing.wait(POLL_S):
-            status = self._client.status
+            status, problem = self._client.status, ""
             if status == "closed":
-                self._fail("the connection to the Dask scheduler was lost, and none came back")
+                problem = "the connection to the Dask scheduler was lost"
             elif status == "running":
-                self._send_again()
                 self._count_workers()
             waited_s = time.monotonic() - self._last_seen_s
-            if self._tasks and waited_s > PATIENCE_S:
-                self._fail(f"the cluster has had no worker for {waited_s:.0f} s")
-
-    def _send_again(self) -> None:
-        connection = self._client.scheduler_comm
-        self._tasks.difference_update([task for task in list(self._tasks) if task.future.done()])
-        lost = [task for task in list(self._tasks) if task.sent_by is not connection]
-        if lost:
-            log_event("tasks sent again", logging.WARNING, tasks=len(lost))
-        for task in lost:
-            self._send(task)
+            if waited_s > PATIENCE_S:
+                problem = problem or f"the cluster has had no worker for {waited_s:.0f} s"
+            for future in list(self._futures) if problem else ():
+                self._fail(future, problem)
 
     def _count_workers(self) -> None:
         try:
@@ -254,15 +236,85 @@ class ClusterExecutor(Executor):
         if threads:
             self._last_seen_s = time.monotonic()
 
-    def _fail(self, reason: str) -> None:
-        error = ClusterError(
-            f"{self._address}: {reason}. What is done is kept: look after the cluster, and run the "
-            "same command again."
+    def _fail(self, future: Future[Any], reason: str) -> None:
+        self._futures.discard(future)
+        with contextlib.suppress(InvalidStateError):
+            future.set_exception(
+                ClusterError(
+                    f"{self._address}: {reason}. What is done is kept: look after the cluster, and "
+                    "run the same command again."
+                )
+            )
+
+
+def pickled(marker: Marker, function: Callable[[Any], Any], item: Any) -> bytes:
+    """Return a marker, a function of this package and its argument, as `work` takes them."""
+    return pickle.dumps((marker, function, item), protocol=5)
+
+
+def work(expected: Mapping[str, str], task: bytes) -> Any:
+    """Do a task and return its result; expected errors get the worker's name.
+
+    Raises `RefusedError` for other versions, `StorageError` where the marker is not seen.
+    """
+    here = f"worker {socket.gethostname()}:{os.getpid()}"
+    _require_same(here, expected, environment())
+    marker, function, item = pickle.loads(task)  # noqa: S301 - from the scheduler, which is trusted
+    marker.require_seen(here)
+    try:
+        return function(item)
+    except FleetSlipError as error:
+        raise type(error)(f"{error} [{here}]") from None
+
+
+def _require_same(where: str, expected: Mapping[str, str], found: Mapping[str, str]) -> None:
+    different = [
+        f"{name} {found.get(name, 'none')} instead of {wanted}"
+        for name, wanted in expected.items()
+        if found.get(name) != wanted
+    ]
+    if different:
+        raise RefusedError(
+            f"{where} has {', '.join(different)}. Results would not be the same everywhere: "
+            "install one set of versions (pip install --constraint constraints.txt), or start all "
+            "from one container image."
         )
-        for task in list(self._tasks):
-            self._tasks.discard(task)
-            with contextlib.suppress(InvalidStateError):
-                task.future.set_exception(error)
+
+
+@cache
+def environment() -> dict[str, str]:
+    """Return what the result of a task may depend on: versions, and the sources' checksum."""
+    versions = {name: _version(name) for name in PACKAGES}
+    return {"python": platform.python_version(), **versions, SOURCES: _sources_digest()}
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "none"
+
+
+def _sources_digest() -> str:
+    """Return a checksum of programs, statements and configs: a checkout may have been edited."""
+    digest = sha256()
+    package: Traversable = Path(__file__).parent.parent
+    own = own_configs()
+    shipped = (folder("configs"), folder("jobs"), folder("warehouse"))
+    for entry in (package, *shipped, *([own] if own else [])):
+        for file in _shipped(entry):
+            digest.update(f"{file.name}\n".encode())
+            digest.update(file.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _shipped(entry: Traversable) -> Iterator[Traversable]:
+    if entry.is_dir():
+        for inner in sorted(entry.iterdir(), key=lambda inner: inner.name):
+            if inner.name != "_data":  # configs, jobs and warehouse of a wheel, which come after
+                yield from _shipped(inner)
+    elif entry.name.endswith(SHIPPED):
+        yield entry
 
 
 class _Forwarder(logging.Handler):
