@@ -9,9 +9,8 @@ column touches no file: null where it lacks. For another scale every count is re
 3. One commit exchanges all files and the schema's scales. Until then nothing old is gone.
 """
 
-import contextlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -19,7 +18,6 @@ from fractions import Fraction
 import numpy as np
 import pyarrow as pa
 from deltalake import CommitProperties, DeltaTable, Field
-from deltalake.exceptions import CommitFailedError
 from deltalake.schema import Schema
 from deltalake.transaction import AddAction
 from numpy.typing import NDArray
@@ -31,7 +29,6 @@ from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.grams.job import land_ahead
 from fleet_slip.operations.rewriting import drop_unused_names, read_kept_drives
 from fleet_slip.storage.commits import NOTE, checked_note
-from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import (
     ALL_STATISTICS,
     SCALE,
@@ -108,7 +105,7 @@ def rescale_counts(counts: NDArray[np.int16], ratio: Fraction) -> IntArray:
 def _add_columns(table: Table, delta: DeltaTable, found: Evolution) -> None:
     fields = {field.name: field for field in Schema.from_arrow(table.schema).fields}
     scales = scales_of(table.schema)
-    with storage_errors(table.folder), _conflicts(table):
+    with table.committing():
         if found.added:
             delta.alter.set_table_properties(ALL_STATISTICS)
             delta.alter.add_columns([_with_scale(fields[n], scales) for n in found.added])
@@ -122,7 +119,7 @@ def _with_scale(field: Field, scales: Mapping[str, Decimal]) -> Field:
 
 
 def _announce(table: Table, found: Evolution) -> None:
-    with storage_errors(table.folder), _conflicts(table):
+    with table.committing():
         delta = _now(table)
         for name, (old, new) in found.rescaled.items():
             delta.alter.set_column_metadata(name, {SCALE: str(old), TARGET: str(new)})
@@ -130,7 +127,7 @@ def _announce(table: Table, found: Evolution) -> None:
 
 def _settle(table: Table) -> None:
     """Take back the announcement of a migration: the scales are those of the catalogue again."""
-    with storage_errors(table.folder), _conflicts(table):
+    with table.committing():
         delta = _now(table)
         for field in delta.schema().fields:
             if field.metadata.get(TARGET):
@@ -149,7 +146,7 @@ def _rescale(warehouse: Warehouse, found: Evolution, progress: Progress) -> tupl
             actions.append(_rewrite(table, file, ratios))
             progress(file.rows, before.rows)
         land_ahead(warehouse, actions, before.files)
-        with storage_errors(table.folder), _conflicts(table):
+        with table.committing():
             delta.create_write_transaction(
                 list(actions),
                 mode="overwrite",
@@ -187,14 +184,3 @@ def _now(table: Table) -> DeltaTable:
     if delta is None:
         raise StorageError(f"{table.folder}: the table is gone. Restore it from a backup.")
     return delta
-
-
-@contextlib.contextmanager
-def _conflicts(table: Table) -> Iterator[None]:
-    try:
-        yield
-    except CommitFailedError:
-        raise ConflictError(
-            f"{table.folder}: another process changed the table at the same moment. Run the same "
-            "command again."
-        ) from None

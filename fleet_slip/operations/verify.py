@@ -59,11 +59,6 @@ DamageKind: TypeAlias = Literal[
     "unchecked",
 ]
 
-TASK_BYTES = 2**27
-
-TASK_FILES = 64
-"""A task reads about so many bytes, or so many files."""
-
 
 @dataclass(frozen=True)
 class Damage:
@@ -120,13 +115,10 @@ def verify_files(
     table = snapshot.table
     read: list[ReadFile] = []
     with LocalThreads(os.cpu_count() or 1) as threads:
-        groups = _groups(snapshot.files)
-        task = partial(_read_files, table)
-        for group, found in run_tasks(
-            executor or threads, task, groups, lambda g: f"{len(g)} files from {g[0].path}"
-        ):
-            read += found
-            progress(sum(file.size_bytes for file in group), snapshot.size_bytes)
+        task, files = partial(read_whole, table), snapshot.files
+        for file, found in run_tasks(executor or threads, task, files, lambda f: f.path):
+            read.append(found)
+            progress(file.size_bytes, snapshot.size_bytes)
     read.sort(key=lambda one: one.file.path)
     for one in read:
         if one.problem:
@@ -136,21 +128,6 @@ def verify_files(
     report.size_bytes += snapshot.size_bytes
     report.rows += snapshot.rows if table.folder.name == "logs" else 0
     return [one for one in read if not one.problem]
-
-
-def _groups(files: Sequence[TableFile]) -> Iterator[tuple[TableFile, ...]]:
-    group: tuple[TableFile, ...] = ()
-    for file in files:
-        group = (*group, file)
-        if sum(one.size_bytes for one in group) >= TASK_BYTES or len(group) == TASK_FILES:
-            yield group
-            group = ()
-    if group:
-        yield group
-
-
-def _read_files(table: Table, files: Sequence[TableFile]) -> list[ReadFile]:
-    return [read_whole(table, file) for file in files]
 
 
 def read_whole(table: Table, file: TableFile) -> ReadFile:

@@ -1,5 +1,6 @@
 """A Delta table of a data root: its files, and what it takes to open and make it."""
 
+import contextlib
 import json
 import math
 import random
@@ -436,22 +437,19 @@ class Snapshot:
         """Apply a change in one atomic commit. Raises `ConflictError` and `StorageError`."""
         table, actions = self.table, change.actions()
         note = checked_note(change.note, actions, {u.name: u.version for u in change.units})
-        with storage_errors(table.folder):
-            try:
-                delta = self.delta or table.create()
-                require_writable(table.folder, table.schema, delta, table.unneeded(change.add))
-                delta.create_write_transaction(
-                    actions,
-                    mode="append",
-                    schema=table.schema,
-                    partition_by=list(table.partition_by),
-                    commit_properties=CommitProperties(
-                        custom_metadata={NOTE: note},
-                        app_transactions=[Transaction(u.name, u.version) for u in change.units],
-                    ),
-                )
-            except CommitFailedError as error:
-                raise table.conflict_of(error) from None
+        with table.committing():
+            delta = self.delta or table.create()
+            require_writable(table.folder, table.schema, delta, table.unneeded(change.add))
+            delta.create_write_transaction(
+                actions,
+                mode="append",
+                schema=table.schema,
+                partition_by=list(table.partition_by),
+                commit_properties=CommitProperties(
+                    custom_metadata={NOTE: note},
+                    app_transactions=[Transaction(u.name, u.version) for u in change.units],
+                ),
+            )
             table.folder.settle_commits(self.version)
 
 
@@ -633,26 +631,28 @@ class Table:
         note = CommitProperties(custom_metadata={NOTE: checked_note({"job": "fence"}, [], {})})
 
         def attempt() -> None:
-            with storage_errors(self.folder):
-                try:
-                    delta = self.open_delta() or self.create()
-                    delta.alter.set_table_properties(
-                        {FENCE: uuid.uuid4().hex}, raise_if_not_exists=False, commit_properties=note
-                    )
-                except CommitFailedError as error:
-                    raise self.conflict_of(error) from None
+            with self.committing():
+                delta = self.open_delta() or self.create()
+                delta.alter.set_table_properties(
+                    {FENCE: uuid.uuid4().hex}, raise_if_not_exists=False, commit_properties=note
+                )
                 self.folder.settle_commits(delta.version() - 1)
 
         retry_conflicts(attempt)
 
-    def conflict_of(self, error: CommitFailedError) -> Exception:
-        """Return what a failed commit is to be raised as: a conflict, or the fault that it is."""
-        if not _CONFLICT.search(str(error)):
-            return error
-        return ConflictError(
-            f"{self.folder}: another process changed the table at the same moment "
-            f"({first_line(error)}). Run the same command again."
-        )
+    @contextlib.contextmanager
+    def committing(self) -> Iterator[None]:
+        """Turn a commit's failures into `ConflictError`, or `StorageError` for a fault."""
+        with storage_errors(self.folder):
+            try:
+                yield
+            except CommitFailedError as error:
+                if not _CONFLICT.search(str(error)):
+                    raise
+                raise ConflictError(
+                    f"{self.folder}: another process changed the table at the same moment "
+                    f"({first_line(error)}). Run the same command again."
+                ) from None
 
     def create(self) -> DeltaTable:
         """Make the table, and return it as made, so that a commit on it meets those of others."""
