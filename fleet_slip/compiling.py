@@ -1,17 +1,39 @@
-"""How the functions of this package are compiled: to the same bits on every machine."""
+"""How the functions of this package are compiled: to the same bits on every machine.
 
+Compiled code is kept in a folder of this user alone, since whoever reads it executes it.
+"""
+
+import atexit
 import functools
+import json
+import logging
+import os
+import shutil
+import stat
 from collections.abc import Callable
+from contextlib import suppress
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from fleet_slip.base import missing
-from fleet_slip.caches import code_folder
+from fleet_slip.resources import cache_folder
 
 try:
     import llvmlite
     import numba
 except ModuleNotFoundError:  # of an extra: what is compiled says so when it is called
     numba = None  # type: ignore[assignment]
+
+LOGGER = logging.getLogger("fleet_slip")
+
+PACKAGE = Path(__file__).parent
+
+CHECKSUMS = "checksums.json"
+LEAST_FREE_BYTES = 2**25
+PREFIX = "fleet-slip-"
+KEPT_VERSIONS = 8
+"""So many folders of other sources stay, newest first."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -52,7 +74,7 @@ exact_loop = _compiler(nogil=True, error_model="numpy", fastmath={"reassoc", "co
 def kernel(function: Function) -> Function:
     """Compile a function that is called from Python, without the GIL.
 
-    numba keeps the code in a folder that this user alone can write, if there is one (`caches`).
+    numba keeps the code in a folder that this user alone can write, if there is one.
     """
     folder = code_folder(f"{numba.__version__} {llvmlite.__version__}") if numba else None
     if folder is None:
@@ -66,3 +88,87 @@ def kernel(function: Function) -> Function:
         return inner_loop(function)
     finally:
         config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = usual
+
+
+@functools.cache
+def code_folder(versions: str) -> Path | None:
+    """Return where code of these sources, compiled by some `versions`, is kept.
+
+    None, and a remark, if there is no such folder or others can write it: what is kept is pickled
+    machine code. Files that are not as the process left them that wrote them are deleted.
+    """
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    try:
+        base = Path(given or cache_folder("compiled")).resolve()
+        folder = base / f"{PREFIX}{digest_sources(versions)}"
+        for one in reversed([folder, *folder.parents]):
+            if not one.is_dir():
+                one.mkdir(0o700, exist_ok=True)
+        _require_own(folder)
+    except OSError as error:
+        LOGGER.warning(
+            "there is no folder where compiled code can be kept (%s): each command compiles anew, "
+            "which takes seconds. Set NUMBA_CACHE_DIR to a folder that this user alone can write.",
+            error,
+        )
+        return None
+    sums = _delete_damaged(folder)
+    atexit.register(_write_checksums, folder, sums)
+    for old in sorted(base.glob(f"{PREFIX}*"), key=os.path.getmtime)[:-KEPT_VERSIONS]:
+        shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+def digest_sources(versions: str) -> str:
+    """Return a digest of all sources: compiled code has constants and functions of any of them."""
+    digest = sha256(versions.encode())
+    for source in sorted(PACKAGE.rglob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:32]
+
+
+def _require_own(folder: Path) -> None:
+    """Raise `OSError` if others can write a folder or put another in its place; if it is full."""
+    for one in (folder, *folder.parents):
+        found = one.stat(follow_symlinks=False)
+        if one == folder:
+            safe = found.st_uid == os.getuid() and not found.st_mode & 0o077
+        else:  # where only owners may rename, as in /tmp, this one's folder stays
+            by_others = found.st_mode & 0o022 and not found.st_mode & stat.S_ISVTX
+            safe = found.st_uid in (os.getuid(), 0) and not by_others
+        if not safe:
+            raise PermissionError(f"others than this user can write {one}")
+    space = os.statvfs(folder)
+    if space.f_bavail * space.f_frsize < LEAST_FREE_BYTES or not os.access(folder, os.W_OK):
+        raise OSError(f"{folder} cannot be written, or its disk is full")
+
+
+def _delete_damaged(folder: Path) -> dict[str, str]:
+    """Delete what a power cut or a disk damaged; return the checksums of the rest.
+
+    numba renames files without flushing them, and executes what it reads.
+    """
+    known = {}
+    with suppress(OSError, ValueError):
+        known = dict(json.loads((folder / CHECKSUMS).read_bytes()))
+    sums = _checksums(folder)
+    for name in sums.keys() - dict(sums.items() & known.items()).keys():
+        (folder / name).unlink(missing_ok=True)
+        del sums[name]
+    return sums
+
+
+def _write_checksums(folder: Path, before: dict[str, str]) -> None:
+    with suppress(OSError):
+        if (sums := _checksums(folder)) != before:
+            draft = folder / f"{CHECKSUMS}.{os.getpid()}"
+            draft.write_text(json.dumps(sums))
+            draft.replace(folder / CHECKSUMS)
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    found = {}
+    for file in folder.glob("*/*.nb[ic]"):
+        with suppress(FileNotFoundError):  # of another process
+            found[str(file.relative_to(folder))] = sha256(file.read_bytes()).hexdigest()
+    return found

@@ -1,4 +1,4 @@
-"""Find `configs/`, `jobs/` and `warehouse/` in a checkout and in an installed package."""
+"""Find `configs/`, `jobs/` and `warehouse/`, installed or not, and folders of this user."""
 
 import os
 from importlib.resources import files
@@ -118,3 +118,10 @@ def _is_file(path: Traversable) -> bool:
         return path.is_file()
     except (OSError, ValueError):
         return False
+
+
+def cache_folder(name: str) -> Path:
+    """Return a folder of this user for what can be lost."""
+    service = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
+    return Path(service or Path(home, "fleet-slip"), name)

@@ -20,8 +20,9 @@ from fleet_slip.ingest.log_files import find_logs, is_url
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.registry import CANDIDATE, ModelVersion
 from fleet_slip.models.request import load_model_list
-from fleet_slip.operations.night import NightReport, NightStep, State
-from fleet_slip.storage.runs import Beginning, Nights, hash_drive, step
+from fleet_slip.operations.night import Beginning, NightReport, Nights, NightStep, State
+from fleet_slip.storage.runs import step
+from fleet_slip.warehouse.condition import hash_drive
 from fleet_slip.warehouse.tables import connect_tables, gram_snapshots
 
 if TYPE_CHECKING:

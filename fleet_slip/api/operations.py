@@ -27,10 +27,9 @@ if TYPE_CHECKING:
     from fleet_slip.grams.calibration import Calibration
     from fleet_slip.models.registry import ModelVersion
     from fleet_slip.operations.find_drives import VacuumReport
-    from fleet_slip.operations.forget import Calling, ForgetReport
+    from fleet_slip.operations.forget import Calling, ForgetReport, RetentionReport
     from fleet_slip.operations.monitor import Chart
     from fleet_slip.operations.quality import QualityReport
-    from fleet_slip.operations.retention import RetentionReport
     from fleet_slip.operations.rewriting import CompactionReport
     from fleet_slip.operations.status import WarehouseStatus
     from fleet_slip.operations.verify import Verification
@@ -259,7 +258,7 @@ class HealthAndUpkeep(JudgedModels):
         `config` is its path, by default the one that ships. Progress is in files. Raises
         `RefusedError` if no drive would be left, and as `forget`.
         """
-        from fleet_slip.operations.retention import load_retention, retain
+        from fleet_slip.operations.forget import load_retention, retain
 
         told = count_from_start(progress)
         with step("retain") as figures:

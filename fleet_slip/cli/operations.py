@@ -52,7 +52,7 @@ def status(
     if json and prometheus:
         raise UsageError("give one of --json and --prometheus.")
     if prometheus:
-        from fleet_slip.operations.metrics import as_openmetrics  # noqa: PLC0415 - seldom asked
+        from fleet_slip.operations.status import as_openmetrics  # noqa: PLC0415 - seldom asked
 
         print_text(as_openmetrics(found).removesuffix("\n"))
     elif json:

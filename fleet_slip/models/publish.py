@@ -28,8 +28,7 @@ from fleet_slip.models.select import GIVEN, RequestedSelection, Selection, check
 from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.models.trained_drives import checksum_of_drives, pack_hashes
 from fleet_slip.regression.folds import CrossValidation
-from fleet_slip.storage.runs import with_all_drives
-from fleet_slip.warehouse.condition import parse_cohort
+from fleet_slip.warehouse.condition import parse_cohort, with_all_drives
 from fleet_slip.warehouse.tables import Warehouse
 
 # How a model is trained again: as its champion was, and whether that would change anything.

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.base import canonical_json, number_of, sha256_of
-from fleet_slip.caches import cache_folder
 from fleet_slip.catalogue.facts import RECEIVED
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.features import PLAIN
@@ -29,14 +28,15 @@ from fleet_slip.grams.reader import GramReader
 from fleet_slip.ingest.drives import SOURCE
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.operations.quality import SensorFault, examine_drives
-from fleet_slip.storage.runs import hash_drive, without_drives
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.condition import (
     Condition,
     asking,
     drive_columns,
+    hash_drive,
     parse_condition,
     row_columns,
+    without_drives,
 )
 from fleet_slip.warehouse.tables import (
     Warehouse,

@@ -1,8 +1,8 @@
-"""Forgets drives: one car's, a single one, or all before a day.
+"""Forgets drives: one car's, a single one, or all that are older than the retention says.
 
 Rows leave `quarantine`, `logs` (files are written again, in one commit) and `grams` (reconciled) in
 this order, so that what is left tells an interrupted job what to do. The record
-(`fleet_slip/warehouse/audit.py`) is written first, then quarantine and logs are fenced: commits
+(`warehouse/forgotten.py`) is written first, then quarantine and logs are fenced: commits
 that have not seen it conflict. Then Gram rows are fenced, against those that have not seen the new
 logs. What such jobs have written is deleted by them or here.
 """
@@ -10,17 +10,23 @@ logs. What such jobs have written is deleted by them or here.
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import date, timedelta
 from typing import Literal, TypeAlias
 
 import pyarrow as pa
 import pyarrow.compute as pc
+from pydantic import Field
 
 from fleet_slip.base import Progress, no_progress
-from fleet_slip.errors import QuestionError
+from fleet_slip.config import Config, load_config
+from fleet_slip.errors import ConfigError, QuestionError, RefusedError
+from fleet_slip.grams.gram_files import is_of_received
 from fleet_slip.grams.job import reconcile
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import (
+    RETENTION_HOURS,
     Located,
+    VacuumReport,
     digests_of,
     drives_by_file,
     find_old_files,
@@ -28,6 +34,7 @@ from fleet_slip.operations.find_drives import (
     quarantined_of,
     read_old_files,
     remove_old_files,
+    vacuum,
 )
 from fleet_slip.operations.marked_models import models_trained_on
 from fleet_slip.operations.rewriting import (
@@ -37,17 +44,12 @@ from fleet_slip.operations.rewriting import (
     rewrite,
     write_without,
 )
+from fleet_slip.resources import config_file, find_config
 from fleet_slip.storage.runs import runs_under_way
 from fleet_slip.storage.table import Change, retry_conflicts, rows_in
 from fleet_slip.views import connect
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
-
-# Which model versions were trained on drives that were forgotten.
-#
-# Who forgets judges the versions there are. One published meanwhile, of older Gram rows, counts as
-# trained on them until the erasure is done; then if one of its own drives
-# (`models/trained_drives.py`), or an unknown one, has no Gram rows any more.
 
 
 @dataclass(frozen=True)
@@ -263,3 +265,56 @@ def _named_rows(warehouse: Warehouse, calling: Calling, *, old: bool) -> Iterato
     if old:
         for table in (warehouse.logs, warehouse.grams):
             yield from (one.rows for one in read_old_files(table.snapshot()))
+
+
+# How long data is kept: `configs/retention.toml`, or a file of the user's own.
+
+
+class Retention(Config):
+    """How long drives and replaced files are kept."""
+
+    drives_days: int = Field(ge=1, le=36_500)
+    replaced_files_hours: int = Field(ge=1, le=RETENTION_HOURS)
+
+
+@dataclass(frozen=True)
+class RetentionReport:
+    """What was forgotten, and which files were removed."""
+
+    before: date
+    forgotten: ForgetReport
+    vacuumed: VacuumReport
+
+
+def load_retention(path: str | None) -> Retention:
+    """Read a retention file, the one that ships unless told otherwise. Raises `ConfigError`."""
+    file = config_file("retention.toml") if path is None else find_config("retention", path)
+    return load_config(file, Retention)
+
+
+def retain(
+    warehouse: Warehouse,
+    retention: Retention,
+    today: date,
+    progress: Progress = no_progress,
+) -> RetentionReport:
+    """Forget the drives that are older than retention says, then vacuum; `progress` counts files.
+
+    Raises `RefusedError` if not one drive would be left, as with a clock that is wrong.
+    """
+    warehouse.require()
+    try:
+        before = today - timedelta(days=retention.drives_days)
+    except OverflowError:
+        raise ConfigError(f"drives_days = {retention.drives_days}: too long ago.") from None
+    days = [file.day for file in warehouse.logs.snapshot().files if file.day is not None]
+    for file in filter(is_of_received, warehouse.grams.snapshot().files):
+        days.append(pc.max(warehouse.grams.read(file.path, ["day"])["day"]).as_py())
+    if days and max(days) < before:
+        raise RefusedError(
+            f"{warehouse.root}: its latest drive is of {max(days)} and all before {before} would "
+            "be forgotten, which leaves none. Check the clock, or drives_days of the retention."
+        )
+    forgotten = forget(warehouse, Forgettable("before", before.isoformat()), progress=progress)
+    vacuumed = vacuum(warehouse, retention.replaced_files_hours)
+    return RetentionReport(before, forgotten, vacuumed)

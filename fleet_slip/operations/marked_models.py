@@ -1,4 +1,9 @@
-"""Which model versions were trained on drives that were forgotten since."""
+"""Which model versions were trained on drives that were forgotten since.
+
+Who forgets judges the versions there are. One published meanwhile, of older Gram rows, counts as
+trained on them until the erasure is done; then if one of its own drives, or an unknown one, has no
+Gram rows any more.
+"""
 
 from collections.abc import Callable, Collection
 from functools import cache

@@ -1,8 +1,8 @@
-"""What a night came to: `Fleet.nightly` returns it."""
+"""What a night came to: `Fleet.nightly` returns it, and the next night knows it."""
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -12,11 +12,90 @@ from fleet_slip.errors import AlarmError, FleetSlipError, printable
 from fleet_slip.operations.monitor import Chart, control_chart
 from fleet_slip.pages.drawing import Picture, draw
 from fleet_slip.pages.page import Cell, Mark, ReportTable, Tile, count, fill_in, table
+from fleet_slip.storage.documents import DocumentFolder
+from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.runs import Beginning, PastNight, hash_drive
+from fleet_slip.warehouse.condition import hash_drive
 
 if TYPE_CHECKING:
     from fleet_slip.operations.quality import SensorFault
+
+NIGHTS_FOLDER = "nights"
+"""Of numbered documents, two of a night: its beginning and its end."""
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What a root had when a night began: its champion, and hashes of drives `known` as faulty."""
+
+    champion: str | None
+    drives: int
+    rows: int
+    quarantined: int
+    known: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class PastNight:
+    """How a night ended; `steps` are the state of each by name."""
+
+    night: date
+    exit_code: int
+    drives: int
+    rows: int
+    champion: str | None
+    steps: Mapping[str, str]
+    faulty: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Nights:
+    """The nights of one model in a data root."""
+
+    root: Folder
+    model: str
+
+    def begin(self, night: date, now: Beginning) -> Beginning:
+        """Record the beginning of a night; return the one that is there, if the night has one."""
+        for content in self._newest_first():
+            if content["night"] < night.isoformat():
+                break
+            if content["night"] == night.isoformat() and content["event"] == "begun":
+                kept = {name: content[name] for name in vars(now)}
+                return Beginning(**{**kept, "known": frozenset(content["known"])})
+        before = next(self.ended(before=night), None)
+        known = before.faulty if before else frozenset()
+        begun = replace(now, known=known)
+        self._append("begun", night, {**vars(begun), "known": sorted(begun.known)})
+        return begun
+
+    def end(self, past: PastNight) -> None:
+        """Record how a night ended."""
+        content = {**vars(past), "steps": dict(past.steps), "faulty": sorted(past.faulty)}
+        self._append("ended", content.pop("night"), content)
+
+    def ended(self, before: date | None = None) -> Iterator[PastNight]:
+        """Yield the nights that ended, the newest first and each once, as it ended at last."""
+        seen = {before.isoformat()} if before else set()
+        for content in self._newest_first():
+            late = before is not None and content["night"] > before.isoformat()
+            if content["event"] == "ended" and content["night"] not in seen and not late:
+                seen.add(content["night"])
+                kept = {field.name: content[field.name] for field in fields(PastNight)}
+                kept |= {"night": date.fromisoformat(content["night"])}
+                yield PastNight(**{**kept, "faulty": frozenset(content["faulty"])})
+
+    def _newest_first(self) -> Iterator[Mapping[str, Any]]:
+        documents = DocumentFolder(self.root / NIGHTS_FOLDER)
+        for number in reversed(documents.numbers()):
+            content = documents.read(number).content
+            if content["model"] == self.model:
+                yield content
+
+    def _append(self, event: str, night: date, content: Mapping[str, Any]) -> None:
+        known = {"event": event, "model": self.model, "night": night.isoformat()}
+        DocumentFolder(self.root / NIGHTS_FOLDER).append({**known, **content})
+
 
 State: TypeAlias = Literal["done", "attention", "failed", "left out"]
 

@@ -1,7 +1,7 @@
 """A folder of files below a data root: the few operations that the rest of the program needs.
 
-Files are written whole, once: no locks, no directories. `fleet_slip.files.local_folder` is one of a
-file system, `fleet_slip.files.object_folder` one of an object store.
+Files are written whole, once: no locks, no directories. `fleet_slip.storage.local` is one of a file
+system, `fleet_slip.storage.objects` one of an object store.
 """
 
 import time

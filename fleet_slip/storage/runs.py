@@ -1,9 +1,8 @@
-"""The history of runs and nights: which commands changed a data root, and what came of it.
+"""The history of runs: which commands changed a data root, and what came of it.
 
     runs/2026-11.jsonl                        one line when a command starts, one when it ends
     runs/2026-11.jsonl/TIME-RANDOM.jsonl      such lines, on an object store
     runs/2026-11.jsonl/CHECKSUM.jsonl         lines of that month, gathered
-    nights/1.json, 2.json, ...                two of a night: its beginning and its end
 
 A line is one write, never changed, that ends in a checksum of the bytes before: no lock, and a
 killed run lacks its second line. A changed line differs from a torn one, which lacks its end and is
@@ -22,12 +21,11 @@ import re
 import socket
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
-from dataclasses import dataclass, field, fields, replace
-from datetime import UTC, date, datetime, timedelta
-from hashlib import sha256
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -484,107 +482,3 @@ def _gather(folder: Folder, month: str, files: list[StoredFile]) -> None:
 
 def _is_record(path: str) -> bool:
     return path.endswith(".jsonl")
-
-
-NIGHTS_FOLDER = "nights"
-HASH_CHARACTERS = 16
-
-
-@dataclass(frozen=True)
-class Beginning:
-    """What a root had when a night began: its champion, and hashes of drives `known` as faulty."""
-
-    champion: str | None
-    drives: int
-    rows: int
-    quarantined: int
-    known: frozenset[str] = frozenset()
-
-
-@dataclass(frozen=True)
-class PastNight:
-    """How a night ended; `steps` are the state of each by name."""
-
-    night: date
-    exit_code: int
-    drives: int
-    rows: int
-    champion: str | None
-    steps: Mapping[str, str]
-    faulty: frozenset[str] = frozenset()
-
-
-def hash_drive(model: str, drive_id: str) -> str:
-    """Return `left(sha256('MODEL ' || drive_id), 16)`, which stands for a drive in the record."""
-    return sha256(f"{model} {drive_id}".encode()).hexdigest()[:HASH_CHARACTERS]
-
-
-@dataclass(frozen=True)
-class Nights:
-    """The nights of one model in a data root."""
-
-    root: Folder
-    model: str
-
-    def begin(self, night: date, now: Beginning) -> Beginning:
-        """Record the beginning of a night; return the one that is there, if the night has one."""
-        for content in self._newest_first():
-            if content["night"] < night.isoformat():
-                break
-            if content["night"] == night.isoformat() and content["event"] == "begun":
-                kept = {name: content[name] for name in vars(now)}
-                return Beginning(**{**kept, "known": frozenset(content["known"])})
-        before = next(self.ended(before=night), None)
-        known = before.faulty if before else frozenset()
-        begun = replace(now, known=known)
-        self._append("begun", night, {**vars(begun), "known": sorted(begun.known)})
-        return begun
-
-    def end(self, past: PastNight) -> None:
-        """Record how a night ended."""
-        content = {**vars(past), "steps": dict(past.steps), "faulty": sorted(past.faulty)}
-        self._append("ended", content.pop("night"), content)
-
-    def ended(self, before: date | None = None) -> Iterator[PastNight]:
-        """Yield the nights that ended, the newest first and each once, as it ended at last."""
-        seen = {before.isoformat()} if before else set()
-        for content in self._newest_first():
-            late = before is not None and content["night"] > before.isoformat()
-            if content["event"] == "ended" and content["night"] not in seen and not late:
-                seen.add(content["night"])
-                kept = {field.name: content[field.name] for field in fields(PastNight)}
-                kept |= {"night": date.fromisoformat(content["night"])}
-                yield PastNight(**{**kept, "faulty": frozenset(content["faulty"])})
-
-    def _newest_first(self) -> Iterator[Mapping[str, Any]]:
-        documents = DocumentFolder(self.root / NIGHTS_FOLDER)
-        for number in reversed(documents.numbers()):
-            content = documents.read(number).content
-            if content["model"] == self.model:
-                yield content
-
-    def _append(self, event: str, night: date, content: Mapping[str, Any]) -> None:
-        known = {"event": event, "model": self.model, "night": night.isoformat()}
-        DocumentFolder(self.root / NIGHTS_FOLDER).append({**known, **content})
-
-
-def without_drives(cohort: str, model: str, hashes: Iterable[str]) -> str:
-    """Return a condition that also leaves out the drives of these hashes."""
-    listed = ", ".join(f"'{one}'" for one in sorted(hashes))
-    if not listed:
-        return cohort
-    return (
-        f"({cohort}) AND left(sha256('{model} ' || drive_id), {HASH_CHARACTERS}) NOT IN ({listed})"
-    )
-
-
-_LEFT_OUT = re.compile(
-    r"\((.*)\) AND left\(sha256\('[^']*' \|\| drive_id\), \d+\) NOT IN \([^()]*\)", re.DOTALL
-)
-
-
-def with_all_drives(cohort: str) -> str:
-    """Return a condition as it was before `without_drives` left out some."""
-    while found := _LEFT_OUT.fullmatch(cohort):
-        cohort = found[1]
-    return cohort

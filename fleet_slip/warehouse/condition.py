@@ -10,9 +10,11 @@ understood, written out again.
 import contextlib
 import functools
 import json
+import re
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any
 
 import duckdb
@@ -216,3 +218,35 @@ def _ask(statement: str, text: str) -> tuple[Any, ...]:
     with _asking:
         [row] = _parser().execute(statement, {"text": text}).fetchall()
     return tuple(row)
+
+
+# Conditions that leave out drives by hashes, which say nothing of a drive's name.
+
+HASH_CHARACTERS = 16
+
+
+def hash_drive(model: str, drive_id: str) -> str:
+    """Return `left(sha256('MODEL ' || drive_id), 16)`, which stands for a drive in the record."""
+    return sha256(f"{model} {drive_id}".encode()).hexdigest()[:HASH_CHARACTERS]
+
+
+def without_drives(cohort: str, model: str, hashes: Iterable[str]) -> str:
+    """Return a condition that also leaves out the drives of these hashes."""
+    listed = ", ".join(f"'{one}'" for one in sorted(hashes))
+    if not listed:
+        return cohort
+    return (
+        f"({cohort}) AND left(sha256('{model} ' || drive_id), {HASH_CHARACTERS}) NOT IN ({listed})"
+    )
+
+
+_LEFT_OUT = re.compile(
+    r"\((.*)\) AND left\(sha256\('[^']*' \|\| drive_id\), \d+\) NOT IN \([^()]*\)", re.DOTALL
+)
+
+
+def with_all_drives(cohort: str) -> str:
+    """Return a condition as it was before `without_drives` left out some."""
+    while found := _LEFT_OUT.fullmatch(cohort):
+        cohort = found[1]
+    return cohort

@@ -10,7 +10,7 @@ import llvmlite
 import numba
 import pytest
 
-from fleet_slip import caches
+from fleet_slip import compiling
 from tests.support.commands import Finished, run
 
 VERSIONS = f"{numba.__version__} {llvmlite.__version__}"
@@ -54,7 +54,7 @@ def cache(compiled: Path, tmp_path: Path) -> Path:
 
 
 def kept(cache: Path, suffix: str) -> Path:
-    (file,) = cache.glob(f"{caches.PREFIX}*/*/*{suffix}")
+    (file,) = cache.glob(f"{compiling.PREFIX}*/*/*{suffix}")
     return file
 
 
@@ -95,8 +95,8 @@ def run_if_unpickled(cache: Path, mark: Path) -> None:
     file = kept(cache, ".nbi")
     file.write_bytes(f"cos\nsystem\n(S'touch {mark}'\ntR.".encode())
     folder = file.parents[1]
-    sums = json.dumps(caches._checksums(folder))
-    (folder / caches.CHECKSUMS).write_text(sums)
+    sums = json.dumps(compiling._checksums(folder))
+    (folder / compiling.CHECKSUMS).write_text(sums)
 
 
 def test_code_that_others_may_have_written_is_not_read(
@@ -157,12 +157,12 @@ def test_a_change_of_any_source_and_of_the_compiler_takes_another_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A kernel has constants and functions of other modules in it."""
-    monkeypatch.setattr(caches, "PACKAGE", tmp_path)
+    monkeypatch.setattr(compiling, "PACKAGE", tmp_path)
     (tmp_path / "vehicle").mkdir()
     digests = set()
     for text in ("one", "other"):
         (tmp_path / "vehicle" / "pose.py").write_text(text)
-        digests |= {caches.digest_sources(version) for version in ("1", "2")}
+        digests |= {compiling.digest_sources(version) for version in ("1", "2")}
     assert len(digests) == 4
 
 

@@ -15,8 +15,7 @@ from fleet_slip.errors import DataError, RefusedError, UnexaminedError
 from fleet_slip.models import acceptance as champion_rules
 from fleet_slip.operations import examined, quality
 from fleet_slip.operations.quality import QualityReport
-from fleet_slip.storage.runs import hash_drive, with_all_drives, without_drives
-from fleet_slip.warehouse.condition import Condition
+from fleet_slip.warehouse.condition import Condition, hash_drive, with_all_drives, without_drives
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.counted_rows import START_S, write_counted

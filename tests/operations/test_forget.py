@@ -20,8 +20,7 @@ from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import compute_grams
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.find_drives import Located, drives_by_file, find_unreferenced, locate
-from fleet_slip.operations.forget import forget
-from fleet_slip.operations.retention import Retention, retain
+from fleet_slip.operations.forget import Retention, forget, retain
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder

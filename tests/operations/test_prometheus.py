@@ -13,8 +13,12 @@ from prometheus_client.openmetrics.parser import (
 )
 from prometheus_client.parser import text_string_to_metric_families as parse_prometheus
 
-from fleet_slip.operations.metrics import as_openmetrics
-from fleet_slip.operations.status import ChampionStatus, TableStatus, WarehouseStatus
+from fleet_slip.operations.status import (
+    ChampionStatus,
+    TableStatus,
+    WarehouseStatus,
+    as_openmetrics,
+)
 from tests.support.commands import done_on, run_on
 
 MOMENT = datetime(2026, 10, 5, 2, 30, tzinfo=UTC)

@@ -32,7 +32,7 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.score import score
 from fleet_slip.models.select import answer_request
-from fleet_slip.operations.retention import load_retention
+from fleet_slip.operations.forget import load_retention
 from fleet_slip.resources import find_config, folder
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.roads import load_track

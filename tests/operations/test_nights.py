@@ -8,9 +8,9 @@ import duckdb
 import pytest
 
 from fleet_slip.errors import StorageError
+from fleet_slip.operations.night import Beginning, Nights, PastNight
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.runs import Beginning, Nights, PastNight, hash_drive, without_drives
-from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.condition import hash_drive, parse_condition, without_drives
 
 MONDAY, TUESDAY = date(2026, 10, 5), date(2026, 10, 6)
 NOW = Beginning("fleet@1", drives=4, rows=100, quarantined=0)
