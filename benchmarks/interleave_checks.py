@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 import fleet_slip
-from benchmarks.interleave_roots import CAR, FIRST_DAY, RESCALED, ROWS
+from benchmarks.interleave_roots import ADDED, CAR, FIRST_DAY, ROWS
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import FleetSlipError
@@ -60,7 +60,7 @@ def drives_of(warehouse: Warehouse) -> tuple[dict[str, Drive], list[str]]:
 def _described(rows: pa.Table, day: str) -> Drive:
     digest = hashlib.sha256()
     for name in ("tick", *catalogue().signals):
-        if name != RESCALED and name in rows.schema.names:
+        if name != ADDED and name in rows.schema.names:
             digest.update(rows[name].fill_null(-32768).combine_chunks().to_numpy().tobytes())
     return Drive(day, rows["vehicle_id"][0].as_py(), rows.num_rows, digest.hexdigest())
 

@@ -137,32 +137,27 @@ class Pair:
     def _settle(self, root: str) -> list[str]:
         """Give both commands again until both are done; return what keeps failing."""
         order = [name for name in (*SETTLING, "gram", *FORGETTING) if name in self._both]
-        environments = [self._inputs.environment(*self._both)]
-        if {"migrate", "repair"} <= self._both:  # what is damaged is repaired before it is migrated
-            environments.append(self._inputs.environment("repair"))
-        given = [(name, self._inputs.arguments(name)) for name in (*order, "gram")]
-        code, said = forked(lambda: _repeat(root, given, environments)).result
+        whole = self._inputs.environment(*self._both)
+        before = self._inputs.environment("repair")  # what was simulated before it is migrated
+        given = [
+            (name, self._inputs.arguments(name), before if name == "repair" else whole)
+            for name in (*order, "gram")
+        ]
+        code, said = forked(lambda: _repeat(root, given)).result
         return [f"keeps failing: {said}"] if code else []
 
 
 def _repeat(
-    root: str, given: Sequence[tuple[str, tuple[str, ...]]], environments: Sequence[Environment]
+    root: str, given: Sequence[tuple[str, tuple[str, ...], Environment]]
 ) -> tuple[int, str]:
     failed: dict[str, int] = {}
     let_temporary_files_age(root)
     for _ in range(ROUNDS):
-        codes = {name: _give(root, arguments, environments) for name, arguments in given}
+        codes = {name: command(root, words, environment) for name, words, environment in given}
         failed = {n: code for n, code in codes.items() if code not in NOTHING_LEFT.get(n, {0})}
         if not failed:
             break
     return len(failed), ", ".join(f"{name} ends with {code}" for name, code in failed.items())
-
-
-def _give(root: str, arguments: tuple[str, ...], environments: Sequence[Environment]) -> int:
-    """Give a command in the first environment whose catalogue it does not refuse."""
-    codes = (command(root, arguments, environment) for environment in environments)
-    refused = RefusedError.exit_code
-    return next((code for code in codes if code != refused), refused)
 
 
 def _base(root: str, environment: Environment) -> dict[str, Any]:

@@ -30,8 +30,20 @@ FIRST_DAY, SECOND_DAY = date(2024, 5, 1), date(2024, 5, 2)
 ROWS = 100
 """Rows of a measured drive of another car; one of the car's has one more."""
 
-RESCALED = "steer_fr"
-"""The signal to which `migrate` gives another scale."""
+ADDED = "tyre_pressure"
+"""The signal that `migrate` adds."""
+
+NEW_SIGNAL = """
+[signals.tyre_pressure]
+unit = "Pa"
+column = "tyre_pressure_pa"
+scale = 1000
+min = 0
+max = 20000000
+role = "input"
+description = "Pressure in a tyre"
+
+"""
 
 TRAINING = ("--cohort", "vehicle_model = 'van'", "--by", "vehicle")
 PUBLISH = ("publish", "sideslip", *TRAINING, "--nested", "ay", "--force")
@@ -111,10 +123,9 @@ def write_inputs(where: Path) -> Inputs:
     (where / "retention.toml").write_text(retention, encoding="utf-8")
     signals = (folder("configs") / "signals.toml").read_text(encoding="utf-8")
     (where / "signals.toml").write_text(signals, encoding="utf-8")
-    before, found, after = signals.partition(f"[signals.{RESCALED}]")
-    rescaled = after.replace("scale = 0.00005", "scale = 0.0001", 1)
-    assert rescaled != after
-    (where / "new_signals.toml").write_text(before + found + rescaled, encoding="utf-8")
+    before, found, after = signals.partition("[drive.drive_id]")
+    assert found
+    (where / "new_signals.toml").write_text(before + NEW_SIGNAL + found + after, encoding="utf-8")
     return Inputs(where)
 
 

@@ -243,17 +243,15 @@ class LogsAndGrams(Rooted):
         return check_grams(self.warehouse, files, count_from_start(progress), begin)
 
     @record_call
-    def migrate(self, *, progress: ShowProgress | None = None) -> "MigrationReport":
-        """Bring the logs to the catalogue (`docs/configuration.md`): new columns, other scales.
+    def migrate(self) -> "MigrationReport":
+        """Bring the tables to this program and its catalogue (`docs/configuration.md`).
 
-        Progress is in rows. Raises `RefusedError` if counts would not fit, and `ConflictError`.
+        Raises `RefusedError` if the counts are in other scales, and `ConflictError`.
         """
         from fleet_slip.operations.migration import migrate
 
-        with step("migrate") as figures:
-            report = migrate(self.warehouse, count_from_start(progress))
-            figures.rows = report.rows_rewritten
-        return report
+        with step("migrate"):
+            return migrate(self.warehouse)
 
 
 def _chosen_logs(

@@ -258,11 +258,11 @@ def _forget_expired(fleet: Fleet, retention: str | None, json: bool) -> None:
 # The command that brings the logs to the signal catalogue: migrate.
 
 
-@command(Fleet.migrate, progress=("migrate", "rows"))
+@command(Fleet.migrate)
 def migrate(report: MigrationReport) -> None:
-    """Bring the logs to the signal catalogue: add columns, convert counts to other scales.
+    """Bring the data root to this program and to the signal catalogue: add columns.
 
-    See docs/configuration.md before widening a scale. It can be repeated after any interruption.
+    It can be repeated after any interruption.
 
     Example: **fleet-slip migrate**
     """
@@ -270,14 +270,6 @@ def migrate(report: MigrationReport) -> None:
         say("migrate: nothing to do, the logs agree with the signal catalogue")
     if report.added:
         say(f"added: {', '.join(report.added)}; null in the files that are there")
-    for name, (old, new) in report.rescaled.items():
-        say(f"{name}: counts of {old} are now counts of {new}")
     if report.files_without_names:
         files = number_of(report.files_without_names, "file")
         say(f"{files} written anew, without names that none of their rows has")
-    if report.files_rewritten:
-        say(
-            f"{number_of(report.files_rewritten, 'file')}, "
-            f"{number_of(report.rows_rewritten, 'row')} rewritten. Run: "
-            "fleet-slip gram"
-        )

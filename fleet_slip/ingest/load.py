@@ -47,7 +47,6 @@ from fleet_slip.ingest.recordings import (
 )
 from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
 from fleet_slip.ingest.suspicion import find_suspicions
-from fleet_slip.resources import cache_folder
 from fleet_slip.storage.folder import StoredFile
 from fleet_slip.storage.table import Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.warehouse.forgotten import Audit

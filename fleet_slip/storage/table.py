@@ -231,14 +231,10 @@ def retry_conflicts(attempt: Callable[[], Result]) -> Result:
     return attempt()
 
 
-# A count means nothing without its scale, so the schema in the Delta log records each. It changes
-# in the commit that exchanges the files (`fleet_slip.operations.migration`).
+# A count means nothing without its scale, so the schema in the Delta log records each.
 
 SCALE = "scale"
 """Key of a field's metadata: the physical value of one count, as in the catalogue."""
-
-TARGET = "migrating_to"
-"""Key of a field's metadata: the new scale while a migration is under way, else empty or absent."""
 
 
 @dataclass(frozen=True)
@@ -249,19 +245,12 @@ class Evolution:
         added, retired: columns of the catalogue alone, and of the table alone.
         rescaled: old and new scale of the signals whose counts mean something else.
         unrecorded: signals whose scale the table does not record, and which is taken to be ours.
-        migrating: a migration was begun and has not ended.
     """
 
     added: tuple[str, ...]
     retired: tuple[str, ...]
     rescaled: Mapping[str, tuple[Decimal, Decimal]]
     unrecorded: tuple[str, ...]
-    migrating: bool
-
-    @property
-    def pending(self) -> bool:
-        """Whether there is anything to migrate. A retired signal needs nothing."""
-        return bool(self.added or self.rescaled or self.unrecorded or self.migrating)
 
 
 def compare_schemas(schema: pa.Schema, delta: DeltaTable) -> Evolution:
@@ -280,7 +269,6 @@ def compare_schemas(schema: pa.Schema, delta: DeltaTable) -> Evolution:
             if SCALE in stored[name] and Decimal(stored[name][SCALE]) != scale
         },
         unrecorded=tuple(name for name in scales if SCALE not in stored[name]),
-        migrating=any(metadata.get(TARGET) for metadata in stored.values()),
     )
 
 
@@ -301,21 +289,16 @@ def require_readable(folder: Folder, schema: pa.Schema, delta: DeltaTable) -> No
         changes = ", ".join(f"{n} {old} -> {new}" for n, (old, new) in found.rescaled.items())
         raise RefusedError(
             f"{folder}: the counts are in other scales than those of the signal catalogue "
-            f"({changes}). Use the catalogue that the data was written with, or convert the data: "
-            "fleet-slip migrate"
+            f"({changes}). Use the catalogue that the data was written with, or ingest the logs "
+            "into another data root."
         )
 
 
 def require_writable(
     folder: Folder, schema: pa.Schema, delta: DeltaTable, unneeded: Collection[str] = ()
 ) -> None:
-    """Raise `RefusedError` if a table is being migrated, or lacks other than `unneeded` columns."""
+    """Raise `RefusedError` if a table lacks other columns than `unneeded` ones."""
     found = compare_schemas(schema, delta)
-    if found.migrating:
-        raise RefusedError(
-            f"{folder}: a migration to other scales is under way, or was interrupted. Wait for it, "
-            "or run it again: fleet-slip migrate"
-        )
     if needed := [name for name in found.added if name not in unneeded]:
         raise RefusedError(
             f"{folder}: the signal catalogue has columns that the table has not: "

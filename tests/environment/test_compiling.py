@@ -80,8 +80,8 @@ def test_damaged_code_is_deleted(
 def found_by(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path | None:
     """Return which folder a process is given that asks for it now."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
-    monkeypatch.setattr("fleet_slip.caches.atexit.register", lambda *_: None)
-    return caches.code_folder.__wrapped__(VERSIONS)
+    monkeypatch.setattr("fleet_slip.compiling.atexit.register", lambda *_: None)
+    return compiling.code_folder.__wrapped__(VERSIONS)
 
 
 def test_without_a_part_code_is_compiled_anew_and_kept(compiled: Path, cache: Path) -> None:
@@ -115,7 +115,7 @@ def test_code_that_others_may_have_written_is_not_read(
 def test_a_folder_is_refused_that_others_can_write_or_put_another_in_its_place(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(caches.LOGGER, "propagate", True)
+    monkeypatch.setattr(compiling.LOGGER, "propagate", True)
     (own,) = cache.iterdir()
     assert found_by(cache, monkeypatch) == own
     cache.chmod(0o1777)  # as /tmp is: nobody else can rename what is in it
@@ -136,7 +136,7 @@ def test_a_folder_is_refused_that_others_can_write_or_put_another_in_its_place(
 def test_so_is_a_folder_of_another_user(
     cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(caches.LOGGER, "propagate", True)
+    monkeypatch.setattr(compiling.LOGGER, "propagate", True)
     (own,) = cache.iterdir()
     for folder in (own, cache):
         os.chown(folder, 12345, 12345)
