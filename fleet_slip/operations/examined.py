@@ -28,6 +28,7 @@ from fleet_slip.grams.reader import GramReader
 from fleet_slip.ingest.drives import SOURCE
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.operations.quality import SensorFault, examine_drives
+from fleet_slip.resources import cache_folder
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.condition import (
     Condition,
