@@ -153,12 +153,12 @@ class HealthAndUpkeep(JudgedModels):
         These are replaced files and leftovers of killed jobs. Progress is in days. Raises
         `StorageError`, and `ConflictError` if others keep changing files.
         """
-        from fleet_slip.operations.find_drives import RETENTION_HOURS, preview_vacuum, vacuum
+        from fleet_slip.operations.find_drives import RETENTION_HOURS, vacuum
         from fleet_slip.operations.rewriting import TARGET_ROWS, compact
 
         hours = RETENTION_HOURS if retention_hours is None else retention_hours
         if dry_run:
-            return Compacted(None, preview_vacuum(self.warehouse, hours))
+            return Compacted(None, vacuum(self.warehouse, hours, dry_run=True))
         with step("compact") as figures:
             report = compact(self.warehouse, target_rows or TARGET_ROWS, count_from_start(progress))
             figures.rows, figures.size_bytes = report.rows_rewritten, report.size_bytes_after

@@ -1,7 +1,7 @@
 """Finds the drives of a car, or of a time: in log files, and in files that no version refers to."""
 
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import date
 
@@ -39,24 +39,18 @@ class VacuumReport:
     dry_run: bool
 
 
-def vacuum(warehouse: Warehouse, retention_hours: float = RETENTION_HOURS) -> VacuumReport:
+def vacuum(
+    warehouse: Warehouse, retention_hours: float = RETENTION_HOURS, *, dry_run: bool = False
+) -> VacuumReport:
     """Remove what nothing has referred to for some hours; gather the records of runs."""
     warehouse.require()
-    removed = [one for one in find_expired(warehouse, retention_hours) if one.folder.remove(one)]
-    gather_runs(warehouse.root)
-    return _report(warehouse, removed, dry_run=False)
-
-
-def preview_vacuum(warehouse: Warehouse, retention_hours: float = RETENTION_HOURS) -> VacuumReport:
-    """Return what `vacuum` would remove. Raises `StorageError`."""
-    warehouse.require()
-    return _report(warehouse, find_expired(warehouse, retention_hours), dry_run=True)
-
-
-def _report(warehouse: Warehouse, files: Sequence[StoredFile], *, dry_run: bool) -> VacuumReport:
+    found = find_expired(warehouse, retention_hours)
+    if not dry_run:
+        found = [file for file in found if file.folder.remove(file)]
+        gather_runs(warehouse.root)
     return VacuumReport(
-        files=tuple(str(file).removeprefix(f"{warehouse.root}/") for file in files),
-        size_bytes=sum(file.size_bytes for file in files),
+        files=tuple(str(file).removeprefix(f"{warehouse.root}/") for file in found),
+        size_bytes=sum(file.size_bytes for file in found),
         dry_run=dry_run,
     )
 

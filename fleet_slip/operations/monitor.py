@@ -136,12 +136,13 @@ def monitor(
             "days are needed. Choose another cohort, or a later first new day."
         )
     models = _models(manifest, feature_set, grams, training)
-    found = [
-        _day(day, gram, count, model, known)
-        for day, gram, count, model, known in zip(
-            days, grams, sums.drives, models, training, strict=True
-        )
-    ]
+    found = []
+    for day, gram, drives, model, known in zip(
+        days, grams, sums.drives, models, training, strict=True
+    ):
+        errors = error_sums(model, gram).figures(input_scales()[model.label])
+        mean_deg, std_deg = errors.error_mean_deg, errors.error_std_deg
+        found.append(Day(day, drives, gram.n, mean_deg, std_deg, errors.rmse_deg, known))
     usual = [day for day in found if day.training]
     mean = Limits.of([day.error_mean_deg for day in usual], limits.false_alarms_per_day)
     std = Limits.above([day.error_std_deg for day in usual], limits.false_alarms_per_day)
@@ -161,12 +162,6 @@ def _models(
         refit(total - gram) if known else champion
         for gram, known in zip(grams, training, strict=True)
     ]
-
-
-def _day(day: date, gram: Gram, drives: int, model: LinearModel, training: bool) -> Day:
-    figures = error_sums(model, gram).figures(input_scales()[model.label])
-    mean, std, rmse = figures.error_mean_deg, figures.error_std_deg, figures.rmse_deg
-    return Day(day, drives, gram.n, mean, std, rmse, training)
 
 
 def _judged(day: Day, mean: Limits, std: Limits) -> Day:

@@ -39,7 +39,7 @@ def checked_note(
     units: Mapping[str, int],
 ) -> str:
     """Return a commit's note as text, with the checksum of itself, its actions and its units."""
-    stated = [_added(a) if isinstance(a, AddAction) else _removed(a) for a in actions]
+    stated = [*map(_as_logged, actions)]
     stated += [{"txn": {"appId": name, "version": number}} for name, number in units.items()]
     return json.dumps({**note, CHECKSUM_KEY: checksum_of_actions(note, stated)})
 
@@ -52,27 +52,19 @@ def checksum_of_actions(note: Mapping[str, Any], actions: Sequence[Action]) -> s
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
-def _added(action: AddAction) -> Action:
-    return {
-        "add": {
-            "path": action.path,
-            "partitionValues": action.partition_values,
-            "size": action.size,
-            "modificationTime": action.modification_time,
-            "dataChange": action.data_change,
-            "stats": action.stats,
-        }
-    }
+_FIELDS = {
+    "add": ("path", "partition_values", "size", "modification_time", "data_change", "stats"),
+    "remove": ("path", "partition_values", "size", "deletion_timestamp", "data_change"),
+}
+"""Of each kind of action what the log has of it, there in camel case."""
 
 
-def _removed(action: RemoveAction) -> Action:
+def _as_logged(action: AddAction | RemoveAction) -> Action:
+    kind = "add" if isinstance(action, AddAction) else "remove"
     return {
-        "remove": {
-            "path": action.path,
-            "partitionValues": action.partition_values,
-            "size": action.size,
-            "deletionTimestamp": action.deletion_timestamp,
-            "dataChange": action.data_change,
+        kind: {
+            re.sub(r"_(\w)", lambda found: found[1].upper(), name): getattr(action, name)
+            for name in _FIELDS[kind]
         }
     }
 

@@ -24,7 +24,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -207,15 +207,6 @@ class MeasuredStep:
     rows: int | None = None
     size_bytes: int | None = None
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the step for the record."""
-        return {
-            "name": self.name,
-            "seconds": round(self.seconds, 6),
-            "rows": self.rows,
-            "size_bytes": self.size_bytes,
-        }
-
 
 @dataclass
 class Run:
@@ -269,7 +260,7 @@ class Run:
             "outcome": outcome,
             "exit_code": exit_code,
             "error": told if error is not None and exit_code else None,
-            "steps": [one.as_dict() for one in self.steps],
+            "steps": [asdict(one) for one in self.steps],
         }
 
 
@@ -313,12 +304,11 @@ def step(name: str) -> Iterator[MeasuredStep]:
     try:
         yield one
     finally:
-        one.seconds = time.monotonic() - begun
+        one.seconds = round(time.monotonic() - begun, 6)
         if run:
             run.steps.append(one)
-        log_event(
-            "step ended", step=name, **{k: v for k, v in one.as_dict().items() if k != "name"}
-        )
+        figures = asdict(one)
+        log_event("step ended", step=figures.pop("name"), **figures)
 
 
 def publishable(arguments: Sequence[str]) -> list[str]:

@@ -4,16 +4,11 @@ import contextlib
 import errno
 import re
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import pyarrow as pa
 from deltalake.exceptions import DeltaError
 
 from fleet_slip.errors import StorageError
-
-if TYPE_CHECKING:
-    pass
-
 
 _CREDENTIALS = (
     "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY or AWS_PROFILE, "
