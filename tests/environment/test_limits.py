@@ -43,8 +43,10 @@ def test_too_narrow_a_limit_is_told_before_anything_is_done(
     assert not (tmp_path / "data").exists()
 
 
-@pytest.mark.parametrize("command", ["status", "select", "sql 'SELECT 1'"])
-@pytest.mark.parametrize("limit", ["-v 65536", "-v 524288", "-d 150000"])
+@pytest.mark.parametrize(
+    ("command", "limit"),
+    [("status", "-v 65536"), ("select", "-v 524288"), ("sql 'SELECT 1'", "-d 150000")],
+)
 def test_every_command_tells_it_before_it_imports_anything(
     command: str, limit: str, tmp_path: Path
 ) -> None:

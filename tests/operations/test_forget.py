@@ -162,13 +162,6 @@ def test_a_gram_job_under_way_does_not_bring_a_forgotten_drive_back(
     assert cars == [("alfa",)]
 
 
-def test_a_file_of_forgotten_drives_only_is_removed(tmp_path: Path) -> None:
-    warehouse = fill(tmp_path, "alfa")
-    report = forget(warehouse, Forgettable("drive", "alfa-1"))
-    assert (report.files_removed, report.files_rewritten) == (1, 0)
-    assert warehouse.logs.snapshot().rows == 400
-
-
 def test_quarantined_rows_of_the_car_go_too(tmp_path: Path) -> None:
     warehouse = fill(tmp_path, *CARS)
     values: list[dict[str, Any]] = [

@@ -1,6 +1,5 @@
 """A forgotten drive stays away when its recording comes again under other names."""
 
-import gzip
 import hashlib
 import shutil
 from collections.abc import Callable
@@ -83,18 +82,6 @@ def test_the_recording_does_not_land_again(
     assert is_empty(forgotten)
 
 
-@pytest.mark.parametrize("more", [b"\n", b"\r\n", b"# end\n"])
-def test_nor_does_its_file_with_some_bytes_more(
-    more: bytes, forgotten: Warehouse, tmp_path: Path
-) -> None:
-    file = write(tmp_path, recording())
-    file.write_bytes(file.read_bytes() + more)
-    assert ingest_file(forgotten, file, a_mapping()).drives_forgotten == 1
-    packed = tmp_path / "packed.csv.gz"
-    packed.write_bytes(gzip.compress(file.read_bytes()))
-    assert ingest_file(forgotten, packed, a_mapping()).drives_forgotten == 1
-
-
 def test_a_car_that_stands_is_known_by_its_name_and_day(
     warehouse: Warehouse, tmp_path: Path
 ) -> None:
@@ -148,15 +135,6 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
     (report,) = load.ingest_files(warehouse, [again], other, replace="all")
     assert report.drives_forgotten == 1
     assert is_empty(warehouse)
-
-
-def test_a_recording_without_every_50th_row_is_another_one(
-    forgotten: Warehouse, tmp_path: Path
-) -> None:
-    kept = [i for i in range(ROWS) if i % 50]
-    columns = {name: [values[i] for i in kept] for name, values in recording().items()}
-    report = ingest_file(forgotten, write(tmp_path, columns, "other.csv"), a_mapping())
-    assert (report.drives_forgotten, report.counts.drives) == (0, 1)
 
 
 def test_what_an_earlier_release_forgot_stays_away_by_name(

@@ -1,8 +1,5 @@
 """Files that no version refers to, and the drives in them."""
 
-from datetime import date
-from pathlib import Path
-
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -12,10 +9,8 @@ from fleet_slip.operations.find_drives import (
     find_old_files,
     quarantined_of,
     remove_old_files,
-    rows_of,
 )
 from fleet_slip.operations.rewriting import compact
-from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
@@ -59,11 +54,6 @@ def test_old_files_with_the_car_are_found_and_no_others_those_of_the_logs_last(
     assert not paths & active
 
 
-def test_who_is_unknown_is_in_no_file(compacted: Warehouse) -> None:
-    assert found(compacted, vehicle("gamma")) == []
-    assert found(compacted, Forgettable("drive", "alfa")) == []
-
-
 def test_a_leftover_is_deleted_at_once_unless_a_job_may_commit_it(
     warehouse: Warehouse,
 ) -> None:
@@ -88,20 +78,6 @@ def test_half_a_file_is_passed_over(compacted: Warehouse) -> None:
     assert "logs/day=2024-05-01/alfa" not in left
 
 
-def test_rows_are_told_by_car_drive_and_day() -> None:
-    rows = pa.table(
-        {
-            "drive_id": ["a-1", "a-2", "b-1"],
-            "vehicle_id": ["a", "a", None],
-            "day": [date(2024, 5, 1), date(2024, 5, 2), date(2024, 5, 3)],
-        }
-    )
-    assert rows_of(rows, vehicle("a")).to_pylist() == [True, True, None]
-    assert rows_of(rows, Forgettable("drive", "a-2")).to_pylist() == [False, True, False]
-    before = Forgettable("before", "2024-05-02")
-    assert rows_of(rows, before).to_pylist() == [True, False, False]
-
-
 def test_refused_rows_are_of_a_drive_or_of_the_whole_that_it_was_cut_from() -> None:
     ids = ["log", "log-1", "log-10", "log2", None]
     rows = pa.table({"drive_id": ids, "vehicle_id": ["a", None, "b", "a", "a"]})
@@ -114,8 +90,3 @@ def test_refused_rows_are_of_a_drive_or_of_the_whole_that_it_was_cut_from() -> N
         *(True, True, False, False),
         False,
     ]
-
-
-def test_an_empty_root_has_no_old_files(tmp_path: Path) -> None:
-    warehouse = Warehouse(LocalFolder(tmp_path))
-    assert find_old_files(warehouse, vehicle("a")) == []

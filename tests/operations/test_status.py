@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import (
-    ConfigError,
     ExtraError,
     FleetSlipError,
     QuestionError,
@@ -64,9 +63,7 @@ def fail(warehouse: Warehouse, error: FleetSlipError, *arguments: str) -> None:
         raise error
 
 
-@pytest.mark.parametrize(
-    "mistake", [UsageError, ConfigError, QuestionError, RefusedError, ExtraError]
-)
+@pytest.mark.parametrize("mistake", [UsageError, ExtraError])
 def test_what_a_person_mistyped_or_was_refused_is_no_failure_of_the_night(
     warehouse: Warehouse, mistake: type[FleetSlipError]
 ) -> None:
@@ -123,11 +120,6 @@ def test_a_changed_line_of_the_history_is_a_problem_and_all_else_is_told(
     found = status_of(warehouse)
     assert found.problems == (f"runs/{history.name}: line 4 is not what a run has written",)
     assert (found.last_runs, found.tables["logs"].rows) == ((), 50)
-
-
-def test_a_missing_data_root_is_a_storage_error(tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match="no data root"):
-        status_of(Warehouse(LocalFolder(tmp_path / "nothing")))
 
 
 def test_the_command_tells_a_monitor(run_command: RunCommand, tmp_path: Path) -> None:

@@ -129,13 +129,6 @@ def test_a_car_that_an_earlier_version_forgot_is_found_by_verify_and_taken_away_
     assert named(tmp_path / "data", GONE) == set()
 
 
-def test_names_in_files_of_a_root_where_nothing_was_forgotten_are_a_remark(old: Warehouse) -> None:
-    report = verify(old)
-    assert not report.damage
-    told = [f for f in report.findings if "names that no row has" in f.problem]
-    assert [f.path for f in told] == ["logs"]
-
-
 @pytest.mark.parametrize("kind", ["vehicle", "drive"])
 def test_rows_of_what_was_forgotten_are_found_if_a_copy_brings_them_back(
     kind: str, tmp_path: Path

@@ -80,17 +80,6 @@ def test_what_cannot_be_recorded_does_not_fail_the_command(
     assert runs(tmp_path) == []
 
 
-def test_a_torn_line_costs_no_other_record(tmp_path: Path) -> None:
-    with recording(LocalFolder(tmp_path), "gram", []):
-        pass
-    (file,) = (tmp_path / "runs").iterdir()
-    with file.open("a") as lines:
-        lines.write('{"run_id":"torn","comm')
-    with recording(LocalFolder(tmp_path), "gram", []):
-        pass
-    assert [row["outcome"] for row in runs(tmp_path)] == ["done", "done"]
-
-
 def test_processes_at_once_lose_no_record(tmp_path: Path) -> None:
     code = (
         "import sys\nfrom pathlib import Path\n"

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import obstore
-import polars as pl
 import pytest
 
 from fleet_slip.errors import InputError
@@ -141,20 +140,6 @@ def test_a_folder_of_a_store_is_one_log(here: Path, server: Server) -> None:
     assert state(here / "root") == state(here / "local")
 
 
-def test_keys_in_the_names_of_folders_are_columns(here: Path, server: Server) -> None:
-    text = (here / "car.toml").read_text()
-    (here / "car.toml").write_text(text.replace('"A7"', '{ column = "car" }'))
-    log = here / "hive" / "car=B9" / "log.parquet"
-    log.parent.mkdir(parents=True)
-    write_log(here / "log.csv", rows=20)
-    pl.read_csv(here / "log.csv").write_parquet(log)
-    url = server.bucket()
-    put_all(url, here / "hive")
-    ingest(here / "root", f"{url}/hive")
-    done = run_on(here / "root", "sql", "SELECT vehicle_id FROM drives", "--json")
-    assert json.loads(done.stdout) == [{"vehicle_id": "B9"}]
-
-
 def test_what_is_wrong_with_an_object_is_said_of_the_object(here: Path, bucket: str) -> None:
     url = f"{bucket}/landing/day 0/münchen 0.csv"
     obstore.put(client(bucket), "landing/day 0/münchen 0.csv", b"t,ay\n0,1\n")
@@ -183,15 +168,6 @@ def test_a_url_with_a_password_is_refused_and_not_shown(here: Path) -> None:
     done = refused(here / "root", "s3://key:s3cr3t@bucket/log.csv")
     assert "s3cr3t" not in done.stderr
     assert "s3://BUCKET/PATH" in done.stderr
-
-
-def test_a_store_that_refuses_is_told_as_such(here: Path, server: Server, bucket: str) -> None:
-    with server.misbehaving(access_key="another"):
-        done = command_on(
-            here / "root", "ingest", f"{bucket}/landing", "--mapping", str(here / "car.toml")
-        )
-    assert done.exit_code == STORAGE
-    assert f"{bucket}/landing: the credentials do not permit this" in done.stderr
 
 
 def test_an_object_is_looked_at_before_it_is_stored(here: Path, bucket: str) -> None:

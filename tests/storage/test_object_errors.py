@@ -82,8 +82,3 @@ def test_failures_of_a_store_become_ours_with_the_place_and_without_the_answer(
     assert SECRET not in str(told.value)
     assert told.value.__cause__ is None
     assert told.value.__suppress_context__
-
-
-def test_a_bug_of_ours_is_not_taken_for_the_store() -> None:
-    with pytest.raises(TypeError), object_errors("s3://bucket"):
-        raise TypeError("InvalidAccessKeyId")

@@ -5,7 +5,6 @@ import threading
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 import xxhash
 from deltalake import DeltaTable
@@ -39,18 +38,6 @@ def test_a_written_file_is_not_part_of_the_table_before_its_commit(warehouse: Wa
     assert (file.rows, file.day, file.path) == (1000, DAY, action.path)
     assert file.null_counts["ax"] == 0
     assert (snapshot.landed("u"), snapshot.landed("other")) == (7, None)
-
-
-def test_counts_are_delta_packed_and_strings_are_dictionaries(warehouse: Warehouse) -> None:
-    action = warehouse.logs.write_file("one", rows("a"), DAY)
-    columns = pq.read_metadata(path_of(warehouse.logs.folder) / action.path).row_group(0)
-    encodings = {
-        columns.column(i).path_in_schema: columns.column(i).encodings
-        for i in range(columns.num_columns)
-    }
-    assert "DELTA_BINARY_PACKED" in encodings["ax"]
-    assert "RLE_DICTIONARY" in encodings["vehicle_id"]
-    assert "day" not in encodings
 
 
 def test_the_same_rows_make_the_same_bytes(warehouse: Warehouse) -> None:
@@ -107,14 +94,6 @@ def test_a_unit_lands_once_in_a_table_that_was_not_there_a_moment_ago(
     with pytest.raises(ConflictError, match="Run the same command again"):
         also_before.commit(change)
     assert warehouse.logs.snapshot().rows == 1000
-
-
-def test_different_units_land_side_by_side(warehouse: Warehouse) -> None:
-    snapshots = [warehouse.logs.snapshot() for _ in range(4)]
-    for number, snapshot in enumerate(snapshots):
-        action = warehouse.logs.write_file(f"f{number}", rows(f"d{number}", 10), DAY)
-        snapshot.commit(Change(add=[action], units=[Unit(f"unit-{number}", 1)]))
-    assert warehouse.logs.snapshot().rows == 40
 
 
 def test_of_many_units_the_log_says_at_once_what_it_says_of_each(warehouse: Warehouse) -> None:

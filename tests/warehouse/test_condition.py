@@ -16,7 +16,7 @@ from fleet_slip.models.score import score_statement
 from fleet_slip.operations.monitor import monitor
 from fleet_slip.operations.quality import examine_drives
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.condition import asking, drive_columns, parse_condition
+from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.database import open_database
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
@@ -213,11 +213,6 @@ def test_whatever_passes_cannot_leave_its_parentheses(text: str) -> None:
             assert database.execute(statement).fetchall() == [(0,)]
         except duckdb.Error as error:
             assert "syntax" not in str(error).lower()
-
-
-def test_every_column_of_a_drive_may_be_named() -> None:
-    for name in drive_columns():
-        assert parse_condition(f"{name} IS NOT NULL").sql
 
 
 def test_asking_ends_when_the_time_is_over() -> None:
