@@ -164,10 +164,10 @@ def faults_of(error: ValidationError) -> str:
     """Return what is wrong, key by key, on one line; of many faults the first."""
     wrong: dict[str, list[str]] = {}
     for fault in error.errors(include_input=False, include_url=False):
-        told = wrong.setdefault(_key_of(fault), [])
-        if (said := _said(fault)) not in told:
-            told.append(said)
-    faults = [f"{key}: {', or '.join(told)}" for key, told in wrong.items()]
+        reasons = wrong.setdefault(_key_of(fault), [])
+        if (said := _said(fault)) not in reasons:
+            reasons.append(said)
+    faults = [f"{key}: {', or '.join(reasons)}" for key, reasons in wrong.items()]
     text = "; ".join(
         fault if len(fault) <= LONGEST_FAULT else fault[:LONGEST_FAULT] + "…"
         for fault in faults[:FAULTS_SHOWN]
@@ -190,7 +190,7 @@ def _key_of(fault: ErrorDetails) -> str:
 
 def _said(fault: ErrorDetails) -> str:
     """Return what is wrong, in words of our own; what a validator of ours says, as it is."""
-    told = _SAID.get(fault["type"])
-    if told is None:
+    words = _SAID.get(fault["type"])
+    if words is None:
         return fault["msg"].replace("Value error, ", "").replace("Input should be", "must be")
-    return told.format(**fault.get("ctx", {}))
+    return words.format(**fault.get("ctx", {}))

@@ -287,7 +287,7 @@ class RetentionReport:
 
 
 def load_retention(path: str | None) -> Retention:
-    """Read a retention file, the one that ships unless told otherwise. Raises `ConfigError`."""
+    """Read a retention file, the one that ships by default. Raises `ConfigError`."""
     file = config_file("retention.toml") if path is None else find_config("retention", path)
     return load_config(file, Retention)
 

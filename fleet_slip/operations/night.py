@@ -118,8 +118,8 @@ class NightStep:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the step for a JSON document."""
-        told = {"name": self.name, "state": self.state, "told": self.told}
-        return {**told, "exit_code": self.error.exit_code if self.error else None}
+        known = {"name": self.name, "state": self.state, "told": self.told}
+        return {**known, "exit_code": self.error.exit_code if self.error else None}
 
 
 @dataclass(frozen=True)
@@ -161,12 +161,12 @@ class NightReport:
     @property
     def problem(self) -> FleetSlipError | None:
         """The first failure, else what calls for attention; None after a good night."""
-        told = f"the night of {self.night}"
+        night = f"the night of {self.night}"
         for step in self.steps:
             if step.error is not None:
-                return type(step.error)(f"{told}: {step.name} failed: {step.error}")
+                return type(step.error)(f"{night}: {step.name} failed: {step.error}")
         calling = [f"{one.name}: {one.told}" for one in self.steps if one.state == "attention"]
-        return AlarmError(f"{told}: {' '.join(calling)}") if calling else None
+        return AlarmError(f"{night}: {' '.join(calling)}") if calling else None
 
     @property
     def exit_code(self) -> int:
@@ -178,19 +178,19 @@ class NightReport:
         """How the night went, in a few words."""
         failed = [step.name for step in self.steps if step.state == "failed"]
         calling = [step.name for step in self.steps if step.state == "attention"]
-        told = [f"{' and '.join(failed)} failed"] if failed else []
+        parts = [f"{' and '.join(failed)} failed"] if failed else []
         if calling:
             calls = "calls" if len(calling) == 1 else "call"
-            told.append(f"{' and '.join(calling)} {calls} for attention")
-        return ", ".join(told) or "all went well"
+            parts.append(f"{' and '.join(calling)} {calls} for attention")
+        return ", ".join(parts) or "all went well"
 
     @property
     def gained(self) -> str:
         """What the night brought in."""
         rows, drives = self.rows - self.before.rows, self.drives - self.before.drives
         held = self.quarantined - self.before.quarantined
-        told = f"{number_of(drives, 'drive')}, {number_of(rows, 'row')}"
-        return f"{told}; in quarantine: {number_of(held, 'row')}" if held else told
+        new = f"{number_of(drives, 'drive')}, {number_of(rows, 'row')}"
+        return f"{new}; in quarantine: {number_of(held, 'row')}" if held else new
 
     def as_past(self) -> PastNight:
         """Return the night as the record keeps it."""
@@ -320,8 +320,8 @@ def _past(report: NightReport) -> ReportTable | None:
     for one, earlier in zip(report.past, [*report.past[1:], None], strict=True):
         found = [f"{name} {state}" for name, state in one.steps.items() if MARKS[state] == "miss"]
         more = "" if earlier is None else f"{one.drives - earlier.drives:+,}"
-        told = Cell("; ".join(found) or "all went well", "miss" if found else "good")
-        rows.append([str(one.night), told, str(one.exit_code), more, one.champion or "none"])
+        outcome = Cell("; ".join(found) or "all went well", "miss" if found else "good")
+        rows.append([str(one.night), outcome, str(one.exit_code), more, one.champion or "none"])
     head = ["night", "how it went", "exit code", "drives", "champion"]
     return table("nights", f"The last {number_of(len(rows), 'night')}", head, rows, left=2)
 

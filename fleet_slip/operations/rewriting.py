@@ -176,11 +176,11 @@ def forget_received(warehouse: Warehouse, subject: Forgettable) -> int:
         concerned: list[TableFile] = []
         rows = 0
         for file in snapshot.files:
-            told = warehouse.grams.read(file.path, ["file", "drive_id", "vehicle_id", "day", "n"])
-            mine = pc.and_(rows_of(told, subject), is_received(told))
+            every = warehouse.grams.read(file.path, ["file", "drive_id", "vehicle_id", "day", "n"])
+            mine = pc.and_(rows_of(every, subject), is_received(every))
             if pc.any(mine).as_py():
                 concerned.append(file)
-                rows += pc.sum(told.filter(mine)["n"]).as_py()
+                rows += pc.sum(every.filter(mine)["n"]).as_py()
         if concerned:
             read = (read_rows(warehouse.grams, file) for file in concerned)
             kept = (r.filter(pc.invert(pc.and_(rows_of(r, subject), is_received(r)))) for r in read)

@@ -122,8 +122,8 @@ def verify_files(
     read.sort(key=lambda one: one.file.path)
     for one in read:
         if one.problem:
-            told = f"{one.problem} (it held {one.file.rows:,} rows)"
-            report.note("file", f"{table.folder.name}/{one.file.path}", told)
+            problem = f"{one.problem} (it held {one.file.rows:,} rows)"
+            report.note("file", f"{table.folder.name}/{one.file.path}", problem)
     report.files += len(snapshot.files)
     report.size_bytes += snapshot.size_bytes
     report.rows += snapshot.rows if table.folder.name == "logs" else 0
@@ -245,9 +245,9 @@ def verify_grams(
     """
     _verify_unique(warehouse, grams, report)
     for file in grams:  # rows that cars counted, which no counts or drives can have
-        for drive, problem in _impossible(warehouse.grams.read(file.path)):
-            told = f"the Gram row that a car sent of drive {drive} {problem}"
-            report.note("gram", f"grams/{file.path}", told)
+        for drive, why in _impossible(warehouse.grams.read(file.path)):
+            problem = f"the Gram row that a car sent of drive {drive} {why}"
+            report.note("gram", f"grams/{file.path}", problem)
     where = find_gram_files(warehouse, grams)
     covered = [file for file in logs if file.path in where]
     step = 1 if full else max(1, len(covered) // SAMPLE)
@@ -305,8 +305,8 @@ def _impossible_among(
     if not set(names) <= set(one.columns):
         yield from ((drive, "has signals that there are not") for drive in drives)
     elif names:
-        told, ranges = gram_table(signals, rows), one.ranges_of(names)
-        for why, at in find_impossible(told.n, told.sums, told.products, ranges).items():
+        table, ranges = gram_table(signals, rows), one.ranges_of(names)
+        for why, at in find_impossible(table.n, table.sums, table.products, ranges).items():
             yield from ((drives[place], why) for place in at.tolist())
 
 
@@ -351,7 +351,7 @@ def verify_models(
                 report.note("model", f"{name}@{number}", str(error))
                 continue
             except (StorageError, DataError, QuestionError) as error:
-                if "drives" in str(error):  # anything else is told as a document
+                if "drives" in str(error):  # anything else is reported as a document
                     report.note("model", f"{name}@{number}", str(error))
                 continue
             trained = manifest.trained_on
@@ -452,7 +452,7 @@ def _list_unreferenced(
     for snapshot in snapshots.values():
         try:
             known, files = snapshot.removed(), find_unreferenced(snapshot.table)
-        except StorageError:  # its log is damaged, as was told: it says of no file what that is
+        except StorageError:  # its log is damaged, as is reported: it says of no file what that is
             continue
         for file in files:
             what = "replaced" if file.path in known else "never committed"

@@ -188,8 +188,8 @@ def read_landed_units(table: Folder, version: int) -> dict[str, int]:
         if base >= 0 and name.startswith(f"{base:020}.checkpoint."):
             with pq.ParquetFile(pa.BufferReader(log.read(name))) as parquet:
                 columns = ["txn.appId", "txn.version"]
-                told = parquet.read(columns=columns)["txn"].combine_chunks().drop_null()
-            each = (told.field(column).to_pylist() for column in ("appId", "version"))
+                units = parquet.read(columns=columns)["txn"].combine_chunks().drop_null()
+            each = (units.field(column).to_pylist() for column in ("appId", "version"))
             numbers.update((n, number) for n, number in zip(*each, strict=True) if n is not None)
     for name in names:
         if _COMMIT.fullmatch(name) and base < int(name[:20]) <= version:

@@ -73,13 +73,13 @@ class Encoding:
 
 def _statistics(rows: pa.Table, stored: Sequence[str]) -> dict[str, Any]:
     nulls = {name: rows[name].null_count for name in rows.schema.names}
-    told: dict[str, Any] = {"numRecords": rows.num_rows, "nullCount": nulls}
+    statistics: dict[str, Any] = {"numRecords": rows.num_rows, "nullCount": nulls}
     if DAY in stored:
         limits = pc.min_max(rows[DAY]).as_py()
         if limits["min"] is not None:
-            told["minValues"] = {DAY: limits["min"].isoformat()}
-            told["maxValues"] = {DAY: limits["max"].isoformat()}
-    return told
+            statistics["minValues"] = {DAY: limits["min"].isoformat()}
+            statistics["maxValues"] = {DAY: limits["max"].isoformat()}
+    return statistics
 
 
 def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:

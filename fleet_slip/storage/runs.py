@@ -155,7 +155,7 @@ def find_missing_documents(root: Folder, since: str = "") -> Iterator[tuple[str,
         if newest < number:
             yield path, f"had {number} documents when a run ended, and has {newest} now"
             continue
-        with contextlib.suppress(StorageError):  # told as a document
+        with contextlib.suppress(StorageError):  # reported as a document
             if documents.read(number).sha256 != digest:
                 yield path, f"{number}.json is not the document that a run had seen"
 
@@ -250,8 +250,8 @@ class Run:
     def end(self, error: BaseException | None, seconds: float) -> dict[str, Any]:
         """Return the line that is written when the run ends."""
         exit_code = _exit_code(error)
-        told = _without(str(error), self.arguments, publishable(self.arguments))
-        told = hide_passwords(told)[:ERROR_MAX]
+        message = _without(str(error), self.arguments, publishable(self.arguments))
+        message = hide_passwords(message)[:ERROR_MAX]
         outcome = {0: "done", INTERRUPTED: "interrupted"}.get(exit_code, "failed")
         return {
             "run_id": self.run_id,
@@ -259,7 +259,7 @@ class Run:
             "seconds": round(seconds, 6),
             "outcome": outcome,
             "exit_code": exit_code,
-            "error": told if error is not None and exit_code else None,
+            "error": message if error is not None and exit_code else None,
             "steps": [asdict(one) for one in self.steps],
         }
 
@@ -277,7 +277,7 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
     file = f"{FOLDER}/{run.started_at:%Y-%m}.jsonl"
     begun = time.monotonic()
     token = _current.set(run)
-    told = _exists(root) and _append(root, file, run.beginning())
+    recorded = _exists(root) and _append(root, file, run.beginning())
     log_event("run started", command=command, arguments=run.shown_arguments)
     error: BaseException | None = None
     try:
@@ -291,7 +291,7 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
         if _exists(root):
             with contextlib.suppress(StorageError):
                 end[NEWEST_DOCUMENTS] = newest_documents(root)
-            _append(root, file, *([] if told else [run.beginning()]), end)
+            _append(root, file, *([] if recorded else [run.beginning()]), end)
         _current.reset(token)
 
 

@@ -195,7 +195,7 @@ def on_newest(
 ) -> Result:
     """Look at tables, and again if what is found may be of files that a newer version removed.
 
-    Damage, or a `StorageError`, is told only if the tables rested meanwhile, or never rest.
+    Damage, or a `StorageError`, is reported only if the tables rested meanwhile, or never rest.
     """
     for _ in range(LOOKS):
         before = _versions(tables)

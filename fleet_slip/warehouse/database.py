@@ -83,7 +83,7 @@ def interruptible(database: duckdb.DuckDBPyConnection, work: Callable[[], Result
     """Do work with a connection so that Ctrl-C ends it, in the middle of an operator, too.
 
     DuckDB asks whether to stop between tasks only, and a recursive query is one task. It forgets an
-    interruption that comes before the query begins, so that it is told again until the work ends.
+    interruption that comes before the query begins, so it is interrupted again until the work ends.
     It never stops in the middle of a function: then `QueryGoesOnError` is raised after `STUCK_S`,
     while the work goes on, in a thread that the end of the process does not wait for.
     """

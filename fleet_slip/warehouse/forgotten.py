@@ -205,8 +205,8 @@ class Audit:
             found[entry["subject"]] = last[subject]
             if last[subject] == "done":
                 at = datetime.now(UTC).isoformat(timespec="seconds")
-                told = dict(zip(("kind", "key", "subject"), subject, strict=True))
-                self._folder.append({**told, "at": at, "event": ALLOWED})
+                known = dict(zip(("kind", "key", "subject"), subject, strict=True))
+                self._folder.append({**known, "at": at, "event": ALLOWED})
                 last[subject] = ALLOWED
         return found
 
