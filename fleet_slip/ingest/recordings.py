@@ -21,6 +21,7 @@ from fleet_slip.errors import RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.log_files import Log, StoredParts
 from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.resources import cache_folder
 from fleet_slip.storage.folder import StoredFile
 from fleet_slip.storage.table import WITHDRAWN, Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
