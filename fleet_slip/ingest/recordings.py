@@ -16,7 +16,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.base import number_of, shown
-from fleet_slip.resources import cache_folder
 from fleet_slip.errors import RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.log_files import Log, StoredParts
