@@ -9,9 +9,11 @@ import math
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from itertools import islice, product
+from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
@@ -232,18 +234,56 @@ AT_ONCE = 2**14
 """Frames of python-can that are kept together."""
 
 
+def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
+    """Yield the data frames of a trace. Raises `InputError`."""
+    if budget.file.suffix.lower() not in SUFFIXES:
+        raise InputError(
+            f"{shown(budget.file)}: the suffix names the format of a CAN trace: "
+            f"{', '.join(sorted(SUFFIXES))}. Name it as what it is."
+        )
+    with reading_with(budget.file, "can") as can, can.LogReader(budget.file) as trace:
+        # A BLF file says how long it is; python-can reads what is there of one that was cut.
+        stated = getattr(trace, "file_size", 0)
+        if stated > budget.size:
+            raise InputError(
+                f"{shown(budget.file)}: {budget.size:,} of {stated:,} bytes: it is truncated. Copy "
+                "it again."
+            )
+        if isinstance(trace, can.BLFReader):
+            yield from read_blf_frames(budget, trace.start_timestamp)
+            return
+        sent = (one for one in trace if not (one.is_error_frame or one.is_remote_frame))
+        while some := list(islice(sent, AT_ONCE)):
+            yield _block_of(some)
+
+
+def _block_of(frames: list[Any]) -> FrameBlock:
+    """Return frames of python-can."""
+    payloads = b"".join(bytes(one.data).ljust(MOST_BYTES, b"\0") for one in frames)
+    return FrameBlock(
+        np.array([one.arbitration_id for one in frames]),
+        np.array([one.is_extended_id for one in frames]),
+        np.array([one.timestamp for one in frames]),
+        np.array([str(one.channel) for one in frames]),
+        np.array([len(one.data) for one in frames]),
+        np.frombuffer(payloads, dtype=np.uint8).reshape(-1, MOST_BYTES),
+    )
+
+
 _Key = tuple[int, bool]
 """Number of a message, and whether it is of 29 bits."""
 
 
 class CanSource(FormatSource):
-    """The messages of a CAN trace."""
+    """The messages of a CAN trace, or of a file with bus logging."""
 
-    def __init__(self, bus: CanBus, database: Any, spool: Spool, budget: Budget) -> None:
-        """Take what the mapping says of the trace, the parsed database, and the file."""
-        self._file, self._bus, self._database = budget.file, bus, database
-        self._spool, self._budget = spool, budget
-        self._messages = {message.name: message for message in database.messages}
+    def __init__(
+        self, file: Path, bus: CanBus, spool: Spool, blocks: Callable[[], Iterator[FrameBlock]]
+    ) -> None:
+        """Take a file, what the mapping says of it, and what reads its frames."""
+        self._file, self._bus, self._spool, self._blocks = file, bus, spool, blocks
+        self._database = parse_database(bus)
+        self._messages = {message.name: message for message in self._database.messages}
         self._wanted: set[_Key] = set()
         self._numbers: set[_Key] = set()
         """Of the messages in the trace, once it was read."""
@@ -284,7 +324,8 @@ class CanSource(FormatSource):
             self._spool.clear()
             self._frames = {key: CanFrames(self._spool) for key in self._wanted}
             self._numbers = set()
-            self._read_trace()
+            for block in self._blocks():
+                self._keep(block)
             if not self._numbers:
                 raise InputError(
                     f"{shown(self._file)}: there is no CAN frame in it. Record it again."
@@ -366,45 +407,6 @@ class CanSource(FormatSource):
             if of in self._frames:
                 self._frames[of].extend(block.where(chosen))
 
-    def _read_trace(self) -> None:
-        """Keep the frames of the wanted messages, and note the numbers of all."""
-        if self._file.suffix.lower() not in SUFFIXES:
-            raise InputError(
-                f"{shown(self._file)}: the suffix names the format of a CAN trace: "
-                f"{', '.join(sorted(SUFFIXES))}. Name it as what it is."
-            )
-        with reading_with(self._file, "can") as can, can.LogReader(self._file) as trace:
-            self._require_whole(trace)
-            if isinstance(trace, can.BLFReader):
-                for block in read_blf_frames(self._budget, trace.start_timestamp):
-                    self._keep(block)
-                return
-            sent = (one for one in trace if not (one.is_error_frame or one.is_remote_frame))
-            while some := list(islice(sent, AT_ONCE)):
-                self._keep(_block_of(some))
-
-    def _require_whole(self, trace: Any) -> None:
-        # A BLF file says how long it is; python-can reads what is there of one that was cut.
-        stated, there = getattr(trace, "file_size", 0), self._file.stat().st_size
-        if stated > there:
-            raise InputError(
-                f"{shown(self._file)}: {there:,} of {stated:,} bytes: it is truncated. Copy it "
-                "again."
-            )
-
-
-def _block_of(frames: list[Any]) -> FrameBlock:
-    """Return frames of python-can."""
-    payloads = b"".join(bytes(one.data).ljust(MOST_BYTES, b"\0") for one in frames)
-    return FrameBlock(
-        np.array([one.arbitration_id for one in frames]),
-        np.array([one.is_extended_id for one in frames]),
-        np.array([one.timestamp for one in frames]),
-        np.array([str(one.channel) for one in frames]),
-        np.array([len(one.data) for one in frames]),
-        np.frombuffer(payloads, dtype=np.uint8).reshape(-1, MOST_BYTES),
-    )
-
 
 def _values(signal: Any, raw: NDArray[Any], sent: BoolArray, *, as_names: bool) -> pl.Series:
     """Return a signal, null where it was not sent; values that have a name are null, or all it."""
@@ -424,4 +426,4 @@ def _key(message: Any) -> _Key:
 def open_can_trace(bus: CanBus, budget: Budget) -> Iterator[CanSource]:
     """Open a CAN trace. Raises `InputError`, for a database that cannot be parsed too."""
     with closing(Spool()) as spool:
-        yield CanSource(bus, parse_database(bus), spool, budget)
+        yield CanSource(budget.file, bus, spool, partial(_read_trace, budget))

@@ -5,6 +5,7 @@ import mmap
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import shown
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.can import Bytes, CanBus, FrameBlock, parse_database
+from fleet_slip.ingest.formats.can import Bytes, CanBus, FrameBlock
 from fleet_slip.ingest.formats.can_files import CanSource
 from fleet_slip.ingest.formats.source import (
     OWN_TIME,
@@ -396,49 +397,37 @@ _EXTENDED = 1 << 31
 _IDENTIFIER = (1 << 29) - 1
 
 
-class MdfBus(CanSource):
-    """The CAN messages of an MDF file."""
-
-    def __init__(
-        self, bus: CanBus, database: Any, spool: Spool, budget: Budget, mdf: MdfSource
-    ) -> None:
-        """Take what a trace does, and the open file."""
-        super().__init__(bus, database, spool, budget)
-        self._mdf = mdf
-
-    def _read_trace(self) -> None:
-        """Keep the frames of the wanted messages, and note the numbers of all."""
-        for number, places in self._mdf.groups_with(f"{_FRAME}ID"):
-            names = ("ID", "DataBytes", "DataLength", "IDE", "BusChannel")
-            there = {n: places[_FRAME + n] for n in names if _FRAME + n in places}
-            if "DataBytes" not in there:
-                raise InputError(
-                    f"{shown(self._file)}: group {number} has frames without {_FRAME}DataBytes. "
-                    "Export it again, with payloads."
-                )
-            for window in self._mdf.windows(number, there):
-                self._keep(self._block(dict(zip(there, window, strict=True))))
-        if not self._numbers:
+def _read_bus(mdf: MdfSource, file: Path) -> Iterator[FrameBlock]:
+    """Yield the CAN frames of an MDF file. Raises `InputError`."""
+    groups = [*mdf.groups_with(f"{_FRAME}ID")]
+    if not groups:
+        raise InputError(
+            f"{shown(file)}: there is no CAN frame in it ({_FRAME}ID). Map its channels "
+            "without [can] in the mapping."
+        )
+    for number, places in groups:
+        names = ("ID", "DataBytes", "DataLength", "IDE", "BusChannel")
+        there = {n: places[_FRAME + n] for n in names if _FRAME + n in places}
+        if "DataBytes" not in there:
             raise InputError(
-                f"{shown(self._file)}: there is no CAN frame in it ({_FRAME}ID). Map its channels "
-                "without [can] in the mapping."
+                f"{shown(file)}: group {number} has frames without {_FRAME}DataBytes. "
+                "Export it again, with payloads."
             )
-
-    def _block(self, found: dict[str, Any]) -> FrameBlock:
-        """Return some frames of a group."""
-        numbers = found["ID"].samples.astype(np.int64)
-        extended = numbers & _EXTENDED != 0
-        if "IDE" in found:
-            extended |= found["IDE"].samples.astype(np.int64) != 0
-        payloads = _payloads(found["DataBytes"].samples)
-        sizes = np.full(len(numbers), payloads.shape[1])
-        if "DataLength" in found:
-            sizes = np.minimum(sizes, found["DataLength"].samples.astype(np.int64))
-        buses = np.zeros(len(numbers), dtype=np.int64)
-        if "BusChannel" in found:
-            buses = found["BusChannel"].samples.astype(np.int64)
-        times_s = self._mdf.times_s(found["ID"])
-        return FrameBlock(numbers & _IDENTIFIER, extended, times_s, buses, sizes, payloads)
+        for window in mdf.windows(number, there):
+            found = {n: one.samples for n, one in zip(there, window, strict=True)}
+            numbers, payloads = found["ID"].astype(np.int64), _payloads(found["DataBytes"])
+            extended = numbers & _EXTENDED != 0
+            if "IDE" in found:
+                extended |= found["IDE"].astype(np.int64) != 0
+            sizes = found.get("DataLength", np.full(len(numbers), payloads.shape[1]))
+            yield FrameBlock(
+                numbers & _IDENTIFIER,
+                extended,
+                mdf.times_s(window[0]),
+                found.get("BusChannel", np.zeros(len(numbers))).astype(np.int64),
+                np.minimum(sizes.astype(np.int64), payloads.shape[1]),
+                payloads,
+            )
 
 
 def _payloads(samples: NDArray[Any]) -> Bytes:
@@ -450,8 +439,7 @@ def _payloads(samples: NDArray[Any]) -> Bytes:
 
 
 @contextmanager
-def open_mdf_bus(bus: CanBus, budget: Budget) -> Iterator[MdfBus]:
+def open_mdf_bus(bus: CanBus, budget: Budget) -> Iterator[CanSource]:
     """Open an MDF file for the CAN frames in it. Raises `InputError`."""
-    database = parse_database(bus)
     with closing(Spool()) as spool, open_mdf(budget) as mdf:
-        yield MdfBus(bus, database, spool, budget, mdf)
+        yield CanSource(budget.file, bus, spool, partial(_read_bus, mdf, budget.file))
