@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, is_hypothesis_test, settings
 
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.budget import Budget
 from tests.support.commands import Finished, RunCommand, done_on, run_on
 from tests.support.once import made_once, require_unchanged
 
@@ -45,6 +46,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="run the tests that need outside programs or minutes, and no others",
     )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(Budget())
 
 
 def tools_of(item: pytest.Item) -> list[str]:

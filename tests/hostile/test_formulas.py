@@ -21,7 +21,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.confined_reader import open_here
 from fleet_slip.ingest.formats.mdf import compute_formula
 from fleet_slip.ingest.formats.source import Budget
-from tests.support.commands import COMMAND, run, run_on
+from tests.support.commands import run_on
 from tests.support.waiting import within
 
 RAW = np.arange(-100, 100, dtype="i2")
@@ -134,7 +134,7 @@ def test_no_command_runs_a_formula_where_sympy_is_there(
     mapping.write_text(MAPPING)
     done = run_on(tmp_path / "root", "ingest", file, "--mapping", mapping)
     assert "__import__" in done.stderr, done
-    told = run([COMMAND, "mapping", "suggest", file])
+    told = run_on(tmp_path / "root", "mapping", "suggest", file)
     assert "not read:" in told.stdout + told.stderr
     assert "channel 'ax': its formula" in " ".join(
         (told.stdout + told.stderr).replace("#", " ").split()

@@ -81,7 +81,7 @@ WRONG: Mapping[str, Change] = {
     "yaw rate without its sign": lambda one: one.update(yaw_rate=np.abs(one["yaw_rate"])),
     "wheels left and right exchanged": exchanged(LEFT_RIGHT),
 }
-USUAL = ("label in rad taken for degrees", "yaw rate stuck")
+USUAL = ("label in rad taken for degrees",)
 """Of those, what is tried every time; the others on long runs."""
 
 

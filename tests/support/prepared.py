@@ -44,9 +44,10 @@ LATE = ("pandas", "matplotlib.figure")
 
 @dataclass(frozen=True)
 class Server:
-    """A running server: where it listens, and the environment that its processes have."""
+    """A running server: where it listens, which process, and what environment those of it have."""
 
     address: str
+    process: int
     environment: dict[str, str]
 
     def can_run_in(self, wanted: Mapping[str, str]) -> bool:
@@ -105,7 +106,7 @@ def server() -> Server:
     )
     assert process.stdout is not None
     assert process.stdout.readline(), "the server of prepared processes did not start"
-    return Server(address, without_test(os.environ))
+    return Server(address, process.pid, without_test(os.environ))
 
 
 def main(address: str) -> None:

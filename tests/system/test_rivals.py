@@ -83,6 +83,7 @@ def test_a_rival_sees_on_a_drive_what_it_was_trained_on(smoke_root: Path) -> Non
     np.testing.assert_array_equal(found[np.isfinite(found)], expected)
 
 
+@pytest.mark.long
 def test_a_tree_without_factors_is_the_filter_and_never_worse_with_them() -> None:
     drive, truth = slalom(CAR, 1500)
     drives = [LabelledDrive(str(seed), noisy(drive, seed), truth) for seed in (1, 2)]

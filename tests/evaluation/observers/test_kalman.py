@@ -209,7 +209,8 @@ def covariances_over(steps: int, every: int, turn: float, c: Any) -> NDArray[np.
     return kept
 
 
-@pytest.mark.parametrize("gps_std", [1e-5, pytest.param(0.05, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("gps_std", [1e-5, 0.05])
 def test_covariance_stays_positive_definite_over_a_million_steps(gps_std: float) -> None:
     """With no bias walk the biases' variance falls for ever; that is where definiteness is lost."""
     noise = FilterNoise(gps_vx_std_mps=gps_std, gps_vy_std_mps=gps_std)

@@ -22,6 +22,7 @@ def evaluated(
     return root, done_on(root, "evaluate", "own", "--scenario", "nominal")
 
 
+@pytest.mark.long
 def test_who_cannot_be_tuned_says_so_in_a_line_and_competes(
     evaluated: tuple[Path, Finished],
 ) -> None:
