@@ -14,7 +14,13 @@ from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalogue.course import BESIDE, LONGEST_TICKS, YAW_RATE, course_units
 from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, plain_column
 from fleet_slip.catalogue.facts import RECEIVED
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Identifier, Signal, catalogue
+from fleet_slip.catalogue.signals import (
+    SAMPLE_TIME_S,
+    Identifier,
+    Signal,
+    SignalCatalogue,
+    catalogue,
+)
 from fleet_slip.catalogue.time_columns import (
     Calibrated,
     Factor,
@@ -154,6 +160,10 @@ class FeatureSet(Config):
 # far as another one opens it.
 
 T = TypeVar("T")
+
+
+_identities: dict[str, tuple["FeatureCatalogue", SignalCatalogue, str]] = {}
+"""The identity of a set by its name, and the catalogues of which it was computed last."""
 
 
 class FeatureCatalogue(Config):
@@ -337,6 +347,12 @@ class FeatureCatalogue(Config):
         """
         if name == PLAIN:
             return PLAIN
+        signals, known = catalogue(), _identities.get(name)
+        if known is None or known[0] is not self or known[1] is not signals:
+            known = _identities[name] = (self, signals, self._identity(name))
+        return known[2]
+
+    def _identity(self, name: str) -> str:
         one = self.feature_set(name)
         used = [*one.features, *(self.regimes[r].of for r in one.regimes)]
         content = {
