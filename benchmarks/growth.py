@@ -1,4 +1,4 @@
-"""What each command costs as a warehouse's history grows: files, Gram rows, versions, runs ...
+"""What each command costs as a warehouse's history grows: log files, Gram rows or model versions.
 
     python -m benchmarks.growth --root FOLDER [--part files gram-rows ...] [--sizes 1e3 1e4]
 
@@ -9,21 +9,16 @@ slope near 0; none should have more than 1.
 """
 
 import argparse
-import json
 import math
 import shutil
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import date
 from pathlib import Path
 from typing import Any
 
 from benchmarks.billion import PROGRAM
-from benchmarks.billion_campaigns import Sized, write
-from benchmarks.harness import insert
 from benchmarks.usage import Usage, measured
-from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support import growth_history as history
@@ -44,12 +39,9 @@ MONITOR = ("monitor", MODEL, "--since", "2020-01-06")
 QUALITY = ("quality",)
 COUNT_GRAMS = ("sql", "SELECT count(*) FROM grams")
 COUNT_MODELS = ("sql", "SELECT count(*) FROM models")
-COUNT_RUNS = ("sql", "SELECT count(*) FROM runs")
 ONE_DAY = ("sql", "SELECT count(*) FROM log_counts WHERE day = DATE '2020-01-02'")
 LAND = ("simulate", "smoke", "--days", "1")
 FORGET = ("forget", "--vehicle", "car-00000003", "--now")
-PLAN = ("simulate", "growth_days.toml")
-"""The first time, complete days are recorded, which a campaign that grows night by night has."""
 
 Command = tuple[str, ...]
 
@@ -77,43 +69,18 @@ def gram_rows(root: Path, count: int) -> None:
     history.write_fleet(Warehouse(LocalFolder(root)), GRAM_FILES, count)
 
 
-def base(root: Path) -> None:
-    history.write_fleet(Warehouse(LocalFolder(root)), BASE_FILES, BASE_GRAMS)
-
-
 def versions(root: Path, count: int) -> None:
-    base(root)
+    history.write_fleet(Warehouse(LocalFolder(root)), BASE_FILES, BASE_GRAMS)
     command(root, PUBLISH)
     history.write_versions(root, MODEL, count)
 
 
-def runs(root: Path, count: int) -> None:
-    base(root)
-    history.write_runs(root, count)
-
-
-def commits(root: Path, count: int) -> None:
-    base(root)
-    history.write_commits(Warehouse(LocalFolder(root)), count)
-
-
-def campaign_file(root: Path, days: int) -> str:
-    sized = Sized("growth_days", date(2000, 1, 1), days, 4, 1.0)
-    return str(write(sized, root.parent))
-
-
-def days(root: Path, count: int) -> None:
-    base(root)
-    history.land_campaign(Warehouse(LocalFolder(root)), load_campaign(campaign_file(root, count)))
-
-
-EVERY_NIGHT = (LAND, GRAM, SELECT, PUBLISH, STATUS)
 PARTS = {
     "files": Part(
         files,
         (1000, 10_000, 100_000),
         (
-            *(PUBLISH, GRAM, SELECT, STATUS, MONITOR, QUALITY, COUNT_GRAMS, COUNT_RUNS, ONE_DAY),
+            *(PUBLISH, GRAM, SELECT, STATUS, MONITOR, QUALITY, COUNT_GRAMS, ONE_DAY),
             *(LAND, GRAM, FORGET),
         ),
     ),
@@ -122,22 +89,17 @@ PARTS = {
         (100_000, 1_000_000, 10_000_000),
         (PUBLISH, GRAM, SELECT, COHORT, STATUS, COUNT_GRAMS, LAND, GRAM),
     ),
-    "gram-rows-in-memory": Part(gram_rows, (10_000, 100_000), (PUBLISH, MONITOR, QUALITY)),
     "versions": Part(
         versions,
         (1000, 10_000, 100_000),
         (MODELS, SHOW, SELECT, PUBLISH, STATUS, COUNT_GRAMS, COUNT_MODELS),
     ),
-    "runs": Part(runs, (10_000, 100_000, 1_000_000), (GRAM, STATUS, COUNT_GRAMS, COUNT_RUNS)),
-    "commits": Part(commits, (1000, 10_000, 100_000), EVERY_NIGHT),
-    "days": Part(days, (100, 1000, 10_000), (PLAN, PLAN, STATUS)),
 }
 
 
 def command(root: Path, arguments: Sequence[str]) -> Usage:
     """Run a command; an alarm (exit code 10) is an answer, too."""
-    shown = [str(root.parent / a) if a.endswith(".toml") else a for a in arguments]
-    return measured([*PROGRAM, "--root", str(root), *shown, "--json"], answers=(0, 10))
+    return measured([*PROGRAM, "--root", str(root), *arguments, "--json"], answers=(0, 10))
 
 
 def grow(name: str, sizes: Sequence[int], folder: Path) -> dict[str, Any]:
@@ -187,19 +149,10 @@ def main() -> None:
     parser.add_argument("--root", type=Path, default=Path("data-growth"), help="where to work")
     parser.add_argument("--part", nargs="*", choices=PARTS, default=list(PARTS))
     parser.add_argument("--sizes", type=float, nargs="*", help="default: those of the part")
-    parser.add_argument("--document", type=Path, help="a page to put the tables into")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of tables")
     options = parser.parse_args()
-    found = {}
     for name in options.part:
         sizes = [round(s) for s in options.sizes] if options.sizes else PARTS[name].sizes
-        found[name] = grow(name, sizes, options.root)
-        if options.document:
-            insert(options.document, f"growth: {name}", markdown(name, found[name]))
-        if not options.json:
-            print(markdown(name, found[name]) + "\n", flush=True)
-    if options.json:
-        print(json.dumps(found, indent=1))
+        print(markdown(name, grow(name, sizes, options.root)) + "\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.job import unit_name
-from fleet_slip.simulation.campaign import Campaign
-from fleet_slip.simulation.job import unit_of
 from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -189,21 +187,6 @@ def write_fleet(warehouse: Warehouse, files: int, grams: int | None = None) -> N
         write_grams(warehouse, paths, grams, WEIGHT)
 
 
-def write_commits(warehouse: Warehouse, commits: int) -> None:
-    """Let the Delta log of the logs have so many commits, each of a unit of work of its own."""
-    snapshot = warehouse.logs.snapshot()
-    folder = Path(warehouse.logs.uri("_delta_log"))
-    first = (snapshot.version or 0) + 1
-    for number in range(first, first + commits):
-        lines = [
-            {"txn": {"appId": f"simulate/growth/{number}", "version": number}},
-            {"commitInfo": {"timestamp": _now_ms(), "operation": "WRITE"}},
-        ]
-        text = "\n".join(json.dumps(line) for line in lines)
-        (folder / f"{number:020}.json").write_text(text, encoding="ascii")
-    _checkpoint(warehouse)
-
-
 def write_versions(root: Path, name: str, versions: int) -> None:
     """Repeat the first version of a model and the first move of its alias so many times."""
     for kind, number in (("versions", "trained_on"), ("history", "version")):
@@ -216,69 +199,6 @@ def write_versions(root: Path, name: str, versions: int) -> None:
             else:
                 content[number] = i
             (folder / f"{i}.json").write_text(_document(content), encoding="utf-8")
-
-
-def records_of_run(run_id: str, at: datetime) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the records of the beginning and the end of a nightly run."""
-    begun = {
-        "run_id": run_id,
-        "command": "gram",
-        "arguments": ["gram"],
-        "host": "growth",
-        "started_at": at.isoformat(),
-        "process": 1,
-        "package_version": "0.1.0",
-    }
-    step = {"name": "gram", "seconds": 1.0, "rows": 1000, "size_bytes": None}
-    ended = {
-        "run_id": run_id,
-        "ended_at": at.isoformat(),
-        "seconds": 1.5,
-        "outcome": "done",
-        "exit_code": 0,
-        "error": None,
-        "steps": [step],
-    }
-    return begun, ended
-
-
-def write_runs(root: Path, runs: int) -> None:
-    """Write the history of so many nightly runs: two lines each, a file a month."""
-    folder = root / "runs"
-    folder.mkdir(exist_ok=True)
-    for month, numbers in _months(runs):
-        lines: list[str] = []
-        for i in numbers:
-            at = datetime(2000, 1, 1, tzinfo=UTC) + timedelta(hours=i)
-            lines += map(json.dumps, records_of_run(f"{at:%Y%m%dT%H%M%SZ}-{i:08x}", at))
-        (folder / f"{month}.jsonl").write_text("\n".join(lines) + "\n", encoding="ascii")
-
-
-def _months(runs: int) -> Iterator[tuple[str, range]]:
-    first = 0
-    while first < runs:
-        start = datetime(2000, 1, 1, tzinfo=UTC) + timedelta(hours=first)
-        end = datetime(start.year + start.month // 12, start.month % 12 + 1, 1, tzinfo=UTC)
-        last = min(runs, first + int((end - start) / timedelta(hours=1)))
-        yield f"{start:%Y-%m}", range(first, last)
-        first = last
-
-
-def land_campaign(warehouse: Warehouse, campaign: Campaign) -> None:
-    """Commit every file of a campaign as landed, without simulating it."""
-    batches = [batch for day in campaign.days() for batch in campaign.batches(day)]
-    stats = _stats(Drives.drawn(0, 1, 1).log(warehouse))
-    actions = [
-        _action(f"day={b.day}/{b.campaign}-{b.index:04d}-{'0' * 32}.parquet", 4000, stats, b.day)
-        for b in batches
-    ]
-    units = [unit_of(batch) for batch in batches]
-    warehouse.logs.snapshot().commit(Change(add=actions, units=units))
-
-
-def _stats(rows: pa.Table) -> str:
-    nulls = {name: rows[name].null_count for name in rows.schema.names} | {"day": 0}
-    return json.dumps({"numRecords": rows.num_rows, "nullCount": nulls})
 
 
 def _action(path: str, size_bytes: int, stats: str, day: date) -> AddAction:

@@ -25,7 +25,7 @@ TINY = {
     "flips": "--flips 1",
     "fuzz": "--cases 10 --target config",
     "gram_variants": "--root {root} --campaign smoke --only DOUBLE",
-    "growth": "--root {folder} --part runs --sizes 10 20",
+    "growth": "--root {folder} --part versions --sizes 2 3",
     "ingest": "--rows 2000,4000",
     "ingest_folder": "--files 3 --rows 100",
     "interleave": "--schedules 2 --first gram --second simulate",
