@@ -73,13 +73,8 @@ class MeanMoments:
     @classmethod
     def of(cls, table: "GramTable") -> "MeanMoments":
         """Divide the sums of a table by its rows."""
-        k = len(table.signals)
-        n = table.n.astype(np.float64)[:, None]
-        matrices = np.ones((len(table), k + 1, k + 1))
-        matrices[:, 0, 1:] = matrices[:, 1:, 0] = table.sums / n
-        i, j = np.tril_indices(k)
-        matrices[:, i + 1, j + 1] = matrices[:, j + 1, i + 1] = table.products / n
-        return cls(table.signals, matrices)
+        n = table.n.astype(np.float64)
+        return cls(table.signals, table.moments() / n[:, None, None])
 
     @classmethod
     def of_rows(cls, values: Mapping[str, FloatArray], rows: BoolArray) -> "MeanMoments":

@@ -280,7 +280,7 @@ def course_moments(reader: GramReader, condition: Condition) -> Moments:
                 continue
             found = collect_sums(opened.batches(condition), {"course": columns}, unnamed=True)
             if sums := found.get("course"):
-                moments = sums.moments() * np.outer(scales, scales)
+                moments = sums.table.moments() * np.outer(scales, scales)
                 return {
                     car: {sums.drives[i][2]: moments[i] for i in range(at.start, at.stop)}
                     for car, at in sums.cars.items()

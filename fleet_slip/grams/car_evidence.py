@@ -174,7 +174,7 @@ class CarEvidence:
     def __init__(self, sums: Mapping[str, DriveSums]) -> None:
         """Take the sums by kind of plane, and learn the variances."""
         self.sums = sums
-        self._moments = {kind: one.moments() for kind, one in sums.items()}
+        self._moments = {kind: one.table.moments() for kind, one in sums.items()}
         self.cars = sorted({car for one in sums.values() for car in one.cars})
         banks = [bank_of_bends(self._totals(self.slices(car))) for car in self.cars]
         self._banked = are_banked([bank for bank in banks if bank is not None])

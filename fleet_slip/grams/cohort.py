@@ -166,15 +166,13 @@ class Cohort:
             return again.folds(by, count)
         require_divided(self.feature_set, by, count)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
-        if self.unlabelled is None:
-            return CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
-        if by == "vehicle" and len(set(values)) == 1:
+        if self.unlabelled and by == "vehicle" and len(set(values)) == 1:
             by, values = "drive", self.drives[FOLD_KEYS["drive"]].to_pylist()
-        return replace(
-            CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers),
-            beside=tuple(table.total() for table in self.unlabelled.tables),
-            weight=self.weight,
-        )
+        folds = CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
+        if self.unlabelled is None:
+            return folds
+        beside = tuple(table.total() for table in self.unlabelled.tables)
+        return replace(folds, beside=beside, weight=self.weight)
 
     def serving(self, inputs: Sequence[str]) -> Served:
         """Return the drives with the label and all inputs, a Gram row each. Raises `DataError`."""
@@ -182,19 +180,12 @@ class Cohort:
             return load_cohort(self.source, self.condition, self.feature_set).serving(inputs)
         table, mask = serving_drives(self.tables, [*inputs, catalogue().label])
         rows = np.flatnonzero(mask)
-        numbers = self.drive_numbers[rows]
-        order = np.argsort(numbers, kind="stable")
-        _, first = np.unique(numbers[order], return_index=True)
+        _, first, number = np.unique(
+            self.drive_numbers[rows], return_index=True, return_inverse=True
+        )
         if len(first) == len(rows):
             return Served(table, self.drives.take(rows))
-        merged = GramTable(
-            table.signals,
-            *(
-                np.add.reduceat(part[order], first)
-                for part in (table.n, table.sums, table.products)
-            ),
-        )
-        return Served(merged, self.drives.take(rows[order[first]]))
+        return Served(table.merged(number), self.drives.take(rows[first]))
 
     def part(self, wanted: BoolArray) -> "Cohort":
         """Return the cohort with some of its Gram rows only; the mask lists them all."""
@@ -374,6 +365,7 @@ def _add_up(
         for signals, table, here in expansion.tables(batch):
             totals, before = table.totals(folds[here], len(names)), grams.get(signals)
             grams[signals] = list(map(Gram.__add__, before, totals)) if before else totals
+            # Filtered lines are copies: a column by itself would keep all of its batch.
             lines.append(_with_signals(some.filter(pa.array(here)), signals))
     if not grams:
         raise empty_cohort_error(opened, condition)

@@ -7,7 +7,7 @@ instead of a log file the row names `received/` and the digest of the table's fi
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import NoReturn
@@ -43,6 +43,7 @@ from fleet_slip.grams.compute import Parts
 from fleet_slip.grams.gram_files import files_to_rewrite, rows_to_keep, write_rows
 from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.reader import BATCH_ROWS
+from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Change, Snapshot, Unit, retry_conflicts
 from fleet_slip.warehouse.database import database_errors, open_database, reading_files
@@ -191,24 +192,23 @@ PRODUCTS = "has products outside the ranges of its signals"
 INDEFINITE = "has a matrix that is not positive semidefinite"
 
 
-def find_impossible(
-    rows: IntArray, sums: IntArray, products: IntArray, ranges: Sequence[tuple[int, int]]
-) -> dict[str, IntArray]:
-    """Return impossible Gram rows by reason, of n (m,), sums (m, k), products and k ranges."""
+def find_impossible(table: GramTable, ranges: Sequence[tuple[int, int]]) -> dict[str, IntArray]:
+    """Return impossible Gram rows by reason, given the range of each of their signals."""
+    sums, products = table.sums, table.products
     least, most = np.array(ranges, dtype=np.int64).reshape(-1, 2).T
     row, column = np.tril_indices(len(least))
     size = np.maximum(np.abs(least), np.abs(most))
-    possible = (rows >= 1) & (rows <= most_rows(ranges))
-    n = np.where(possible, rows, 1)[:, None]
+    possible = (table.n >= 1) & (table.n <= most_rows(ranges))
+    n = np.where(possible, table.n, 1)[:, None]
     bound = n * (size[row] * size[column])
     judged = (
         (NO_ROWS, ~possible),
         (SUMS, ((sums < n * least) | (sums > n * most)).any(axis=1)),
         (PRODUCTS, ((products > bound) | (products < -bound)).any(axis=1)),
-        (INDEFINITE, _indefinite(n[:, 0], sums, products)),
+        (INDEFINITE, _indefinite(replace(table, n=n[:, 0]))),
     )
     found: dict[str, IntArray] = {}
-    left = np.ones(len(rows), dtype=np.bool_)
+    left = np.ones(len(table), dtype=np.bool_)
     for reason, bad in judged:
         if (bad & left).any():
             found[reason] = np.flatnonzero(bad & left)
@@ -222,16 +222,12 @@ def most_rows(ranges: Sequence[tuple[int, int]]) -> int:
     return min(ROWS_IN_A_SUM, (LARGEST_SUM - 1) // largest**2)
 
 
-def _indefinite(n: IntArray, sums: IntArray, products: IntArray) -> BoolArray:
+def _indefinite(table: GramTable) -> BoolArray:
     """Whether each matrix is not positive semidefinite."""
-    k = sums.shape[1]
-    row, column = np.tril_indices(k)
-    matrix = np.zeros((len(n), k + 1, k + 1))
-    matrix[:, 0, 0], matrix[:, 1:, 0] = n, sums
-    matrix[:, row + 1, column + 1] = products
+    matrix = table.moments()
     scale = 1 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), 1.0))
     matrix *= scale[:, :, None] * scale[:, None, :]
-    bad: BoolArray = np.linalg.eigvalsh(matrix)[:, 0] < -NEAR  # of the lower triangle
+    bad: BoolArray = np.linalg.eigvalsh(matrix)[:, 0] < -NEAR
     return bad
 
 
@@ -420,8 +416,8 @@ def _require_possible(file: Path, table: pa.Table) -> None:
             for signals, rows, _ in by_signals(batch):
                 if not signals:
                     continue
-                one, ranges = gram_table(signals, rows), sets[key].ranges_of(signals.split(","))
-                for reason, at in find_impossible(one.n, one.sums, one.products, ranges).items():
+                ranges = sets[key].ranges_of(signals.split(","))
+                for reason, at in find_impossible(gram_table(signals, rows), ranges).items():
                     row = rows.slice(int(at[0]), 1).to_pylist()[0]
                     _refuse(file, row["number"], row["drive_id"], reason)
 

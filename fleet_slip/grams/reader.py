@@ -13,7 +13,6 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.course import TURNED
 from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, LONGEST_PAUSE_S, TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN, features
@@ -22,7 +21,7 @@ from fleet_slip.errors import DataError, NotComputedError
 from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.receiver_delay import RECEIVER
-from fleet_slip.regression.gram import GramTable, packed_position, packed_size
+from fleet_slip.regression.gram import GramTable, packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.condition import Condition, asking
@@ -242,16 +241,6 @@ class DriveSums:
     table: GramTable
     cars: Mapping[str, slice]
 
-    def moments(self) -> FloatArray:
-        """Return the moments of (1, columns) of each drive, shape (drives, k+1, k+1)."""
-        k = len(self.table.signals)
-        found = np.empty((len(self.table), k + 1, k + 1))
-        found[:, 0, 0] = self.table.n
-        found[:, 0, 1:] = found[:, 1:, 0] = self.table.sums
-        at = np.array([[packed_position(i, j) for j in range(k)] for i in range(k)])
-        found[:, 1:, 1:] = self.table.products[:, at]
-        return found
-
 
 def collect_sums(
     batches: Iterable[pa.RecordBatch],
@@ -287,13 +276,9 @@ def _sorted(parts: Sequence[GramTable], rows: Sequence[Drive]) -> DriveSums:
     drives = sorted(set(rows))
     number = {drive: i for i, drive in enumerate(drives)}
     at = np.array([number[row] for row in rows], dtype=np.int64)
-    order = np.argsort(at, kind="stable")
-    first = np.searchsorted(at[order], np.arange(len(drives)))
-    stacked = (
-        np.concatenate([getattr(part, name) for part in parts])[order]
-        for name in ("n", "sums", "products")
-    )
-    table = GramTable(parts[0].signals, *(np.add.reduceat(values, first) for values in stacked))
+    names = ("n", "sums", "products")
+    stacked = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+    table = GramTable(parts[0].signals, *stacked).merged(at)
     cars: dict[str, slice] = {}
     for i, (car, _, _) in enumerate(drives):
         cars[car] = slice(cars[car].start if car in cars else i, i + 1)

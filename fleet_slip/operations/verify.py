@@ -305,8 +305,8 @@ def _impossible_among(
     if not set(names) <= set(one.columns):
         yield from ((drive, "has signals that there are not") for drive in drives)
     elif names:
-        table, ranges = gram_table(signals, rows), one.ranges_of(names)
-        for why, at in find_impossible(table.n, table.sums, table.products, ranges).items():
+        found = find_impossible(gram_table(signals, rows), one.ranges_of(names))
+        for why, at in found.items():
             yield from ((drives[place], why) for place in at.tolist())
 
 

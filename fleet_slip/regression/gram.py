@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.arrays import IntArray, ObjectArray
+from fleet_slip.arrays import FloatArray, IntArray, ObjectArray
 from fleet_slip.errors import DataError
 
 SomeSize = TypeVar("SomeSize", int, IntArray)
@@ -295,6 +295,23 @@ class GramTable:
         order = np.argsort(groups, kind="stable")
         stops = np.cumsum(np.bincount(groups, minlength=count))
         return [self.take(rows)._sum() for rows in np.split(order, stops[:-1])]
+
+    def merged(self, numbers: IntArray) -> "GramTable":
+        """Return a Gram for each number 0, 1, ..., the sum of the rows that have it."""
+        order = np.argsort(numbers, kind="stable")
+        first = np.searchsorted(numbers[order], np.arange(numbers.max() + 1))
+        parts = (self.n, self.sums, self.products)
+        return GramTable(self.signals, *(np.add.reduceat(part[order], first) for part in parts))
+
+    def moments(self) -> FloatArray:
+        """Return the sums of the products of (1, signals) of each drive, (drives, k+1, k+1)."""
+        k = len(self.signals)
+        found = np.empty((len(self), k + 1, k + 1))
+        found[:, 0, 0] = self.n
+        found[:, 0, 1:] = found[:, 1:, 0] = self.sums
+        i, j = np.tril_indices(k)
+        found[:, i + 1, j + 1] = found[:, j + 1, i + 1] = self.products
+        return found
 
     def restrict(self, signals: Sequence[str]) -> "GramTable":
         """Return the drives with some of the signals. Raises `DataError` if one is missing."""

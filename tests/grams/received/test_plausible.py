@@ -9,16 +9,9 @@ from hypothesis import strategies as st
 
 from fleet_slip.grams.on_board import INDEFINITE, NO_ROWS, PRODUCTS, SUMS, find_impossible
 from fleet_slip.regression.gram import Gram
+from tests.support.counts import table_of
 
 RANGES = [(-100, 100), (0, 30000), (-32767, 32767)]
-
-
-def arrays(gram: Gram) -> tuple[Any, Any, Any]:
-    return (
-        np.array([gram.n], np.int64),
-        np.array([gram.sums], np.int64),
-        np.array([gram.products], np.int64),
-    )
 
 
 @st.composite
@@ -31,14 +24,14 @@ def counts(draw: st.DrawFn) -> Any:
 @settings(max_examples=200)
 @given(counts())
 def test_what_counts_have_is_possible(rows: Any) -> None:
-    assert find_impossible(*arrays(Gram.from_counts("abc", rows)), RANGES) == {}
+    assert find_impossible(table_of([Gram.from_counts("abc", rows)]), RANGES) == {}
 
 
 @pytest.mark.parametrize("value", [-32767, 0, 1, 32767])
 def test_the_longest_drive_at_the_ends_of_the_ranges_is_possible(value: int) -> None:
     n = 2**31 - 1
     gram = Gram(("a", "b"), n, (n * value, n * value), (n * value**2,) * 3)
-    assert find_impossible(*arrays(gram), [(-32767, 32767)] * 2) == {}
+    assert find_impossible(table_of([gram]), [(-32767, 32767)] * 2) == {}
 
 
 DRIVE = Gram.from_counts("abc", np.array([[3, 5, -7], [4, 5, 900], [-2, 8, 11], [3, 0, 1]]))
@@ -60,16 +53,14 @@ DRIVE = Gram.from_counts("abc", np.array([[3, 5, -7], [4, 5, 900], [-2, 8, 11], 
     ],
 )
 def test_what_no_counts_have_is_told(field: str, place: int, change: int, reason: str) -> None:
-    known = dict(zip(("n", "sums", "products"), arrays(DRIVE), strict=True))
-    values = known[field].reshape(-1)
-    values[place] += np.int64(change)
-    found = find_impossible(known["n"], known["sums"], known["products"], RANGES)
+    table = table_of([DRIVE])
+    getattr(table, field).reshape(-1)[place] += np.int64(change)
+    found = find_impossible(table, RANGES)
     assert {why: at.tolist() for why, at in found.items()} == {reason: [0]}
 
 
 def test_each_row_is_judged_by_itself() -> None:
-    good, bad = arrays(DRIVE), arrays(DRIVE)
-    bad[2][0, 4] += 50_000
-    n, sums, products = (np.concatenate([a, b, a]) for a, b in zip(good, bad, strict=True))
-    found = find_impossible(n, sums, products, RANGES)
+    table = table_of([DRIVE, DRIVE, DRIVE])
+    table.products[1, 4] += 50_000
+    found = find_impossible(table, RANGES)
     assert {why: at.tolist() for why, at in found.items()} == {INDEFINITE: [1]}
