@@ -132,7 +132,7 @@ def _require_own(folder: Path) -> None:
     for one in (folder, *folder.parents):
         found = one.stat(follow_symlinks=False)
         if one == folder:
-            safe = found.st_uid == os.getuid() and not found.st_mode & 0o077
+            safe = found.st_uid == os.getuid() and not found.st_mode & 0o022
         else:  # where only owners may rename, as in /tmp, this one's folder stays
             by_others = found.st_mode & 0o022 and not found.st_mode & stat.S_ISVTX
             safe = found.st_uid in (os.getuid(), 0) and not by_others

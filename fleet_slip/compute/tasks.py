@@ -29,8 +29,6 @@ Result = TypeVar("Result")
 
 AHEAD = 2
 """Items that are read before they are asked for."""
-WORKERS = 2
-"""Items that are worked on at once."""
 
 
 class LostTaskError(BrokenExecutor):
@@ -133,36 +131,6 @@ def read_ahead(items: Iterator[Item], ahead: int = AHEAD) -> Generator[Item, Non
         finally:
             for future in taken:
                 future.cancel()
-
-
-def map_ahead(
-    function: Callable[[Item], Result], items: Iterator[Item]
-) -> Generator[Result, None, None]:
-    """Yield results in the order of the items while threads work on the next; errors too."""
-    held = _take(items)
-    failure: Exception | None = None
-    with ThreadPoolExecutor(WORKERS, thread_name_prefix="map-ahead") as threads:
-        under_way: deque[Future[Result]] = deque()
-        try:
-            while held:
-                try:
-                    following = _take(items)
-                except Exception as error:
-                    following, failure = (), error
-                if not following and not under_way:
-                    yield function(*held)  # a single item, as most small files have
-                    break
-                under_way.append(threads.submit(function, *held))
-                held = following
-                if len(under_way) > WORKERS:
-                    yield under_way.popleft().result()
-            while under_way:
-                yield under_way.popleft().result()
-        finally:
-            for future in under_way:
-                future.cancel()
-    if failure is not None:
-        raise failure
 
 
 def _take(items: Iterator[Item]) -> tuple[Item, ...]:

@@ -1,7 +1,6 @@
 """The same rows and drives, in whatever blocks a file is read; plain numbers as by way of text."""
 
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.compute import tasks as read_ahead_module
-from fleet_slip.compute.tasks import AHEAD, map_ahead, read_ahead
+from fleet_slip.compute.tasks import AHEAD, read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import drives as drive_cutter
 from fleet_slip.ingest import drives as open_drives
@@ -24,7 +22,6 @@ from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
 from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.commands import PATIENCE_S
 from tests.support.measured import (
     a_mapping,
     csv_text,
@@ -152,7 +149,6 @@ def test_the_bits_that_land_depend_on_neither_threads_nor_blocks(
     (tmp_path / "log.csv").write_text(csv_text(columns))
     monkeypatch.setattr(load, "FILE_ROWS", 50)
     expected = _land_in(tmp_path / "as it is", tmp_path / "log.csv")
-    monkeypatch.setattr(read_ahead_module, "WORKERS", threads)
     monkeypatch.setattr(load, "WRITERS", threads)
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", block_bytes)
     assert _land_in(tmp_path / "otherwise", tmp_path / "log.csv") == expected
@@ -244,39 +240,6 @@ def test_items_are_read_ahead_in_order_and_errors_come_in_their_place() -> None:
             seen.append(item)
     assert seen == [0, 1, 2, 3]
     assert not [t for t in threading.enumerate() if t.name.startswith("read-ahead")]
-
-
-def test_results_come_in_the_order_of_their_items_whoever_is_faster() -> None:
-    second_is_done = threading.Event()
-
-    def work(item: int) -> int:
-        if item == 0:
-            assert second_is_done.wait(PATIENCE_S)  # so the first is done last
-        if item == 1:
-            second_is_done.set()
-        if item == 5:
-            raise ValueError("five")
-        return 10 * item
-
-    def items(number: int) -> Iterator[int]:
-        yield from range(number)
-        raise ValueError("end")
-
-    def results(items: Iterator[int]) -> tuple[list[int], str]:
-        seen: list[int] = []
-        try:
-            for result in map_ahead(work, items):
-                seen.append(result)
-        except ValueError as error:
-            return seen, str(error)
-        return seen, ""
-
-    assert results(items(4)) == ([0, 10, 20, 30], "end")
-    assert results(items(8)) == ([0, 10, 20, 30, 40], "five")
-    assert results(iter(range(4))) == ([0, 10, 20, 30], "")
-    assert results(items(1)) == ([0], "end")
-    assert results(iter([])) == ([], "")
-    assert not [t for t in threading.enumerate() if t.name.startswith("map-ahead")]
 
 
 def test_the_longest_drive_is_said_in_the_docs() -> None:

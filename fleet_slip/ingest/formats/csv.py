@@ -16,7 +16,6 @@ from pydantic import Field, field_validator, model_validator
 
 from fleet_slip.arrays import is_finite
 from fleet_slip.base import shown
-from fleet_slip.compute.tasks import map_ahead
 from fleet_slip.config import Config, added
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.source import Budget, Channel, FormatSource, find_column
@@ -188,7 +187,7 @@ class CsvSource(FormatSource):
             blocks = _whole_lines(plain, self._file, padding)
             if unfolded is not stream:
                 blocks = _within(self._budget, blocks)
-            yield from map_ahead(parse, blocks)
+            yield from map(parse, blocks)
 
     def _parse(
         self, block: bytes, width: int, positions: dict[str, int], numbers: Set[str]
