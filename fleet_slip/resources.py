@@ -1,10 +1,12 @@
 """Find `configs/`, `jobs/` and `warehouse/`, installed or not, and folders of this user."""
 
+import json
 import os
+from contextlib import suppress
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from fleet_slip.errors import ConfigError
 
@@ -125,3 +127,12 @@ def cache_folder(name: str) -> Path:
     service = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
     return Path(service or Path(home, "fleet-slip"), name)
+
+
+def keep_json(file: Path, content: Any) -> None:
+    """Write JSON to a file of a cache, whole; what cannot be written is not kept."""
+    with suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        draft = file.with_suffix(f".{os.getpid()}")
+        draft.write_text(json.dumps(content))
+        draft.replace(file)

@@ -14,7 +14,6 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from fleet_slip.arrays import FloatArray
 from fleet_slip.base import shown
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import catalogue
@@ -35,7 +34,7 @@ from fleet_slip.ingest.guess import (
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.preview import preview_log
 from fleet_slip.ingest.profile import FileProfile
-from fleet_slip.ingest.suspicion import STEERING_RATIO, find_suspicions
+from fleet_slip.ingest.suspicion import STEERING_RATIO, Signals, find_suspicions
 from fleet_slip.ingest.vocabulary import parts_of
 
 _MOST_REFUSED = 20
@@ -72,7 +71,7 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     bases = [guess.profile.channel.base for guess in guesses.values()]
     time = guess_time(profile, {guess.column for guess in guesses.values()}, bases, group)
 
-    def drive_of(guesses: dict[str, Guess]) -> dict[str, FloatArray]:
+    def drive_of(guesses: dict[str, Guess]) -> Signals:
         """Return the signals of the longest drive, of all guesses that the catalogue can hold."""
         usable = {name: guess for name, guess in guesses.items() if not guess.doubts}
         if COURSE in usable and not {SPEED, "yaw_rate"} <= set(usable):
@@ -100,7 +99,7 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     return Draft(file, profile, time, sure, left, drive_keys, notes)
 
 
-def _road_wheels(guesses: dict[str, Guess], drive: dict[str, FloatArray]) -> dict[str, Guess]:
+def _road_wheels(guesses: dict[str, Guess], drive: Signals) -> dict[str, Guess]:
     """Return an angle called that of steering as the road wheels', where the car turns so."""
     guess = guesses.get("steering_wheel")
     in_bends = (one for one in find_relations(drive) if not one.expected)

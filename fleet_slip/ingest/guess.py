@@ -25,6 +25,7 @@ from fleet_slip.ingest.suspicion import (
     TURNING,
     WHEELS,
     SignalRelation,
+    Signals,
     relations,
     speed_mps,
 )
@@ -443,7 +444,7 @@ _TOLERANCES = {"yaw_rate": 0.3, "ax": 0.3, **dict.fromkeys(("steering_wheel", *R
 Keys: TypeAlias = Mapping[str, Any]
 
 
-def choose_units(guesses: dict[str, Guess], drive: Mapping[str, FloatArray]) -> dict[str, Guess]:
+def choose_units(guesses: dict[str, Guess], drive: Signals) -> dict[str, Guess]:
     """Return the guesses without a unit with that in which the car moves as cars do."""
     related, groups = find_relations(drive), _groups(guesses)
     by = _speed_source(drive)
@@ -469,7 +470,7 @@ def choose_units(guesses: dict[str, Guess], drive: Mapping[str, FloatArray]) -> 
     return found
 
 
-def find_relations(drive: Mapping[str, FloatArray]) -> list[SignalRelation]:
+def find_relations(drive: Signals) -> list[SignalRelation]:
     """Return how the signals of a drive go with one another, where they do."""
     speed = speed_mps(drive)
     alike = {*WHEELS, _speed_source(drive)}  # which have the unit of the speed itself
@@ -480,7 +481,7 @@ def find_relations(drive: Mapping[str, FloatArray]) -> list[SignalRelation]:
     ]
 
 
-def _speed_source(drive: Mapping[str, FloatArray]) -> str:
+def _speed_source(drive: Signals) -> str:
     """Return the first signal that the speed of a drive is of."""
     return next((n for n in (*WHEELS, "vx", "vehicle_speed") if n in drive), "vehicle_speed")
 

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.base import Progress, no_progress, number_of
+from fleet_slip.base import Progress, Record, no_progress, number_of
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import as_arrow, catalogue
 from fleet_slip.compute.tasks import run_tasks
@@ -71,8 +71,10 @@ TakeOut: TypeAlias = Callable[[TableName, Snapshot, Collection[Origin]], Change]
 
 
 @dataclass
-class IngestReport:
+class IngestReport(Record):
     """What became of one file."""
+
+    DOCUMENT = "file new *counts rows_quarantined drives_forgotten drives_replaced suspicions"
 
     file: str
     new: bool
@@ -89,17 +91,10 @@ class IngestReport:
         """What looks wrong and does harm."""
         return tuple(one for one in self.suspicions if one.does_harm)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return what `ingest --json` prints."""
-        return {
-            "file": self.file,
-            "new": self.new,
-            **vars(self.counts),
-            "rows_quarantined": sum(self.counts.quarantined.values()),
-            "drives_forgotten": self.drives_forgotten,
-            "drives_replaced": self.drives_replaced,
-            "suspicions": [vars(one) for one in self.suspicions],
-        }
+    @property
+    def rows_quarantined(self) -> int:
+        """How many rows were refused."""
+        return sum(self.counts.quarantined.values())
 
 
 @dataclass

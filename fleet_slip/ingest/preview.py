@@ -2,20 +2,19 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import polars as pl
 import pyarrow.compute as pc
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.base import Record
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.log_files import Log, local_copy
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
-from fleet_slip.ingest.suspicion import find_suspicions
+from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
 
 MOST_TICKS = 200_000
 """Ticks of the longest drive that are looked at: half an hour."""
@@ -34,29 +33,22 @@ class SignalRange:
 
 
 @dataclass(frozen=True)
-class Preview:
+class Preview(Record):
     """What would become of a file."""
+
+    DOCUMENT = "file *counts ranges suspicions"
 
     file: str
     counts: IngestCounts
     ranges: tuple[SignalRange, ...]
     suspicions: tuple[Fault, ...]
-    longest: dict[str, FloatArray]
+    longest: Signals
     """The signals of the longest drive, on consecutive ticks from its first."""
 
     @property
     def alarms(self) -> tuple[Fault, ...]:
         """What looks wrong and does harm."""
         return tuple(one for one in self.suspicions if one.does_harm)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what `ingest --dry-run --json` prints."""
-        return {
-            "file": self.file,
-            **vars(self.counts),
-            "ranges": [vars(one) for one in self.ranges],
-            "suspicions": [vars(one) for one in self.suspicions],
-        }
 
 
 def preview_log(log: Log, mapping: Mapping) -> Preview:
@@ -84,14 +76,11 @@ def preview_log(log: Log, mapping: Mapping) -> Preview:
     return Preview(str(log), counts, tuple(ranges), suspicions, signals)
 
 
-def signals_of(drive: MeasuredDrive) -> dict[str, FloatArray]:
-    """Return the signals of the beginning of a drive in SI units, NaN where there is no value."""
-    ticks = drive.ticks - drive.ticks[0]
-    kept = ticks < MOST_TICKS
-    signals = {}
-    for name, counts in drive.counts.items():
-        values = np.full(int(ticks[kept][-1]) + 1, np.nan)
-        numbers = pl.Series(counts).cast(pl.Float64).to_numpy()  # Arrow's own would load pandas
-        values[ticks[kept]] = numbers[kept] * float(catalogue()[name].scale)
-        signals[name] = values
-    return signals
+def signals_of(drive: MeasuredDrive) -> Signals:
+    """Return the signals of the beginning of a drive, as `find_suspicions` takes them."""
+    kept = drive.ticks - drive.ticks[0] < MOST_TICKS
+    counts = {  # by Polars: Arrow's own would load pandas
+        name: pl.Series(values).cast(pl.Float64).fill_null(float("nan")).to_numpy()[kept]
+        for name, values in drive.counts.items()
+    }
+    return on_every_tick(drive.ticks[kept], counts)

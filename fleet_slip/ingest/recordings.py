@@ -20,7 +20,7 @@ from fleet_slip.errors import RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.log_files import Log, StoredParts
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.resources import cache_folder
+from fleet_slip.resources import cache_folder, keep_json
 from fleet_slip.storage.folder import StoredFile
 from fleet_slip.storage.table import WITHDRAWN, Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
@@ -224,11 +224,7 @@ class KnownFiles:
 
     def save(self) -> None:
         """Write the cache; what cannot be written is not kept."""
-        with suppress(OSError):
-            self.cache.parent.mkdir(parents=True, exist_ok=True)
-            draft = self.cache.with_suffix(f".{os.getpid()}")
-            draft.write_text(json.dumps({"files": self.digests}))
-            draft.replace(self.cache)
+        keep_json(self.cache, {"files": self.digests})
 
 
 def _name_of(log: Log) -> str:

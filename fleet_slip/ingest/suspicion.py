@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.course import COURSE, LARGEST_RAD, CourseRelation, relate
@@ -305,6 +306,15 @@ _SOUND_RATIOS = {
 }
 """Of a speed to that of the wheels; other quantities are known to a factor of 2.5."""
 _FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
+
+
+def on_every_tick(ticks: NDArray[np.int32], counts: Mapping[str, FloatArray]) -> Signals:
+    """Return counts at some ticks, NaN for none, in SI units on all ticks from the first."""
+    found = {}
+    for name, values in counts.items():
+        found[name] = np.full(int(ticks[-1] - ticks[0]) + 1, np.nan)
+        found[name][ticks - ticks[0]] = values * float(catalogue()[name].scale)
+    return found
 
 
 def find_suspicions(signals: Signals) -> list[Fault]:

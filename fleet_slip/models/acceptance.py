@@ -22,7 +22,7 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
-from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.arrays import BoolArray
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.course import relate
 from fleet_slip.catalogue.facts import ALL_DRIVES, DELAY
@@ -38,7 +38,7 @@ from fleet_slip.grams.gram_rows import hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
 from fleet_slip.ingest.drives import SOURCE
-from fleet_slip.ingest.suspicion import find_suspicions
+from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import counts_model
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
@@ -373,19 +373,15 @@ def _look(
     return found, len(chosen), measured
 
 
-def _signals(columns: Mapping[str, Any]) -> dict[str, FloatArray]:
-    """Return the signals of a drive in SI units on consecutive ticks, NaN where there is none."""
-    ticks = np.asarray(columns["tick"], dtype=np.int64)
-    found = {}
-    for name, signal in catalogue().signals.items():
-        if name not in columns:
-            continue
-        values = np.ma.filled(np.ma.asarray(columns[name], dtype=np.float64), np.nan)
-        if np.isfinite(values).any():
-            dense = np.full(int(ticks[-1] - ticks[0]) + 1, np.nan)
-            dense[ticks - ticks[0]] = values * float(signal.scale)
-            found[name] = dense
-    return found
+def _signals(columns: Mapping[str, Any]) -> Signals:
+    """Return the signals of a drive that has values of them."""
+    counts = {
+        name: np.ma.filled(np.ma.asarray(columns[name], dtype=np.float64), np.nan)
+        for name in catalogue().signals
+        if name in columns
+    }
+    some = {name: values for name, values in counts.items() if np.isfinite(values).any()}
+    return on_every_tick(np.asarray(columns["tick"], dtype=np.int32), some)
 
 
 # Whether a challenger is better on the drives that vouch for the champion, or on odd ones alone.

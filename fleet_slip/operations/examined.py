@@ -7,7 +7,6 @@ Whatever trains, scores or publishes asks here, so that all have the same answer
 """
 
 import json
-import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -28,7 +27,7 @@ from fleet_slip.grams.reader import GramReader
 from fleet_slip.ingest.drives import SOURCE
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.operations.quality import SensorFault, examine_drives
-from fleet_slip.resources import cache_folder
+from fleet_slip.resources import cache_folder, keep_json
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.condition import (
     Condition,
@@ -175,7 +174,8 @@ def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
         name = sha256(canonical_json({k: str(v) for k, v in about.items()}).encode()).hexdigest()
         kept = cache_folder("examined") / f"{name[:32]}.json"
         parts.append(_known(kept, state) or _examine(warehouse, condition & piece.condition))
-        _keep(kept, {**parts[-1], "state": state})
+        content = {**parts[-1], "state": state}
+        keep_json(kept, {**content, "sha256": sha256_of(canonical_json(content))})
     found = {
         name: Fault(kind, tuple(signals), figure)
         for one in parts
@@ -219,14 +219,6 @@ def _known(kept: Path, state: list[Any]) -> Mapping[str, Any] | None:
         if known["state"] == state and checksum == sha256_of(canonical_json(known)):
             return dict(known)
     return None
-
-
-def _keep(kept: Path, content: Mapping[str, Any]) -> None:
-    with suppress(OSError):
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        draft = kept.with_suffix(f".{os.getpid()}")
-        draft.write_text(json.dumps({**content, "sha256": sha256_of(canonical_json(content))}))
-        draft.replace(kept)
 
 
 def _pieces(warehouse: Warehouse, condition: Condition) -> list[_Piece]:

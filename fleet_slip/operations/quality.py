@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from datetime import date
 from math import ceil
 from operator import attrgetter
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.base import Record
 from fleet_slip.catalogue.course import relate
 from fleet_slip.catalogue.facts import DELAY, TRAINING_DRIVES
 from fleet_slip.catalogue.faults import DriveBatches, Fault, find_implausible
@@ -31,26 +31,22 @@ from fleet_slip.warehouse.tables import Warehouse
 
 
 @dataclass(frozen=True)
-class SensorFault:
+class SensorFault(Record):
     """A drive whose sensors are not in order."""
+
+    DOCUMENT = "drive_id vehicle_id day kind=fault.kind signals=fault.signals figure=fault.figure"
 
     drive_id: str
     vehicle_id: str
     day: date
     fault: Fault
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the finding for a JSON document."""
-        named = {"drive_id": self.drive_id, "vehicle_id": self.vehicle_id, "day": self.day}
-        fault = self.fault
-        return named | {"kind": fault.kind, "signals": fault.signals, "figure": fault.figure}
-
 
 BY_DAY = attrgetter("day", "drive_id")
 
 
 @dataclass(frozen=True)
-class QualityReport:
+class QualityReport(Record):
     """What was examined and found.
 
     Attributes:
@@ -62,14 +58,6 @@ class QualityReport:
     drives: int
     compared: int
     findings: tuple[SensorFault, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the report for a JSON document."""
-        return {
-            "drives": self.drives,
-            "compared": self.compared,
-            "findings": [finding.as_dict() for finding in self.findings],
-        }
 
 
 def examine_drives(
