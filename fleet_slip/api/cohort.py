@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fleet_slip.evaluation.identify import Identified
     from fleet_slip.grams.cohort import Cohort
     from fleet_slip.models.diagnose import Diagnosis, WhatIf
-    from fleet_slip.models.select import RequestedSelection
+    from fleet_slip.models.select import Selection
     from fleet_slip.operations.examined import Examined
 
 OR_SIGNALS = Doc(
@@ -62,7 +62,7 @@ class FleetCohort(Rooted):
         return find_trainable(self.warehouse, self.condition)
 
     @takes(SelectionRequest)
-    def select(self, request: SelectionRequest) -> "RequestedSelection":
+    def select(self, request: SelectionRequest) -> "Selection":
         """Compare models by cross-validation and choose one; `Fleet.publish` takes the answer.
 
         Drives that are not in order are left out: see `examine`, and `examined` of the answer.

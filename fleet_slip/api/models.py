@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from fleet_slip.models.manifest import Manifest
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.score import Score
-    from fleet_slip.models.select import RequestedSelection
+    from fleet_slip.models.select import Selection
     from fleet_slip.operations.examined import Examined
     from fleet_slip.storage.documents import Document
     from fleet_slip.warehouse.condition import Condition
@@ -69,7 +69,7 @@ class PublishedModels(Rooted):
     def publish(
         self,
         name: Annotated[str, Doc("Name of the model, such as sideslip.")],
-        choice: "RequestedSelection | FleetCohort | None" = None,
+        choice: "Selection | FleetCohort | None" = None,
         *,
         force: Annotated[bool, Doc("Publish even what is worse than the champion.")] = False,
         candidate: Annotated[
@@ -96,7 +96,7 @@ class PublishedModels(Rooted):
     def would_publish(
         self,
         name: str,
-        choice: "RequestedSelection | FleetCohort | None" = None,
+        choice: "Selection | FleetCohort | None" = None,
         *,
         force: bool = False,
         candidate: bool = False,
@@ -114,11 +114,11 @@ class PublishedModels(Rooted):
     def _challenger(
         self,
         name: str,
-        choice: "RequestedSelection | FleetCohort | None",
+        choice: "Selection | FleetCohort | None",
         *,
         force: bool,
         candidate: bool,
-    ) -> "tuple[Manifest, RequestedSelection]":
+    ) -> "tuple[Manifest, Selection]":
         """Return a selection's winner, whose drives and course are looked at unless forced."""
         from fleet_slip.models.acceptance import (
             require_in_time,
@@ -143,9 +143,7 @@ class PublishedModels(Rooted):
                 require_sound_drives(self.warehouse, manifest, made, settled)
         return manifest, selection
 
-    def _chosen(
-        self, name: str, choice: "RequestedSelection | FleetCohort | None"
-    ) -> "RequestedSelection":
+    def _chosen(self, name: str, choice: "Selection | FleetCohort | None") -> "Selection":
         from fleet_slip.models.publish import recipe_for
         from fleet_slip.models.request import SelectionRequest
 

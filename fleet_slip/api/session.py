@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
     from fleet_slip.grams.job import GramReport
     from fleet_slip.models.publish import Publication
-    from fleet_slip.models.select import RequestedSelection
+    from fleet_slip.models.select import Selection
     from fleet_slip.simulation.job import SimulationReport
 
 Result = TypeVar("Result")
@@ -100,7 +100,7 @@ class RunReport(Record):
     simulation: "SimulationReport"
     gram: "GramReport"
     gram_features: "GramReport | None"
-    selection: "RequestedSelection | None"
+    selection: "Selection | None"
     publication: "Publication | None"
     refusal: str
     seconds: float
@@ -140,13 +140,13 @@ class Training:
             return None
         return Publication(champion, False, "The champion was made from the same data and list.")
 
-    def select(self, fleet: "Fleet") -> "RequestedSelection":
+    def select(self, fleet: "Fleet") -> "Selection":
         """Compare the models of the list on the cohort, which a night has examined."""
         cohort = fleet.cohort(self.cohort, unexamined=True)
         return cohort.select(models=self.models, worth=self.worth)
 
     def publish_if_not_worse(
-        self, fleet: "Fleet", selection: "RequestedSelection", *, replace_marked: bool
+        self, fleet: "Fleet", selection: "Selection", *, replace_marked: bool
     ) -> "tuple[Publication | None, str]":
         """Return the publication, or None and why it was refused.
 

@@ -24,7 +24,7 @@ from fleet_slip.errors import FleetSlipError, RefusedError
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import DryRun, Publication, recipe_for
 from fleet_slip.models.request import SelectionRequest
-from fleet_slip.models.select import RequestedSelection
+from fleet_slip.models.select import Selection
 from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.runs import step
 
@@ -206,7 +206,7 @@ def _faster_half(fleet: Fleet, campaign: str) -> str | None:
 
 
 @command(Fleet.cohort, FleetCohort.select)
-def select(selection: RequestedSelection, everything: All = False) -> None:
+def select(selection: Selection, everything: All = False) -> None:
     """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only.
 
     Compare a list of models: **fleet-slip select --models table1**

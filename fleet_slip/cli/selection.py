@@ -8,7 +8,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.cli.output import cell, figures_cells, print_line, print_table, print_text, say
 from fleet_slip.grams.folding import BANDS, PARTS, ROW_FOLDS
 from fleet_slip.models.search import SearchChoice
-from fleet_slip.models.select import RequestedSelection, Selection, Uncertainty, WithoutLabel
+from fleet_slip.models.select import Selection, Uncertainty, WithoutLabel
 from fleet_slip.regression.choice import CROSS_VALIDATION, NestedDistances
 from fleet_slip.regression.drives import Influential
 from fleet_slip.regression.folds import CrossValidation
@@ -154,7 +154,7 @@ def _print_models(selection: Selection, everything: bool) -> None:
         say("+ and -: what a size of the search has, and has not, unlike the size before it.")
 
 
-def _say_label_noise(selection: RequestedSelection) -> None:
+def _say_label_noise(selection: Selection) -> None:
     """Say how much of the errors is noise of the label they are measured against."""
     if selection.without_label is not None or selection.cohort.unlabelled:
         return
@@ -175,14 +175,14 @@ def _say_without_label(told: WithoutLabel) -> None:
         f"learned from changes of the course over {over} s: the figures are of changes, with the "
         "noise of two fixes in them, and not of the angle."
     )
-    if told.noise is None:
+    if told.noise_deg is None:
         say("cars hardly go straight on: what of the error is the noise of the course is not told.")
     else:
         say(
-            f"where cars go straight on, the course changes by {told.noise:.4f} +- "
-            f"{2 * (told.noise_uncertainty or 0):.4f} deg beyond the heading, and by more where "
-            f"they are slower: the angle's own error over so long is at most "
-            f"{told.angle_at_most:.3f} deg."
+            f"where cars go straight on, the course changes by {told.noise_deg:.4f} +- "
+            f"{2 * (told.noise_uncertainty_deg or 0):.4f} deg beyond the heading, and by more "
+            "where they are slower: the angle's own error over so long is at most "
+            f"{told.angle_at_most_deg:.3f} deg."
         )
     if (side := told.one_way) is not None:
         say(
@@ -190,8 +190,8 @@ def _say_without_label(told: WithoutLabel) -> None:
             "alone, such as ay and its square, cannot be told apart, nor can offsets. Add drives "
             "that turn to the other side."
         )
-    late = "" if told.late is None else f"; a course 10 ms late adds {told.late:.3f} deg"
-    away = "" if told.away is None else f"; an antenna 0.1 m elsewhere {told.away:.3f} deg"
+    late = "" if told.late_deg is None else f"; a course 10 ms late adds {told.late_deg:.3f} deg"
+    away = "" if told.away_deg is None else f"; an antenna 0.1 m elsewhere {told.away_deg:.3f} deg"
     say(f"no change tells: the constant, which show says of a published version{late}{away}.")
 
 
@@ -202,13 +202,12 @@ def _say_left_out(selection: Selection) -> None:
     if without_log := selection.cohort.count_received_with():
         say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
     say_without_log(selection.cohort.left_out, selection.cohort.feature_set)
-    if isinstance(selection, RequestedSelection):
-        say_influential(selection.left_out, "left out")
-        if selection.remark:
-            say(selection.remark)
-        if selection.without_label is not None:
-            _say_without_label(selection.without_label)
-        _say_label_noise(selection)
+    say_influential(selection.left_out, "left out")
+    if selection.remark:
+        say(selection.remark)
+    if selection.without_label is not None:
+        _say_without_label(selection.without_label)
+    _say_label_noise(selection)
 
 
 def _print_folds(model: CrossValidation) -> None:

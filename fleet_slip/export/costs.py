@@ -7,10 +7,10 @@ estimate for a Cortex-M4; `python -m benchmarks.on_board` measures both.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
-from fleet_slip.base import number_of
+from fleet_slip.base import Record, number_of
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.export.c import StepWriter, state_bytes, step_lines
 from fleet_slip.export.compile import write_program
@@ -22,7 +22,7 @@ COEFFICIENT_BYTES = 8
 
 
 @dataclass(frozen=True)
-class Costs:
+class Costs(Record):
     """What one estimate takes.
 
     Attributes:
@@ -35,6 +35,8 @@ class Costs:
         estimated_code_bytes, estimated_instructions: on a Cortex-M4, of code and constants with the
             compiler's divisions of 64 bits, and of a tick; at or above what was measured.
     """
+
+    DOCUMENT = "... operations"
 
     columns: int
     coefficient_bytes: int
@@ -50,10 +52,6 @@ class Costs:
     def operations(self) -> int:
         """All of them."""
         return self.multiplications + self.additions + self.divisions
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
-        return {**asdict(self), "operations": self.operations}
 
     def __str__(self) -> str:
         """Return it as `show` prints it."""

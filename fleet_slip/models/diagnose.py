@@ -1,10 +1,10 @@
 """What there is to know about a model's fit to a cohort: errors, collinearity, stability."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Literal
 
-from fleet_slip.base import number_of
+from fleet_slip.base import Record, number_of
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
@@ -32,8 +32,10 @@ from fleet_slip.regression.shrinkage import disturb, fit_noise_matched
 
 
 @dataclass(frozen=True)
-class CohortComparison:
+class CohortComparison(Record):
     """Whether another cohort has the same coefficients: Wald's test; None of too few drives."""
+
+    DOCUMENT = "cohort=condition by_clusters=other.estimates wald_clusters_independent=test"
 
     condition: str
     other: Inference
@@ -41,7 +43,7 @@ class CohortComparison:
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class Diagnosis(Record):
     """One model on one cohort; coefficients are in SI units, and None is what was not asked for.
 
     Attributes:
@@ -52,6 +54,14 @@ class Diagnosis:
         evidence: effective rows and design effect.
         influential: the cars that `robust` would leave out of a selection, by name.
     """
+
+    DOCUMENT = (
+        "signals=fitted.model.signals drives cluster clusters rows=fitted.gram.n "
+        "effective_rows=evidence.rows design_effect=evidence.design_effect "
+        "r_squared=fitted.r_squared residual_std=naive.residual_std condition_number "
+        "variance_inflation=inflation by_rows=naive.estimates by_clusters=robust.estimates "
+        "influential? against=comparison?"
+    )
 
     fitted: Fit = field(repr=False)  # holds a Gram matrix and long fractions
     drives: int
@@ -64,36 +74,10 @@ class Diagnosis:
     comparison: CohortComparison | None = None
     influential: Mapping[str, Influential] = field(default_factory=dict)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return what `diagnose --json` prints."""
-        document: dict[str, Any] = {
-            "signals": list(self.fitted.model.signals),
-            "drives": self.drives,
-            "cluster": self.cluster,
-            "clusters": self.robust.degrees_of_freedom + 1 if self.cluster != "row" else 1,
-            "rows": self.fitted.gram.n,
-            "effective_rows": self.evidence.rows,
-            "design_effect": self.evidence.design_effect,
-            "r_squared": self.fitted.r_squared,
-            "residual_std": self.naive.residual_std,
-            "condition_number": self.condition_number,
-            "variance_inflation": dict(self.inflation),
-            "by_rows": [asdict(estimate) for estimate in self.naive.estimates],
-            "by_clusters": [asdict(estimate) for estimate in self.robust.estimates],
-        }
-        if self.influential:
-            document["influential"] = {
-                car: {"times": one.times, "rows": one.rows} for car, one in self.influential.items()
-            }
-        if self.comparison is not None:
-            document["against"] = {
-                "cohort": self.comparison.condition,
-                "by_clusters": [asdict(estimate) for estimate in self.comparison.other.estimates],
-                "wald_clusters_independent": asdict(self.comparison.test)
-                if self.comparison.test
-                else None,
-            }
-        return document
+    @property
+    def clusters(self) -> int:
+        """How many pieces of independent evidence there are."""
+        return self.robust.degrees_of_freedom + 1 if self.cluster != "row" else 1
 
 
 def diagnose(
@@ -176,24 +160,16 @@ def _compare(
 
 
 @dataclass(frozen=True)
-class WhatIf:
+class WhatIf(Record):
     """Figures of a model before and after bias and noise come, and of the best model after it."""
+
+    DOCUMENT = "drives before after refitted_after refitted"
 
     drives: int
     before: Figures
     after: Figures
     refitted: LinearModel
     refitted_after: Figures
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what `what-if --json` prints."""
-        return {
-            "drives": self.drives,
-            "before": self.before.as_dict(),
-            "after": self.after.as_dict(),
-            "refitted_after": self.refitted_after.as_dict(),
-            "refitted": {"intercept": self.refitted.offset, **self.refitted.weights},
-        }
 
 
 def what_if(

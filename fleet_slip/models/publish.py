@@ -7,6 +7,7 @@ from fractions import Fraction
 from importlib.metadata import version as package_version
 from typing import Any
 
+from fleet_slip.base import Record
 from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
@@ -24,7 +25,7 @@ from fleet_slip.models.manifest import (
 )
 from fleet_slip.models.registry import CANDIDATE, CHAMPION, AliasMove, ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest, load_model_list
-from fleet_slip.models.select import GIVEN, RequestedSelection, Selection, checksum_of_list
+from fleet_slip.models.select import GIVEN, Selection, checksum_of_list
 from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.models.trained_drives import checksum_of_drives, pack_hashes
 from fleet_slip.regression.folds import CrossValidation
@@ -50,7 +51,7 @@ class Recipe:
     told: str = ""
 
 
-def asked_of(selection: RequestedSelection) -> dict[str, Any] | None:
+def asked_of(selection: Selection) -> dict[str, Any] | None:
     """Return what a manifest keeps of what was asked for; None if its list says it all."""
     asked = _asked(selection.request)
     if asked.keys() <= {"models"}:
@@ -148,7 +149,7 @@ def is_up_to_date(
     )
 
 
-def manifest_of(selection: RequestedSelection, name: str) -> Manifest:
+def manifest_of(selection: Selection, name: str) -> Manifest:
     """Describe the winner of a selection as a manifest."""
     signals = catalogue()
     winner = selection.winner.model
@@ -251,7 +252,7 @@ def _term(name: str, coefficient: Fraction) -> ModelTerm:
     )
 
 
-def _cross_validated(winner: CrossValidation, selection: RequestedSelection) -> CrossValidated:
+def _cross_validated(winner: CrossValidation, selection: Selection) -> CrossValidated:
     figures = winner.pooled
     return CrossValidated(
         folds_by=selection.folds.by,
@@ -267,25 +268,19 @@ def _cross_validated(winner: CrossValidation, selection: RequestedSelection) -> 
 
 
 @dataclass(frozen=True)
-class Publication:
+class Publication(Record):
     """What publishing came to."""
+
+    DOCUMENT = (
+        "model=version.manifest.name version=version.version new candidate reason "
+        "sha256=version.sha256"
+    )
 
     version: ModelVersion
     new: bool
     reason: str
     candidate: bool = False
     """Whether it waits for somebody to promote it."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what `publish --json` prints."""
-        return {
-            "model": self.version.manifest.name,
-            "version": self.version.version,
-            "new": self.new,
-            "candidate": self.candidate,
-            "reason": self.reason,
-            "sha256": self.version.sha256,
-        }
 
 
 def publish(

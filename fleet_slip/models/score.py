@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.base import Record
 from fleet_slip.catalogue.definitions import limit_of
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, catalogue
@@ -27,7 +27,7 @@ BATCH_ROWS = 2**17
 
 
 @dataclass(frozen=True)
-class Score:
+class Score(Record):
     """Figures of the error, estimate minus truth, over the rows of a cohort with the signals."""
 
     rows: int
@@ -49,10 +49,6 @@ class Score:
     """Of the cohort, that tell nothing of the model: the label or a signal is missing."""
     examined: str = ""
     """Which drives were left out since they are not in order, as a sentence."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what `score --json` prints."""
-        return asdict(self)
 
 
 def score_statement(manifest: Manifest, condition: str | Condition) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from fleet_slip.base import Record
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
@@ -41,7 +42,7 @@ ALL_SUBSETS = "all-subsets"
 
 
 @dataclass(frozen=True)
-class SearchChoice:
+class SearchChoice(Record):
     """How a number of signals was chosen.
 
     Attributes:
@@ -52,29 +53,17 @@ class SearchChoice:
         honest: figures of the choice, made again in every training fold; None of two folds.
     """
 
+    DOCUMENT = (
+        "ranking=rule.ranking criterion=rule.criterion evidence=evidence.kind "
+        "effective_rows=evidence.rows *nested subsets? picks? honest?"
+    )
+
     rule: Rule
     evidence: Evidence
     nested: NestedSelection | None = None
     subsets: tuple[SizeResult, ...] | None = None
     picks: dict[str, int] | None = None
     honest: CrossValidation | None = None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
-        document: dict[str, Any] = {
-            "ranking": self.rule.ranking,
-            "criterion": self.rule.criterion,
-            "evidence": self.evidence.kind,
-            "effective_rows": self.evidence.rows,
-        }
-        if self.nested is not None:
-            document |= self.nested.as_dict()
-        if self.subsets is not None:
-            document["subsets"] = [result.as_dict() for result in self.subsets]
-            document["picks"] = self.picks
-        if self.honest is not None:
-            document["honest"] = self.honest.as_dict()
-        return document
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import canonical_json, sha256_of
+from fleet_slip.base import Record, canonical_json, document_of, sha256_of
 from fleet_slip.catalogue.course import STRAIGHT, STRAIGHT_COURSE, TURNED, YAW_RATE
 from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN, features, input_scales
@@ -171,27 +171,27 @@ ONE_WAY = 0.7
 
 
 @dataclass(frozen=True)
-class WithoutLabel:
-    """What changes of the course tell of a model's error, in degrees; None is untold.
+class WithoutLabel(Record):
+    """What changes of the course say of a model's error; None where it cannot be estimated.
 
     Attributes:
         change_s: over how long.
-        error: cross-validated, of changes of the course.
-        noise, noise_uncertainty: of the course, where cars go straight on; over drives.
-        angle_at_most: bound of the angle's error over so long: what is left of `error`.
-        late: what a course would cost that is late by `LATE_S`.
-        away: what an antenna would that is `AWAY_M` from its place.
+        error_deg: cross-validated, of changes of the course.
+        noise_deg, noise_uncertainty_deg: of the course, where cars go straight on; over drives.
+        angle_at_most_deg: bound of the angle's error over so long: what is left of `error_deg`.
+        late_deg: what a course would cost that is late by `LATE_S`.
+        away_deg: what an antenna would that is `AWAY_M` from its place.
         to_the_left: mean of the angles turned over their root mean square: 1 where cars turn to
             the left alone and as hard at any time, −1 to the right.
     """
 
     change_s: tuple[float, ...]
-    error: float
-    noise: float | None
-    noise_uncertainty: float | None
-    angle_at_most: float | None
-    late: float | None
-    away: float | None
+    error_deg: float
+    noise_deg: float | None
+    noise_uncertainty_deg: float | None
+    angle_at_most_deg: float | None
+    late_deg: float | None
+    away_deg: float | None
     to_the_left: float
 
     @property
@@ -200,12 +200,6 @@ class WithoutLabel:
         if abs(self.to_the_left) < ONE_WAY:
             return None
         return "left" if self.to_the_left > 0 else "right"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
-        found = asdict(self)
-        plain = ("change_s", "to_the_left")
-        return {name if name in plain else f"{name}_deg": one for name, one in found.items()}
 
 
 def without_label(warehouse: Warehouse, cohort: Cohort, error: float) -> WithoutLabel | None:
@@ -237,12 +231,12 @@ def without_label(warehouse: Warehouse, cohort: Cohort, error: float) -> Without
     rate, away = spread[YAW_RATE], spread[CURVATURE]
     return WithoutLabel(
         change_s=tuple(float(one) for one in times),
-        error=error,
-        noise=own,
-        noise_uncertainty=unsure,
-        angle_at_most=None if left is None else math.sqrt(left / 2),
-        late=None if rate is None else math.degrees(LATE_S * rate),
-        away=None if away is None else math.degrees(AWAY_M * away),
+        error_deg=error,
+        noise_deg=own,
+        noise_uncertainty_deg=unsure,
+        angle_at_most_deg=None if left is None else math.sqrt(left / 2),
+        late_deg=None if rate is None else math.degrees(LATE_S * rate),
+        away_deg=None if away is None else math.degrees(AWAY_M * away),
         to_the_left=turned / math.sqrt(rows * square) if square else 0.0,
     )
 
@@ -293,6 +287,13 @@ class Selection:
         searched: the models of a search, which are among `models`.
         distances: of an order's nested models from the full and the true one, or why not told.
         intercept: whether models have one; without it they go through the origin.
+        model_list, config_sha256: what was compared, such as `table1`, and its checksum.
+        left_out: the cars that `robust` left out, and what influence they had.
+        without_label: how good the winner is, if changes of the course alone trained it.
+        label_noise_deg: of the label, which every error has in it; None where it is not known.
+        request, asked: what was asked for, and of which drives.
+        remark: why another list than the usual one was compared.
+        examined: which drives were left out since they are not in order, as a sentence.
     """
 
     cohort: Cohort
@@ -305,6 +306,15 @@ class Selection:
     uncertainty: Uncertainty | None = None
     distances: NestedDistances | str | None = None
     intercept: bool = True
+    model_list: str = ""
+    config_sha256: str = ""
+    left_out: Mapping[str, Influential] = field(default_factory=dict)
+    without_label: WithoutLabel | None = None
+    label_noise_deg: float | None = None
+    request: SelectionRequest = field(default_factory=SelectionRequest)
+    asked: str = TRAINING_DRIVES
+    remark: str = ""
+    examined: str = ""
 
     def __repr__(self) -> str:
         winner = self.winner.model
@@ -335,14 +345,21 @@ class Selection:
         """Rows of the cohort that tell nothing of the winner: the label or a column is missing."""
         return max(self.cohort.rows - self.winner.model.pooled.rows, 0)
 
-    def _gram_rows(self, model: CrossValidation) -> dict[str, str]:
-        """Return which Gram rows a model is made of, for SQL; it may name cars."""
-        return {"gram_rows": self.cohort.gram_condition(model.signals)}
+    @property
+    def beyond_label_noise_deg(self) -> float | None:
+        """The winner's RMSE without the label's noise."""
+        if self.label_noise_deg is None:
+            return None
+        rmse_deg = self.winner.model.pooled.rmse_deg
+        return math.sqrt(max(rmse_deg**2 - self.label_noise_deg**2, 0.0))
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `select --json` prints."""
         document: dict[str, Any] = {
-            "models": [{**model.as_dict(), **self._gram_rows(model)} for model in self.models],
+            "models": [
+                {**model.as_dict(), "gram_rows": self.cohort.gram_condition(model.signals)}
+                for model in self.models
+            ],
             "winner": self.winner.model.name,
             "reason": self.winner.reason,
             "cohort": self.cohort.condition.text,
@@ -359,19 +376,22 @@ class Selection:
                 "leaking": self.folds.by == ROW_FOLDS,
             },
             "skipped": self.skipped,
+            "vehicles_left_out": {car: one.times for car, one in self.left_out.items()},
+            "label_noise_deg": self.label_noise_deg,
         }
         for model, shortfall in zip(document["models"], self.winner.shortfalls, strict=False):
             model["shortfall"] = shortfall.as_dict()
-        if self.choice is not None:
-            document["choice"] = self.choice.as_dict()
-        if self.searched is not None:
-            document["search"] = self.searched.as_dict()
-        if isinstance(self.distances, str):
-            document["nested"] = {"left_out": self.distances}
-        elif self.distances is not None:
-            document["nested"] = self.distances.as_dict()
-        if self.uncertainty is not None:
-            document["uncertainty"] = asdict(self.uncertainty)
+        nested = {"left_out": self.distances} if isinstance(self.distances, str) else self.distances
+        found = {
+            "choice": self.choice,
+            "search": self.searched,
+            "nested": nested,
+            "uncertainty": self.uncertainty,
+            "without_label": self.without_label,
+            "remark": self.remark,
+            "examined": self.examined,
+        }
+        document |= {name: document_of(one) for name, one in found.items() if one}
         return document
 
 
@@ -432,56 +452,6 @@ def validate(
     )
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
-class RequestedSelection(Selection):
-    """A selection that can be published: it tells what it was made from.
-
-    Attributes:
-        model_list, config_sha256: what was compared, such as `table1`, and its checksum.
-        left_out: the cars that `robust` left out, and what influence they had.
-        without_label: what changes of the course tell of the winner, if they taught it alone.
-        label_noise_deg: of the label, which every error has in it; None where it is not known.
-        request, asked: what was asked for, and of which drives.
-        remark: why another list than the usual one was compared.
-        examined: which drives were left out since they are not in order, as a sentence.
-    """
-
-    model_list: str
-    config_sha256: str
-    left_out: Mapping[str, Influential] = field(default_factory=dict)
-    without_label: WithoutLabel | None = None
-    label_noise_deg: float | None = None
-    request: SelectionRequest = field(default_factory=SelectionRequest)
-    asked: str = TRAINING_DRIVES
-    remark: str = ""
-    examined: str = ""
-
-    @property
-    def beyond_label_noise_deg(self) -> float | None:
-        """The winner's RMSE without the label's noise."""
-        if self.label_noise_deg is None:
-            return None
-        rmse_deg = self.winner.model.pooled.rmse_deg
-        return math.sqrt(max(rmse_deg**2 - self.label_noise_deg**2, 0.0))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what `select --json` prints."""
-        named = {car: one.times for car, one in self.left_out.items()}
-        document = {
-            **super().as_dict(),
-            "vehicles_left_out": named,
-            "label_noise_deg": self.label_noise_deg,
-        }
-        course = {"without_label": self.without_label.as_dict()} if self.without_label else {}
-        said = {"remark": self.remark, "examined": self.examined}
-        return {**document, **course, **{name: text for name, text in said.items() if text}}
-
-    @classmethod
-    def of(cls, selection: Selection, model_list: str, config_sha256: str) -> "RequestedSelection":
-        """Return a selection with what it was made from."""
-        return cls(**vars(selection), model_list=model_list, config_sha256=config_sha256)
-
-
 # Answers a request: reads the Gram rows it needs, and selects among models.
 
 GIVEN = "given"
@@ -490,7 +460,7 @@ GIVEN = "given"
 
 def answer_request(
     warehouse: Warehouse, request: SelectionRequest, condition: str = TRAINING_DRIVES
-) -> RequestedSelection:
+) -> Selection:
     """Select on a condition's drives. Raises `UsageError` for options that do not go together."""
     usual = not (request.models or request.model or request.label or request.chosen_by_inputs)
     find = _answer_usual if usual else _answer
@@ -502,9 +472,7 @@ def answer_request(
     return replace(answer, without_label=told, label_noise_deg=noise_deg)
 
 
-def _answer_usual(
-    warehouse: Warehouse, request: SelectionRequest, condition: str
-) -> RequestedSelection:
+def _answer_usual(warehouse: Warehouse, request: SelectionRequest, condition: str) -> Selection:
     """Select from the usual list, or from that of logged signals where it cannot be had."""
     logged = replace(request, models=LOGGED_MODELS)
     if request.features or request.by in (ROW_FOLDS, PARTS):
@@ -519,7 +487,7 @@ def _answer_usual(
     return replace(_answer(warehouse, logged, condition), remark=remark)
 
 
-def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> RequestedSelection:
+def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> Selection:
     request.check()
     name = request.models or (COURSE if request.label and not request.chosen_by_inputs else None)
     model_list = _given(request) or (load_model_list(name) if name else None)
@@ -563,7 +531,7 @@ def weigh(
     request: SelectionRequest,
     model_list: ModelList | None,
     folds: Folding,
-) -> RequestedSelection:
+) -> Selection:
     """Select with the weight of the course that serves held-out drives with the label best.
 
     Of those not worse for sure, by Student's t over the folds, the largest: few cars have a label.
@@ -590,7 +558,7 @@ def _answer_without(
     condition: str,
     model_list: ModelList | None,
     feature_set: str,
-) -> RequestedSelection:
+) -> Selection:
     """Select without the cars whose influence on a model of all compared inputs is unusual."""
     cohort = load_cohort(warehouse, condition, feature_set)
     inputs = inputs_of(cohort, request.nested or WHOLE_SET)
@@ -637,7 +605,7 @@ def _compare_listed(
     request: SelectionRequest,
     model_list: ModelList | None,
     folds: Folding,
-) -> RequestedSelection:
+) -> Selection:
     listed = model_list.model if model_list else ()
     search = _search_of(request, model_list)
     worth = None if request.worth is None else parse_worth(request.worth)
@@ -652,7 +620,7 @@ def _compare_listed(
         content = {"inputs": list(inputs), **search.model_dump()}
         label = f"search:{search.method} {search.most}"
         checksum = _checksum(sha256_of(canonical_json(content)), request.worth, request.intercept)
-        return RequestedSelection.of(selection, label, checksum)
+        return replace(selection, model_list=label, config_sha256=checksum)
     described = ModelList(
         description=model_list.description if model_list else "Nested models of an order",
         features=cohort.feature_set,
@@ -667,7 +635,7 @@ def _compare_listed(
         cohort, described.model, folds, worth, search, inputs, intercept=request.intercept
     )
     checksum = _checksum(described.sha256, request.worth, request.intercept)
-    return RequestedSelection.of(selection, label, checksum)
+    return replace(selection, model_list=label, config_sha256=checksum)
 
 
 def checksum_of_list(model_list: ModelList, worth: str | None) -> str | None:
@@ -697,7 +665,7 @@ def _search_of(request: SelectionRequest, model_list: ModelList | None) -> Searc
     return model_list.search if model_list else None
 
 
-def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> RequestedSelection:
+def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Selection:
     nested = request.nested or WHOLE_SET
     inputs = inputs_of(cohort, nested)
     criterion = require_criterion(request.criterion or "cv")
@@ -712,10 +680,16 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Reques
     )
     content = {"inputs": described.sha256, "ranking": rule.ranking, "criterion": rule.criterion}
     content |= {"evidence": found.choice.evidence.kind}
-    chosen, intercept = found.choice, request.intercept
-    selection = Selection(
-        cohort, folds, found.models, found.winner, {}, choice=chosen, intercept=intercept
+    return Selection(
+        cohort,
+        folds,
+        found.models,
+        found.winner,
+        {},
+        choice=found.choice,
+        intercept=request.intercept,
+        model_list=f"nested:{nested} {rule.ranking} {rule.criterion}",
+        config_sha256=_checksum(
+            sha256_of(canonical_json(content)), request.worth, request.intercept
+        ),
     )
-    label = f"nested:{nested} {rule.ranking} {rule.criterion}"
-    checksum = _checksum(sha256_of(canonical_json(content)), request.worth, request.intercept)
-    return RequestedSelection.of(selection, label, checksum)

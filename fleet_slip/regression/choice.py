@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import IntArray
+from fleet_slip.base import Record
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import eliminate
@@ -59,10 +60,15 @@ class Worth:
         share = self.amount * (2 + self.amount) * rmse**2  # ((1 + amount) rmse)^2 - rmse^2
         return share if self.relative else self.amount**2
 
-    def __str__(self) -> str:
+    @property
+    def text(self) -> str:
+        """The gain in words."""
         if self.relative:
             return f"{100 * self.amount:.3g} % of the best"
         return f"{math.degrees(self.amount):.4g} deg"
+
+    def __str__(self) -> str:
+        return self.text
 
 
 DEFAULT_WORTH = Worth(math.radians(0.025))
@@ -252,12 +258,14 @@ class Rule:
 
 
 @dataclass(frozen=True)
-class NestedChoice:
+class NestedChoice(Record):
     """A choice of the first `size` signals of an order, their exact fit and its evidence.
 
     `values` of the criterion are for 0..k signals, smaller being better; of cross-validation they
     are the negative correlations.
     """
+
+    DOCUMENT = "order signals criterion_values=values *evidence"
 
     order: tuple[str, ...]
     size: int
@@ -270,27 +278,16 @@ class NestedChoice:
         """The chosen signals."""
         return self.order[: self.size]
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
-        return {
-            "order": list(self.order),
-            "signals": list(self.signals),
-            "criterion_values": list(self.values),
-            **self.evidence.as_dict(),
-        }
-
 
 @dataclass(frozen=True)
-class NestedDistances:
+class NestedDistances(Record):
     """Distances D of the nested models of an order; `null` is the model without any signal."""
+
+    DOCUMENT = "order *evidence null"
 
     order: tuple[str, ...]
     evidence: Evidence
     null: CrossValidation
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
-        return {"order": list(self.order), **self.evidence.as_dict(), "null": self.null.as_dict()}
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
+from fleet_slip.base import Record
 from fleet_slip.errors import DataError
 from fleet_slip.regression.gram import GramTable, packed_position, packed_size
 from fleet_slip.regression.least_squares import LinearModel
@@ -180,8 +181,10 @@ LEAST_CARS = 20
 
 
 @dataclass(frozen=True)
-class Influential:
+class Influential(Record):
     """A car, its influence over what its leverage gives and the median car's, and its rows."""
+
+    DOCUMENT = "times rows"
 
     car: int
     times: float

@@ -7,11 +7,11 @@ import math
 import operator
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.base import Record
 from fleet_slip.regression import exact
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import LinearModel
@@ -73,7 +73,7 @@ class ErrorSums:
 
 
 @dataclass(frozen=True)
-class Figures:
+class Figures(Record):
     """How well a model predicts rows it was not fitted on, in units of the label (rad).
 
     Attributes:
@@ -81,6 +81,8 @@ class Figures:
         error_mean, error_std: of prediction minus label, as in Table II.
         relative_rmse: RMSE over that of always predicting the mean of the training rows.
     """
+
+    DOCUMENT = "rows correlation rmse_deg error_mean_deg error_std_deg relative_rmse"
 
     rows: int
     correlation: float
@@ -103,17 +105,6 @@ class Figures:
     def error_std_deg(self) -> float:
         """Standard deviation of the error in degrees."""
         return math.degrees(self.error_std)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures for a JSON document, errors in degrees."""
-        return {
-            "rows": self.rows,
-            "correlation": self.correlation,
-            "rmse_deg": self.rmse_deg,
-            "error_mean_deg": self.error_mean_deg,
-            "error_std_deg": self.error_std_deg,
-            "relative_rmse": self.relative_rmse,
-        }
 
 
 def error_sums(model: LinearModel, gram: Gram, training_mean: Fraction | None = None) -> ErrorSums:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.base import number_of
+from fleet_slip.base import Record, number_of
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.figures import ErrorSums, Figures, error_sums
 from fleet_slip.regression.gram import Gram, GramTable, require_signals
@@ -204,7 +204,7 @@ Procedure = Callable[[Gram], LinearModel]
 
 
 @dataclass(frozen=True)
-class CrossValidation:
+class CrossValidation(Record):
     """A model's figures on rows that it was not fitted on, and its fit to all rows.
 
     Attributes:
@@ -214,6 +214,11 @@ class CrossValidation:
         model, counts: exact fit to all rows, in physical units and in counts.
         sums: exact pooled sums behind `pooled`, in counts.
     """
+
+    DOCUMENT = (
+        "name signals drives *pooled correlation_standard_error=standard_error condition_number "
+        "coefficients=model.weights intercept=model.offset folds=named_folds"
+    )
 
     name: str
     signals: tuple[str, ...]
@@ -236,22 +241,11 @@ class CrossValidation:
         """Standard error of the correlation over folds: std of the folds' / sqrt(folds)."""
         return error_of_mean([fold.correlation for fold in self.folds])
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
-        return {
-            "name": self.name,
-            "signals": list(self.signals),
-            "drives": self.drives,
-            **self.pooled.as_dict(),
-            "correlation_standard_error": self.standard_error,
-            "condition_number": self.condition_number,
-            "coefficients": self.model.weights,
-            "intercept": self.model.offset,
-            "folds": [
-                {"fold": name, **figures.as_dict()}
-                for name, figures in zip(self.fold_names, self.folds, strict=True)
-            ],
-        }
+    @property
+    def named_folds(self) -> list[dict[str, Any]]:
+        """The figures of each fold with its name, for a JSON document."""
+        both = zip(self.fold_names, self.folds, strict=True)
+        return [{"fold": name, **figures.as_dict()} for name, figures in both]
 
 
 def error_of_mean(values: Sequence[float]) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import number_of
+from fleet_slip.base import Record, number_of
 from fleet_slip.errors import DataError
 from fleet_slip.regression import exact
 from fleet_slip.regression.exact import (
@@ -29,8 +29,10 @@ Scales = Mapping[str, Fraction]
 
 
 @dataclass(frozen=True)
-class LinearModel:
+class LinearModel(Record):
     """label = intercept + sum of coefficient times signal, exactly; of counts, or `physical`."""
+
+    DOCUMENT = "intercept=offset *weights"
 
     signals: tuple[str, ...]
     label: str

@@ -16,12 +16,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.base import Record
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.figures import normal_cdf, normal_density
 from fleet_slip.regression.gram import Gram
@@ -122,8 +122,10 @@ _SPARE = 3
 
 
 @dataclass(frozen=True)
-class SizeResult:
+class SizeResult(Record):
     """Exact fits of the best models of one size, best first; signals in declared order."""
+
+    DOCUMENT = "size=best.size signals=best.model.signals r_squared=best.r_squared gap"
 
     fits: tuple[Fit, ...]
 
@@ -138,15 +140,6 @@ class SizeResult:
         if len(self.fits) < 2 or self.best.rss == 0:
             return None
         return float(self.fits[1].rss / self.best.rss - 1)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
-        return {
-            "size": self.best.size,
-            "signals": list(self.best.model.signals),
-            "r_squared": self.best.r_squared,
-            "gap": self.gap,
-        }
 
 
 def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) -> list[SizeResult]:

@@ -11,7 +11,7 @@ def test_answers_are_shown_on_a_line_or_two(smoke_root: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     cohort = fleet.cohort()
     selection = cohort.select(models="table1")
-    assert repr(selection).startswith("<RequestedSelection: ")
+    assert repr(selection).startswith("<Selection: ")
     assert "RMSE" in repr(selection)
     model = fleet.model("smoke")
     assert repr(model).startswith("<ModelVersion smoke@1: ")

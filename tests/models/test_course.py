@@ -153,11 +153,11 @@ def test_columns_are_searched_for(fleet: Fleet) -> None:
     assert math.isclose(selection.winner.model.pooled.error_mean_deg, 0, abs_tol=1e-9)
     assert selection.model_list == "course"
     told = selection.without_label
-    assert told is not None and told.noise is not None and told.angle_at_most is not None
+    assert told is not None and told.noise_deg is not None and told.angle_at_most_deg is not None
     # The noise of two fixes of 0.03 m/s each, at 15 to 45 m/s.
-    assert 0.05 < told.noise < 0.2 < told.error and told.noise_uncertainty is not None
-    assert 0.02 < told.angle_at_most < told.error / math.sqrt(2)
-    assert told.late is not None and 0.02 < told.late < 0.3
+    assert 0.05 < told.noise_deg < 0.2 < told.error_deg and told.noise_uncertainty_deg is not None
+    assert 0.02 < told.angle_at_most_deg < told.error_deg / math.sqrt(2)
+    assert told.late_deg is not None and 0.02 < told.late_deg < 0.3
     assert told.one_way is None and -0.4 < told.to_the_left < -0.1
 
 

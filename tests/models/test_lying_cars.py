@@ -12,7 +12,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import RefusedError
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import counts_model
-from fleet_slip.models.select import RequestedSelection
+from fleet_slip.models.select import Selection
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram, packed_position
 from tests.support.cars import counts, drive
@@ -54,7 +54,7 @@ def receive(fleet: fleet_slip.Fleet, path: Path, rows: Rows) -> None:
     assert fleet.ingest_counted(write_counted(path, rows)).gram_rows == len(rows)
 
 
-def select(fleet: fleet_slip.Fleet) -> RequestedSelection:
+def select(fleet: fleet_slip.Fleet) -> Selection:
     return fleet.cohort(unexamined=True).select(model=INPUTS)
 
 
