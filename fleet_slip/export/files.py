@@ -24,9 +24,8 @@ from fleet_slip.export.fmu import fmu
 from fleet_slip.export.program import Angle, Input, Program, Target
 from fleet_slip.export.sql import sql_macro, sql_statement
 from fleet_slip.export.templating import c_prefix, file_prefix, fill_in_version
-from fleet_slip.models.manifest import ImportedFrom, Manifest
+from fleet_slip.models.manifest import ImportedFrom, Manifest, checksum_of_drives
 from fleet_slip.models.registry import ModelVersion, Registry
-from fleet_slip.models.trained_drives import checksum_of_drives, pack_hashes
 from fleet_slip.storage.documents import checksum
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -192,7 +191,7 @@ def _subject(
     drives = None
     if warehouse is not None:
         made = Registry.of(warehouse).trained_drives(version.manifest)
-        drives = pack_hashes(made.salted) if made else None
+        drives = made.content if made else None
     return Subject(version, program, checks, drives, with_gram)
 
 

@@ -39,12 +39,11 @@ from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
 from fleet_slip.ingest.drives import SOURCE
 from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
-from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.manifest import Manifest, TrainedDrives
 from fleet_slip.models.predict import counts_model
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 from fleet_slip.models.search import searching
 from fleet_slip.models.select import Selection
-from fleet_slip.models.trained_drives import TrainedDrives
 from fleet_slip.regression.choice import Shortfall, Worth, compare_paired, compare_typical
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import (

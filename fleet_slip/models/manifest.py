@@ -5,6 +5,7 @@ It may come from anywhere: texts and numbers are bounded, and what becomes SQL i
 
 import math
 import re
+from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 from hashlib import sha256
@@ -20,6 +21,7 @@ from pydantic import (
     model_validator,
 )
 
+from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.definitions import Definition, integer_arithmetic, plain_column
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config
@@ -176,7 +178,7 @@ class CrossValidated(Config):
 class TrainedOn(Config):
     """The data that made a model.
 
-    `vehicles` and `drives_sha256` (`fleet_slip.models.trained_drives`) are None in older versions;
+    `vehicles` and `drives_sha256` (`TrainedDrives`) are None in older versions;
     `drives_without_log` sent Gram rows.
     """
 
@@ -319,18 +321,48 @@ def require_model_name(name: str) -> str:
     return name
 
 
-# Hashes of drives as they stay where rows go: salted with a model's name.
+# The drives that made a version, for ever, without their names: whoever knows a drive's name can
+# see whether it was among them.
 
 _SALT = b"fleet-slip trained drives\n"
 _AT_ONCE = 2**20
 
 
-def hash_drives(name: str, drives: Hashes) -> Hashes:
-    """Return the salted hashes of drives, as the versions of a model keep them, sorted."""
-    return np.sort(salt_drives(name, drives))
+@dataclass(frozen=True)
+class TrainedDrives:
+    """Hashes of the drives of a version, salted with its model's name; sorted."""
+
+    name: str
+    salted: Hashes
+
+    @classmethod
+    def of(cls, name: str, drives: Hashes) -> "TrainedDrives":
+        """Return those of some drives, by the hashes of their names."""
+        return cls(name, np.sort(_salt(name, drives)))
+
+    @classmethod
+    def unpacked(cls, name: str, content: bytes) -> "TrainedDrives":
+        """Return those of a file's content."""
+        return cls(name, np.frombuffer(content, dtype=">u8").astype(np.uint64))
+
+    @property
+    def content(self) -> bytes:
+        """What a file holds: 8 bytes a drive."""
+        return self.salted.astype(">u8").tobytes()
+
+    def among(self, drives: Hashes) -> BoolArray:
+        """Return which of some drives, by the hashes of their names, made the version."""
+        wanted, place = np.unique(drives, return_inverse=True)
+        found: BoolArray = np.isin(_salt(self.name, wanted), self.salted)[place]
+        return found
 
 
-def salt_drives(name: str, drives: Hashes) -> Hashes:
+def checksum_of_drives(content: bytes) -> str:
+    """Return the SHA-256 by which a manifest names a file of its drives."""
+    return sha256(content).hexdigest()
+
+
+def _salt(name: str, drives: Hashes) -> Hashes:
     """Return the salted hash of each drive, in the order of the drives."""
     salt, numbers = _SALT + name.encode(), drives.astype("<u8")
     hashed = np.empty(len(drives), dtype=np.uint64)

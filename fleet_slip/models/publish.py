@@ -20,14 +20,14 @@ from fleet_slip.models.manifest import (
     ModelLabel,
     ModelTerm,
     SelectedBy,
+    TrainedDrives,
     TrainedOn,
-    hash_drives,
+    checksum_of_drives,
 )
 from fleet_slip.models.registry import CANDIDATE, CHAMPION, AliasMove, ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import GIVEN, Selection, checksum_of_list
 from fleet_slip.models.straight_on import StraightOn, straight_on
-from fleet_slip.models.trained_drives import checksum_of_drives, pack_hashes
 from fleet_slip.regression.folds import CrossValidation
 from fleet_slip.warehouse.condition import parse_cohort, with_all_drives
 from fleet_slip.warehouse.tables import Warehouse
@@ -228,7 +228,7 @@ def with_straight_intercept(
 def drives_of(selection: Selection, name: str) -> bytes:
     """Return the salted hashes of the drives that a selection's winner was trained on, packed."""
     signals = (*selection.winner.model.signals, catalogue().label)
-    return pack_hashes(hash_drives(name, selection.cohort.hash_drives_with(signals)))
+    return TrainedDrives.of(name, selection.cohort.hash_drives_with(signals)).content
 
 
 def _term(name: str, coefficient: Fraction) -> ModelTerm:

@@ -1,6 +1,7 @@
 """Model versions: immutable, numbered, each explaining itself; and aliases with their history.
 
 models/<name>/versions/1.json, 2.json, ...     what was published
+models/<name>/versions/drives-SHA256.bin       the drives that made it, as salted hashes
 models/<name>/history/1.json, 2.json, ...      every move of an alias, with its time
 """
 
@@ -17,8 +18,7 @@ from pydantic import Field
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier
 from fleet_slip.config import Config, parse_document
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
-from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.trained_drives import TrainedDrives, keep_drives, read_listed
+from fleet_slip.models.manifest import Manifest, TrainedDrives, checksum_of_drives
 from fleet_slip.pages.notebook import notebook_table
 from fleet_slip.storage.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.storage.folder import Folder
@@ -347,12 +347,17 @@ class Registry:
 
     def trained_drives(self, manifest: Manifest) -> TrainedDrives | None:
         """Return what drives made a version; None if it does not tell. Raises `StorageError`."""
-        listed = read_listed(self.folder_of(manifest.name), manifest)
-        return None if listed is None else TrainedDrives(manifest.name, listed)
-
-    def require_drives(self, manifest: Manifest) -> None:
-        """Raise `StorageError` if what tells a version's drives is damaged or gone."""
-        self.trained_drives(manifest)
+        expected = manifest.trained_on.drives_sha256
+        if expected is None:
+            return None
+        folder, file = self.folder_of(manifest.name), _drives_file(expected)
+        content = folder.read(file)
+        if checksum_of_drives(content) != expected:
+            raise StorageError(
+                f"{folder}/{file}: its bytes do not match the checksum in its name. Restore the "
+                "file from a backup."
+            )
+        return TrainedDrives.unpacked(manifest.name, content)
 
     def add(self, manifest: Manifest, drives: bytes | None = None) -> ModelVersion:
         """Make a manifest the next version of its model, after what tells its `drives`.
@@ -362,7 +367,7 @@ class Registry:
         """
         name, versions = manifest.name, self._versions(manifest.name)
         if drives is not None:
-            keep_drives(self.folder_of(name), drives)
+            self.folder_of(name).create(_drives_file(checksum_of_drives(drives)), drives)
 
         def next_version(latest: int) -> int | None:
             if latest and self.load(name, latest).manifest.same_estimator(manifest):
@@ -476,3 +481,7 @@ _TABLE_SCHEMA = pa.schema(
 def _unknown(name: str, which: str, known: Sequence[int | str]) -> QuestionError:
     there = ", ".join(map(str, known))
     return QuestionError(f"{name} has no version or alias {which!r}. It has: {there}.")
+
+
+def _drives_file(sha256: str) -> str:
+    return f"drives-{sha256}.bin"

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.gram_rows import Hashes, hash_numbers
-from fleet_slip.models.manifest import hash_drives
+from fleet_slip.models.manifest import TrainedDrives
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder
 from fleet_slip.warehouse.forgotten import Audit
@@ -36,7 +36,7 @@ def marked_models(root: Folder) -> frozenset[str]:
     registry = Registry.of(warehouse)
     versions = [(n, number) for n in registry.names() if judged for number in registry.versions(n)]
     hashes = cache(lambda: _hashes_of_present(warehouse))
-    present = cache(lambda name: hash_drives(name, hashes()))
+    present = cache(lambda name: TrainedDrives.of(name, hashes()).salted)
     for subject, numbers in judged.items():
         found |= {
             f"{name}@{number}"

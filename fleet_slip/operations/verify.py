@@ -346,7 +346,7 @@ def verify_models(
         for number in numbers:
             try:
                 manifest = registry.load(name, number).manifest
-                registry.require_drives(manifest)
+                registry.trained_drives(manifest)
             except RefusedError as error:  # its signature
                 report.note("model", f"{name}@{number}", str(error))
                 continue

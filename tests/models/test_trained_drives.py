@@ -2,17 +2,16 @@
 
 import numpy as np
 
-from fleet_slip.models.manifest import hash_drives
-from fleet_slip.models.trained_drives import pack_hashes
+from fleet_slip.models.manifest import TrainedDrives
 
 
 def test_hashes_of_drives_are_those_of_versions_of_before() -> None:
     """Computed by the release in which they came."""
     drives = np.array([1, 2], dtype=np.uint64)
     known = [10430483359262113544, 11180994063705713938]
-    assert hash_drives("year", drives).tolist() == known
-    assert pack_hashes(hash_drives("year", drives)) == b"".join(
-        one.to_bytes(8, "big") for one in known
-    )
-    assert not len(hash_drives("year", drives[:0]))
-    assert hash_drives("other", drives).tolist() != known
+    made = TrainedDrives.of("year", drives)
+    assert made.salted.tolist() == known
+    assert made.content == b"".join(one.to_bytes(8, "big") for one in known)
+    assert TrainedDrives.unpacked("year", made.content).among(drives).all()
+    assert not len(TrainedDrives.of("year", drives[:0]).salted)
+    assert TrainedDrives.of("other", drives).salted.tolist() != known
