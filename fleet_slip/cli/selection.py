@@ -190,9 +190,10 @@ def _say_without_label(told: WithoutLabel) -> None:
             "alone, such as ay and its square, cannot be told apart, nor can offsets. Add drives "
             "that turn to the other side."
         )
-    late = "" if told.late_deg is None else f"; a course 10 ms late adds {told.late_deg:.3f} deg"
-    away = "" if told.away_deg is None else f"; an antenna 0.1 m elsewhere {told.away_deg:.3f} deg"
-    say(f"no change tells: the constant, which show says of a published version{late}{away}.")
+    say(
+        "changes do not show the constant (see show of a published version), nor what a course "
+        "that is late or an antenna in another place would add."
+    )
 
 
 def _say_left_out(selection: Selection) -> None:

@@ -7,7 +7,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from fleet_slip.columns.operations import operation_of, plain_of, size_of
 from fleet_slip.export.program import Program, Steps
@@ -23,10 +22,6 @@ from fleet_slip.export.templating import (
     read_source,
 )
 from fleet_slip.models.registry import ModelVersion
-
-if TYPE_CHECKING:
-    from fleet_slip.export.compile import Check
-
 
 # The steps of a program as statements of C.
 #
@@ -363,28 +358,6 @@ def c_source(version: ModelVersion, program: Program) -> str:
         shift=angle.bits - angle.low_bits,
         valid=valid,
     )
-
-
-def c_self_test(version: ModelVersion, program: Program, checks: "Sequence[Check]") -> str:
-    """Return the source of a program that ends with 0 if the angles of all checks agree."""
-    total = sum(len(check.angles) for check in checks)
-    name = "templates/self_test.c"
-    return fill_in_version(name, version, program, checks=checks, total=total)
-
-
-def c_fuzz_target(version: ModelVersion, program: Program) -> str:
-    """Return a fuzz target for libFuzzer: a car, then samples, of any bytes."""
-    return fill_in_version("templates/fuzz.c", version, program)
-
-
-def a2l_text(version: ModelVersion, program: Program) -> str:
-    """Return what a calibration tool measures: an A2L file (ASAM MCD-2 MC, ASAP2 1.71).
-
-    It names symbols instead of addresses, which the tool takes from the linked program. Whose
-    program it is declares the variables, under the names that stand there. Coefficients are
-    constants inside of a function, which no tool could change.
-    """
-    return fill_in_version("templates/estimator.a2l", version, program)
 
 
 def helper_texts(writer: StepWriter) -> list[str]:

@@ -15,15 +15,14 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.columns.operations import CarFact
 from fleet_slip.config import parse_document, read_named_file
 from fleet_slip.errors import ConfigError, InputError, RefusedError, StorageError, UsageError
-from fleet_slip.export.c import a2l_text, c_fuzz_target, c_header, c_self_test, c_source
+from fleet_slip.export.c import c_header, c_source
 from fleet_slip.export.c_gram import c_gram_header, c_gram_source, sets_on_board
 from fleet_slip.export.compile import Check, checks_csv, compile_program, make_checks
 from fleet_slip.export.costs import count_costs
-from fleet_slip.export.dbc import dbc_text
 from fleet_slip.export.fmu import fmu
 from fleet_slip.export.program import Angle, Input, Program, Target
 from fleet_slip.export.sql import sql_macro, sql_statement
-from fleet_slip.export.templating import c_prefix, file_prefix, fill_in_version
+from fleet_slip.export.templating import c_prefix, different, file_prefix, fill_in_version
 from fleet_slip.models.manifest import ImportedFrom, Manifest, checksum_of_drives
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.storage.documents import checksum
@@ -226,12 +225,15 @@ def _c(subject: Subject) -> dict[str, str]:
         if sets
         else {}
     )
+    total = sum(len(check.angles) for check in subject.checks)
+    tested = {"checks": subject.checks, "total": total}
     return {
         f"{prefix}.h": c_header(version, program),
         f"{prefix}.c": c_source(version, program),
-        f"{prefix}_test.c": c_self_test(version, program, subject.checks),
-        f"{prefix}_fuzz.c": c_fuzz_target(version, program),
-        f"{prefix}.a2l": a2l_text(version, program),
+        f"{prefix}_test.c": fill_in_version("templates/self_test.c", version, program, **tested),
+        f"{prefix}_fuzz.c": fill_in_version("templates/fuzz.c", version, program),  # for libFuzzer
+        # ASAM MCD-2 MC: symbols instead of addresses, which the tool takes from the linked program.
+        f"{prefix}.a2l": fill_in_version("templates/estimator.a2l", version, program),
         **gram,
     }
 
@@ -246,11 +248,32 @@ def _sql(subject: Subject) -> dict[str, str]:
     }
 
 
+FIRST_ID = 0x100
+"""Identifier of the first CAN message; whose bus it is decides."""
+
+PER_MESSAGE = 4
+"""Signals of 16 bits in a message of 8 bytes."""
+
+LONGEST_DBC_NAME = 32
+
+
 def _dbc(subject: Subject) -> dict[str, str]:
-    prefix = file_prefix(subject.version)
+    """Write messages of four signals each, and one with the angle; raw values are counts."""
+    version, program = subject.version, subject.program
+    prefix = file_prefix(version)
+    words = {
+        "node": "fleet_slip",
+        "names": different([one.name for one in program.signals], LONGEST_DBC_NAME),
+        "longest_name": LONGEST_DBC_NAME,
+        "first_id": FIRST_ID,
+        "last_id": FIRST_ID + -(-len(program.signals) // PER_MESSAGE),
+        "per_message": PER_MESSAGE,
+        "missing": -(2**15),
+        "tick_ms": round(1000 * SAMPLE_TIME_S),
+    }
     return {
-        f"{prefix}.dbc": dbc_text(subject.version, subject.program),
-        f"{prefix}_checks.csv": checks_csv(subject.program, subject.checks),
+        f"{prefix}.dbc": fill_in_version("templates/estimator.dbc", version, program, **words),
+        f"{prefix}_checks.csv": checks_csv(program, subject.checks),
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Record, canonical_json, document_of, sha256_of
-from fleet_slip.catalogue.course import STRAIGHT, STRAIGHT_COURSE, TURNED, YAW_RATE
+from fleet_slip.catalogue.course import STRAIGHT, STRAIGHT_COURSE, TURNED
 from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN, features, input_scales
 from fleet_slip.catalogue.signals import catalogue
@@ -155,16 +155,6 @@ def _stated_rad(source: str, campaign: str | None) -> float | None:
         return None
 
 
-# How good a model learned from changes of the course is, where no sensor measures the angle.
-#
-# The error of changes has the noise of two fixes in it, which changes of cars that go straight on
-# show. These are fast, and fast cars have less of it: what is left is more than the angle's error
-# over the change, and each of two independent errors has half the square. What no change tells
-# stands beside as its cost: a late course, an antenna elsewhere.
-
-CURVATURE = "curvature"
-LATE_S, AWAY_M = 0.01, 0.1
-"""A course that is so late and an antenna that is so far from where it was said to be."""
 FEWEST_STRAIGHT = 100
 ONE_WAY = 0.7
 """Share of one side beyond which bends cannot be told apart: 1 on a skid pad, 0.2 on a circuit."""
@@ -176,11 +166,10 @@ class WithoutLabel(Record):
 
     Attributes:
         change_s: over how long.
-        error_deg: cross-validated, of changes of the course.
+        error_deg: cross-validated, of changes of the course, with the noise of two fixes in it.
         noise_deg, noise_uncertainty_deg: of the course, where cars go straight on; over drives.
-        angle_at_most_deg: bound of the angle's error over so long: what is left of `error_deg`.
-        late_deg: what a course would cost that is late by `LATE_S`.
-        away_deg: what an antenna would that is `AWAY_M` from its place.
+        angle_at_most_deg: bound of the angle's error over so long: what noise leaves of `error_deg`
+            is of two independent errors, each of half the square.
         to_the_left: mean of the angles turned over their root mean square: 1 where cars turn to
             the left alone and as hard at any time, −1 to the right.
     """
@@ -190,8 +179,6 @@ class WithoutLabel(Record):
     noise_deg: float | None
     noise_uncertainty_deg: float | None
     angle_at_most_deg: float | None
-    late_deg: float | None
-    away_deg: float | None
     to_the_left: float
 
     @property
@@ -202,79 +189,57 @@ class WithoutLabel(Record):
         return "left" if self.to_the_left > 0 else "right"
 
 
-def without_label(warehouse: Warehouse, cohort: Cohort, error: float) -> WithoutLabel | None:
-    """Return how good a model of such an error in degrees is; None unless changes taught it."""
+def without_label(warehouse: Warehouse, cohort: Cohort, error_deg: float) -> WithoutLabel | None:
+    """Return how good a model of such an error is; None unless it was learned from changes."""
     times = features().feature_set(cohort.feature_set).change_s
     if not times:
         return None
-    noise = _Noise()
-    squares = {YAW_RATE: [0.0, 0.0], CURVATURE: [0.0, 0.0], TURNED: [0.0, 0.0]}
-    turned = 0.0
+    straight: list[FloatArray] = []
+    turned = square = rows = 0.0
     with open_grams(warehouse, cohort.feature_set, cohort.condition) as opened:
         for batch in opened.batches(cohort.condition):
-            for names, rows, _ in by_signals(batch):
+            for names, lines, _ in by_signals(batch):
                 if STRAIGHT not in names.split(","):
                     continue
-                table = gram_table(names, rows)
-                noise.add(table)
-                _add_squares(squares, table)
-                turned += float(table.sums[:, table.signals.index(TURNED)].astype(np.float64).sum())
+                table = gram_table(names, lines)
+                straight.append(_changes_straight_on(table))
+                at = table.signals.index(TURNED)
+                turned += float(table.sums[:, at].astype(np.float64).sum())
+                square += float(table.products[:, packed_position(at, at)].astype(np.float64).sum())
+                rows += float(table.n.sum())
     scale = math.degrees(input_scales()[catalogue().label])
-    spread = {
-        name: math.sqrt(square / rows) * float(input_scales()[name]) if rows else None
-        for name, (square, rows) in squares.items()
-        if name in input_scales()
-    }
-    square, rows = squares[TURNED]
-    own, unsure = noise.told(float(scale)) or (None, None)
-    left = None if own is None else max(0.0, error**2 - max(0.0, own - 2 * (unsure or 0.0)) ** 2)
-    rate, away = spread[YAW_RATE], spread[CURVATURE]
+    noise, unsure = _noise(np.concatenate([*straight, np.zeros((2, 0))], axis=1), scale)
+    left = None
+    if noise is not None and unsure is not None:  # fast cars have less noise than others
+        left = max(0.0, error_deg**2 - max(0.0, noise - 2 * unsure) ** 2)
     return WithoutLabel(
         change_s=tuple(float(one) for one in times),
-        error_deg=error,
-        noise_deg=own,
+        error_deg=error_deg,
+        noise_deg=noise,
         noise_uncertainty_deg=unsure,
         angle_at_most_deg=None if left is None else math.sqrt(left / 2),
-        late_deg=None if rate is None else math.degrees(LATE_S * rate),
-        away_deg=None if away is None else math.degrees(AWAY_M * away),
         to_the_left=turned / math.sqrt(rows * square) if square else 0.0,
     )
 
 
-class _Noise:
-    """Adds up the changes of drives where they go straight on, about their mean in each drive."""
-
-    def __init__(self) -> None:
-        self.rows: list[FloatArray] = []
-        self.squares: list[FloatArray] = []
-
-    def add(self, table: GramTable) -> None:
-        at, course = table.signals.index(STRAIGHT), table.signals.index(STRAIGHT_COURSE)
-        rows = table.sums[:, at].astype(np.float64)
-        some = rows > 1
-        square = table.products[some, packed_position(course, course)].astype(np.float64)
-        self.rows.append(rows[some] - 1)
-        self.squares.append(square - table.sums[some, course].astype(np.float64) ** 2 / rows[some])
-
-    def told(self, scale: float) -> tuple[float, float] | None:
-        """Return the standard deviation of changes and its standard error; None of few."""
-        rows, squares = (
-            np.concatenate([*parts, np.zeros(0)]) for parts in (self.rows, self.squares)
-        )
-        if rows.sum() < FEWEST_STRAIGHT or len(rows) < 2:
-            return None
-        variance = float(squares.sum() / rows.sum())
-        error = math.sqrt(float(((squares - variance * rows) ** 2).sum())) / float(rows.sum())
-        return math.sqrt(variance) * scale, error / (2 * math.sqrt(variance)) * scale
+def _changes_straight_on(table: GramTable) -> FloatArray:
+    """Return degrees of freedom and squares of changes about each drive's mean, shape (2, n)."""
+    at, course = table.signals.index(STRAIGHT), table.signals.index(STRAIGHT_COURSE)
+    rows = table.sums[:, at].astype(np.float64)
+    some = rows > 1
+    square = table.products[some, packed_position(course, course)].astype(np.float64)
+    mean_square = table.sums[some, course].astype(np.float64) ** 2 / rows[some]
+    return np.stack([rows[some] - 1, square - mean_square])
 
 
-def _add_squares(squares: dict[str, list[float]], table: GramTable) -> None:
-    """Add the squares of what columns change by, in counts, and the rows that they are of."""
-    for name, found in squares.items():
-        if name in table.signals:
-            at = table.signals.index(name)
-            found[0] += float(table.products[:, packed_position(at, at)].astype(np.float64).sum())
-            found[1] += float(table.n.sum())
+def _noise(changes: FloatArray, scale: float) -> tuple[float | None, float | None]:
+    """Return the standard deviation of changes and its standard error; None of few."""
+    rows, squares = changes
+    if rows.sum() < FEWEST_STRAIGHT or len(rows) < 2:
+        return None, None
+    variance = float(squares.sum() / rows.sum())
+    error = math.sqrt(float(((squares - variance * rows) ** 2).sum())) / float(rows.sum())
+    return math.sqrt(variance) * scale, error / (2 * math.sqrt(variance)) * scale
 
 
 @dataclass(frozen=True)
@@ -451,8 +416,6 @@ def validate(
         intercept=intercept,
     )
 
-
-# Answers a request: reads the Gram rows it needs, and selects among models.
 
 GIVEN = "given"
 """The name of a model whose inputs were asked for one by one."""

@@ -8,7 +8,6 @@ import pytest
 from cantools.database.can.database import Database
 
 from fleet_slip.export.compile import Sample, angles_by_kernel, compile_program
-from fleet_slip.export.dbc import MISSING
 from fleet_slip.export.program import Car, Program
 from fleet_slip.models.registry import ModelVersion
 from tests.export.models import DEFINITIONS, export_texts, hostile_drive, model_of
@@ -29,7 +28,7 @@ def over_the_bus(bus: Database, program: Program, sample: Sample) -> Sample:
     """Encode counts as physical values in messages; return the counts of the decoded ones."""
     counts: dict[str, int] = {}
     names = [one.name for one in program.signals]
-    known = [MISSING if count is None else count for count in sample]
+    known = [-(2**15) if count is None else count for count in sample]
     given = dict(zip(names, known, strict=True))
     for message in bus.messages[:-1]:
         raw = {signal.name: given[signal.name] for signal in message.signals}

@@ -157,7 +157,6 @@ def test_columns_are_searched_for(fleet: Fleet) -> None:
     # The noise of two fixes of 0.03 m/s each, at 15 to 45 m/s.
     assert 0.05 < told.noise_deg < 0.2 < told.error_deg and told.noise_uncertainty_deg is not None
     assert 0.02 < told.angle_at_most_deg < told.error_deg / math.sqrt(2)
-    assert told.late_deg is not None and 0.02 < told.late_deg < 0.3
     assert told.one_way is None and -0.4 < told.to_the_left < -0.1
 
 
