@@ -26,7 +26,7 @@ from fleet_slip.cli.output import (
 from fleet_slip.cli.progress import progress
 from fleet_slip.cli.selection import say_examined, say_without_information
 from fleet_slip.errors import UsageError
-from fleet_slip.models.score import Score, score_statement
+from fleet_slip.models.score import Score
 from fleet_slip.resources import folder
 from fleet_slip.storage.storage_errors import storage_errors
 
@@ -153,7 +153,6 @@ def score(
             "all if there is nothing else."
         ),
     ] = None,
-    sql: Annotated[bool, typer.Option("--sql", help="Print the statement and do nothing.")] = False,
     against: Annotated[
         str | None,
         typer.Option(help="Another version of the model, such as champion, on the same rows."),
@@ -166,9 +165,6 @@ def score(
     Example: **fleet-slip score waterford --cohort "speed_factor > 0.9"**
     """
     version = context.obj.model(model)
-    if sql:
-        typer.echo(score_statement(version.manifest, cohort or ALL_DRIVES))
-        return
     if against is not None:
         name = against if "@" in against else f"{version.manifest.name}@{against}"
         other = context.obj.model(name)

@@ -1,6 +1,6 @@
 """A published model on a data frame: side-slip angles from columns in SI units.
 
-Terms are added from left to right, to the bits of `score` in SQL. Features are arithmetic of
+Terms are added from left to right, to the bits of a dot product in SQL. Features are arithmetic of
 rounded counts, as the manifest has it; what is out of its valid range is missing. Models with
 columns over time look back within a drive.
 """
@@ -82,8 +82,8 @@ class Predictor:
     def __call__(self, drive: DriveCounts, workspace: Workspace | None = None) -> FloatArray:
         """Return the estimate at each row in rad, shape (rows,); NaN where a column is missing.
 
-        Added up left to right and block by block, to the bits of `score --sql`. Raises `DataError`
-        for a drive that cannot be looked back on.
+        Added up left to right, to the bits of a dot product in SQL. Raises `DataError` for a drive
+        that cannot be looked back on.
         """
         workspace = workspace or Workspace(self.plan)
         workspace.load(drive)

@@ -1,18 +1,15 @@
-"""Evaluates a published model on the rows of a cohort, in SQL."""
+"""Evaluates a published model on the rows of a cohort."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Record
-from fleet_slip.catalogue.definitions import limit_of
 from fleet_slip.catalogue.features import input_scales
-from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, catalogue
-from fleet_slip.columns.sql import with_columns
-from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.compute import counts_of, drives_of_stream
 from fleet_slip.grams.expansion import CarCounts
@@ -51,88 +48,35 @@ class Score(Record):
     """Which drives were left out since they are not in order, as a sentence."""
 
 
-def score_statement(manifest: Manifest, condition: str | Condition) -> str:
-    """Return `jobs/score.sql` for a model: its dot product over the logs in SI units.
-
-    Raises `QuestionError` for a condition that is not one expression on the view `log`, and for a
-    model with numbers that a car's drives tell.
-    """
-    if numbers := numbers_of(manifest):
-        raise QuestionError(
-            f"{manifest.name} uses numbers of each car ({', '.join(numbers)}), which one statement "
-            "on rows does not have. They are in the view calibration. Score it by fleet-slip score."
-        )
-    terms = [f"{term.coefficient!r} * {term.column}" for term in manifest.terms]
-    return read_sql("jobs", "score.sql").format(
-        estimate="\n        + ".join([repr(manifest.intercept), *terms]),
-        label=manifest.label.column,
-        step_rad=repr(_step_rad(manifest)),
-        **_scored_rows(manifest, parse_cohort(condition, row_columns())),
-    )
-
-
-def _scored_rows(manifest: Manifest, condition: Condition) -> dict[str, str]:
-    columns = [term.column for term in manifest.terms] + [manifest.label.column]
-    return {
-        "rows": _rows(manifest),
-        "complete": " AND ".join(f"{column} IS NOT NULL" for column in columns),
-        "condition": condition.sql,
-    }
-
-
-def _step_rad(manifest: Manifest) -> float:
-    """Return a power of two of which no angle has 2^45, so that 2^34 squares fit into HUGEINT."""
-    largest = abs(manifest.intercept) + float(manifest.label.scale) * COUNT_MAX
-    for term in manifest.terms:
-        limit = limit_of(term.definition.bits) if term.definition else COUNT_MAX + 1
-        largest += abs(term.coefficient) * float(term.scale) * limit
-    return 2.0 ** (math.frexp(largest)[1] - 45)
-
-
-def _rows(manifest: Manifest) -> str:
-    """Return the view `log`, or for a model with features a subquery with their columns too."""
-    if not manifest.features and not manifest.definitions:
-        return "log"
-    computed = [
-        f"{t.signal} * {t.scale}::DOUBLE AS {t.column}" for t in manifest.terms if not t.logged
-    ]
-    rows = with_columns("log_counts", manifest.features, manifest.definitions)
-    return _si_rows(rows, computed)
-
-
-def _si_rows(rows: str, computed: Sequence[str] = ()) -> str:
-    """Return a subquery: rows of counts with the columns of the view `log`, and further ones."""
+def _si_rows() -> str:
+    """Return a subquery: the rows of `log_counts` with the columns of the view `log`."""
     columns = [
         f"tick / {int(1 / SAMPLE_TIME_S)}::DOUBLE AS time_s",
         *(f"{name} * {s.scale}::DOUBLE AS {s.column}" for name, s in catalogue().signals.items()),
-        *computed,
     ]
     separator = ",\n            "
     return f"""(
         SELECT
             *,
             {separator.join(columns)}
-        FROM {rows}
+        FROM log_counts
     )"""
 
 
 def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) -> Score:
     """Score a model on the rows of `log` that satisfy a condition.
 
-    Raises like `score_statement`, and `DataError` if no row has the model's signals.
+    The drives that have such rows are estimated whole. Raises `QuestionError` for a condition that
+    is not one expression, and `DataError` if no row has the model's signals.
     """
     condition = cohort_of_rows(condition)
-    manifest.require_same_counts()
-    found = (
-        _score_over_time(warehouse, manifest, condition)
-        if manifest.definitions
-        else _score_by_sql(warehouse, manifest, condition)
-    )
-    if found is None:
+    estimate_rad, truth_rad = _estimate_rows(warehouse, manifest, condition)
+    if not len(truth_rad):
         raise DataError(
             f"no row of the cohort {condition.text!r} has {', '.join(manifest.signals)} and "
             f"{manifest.label.signal}. Choose another cohort, or a model with fewer signals."
         )
+    found = _figures(estimate_rad, truth_rad)
     return replace(found, rows_without=_count_rows(warehouse, condition) - found.rows)
 
 
@@ -148,31 +92,17 @@ def cohort_of_rows(condition: str | Condition) -> Condition:
     return condition if isinstance(condition, Condition) else parse_cohort(condition, row_columns())
 
 
-def _score_by_sql(warehouse: Warehouse, manifest: Manifest, condition: Condition) -> Score | None:
-    statement = score_statement(manifest, condition)
-    with connect_tables(warehouse, statement) as database, asking(database, condition):
-        result = database.execute(statement)
-        names = [column[0] for column in result.description or ()]
-        row = result.fetchone()
-    if row is None or not row[0]:
-        return None
-    figures = dict(zip(names, row, strict=True))
-    percentiles = figures.pop("error_percentiles_deg")
-    median, p95, p99 = percentiles
-    return Score(**figures, error_median_deg=median, error_p95_deg=p95, error_p99_deg=p99)
-
-
-def _score_over_time(
+def _estimate_rows(
     warehouse: Warehouse, manifest: Manifest, condition: Condition
-) -> Score | None:
-    """Estimate the drives that have rows of the cohort, whole; score the rows of the cohort."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return estimate and label in rad of the rows of a cohort that have both."""
     predictor = Predictor.of(manifest)
     label = manifest.label.signal
     needed = [*predictor.plan.signals, label, *predictor.plan.facts, "vehicle_id"]
     cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
     counts = ", ".join(dict.fromkeys(needed))
     text = read_sql("jobs", "drives_in_time.sql").format(
-        columns=counts, rows=_si_rows("log_counts"), condition=condition.sql
+        columns=counts, rows=_si_rows(), condition=condition.sql
     )
     estimates: list[FloatArray] = []
     truths: list[FloatArray] = []
@@ -191,15 +121,7 @@ def _score_over_time(
             given = chosen & np.isfinite(estimate) & np.isfinite(truth)
             estimates.append(estimate[given])
             truths.append(truth[given])
-    if not sum(map(len, truths)):
-        return None
-    return _figures(np.concatenate(estimates), np.concatenate(truths))
-
-
-def numbers_of(manifest: Manifest) -> tuple[str, ...]:
-    """Return the numbers of a car that a model uses."""
-    found = (one.number.name for one in manifest.definitions.values() if one.number)
-    return tuple(dict.fromkeys(found))
+    return np.concatenate([*estimates, np.empty(0)]), np.concatenate([*truths, np.empty(0)])
 
 
 def calibrated_cars(warehouse: Warehouse) -> CarCounts:

@@ -12,7 +12,7 @@ from fleet_slip.grams.cohort import load_cohort, sum_days
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.models.score import score_statement
+from fleet_slip.models.score import cohort_of_rows, score
 from fleet_slip.operations.monitor import monitor
 from fleet_slip.operations.quality import examine_drives
 from fleet_slip.storage.local import LocalFolder
@@ -156,7 +156,7 @@ def test_every_way_in_passes_the_same_gate(fleet: Warehouse, text: str) -> None:
         lambda: load_cohort(fleet, text, folding=Folding()),
         lambda: sum_days(fleet, ["ay"], text),
         lambda: examine_drives(fleet, text),
-        lambda: score_statement(published, text),
+        lambda: score(fleet, published, text),
         lambda: monitor(fleet, ModelVersion(1, published, ""), text),
         lambda: monitor(fleet, ModelVersion(1, kept, "")),
     )
@@ -166,7 +166,7 @@ def test_every_way_in_passes_the_same_gate(fleet: Warehouse, text: str) -> None:
 
 
 def test_a_score_may_ask_about_rows() -> None:
-    assert "abs(ay_mps2) > 3" in score_statement(manifest(), "abs(ay_mps2) > 3")
+    assert "abs(ay_mps2) > 3" in cohort_of_rows("abs(ay_mps2) > 3").sql
     with pytest.raises(QuestionError, match="ay_mps2"):
         parse_condition("abs(ay_mps2) > 3")
 

@@ -11,14 +11,14 @@ from fleet_slip.catalogue.facts import CAR_NUMBERS
 from fleet_slip.catalogue.features import features
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan
-from fleet_slip.errors import DataError, InputError, QuestionError
+from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.expansion import expand
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.predict import predict
-from fleet_slip.models.score import score, score_statement
+from fleet_slip.models.score import score
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support import cars
@@ -172,5 +172,3 @@ def test_a_model_is_published_scored_and_asked(filled: Warehouse) -> None:
     angle = predict(manifest, frame).to_numpy()
     error = np.degrees(angle - frame["sideslip_rad"].to_numpy())
     assert float(np.sqrt(np.mean(error**2))) == pytest.approx(found.rmse_deg, rel=1e-12)
-    with pytest.raises(QuestionError, match="numbers of each car"):
-        score_statement(manifest, "true")
