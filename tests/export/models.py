@@ -100,17 +100,6 @@ def _term(name: str, coefficient: Fraction) -> ModelTerm:
     )
 
 
-COEFFICIENT = st.fractions(-2, 2, max_denominator=10**9)
-COLUMN = st.sampled_from([*DEFINITIONS, "ay", "wheel_rr", "curvature", "ay_signed_square"])
-
-
-@st.composite
-def models(draw: st.DrawFn) -> Manifest:
-    """A model of one to six columns."""
-    names = draw(st.lists(COLUMN, min_size=1, max_size=6, unique=True))
-    return model_of({name: draw(COEFFICIENT) for name in names}, draw(COEFFICIENT))
-
-
 @st.composite
 def cars(draw: st.DrawFn) -> Car:
     """A car of which anything may be known, or nothing."""
@@ -119,18 +108,6 @@ def cars(draw: st.DrawFn) -> Car:
     number = st.sampled_from([-32767, -3, 0, 2000, 32767])
     known = draw(st.sets(st.sampled_from(["yaw_rate_offset", "speed_ratio", "understeer"])))
     return Car(facts, {name: draw(number) for name in sorted(known)})
-
-
-COUNT = st.one_of(
-    st.none(), st.sampled_from([-32768, -32767, -1, 0, 1, 32767]), st.integers(-2000, 2000)
-)
-
-
-def drives(program: Program) -> st.SearchStrategy[list[Sample]]:
-    """A drive with holes, missing values and extremes, perhaps of one tick."""
-    width = len(program.signals)
-    hole = st.just((None,) * width)
-    return st.lists(st.one_of(st.tuples(*[COUNT] * width), hole), min_size=1, max_size=12)
 
 
 SMALL = Fraction(1, 10**4)

@@ -1,56 +1,14 @@
 """The streaming object has the bits of `predict` and `score`, sample by sample."""
 
-from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
 
-import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import fleet_slip
 from fleet_slip.errors import InputError
-from fleet_slip.export.compile import Sample, compile_program, drive_counts
-from fleet_slip.export.program import Car, Program
 from fleet_slip.export.stepping import Estimator
-from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.predict import Predictor
-from tests.export.models import cars, drives, model_of, models
-
-
-def in_si(program: Program, sample: Sample) -> dict[str, float | None]:
-    return {
-        one.column: None if count is None else count * float(one.scale)
-        for one, count in zip(program.signals, sample, strict=True)
-    }
-
-
-def known(program: Program, car: Car) -> dict[str, object]:
-    """What `Fleet.estimator` is told of a car: numbers in SI units."""
-    facts = {one.name: car.facts[one.name] for one in program.facts}
-    numbers = {
-        one.name: Decimal(car.numbers[one.name]) * one.grain
-        for one in program.numbers
-        if one.name in car.numbers
-    }
-    return {**facts, **numbers}
-
-
-@settings(max_examples=40)
-@given(models(), cars(), st.data())
-def test_any_model_on_any_drive_has_the_bits_of_the_kernel(
-    manifest: Manifest, car: Car, data: st.DataObject
-) -> None:
-    program = compile_program(manifest)
-    samples = data.draw(drives(program))  # counts beyond their ranges among them
-    predictor = Predictor.of(manifest)
-    expected = predictor(drive_counts(program, predictor, car, samples))
-    estimator = Estimator(manifest, known(program, car))
-    found = [estimator.step(in_si(program, sample)) for sample in samples]
-    assert [np.nan if one is None else one for one in found] == pytest.approx(
-        expected.tolist(), rel=0, abs=0, nan_ok=True
-    )
+from tests.export.models import model_of
 
 
 def test_a_whole_drive_has_the_bits_of_predict(smoke_root: Path) -> None:

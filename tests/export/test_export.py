@@ -11,11 +11,7 @@ import pytest
 import fleet_slip
 from fleet_slip.base import canonical_json
 from fleet_slip.cli.app import app
-from fleet_slip.columns.drive_columns import DriveColumns
 from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.export.compile import angles_of_columns, compile_program
-from fleet_slip.grams.compute import read_drives
-from fleet_slip.models.predict import Predictor
 from fleet_slip.storage.documents import checksum
 from tests.export import plain
 from tests.export.models import export_texts
@@ -27,22 +23,6 @@ def document(smoke_root: Path) -> Any:
     ((name, text),) = export_texts(fleet.model("smoke"), fleet.warehouse, "json").items()
     assert name == "smoke-1.json"
     return json.loads(text)
-
-
-def test_the_angles_of_all_drives_are_those_of_score(smoke_root: Path) -> None:
-    fleet = fleet_slip.open(smoke_root)
-    manifest = fleet.model("smoke").manifest
-    program, predictor = compile_program(manifest), Predictor.of(manifest)
-    scale, rows = float(program.angle.scale), 0
-    for file in fleet.warehouse.logs.snapshot().files:
-        for drive in read_drives(fleet.warehouse, file, predictor.plan):
-            angles = angles_of_columns(
-                program, DriveColumns(predictor.plan, drive.counts).compute()
-            )
-            rounded = np.floor(predictor(drive.counts) / scale + 0.5)
-            assert angles == [None if np.isnan(one) else int(one) for one in rounded]
-            rows += len(angles)
-    assert rows == fleet.warehouse.logs.snapshot().rows
 
 
 def test_the_document_alone_gives_the_angles_of_a_whole_drive(

@@ -4,33 +4,15 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.columns.operations import most_values
 from fleet_slip.errors import QuestionError
-from fleet_slip.export.compile import angles_by_kernel, compile_program, make_checks
+from fleet_slip.export.compile import compile_program, make_checks
 from fleet_slip.export.files import program_content
-from fleet_slip.export.program import Car
-from fleet_slip.models.manifest import Manifest
 from tests.export import plain
-from tests.export.models import DEFINITIONS, MODELS, cars, drives, model_of, models
-
-
-@settings(max_examples=40)
-@given(models(), cars(), st.data())
-def test_a_fresh_implementation_agrees_with_the_kernel(
-    manifest: Manifest, car: Car, data: st.DataObject
-) -> None:
-    program = compile_program(manifest)
-    samples = data.draw(drives(program))
-    found = plain.angles(
-        program_content(program), list(car.fact_counts(program)), list(car.number_counts(program)),
-        samples,
-    )  # fmt: skip
-    assert found == angles_by_kernel(manifest, program, car, samples)
+from tests.export.models import DEFINITIONS, MODELS, model_of
 
 
 def test_what_divides_by_a_constant_below_zero_has_no_program(
@@ -54,14 +36,6 @@ def test_every_kind_of_column_has_an_angle_in_the_checks() -> None:
             content = program_content(program)
             facts, numbers = list(check.facts), list(check.numbers)
             assert plain.angles(content, facts, numbers, list(check.samples)) == list(check.angles)
-
-
-def test_what_several_columns_are_made_of_is_computed_once() -> None:
-    third = Fraction(1, 3)
-    program = compile_program(model_of(dict.fromkeys(("mean_3", "below", "mean_5", "ay"), third)))
-    assert [one.name for one in program.signals] == ["ay", "wheel_fl"]
-    assert program.rings == {0: 5, 1: 4}
-    assert program.sums == [(0, 3, 3), (1, 4, 4), (0, 5, 5)]
 
 
 def test_steps_that_several_columns_are_made_of_stand_once() -> None:
