@@ -204,7 +204,7 @@ def test_columns_are_those_of_the_signals_each_once() -> None:
 
 
 def test_the_bits_on_the_logs_are_those_of_a_dot_product_in_sql(fleet: Fleet) -> None:
-    one = fleet.model("smoke")
+    one = LINEAR
     terms = [f"{term.coefficient!r} * {term.column}" for term in one.manifest.terms]
     estimate = " + ".join([repr(one.manifest.intercept), *terms])
     complete = " AND ".join(f"{column} IS NOT NULL" for column in one.columns)
