@@ -107,16 +107,32 @@ class HealthAndUpkeep(JudgedModels):
         return monitor(self.warehouse, self.resolve(model), cohort, date_of(since, "since"))
 
     def verify(
-        self, *, full: bool = False, workers: Workers = None, progress: ShowProgress | None = None
+        self,
+        *,
+        full: Annotated[bool, Doc("Compute the Gram rows of all log files again.")] = False,
+        grams: Annotated[
+            bool,
+            Doc(
+                "Compute the Gram rows of some log files in several ways, too; compare bit for bit."
+            ),
+        ] = False,
+        repair: Annotated[
+            bool, Doc("Rebuild Gram rows from the logs, and simulated logs from campaigns.")
+        ] = False,
+        campaigns: Annotated[
+            Sequence[str], Doc("A campaign's TOML file for `repair`, besides those that ship.")
+        ] = (),
+        workers: Workers = None,
+        progress: ShowProgress | None = None,
     ) -> "Verification":
         """Verify every byte against its checksum, and everything against everything else.
 
-        `full` computes all Gram rows again. Progress is in bytes. `damage` is what is wrong. Raises
+        Progress is in bytes. `damage` is what is wrong, after a repair what is left. Raises
         `StorageError` without a data root, and `ClusterError`.
         """
         from fleet_slip.operations.verify import verify
 
-        with open_workers(self.root, workers) as executor:
+        def look() -> "Verification":
             return verify(
                 within_reach(self.warehouse, executor),
                 full=full,
@@ -124,12 +140,19 @@ class HealthAndUpkeep(JudgedModels):
                 executor=unless_local(executor),
             )
 
+        with open_workers(self.root, workers) as executor:
+            found = look()
+            if repair:
+                rebuilt = self.repair(found, campaigns)
+                found = look()
+                found.rebuilt = rebuilt
+        if grams and not found.damage:
+            found.compared = self.check()
+        return found
+
     @record_call
     def repair(self, found: "Verification", campaigns: Sequence[str] = ()) -> list[str]:
-        """Rebuild what `verify` found damaged; return the paths, below the root. Then verify again.
-
-        Gram rows come from logs, simulated logs from `campaigns`, files or shipped ones.
-        """
+        """Rebuild what `verify` found damaged; return the paths, below the root."""
         from fleet_slip.operations.repair import repair
 
         return repair(self.warehouse, found, campaigns)

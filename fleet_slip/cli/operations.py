@@ -15,7 +15,6 @@ from fleet_slip.catalogue.facts import CAR_NUMBERS, NumberName
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import (
     Json,
-    cell,
     print_json,
     print_records,
     print_table,
@@ -66,20 +65,14 @@ def status(
 
 
 def _print_status(found: WarehouseStatus) -> None:
-    print_table(
+    print_records(
         f"{found.root} at {found.checked_at:%Y-%m-%d %H:%M} UTC",
-        ["table", "last commit", "version", "files", "rows", "size MB"],
-        [
-            [
-                name,
-                f"{one.committed_at:%Y-%m-%d %H:%M}" if one.committed_at else "never",
-                cell(one.version),
-                f"{one.files:,}",
-                f"{one.rows:,}",
-                f"{one.size_bytes / 1e6:,.1f}",
-            ]
+        "table|last commit|version|files|rows|size MB",
+        "{name}|{committed_at:%Y-%m-%d %H:%M}|{version}|{files:,}|{rows:,}|{size_mb:,.1f}",
+        (
+            {"name": name, "size_mb": one.size_bytes / 1e6, **vars(one)}
             for name, one in found.tables.items()
-        ],
+        ),
         left=2,
     )
     backlog = f"{number_of(found.backlog_files, 'file')}, {number_of(found.backlog_rows, 'row')}"
@@ -154,21 +147,11 @@ def _print_car(
     numbers: Mapping[NumberName, CalibratedNumber],
     refusals: Mapping[NumberName, str],
 ) -> None:
-    print_table(
+    print_records(
         f"{car}, by its own drives",
-        ["number", "unit", "value", "+-", "drives", "count on board", "of"],
-        [
-            [
-                name,
-                CAR_NUMBERS[name].unit,
-                f"{one.value:.6g}",
-                cell(one.uncertainty, ".2g"),
-                str(one.drives),
-                str(one.count),
-                str(CAR_NUMBERS[name].grain),
-            ]
-            for name, one in numbers.items()
-        ],
+        "number|unit|value|+-|drives|count on board|of",
+        "{name}|{of.unit}|{one.value:.6g}|{one.uncertainty:.2g}|{one.drives}|{one.count}|{of.grain}",
+        ({"name": name, "of": CAR_NUMBERS[name], "one": one} for name, one in numbers.items()),
         left=2,
     )
     for reason in dict.fromkeys(refusals.values()):
@@ -177,24 +160,20 @@ def _print_car(
 
 
 def _print_fleet(found: Calibration) -> None:
-    by_number = {
-        name: [cars[name] for cars in found.cars.values() if name in cars] for name in CAR_NUMBERS
-    }
-    print_table(
+    rows = []
+    for name, about in CAR_NUMBERS.items():
+        cars = [numbers[name] for numbers in found.cars.values() if name in numbers]
+        known = [one.uncertainty for one in cars if one.uncertainty is not None]
+        if cars:
+            row = {"name": name, "unit": about.unit, "cars": len(cars)}
+            values = [one.value for one in cars]
+            row |= {"median": median(values), "spread": pstdev(values)}
+            rows.append(row | {"known": median(known) if known else None})
+    print_records(
         f"{number_of(len(found.cars), 'car')}, by their own drives",
-        ["number", "unit", "cars", "median", "differs by", "known to +-"],
-        [
-            [
-                name,
-                CAR_NUMBERS[name].unit,
-                f"{len(cars):,}",
-                f"{median(one.value for one in cars):.3g}",
-                f"{pstdev(one.value for one in cars):.2g}",
-                cell(_median([one.uncertainty for one in cars]), ".2g"),
-            ]
-            for name, cars in by_number.items()
-            if cars
-        ],
+        "number|unit|cars|median|differs by|known to +-",
+        "{name}|{unit}|{cars:,}|{median:.3g}|{spread:.2g}|{known:.2g}",
+        rows,
         left=2,
     )
     if not any(one.uncertainty for cars in found.cars.values() for one in cars.values()):
@@ -230,11 +209,6 @@ def _say_of_roads(roads: Roads) -> None:
         )
 
 
-def _median(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return median(known) if known else None
-
-
 # The command that charts a model's error by day: monitor.
 
 
@@ -268,22 +242,13 @@ def monitor(
 
 def _print_chart(chart: "Chart") -> None:
     mean, std = chart.mean_limits, chart.std_limits
-    print_table(
+    print_records(
         f"{chart.model}, drives where {chart.cohort}; limits from the training days: "
         f"mean {mean.lower:+.4f} to {mean.upper:+.4f}, std up to {std.upper:.4f} deg",
-        ["day", "", "drives", "rows", "RMSE deg", "mean deg", "std deg"],
-        [
-            [
-                str(day.day),
-                "training" if day.training else "new, alarm" if day.alarms else "new",
-                f"{day.drives:,}",
-                f"{day.rows:,}",
-                f"{day.rmse_deg:.4f}",
-                f"{day.error_mean_deg:+.4f}" + ("*" if "mean" in day.alarms else ""),
-                f"{day.error_std_deg:.4f}" + ("*" if "std" in day.alarms else ""),
-            ]
-            for day in chart.days
-        ],
+        "day||drives|rows|RMSE deg|mean deg|std deg|beyond",
+        "{day}|{kind}|{drives:,}|{rows:,}|{rmse_deg:.4f}|{error_mean_deg:+.4f}|{error_std_deg:.4f}|"
+        "{alarms}",
+        ({**vars(one), "kind": "training" if one.training else "new"} for one in chart.days),
         left=2,
     )
 

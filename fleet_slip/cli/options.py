@@ -103,6 +103,7 @@ MODELS = ("model", "reference", "name", "one", "other")
 READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "bias": (list[str] | None, lambda values: quantities(values, "--bias")),
     "campaign": (str, str),
+    "campaigns": (list[str] | None, lambda files: files or ()),
     "folds": (str | None, lambda folds: folds),
     "landing": (str, str),
     "model": (str | None, lambda model: model),

@@ -5,7 +5,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import features
-from fleet_slip.cli.output import cell, figures_cells, print_line, print_table, print_text, say
+from fleet_slip.cli.output import (
+    cell,
+    figures_cells,
+    print_line,
+    print_records,
+    print_table,
+    print_text,
+    say,
+)
 from fleet_slip.grams.folding import BANDS, PARTS, ROW_FOLDS
 from fleet_slip.models.search import SearchChoice
 from fleet_slip.models.select import Selection, Uncertainty, WithoutLabel
@@ -115,49 +123,44 @@ def _print_models(selection: Selection, everything: bool) -> None:
 
     A search changes some columns from size to size: how many there are stands here.
     """
-    where, models, listed = selection.cohort.condition, selection.models, selection.choice is None
+    cohort, models, where = selection.cohort, selection.models, selection.cohort.condition.text
     ranked = sorted(models, key=lambda model: model.pooled.rmse)
     shown = models if everything else [one for one in models if one in ranked[:BEST]]
-    found = selection.searched.models if selection.searched else ()
-
-    def signals_of(model: CrossValidation) -> str:
-        if everything:
-            return _columns_of(model, selection)
-        many = model in found
-        return number_of(len(model.signals), "column") if many else in_families(model.signals)
-
-    print_table(
-        f"{number_of(selection.cohort.drive_count, 'drive')}, "
-        f"{number_of(selection.cohort.rows, 'row')}"
-        + ("" if where.text == TRAINING_DRIVES else f" where {_shortened(where.text, everything)}")
-        + f"; {number_of(len(models[0].folds), 'fold')} by {selection.folds.by}"
-        + ("" if selection.intercept else "; no intercept")
-        + ("" if len(shown) == len(models) else f"; the {BEST} best of {len(models)} (--all)"),
-        [
-            "model",
-            *(["signals"] if listed else []),
-            *(["drives", *ERROR, "condition number"] if everything else ERROR[:2]),
-        ],
-        [
-            [
-                model.name,
-                *([signals_of(model)] if listed else []),
-                *([f"{model.drives:,}"] if everything else []),
-                *figures_cells(model.pooled)[: None if everything else 2],
-                *([f"{model.condition_number:.3g}"] if everything else []),
-            ]
-            for model in shown
-        ],
-        left=1 + listed,
+    found = () if everything or selection.searched is None else selection.searched.models
+    title = f"{number_of(cohort.drive_count, 'drive')}, {number_of(cohort.rows, 'row')}"
+    title += "" if where == TRAINING_DRIVES else f" where {_shortened(where, everything)}"
+    title += f"; {number_of(len(models[0].folds), 'fold')} by {selection.folds.by}"
+    title += "" if selection.intercept else "; no intercept"
+    title += "" if len(shown) == len(models) else f"; the {BEST} best of {len(models)} (--all)"
+    header, row = "model", "{model.name}"
+    if listed := selection.choice is None:
+        header, row = f"{header}|signals", f"{row}|{{signals}}"
+    if everything:
+        header, row = f"{header}|drives", f"{row}|{{model.drives:,}}"
+    header, row = (
+        f"{header}|correlation|RMSE deg",
+        f"{row}|{{pooled.correlation:.4f}}|{{pooled.rmse_deg:.4f}}",
     )
-    if everything and listed and found:
-        say("+ and -: what a size of the search has, and has not, unlike the size before it.")
+    if everything:
+        header += "|error mean deg|error std deg|condition number"
+        row += (
+            "|{pooled.error_mean_deg:+.4f}|{pooled.error_std_deg:.4f}|{model.condition_number:.3g}"
+        )
+    rows = (
+        {
+            "model": one,
+            "pooled": one.pooled,
+            "signals": number_of(len(one.signals), "column")
+            if one in found
+            else in_families(one.signals),
+        }
+        for one in shown
+    )
+    print_records(title, header, row, rows, left=1 + listed)
 
 
 def _say_label_noise(selection: Selection) -> None:
     """Say how much of the errors is noise of the label they are measured against."""
-    if selection.without_label is not None or selection.cohort.unlabelled:
-        return
     noise = selection.label_noise_deg
     if noise is None:
         say("how noisy the label is, is not known: all errors have its noise in them.")
@@ -171,19 +174,13 @@ def _say_label_noise(selection: Selection) -> None:
 def _say_without_label(told: WithoutLabel) -> None:
     """Say what changes of the course tell of the angle, and what they do not."""
     over = ", ".join(f"{one:g}" for one in told.change_s)
-    say(
-        f"learned from changes of the course over {over} s: the figures are of changes, with the "
-        "noise of two fixes in them, and not of the angle."
-    )
-    if told.noise_deg is None:
-        say("cars hardly go straight on: what of the error is the noise of the course is not told.")
-    else:
-        say(
-            f"where cars go straight on, the course changes by {told.noise_deg:.4f} +- "
-            f"{2 * (told.noise_uncertainty_deg or 0):.4f} deg beyond the heading, and by more "
-            "where they are slower: the angle's own error over so long is at most "
-            f"{told.angle_at_most_deg:.3f} deg."
+    figures = f"learned from changes of the course over {over} s: the figures are of these changes"
+    if told.noise_deg is not None:
+        figures += (
+            f", which have {told.noise_deg:.4f} deg of noise where cars go straight on; the "
+            f"angle's own error over so long is at most {told.angle_at_most_deg:.3f} deg"
         )
+    say(f"{figures}.")
     if (side := told.one_way) is not None:
         say(
             f"cars turn to the {side} nearly always: columns that differ between left and right "
@@ -208,7 +205,8 @@ def _say_left_out(selection: Selection) -> None:
         say(selection.remark)
     if selection.without_label is not None:
         _say_without_label(selection.without_label)
-    _say_label_noise(selection)
+    elif not selection.cohort.unlabelled:
+        _say_label_noise(selection)
 
 
 def _print_folds(model: CrossValidation) -> None:
@@ -220,17 +218,6 @@ def _print_folds(model: CrossValidation) -> None:
             for name, found in zip(model.fold_names, model.folds, strict=True)
         ],
     )
-
-
-def _columns_of(model: CrossValidation, selection: Selection) -> str:
-    """Return a model's signals; of one that a search found, what its size changed."""
-    found = selection.searched.models if selection.searched else ()
-    if model not in found or model is selection.winner.model:
-        return in_families(model.signals)
-    before = found[len(model.signals) - 2].signals if len(model.signals) > 1 else ()
-    added = [f"+{name}" for name in model.signals if name not in before]
-    removed = [f"-{name}" for name in before if name not in model.signals]
-    return " ".join([*added, *removed])
 
 
 def in_families(signals: Sequence[str]) -> str:

@@ -1,19 +1,14 @@
 """Commands that look after the warehouse: verify, compact, forget, migrate."""
 
-import sys
-from concurrent.futures import Executor
-from contextlib import nullcontext
-from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.operations import Compacted
 from fleet_slip.base import number_of
-from fleet_slip.cli.options import Cluster, command
-from fleet_slip.cli.output import Json, print_json, print_table, say
+from fleet_slip.cli.options import command
+from fleet_slip.cli.output import Json, print_json, print_records, print_table, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.errors import DamageError, PendingError, UsageError
 from fleet_slip.grams.check import CheckReport
@@ -21,63 +16,23 @@ from fleet_slip.operations.find_drives import VacuumReport
 from fleet_slip.operations.forget import ForgetReport
 from fleet_slip.operations.migration import MigrationReport
 from fleet_slip.operations.verify import Verification
-from fleet_slip.storage.runs import recording
 
 PENDING_SHOWN = 5
 """So many are named on a line; --json names all."""
 
 
-def verify(
-    context: typer.Context,
-    full: Annotated[
-        bool, typer.Option("--full", help="Compute the Gram rows of all log files again.")
-    ] = False,
-    grams: Annotated[
-        bool,
-        typer.Option(
-            "--grams",
-            help="Compute the Gram rows of some log files in three ways, too; compare bit for bit.",
-        ),
-    ] = False,
-    repair: Annotated[
-        bool,
-        typer.Option(
-            "--repair", help="Rebuild Gram rows from the logs, and simulated logs from campaigns."
-        ),
-    ] = False,
-    campaign: Annotated[
-        list[str] | None,
-        typer.Option(help="A campaign's TOML file for --repair, besides those that ship."),
-    ] = None,
-    cluster: Cluster = None,
-    json: Json = False,
-) -> None:
+@command(Fleet.verify, progress=("verify", "bytes"), campaigns="--campaign")
+def verify(report: Verification, fleet: Fleet, repair: bool, json: Json = False) -> None:
     """Verify every byte against its checksum, and everything against everything else.
 
     Exits with 9 if there is damage that was not repaired.
 
     Example: **fleet-slip verify --full**
     """
-    fleet: Fleet = context.obj
-    # What repairs changes the warehouse; what only looks leaves no record.
-    recorded = recording(fleet.root, "verify", sys.argv[1:]) if repair else nullcontext()
-    with recorded, open_workers(fleet.root, cluster) as executor:
-        report = _verify(fleet, executor, full=full)
-        rebuilt: list[str] = []
-        if repair:
-            rebuilt = fleet.repair(report, campaign or ())
-            report = _verify(fleet, executor, full=full)
-    if grams and not report.damage:
-        with progress("verify Gram rows", "files") as show:
-            ways = fleet.check(progress=show)
-    else:
-        ways = None
     if json:
-        print_json({**_verified(report, rebuilt), **({"grams": ways} if ways else {})})
+        print_json(report)
     else:
-        _print_verification(report, rebuilt)
-        if ways:
-            _print_ways(ways)
+        _print_verification(report)
     if report.damage:
         advice = (
             "What is left cannot be rebuilt here: restore these files from a backup. Data files "
@@ -85,47 +40,27 @@ def verify(
             if repair
             else "Rebuild what can be rebuilt with: fleet-slip verify --repair"
         )
-        raise DamageError(f"{context.obj.root}: {len(report.damage)} damaged. {advice}")
+        raise DamageError(f"{fleet.root}: {len(report.damage)} damaged. {advice}")
 
 
-def _verify(fleet: Fleet, executor: Executor, *, full: bool) -> Verification:
-    with progress("verify", "bytes", executor) as show:
-        return fleet.verify(full=full, workers=executor, progress=show)
-
-
-def _verified(report: Verification, rebuilt: list[str]) -> dict[str, Any]:
-    counts = asdict(report)
-    del counts["findings"]
-    return {
-        **counts,
-        "damage": [asdict(finding) for finding in report.damage],
-        "remarks": [asdict(finding) for finding in report.findings if not finding.damage],
-        "rebuilt": rebuilt,
-    }
-
-
-def _print_verification(report: Verification, rebuilt: list[str]) -> None:
-    for path in rebuilt:
+def _print_verification(report: Verification) -> None:
+    for path in report.rebuilt:
         say(f"rebuilt {path}")
-    remarks = [finding for finding in report.findings if not finding.damage]
-    for title, findings in (("damage", report.damage), ("remarks", remarks)):
-        if findings:
-            rows = ([finding.path, finding.problem] for finding in findings)
-            print_table(title, ["where", "problem"], rows, left=2)
+    for title in ("damage", "remarks"):
+        if findings := getattr(report, title):
+            print_records(title, "where|problem", "{path}|{problem}", findings, left=2)
     say(
         f"{number_of(report.files, 'file')} with {report.size_bytes:,} bytes and "
-        f"{number_of(report.documents, 'document')} "
-        f"were read, the Gram rows of {number_of(report.log_files_recomputed, 'log file')} "
-        f"computed again: "
+        f"{number_of(report.documents, 'document')} were read, the Gram rows of "
+        f"{number_of(report.log_files_recomputed, 'log file')} computed again: "
         + (f"{len(report.damage)} damaged" if report.damage else "all is as it must be")
     )
+    if report.compared:
+        _print_ways(report.compared)
 
 
 def _print_ways(report: CheckReport) -> None:
-    ways = {
-        "SQL against stored Gram rows": report.drives,
-        "SQL against the kernel": report.drives,
-    }
+    ways = dict.fromkeys(("SQL against stored Gram rows", "SQL against the kernel"), report.drives)
     if report.wide_sets:
         ways[f"SQL against the kernel: {', '.join(report.wide_sets)}"] = report.wide_drives
     rows = [[way, f"{drives}", "yes"] for way, drives in ways.items()]

@@ -16,12 +16,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from fleet_slip.base import Progress, no_progress, number_of
+from fleet_slip.base import Progress, Record, no_progress, number_of
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
 from fleet_slip.grams.backlog import named_files
 from fleet_slip.grams.check import (
+    CheckReport,
     DriveGrams,
     differing_drives,
     find_gram_files,
@@ -79,8 +80,13 @@ class Damage:
 
 
 @dataclass
-class Verification:
-    """What was looked at, and what was found."""
+class Verification(Record):
+    """What was looked at, what was found, and what was rebuilt and compared besides."""
+
+    DOCUMENT = (
+        "files size_bytes rows log_files_recomputed documents damage remarks rebuilt "
+        "grams=compared?"
+    )
 
     files: int = 0
     size_bytes: int = 0
@@ -88,6 +94,8 @@ class Verification:
     log_files_recomputed: int = 0
     documents: int = 0
     findings: list[Damage] = field(default_factory=list)
+    rebuilt: Sequence[str] = ()
+    compared: CheckReport | None = None
 
     def note(self, kind: DamageKind, path: str, problem: str) -> None:
         """Add a finding."""
@@ -97,6 +105,11 @@ class Verification:
     def damage(self) -> list[Damage]:
         """The findings that are damage."""
         return [finding for finding in self.findings if finding.damage]
+
+    @property
+    def remarks(self) -> list[Damage]:
+        """The others, which are worth knowing."""
+        return [finding for finding in self.findings if not finding.damage]
 
 
 @dataclass(frozen=True)
