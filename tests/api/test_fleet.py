@@ -110,18 +110,6 @@ def test_a_wrong_root_is_not_an_empty_warehouse(tmp_path: Path) -> None:
             ask()
 
 
-def test_models_are_listed_and_found(fleet: Fleet) -> None:
-    table = fleet.models()
-    assert {"smoke", "bent"} == {*table["name"].to_pylist()}
-    assert table["trained_on_forgotten"].to_pylist() == [False, False]
-    assert fleet.models("bent").num_rows == 1
-    assert fleet.model("smoke").reference == "smoke@1"
-    assert fleet.model("smoke@1") == fleet.model("smoke@champion") == fleet.model("smoke")
-    for ask in (lambda: fleet.models("nobody"), lambda: fleet.model("nobody@1")):
-        with pytest.raises(QuestionError, match=r"'nobody'\. Models: bent, smoke"):
-            ask()
-
-
 def test_threads_share_a_fleet_and_a_model(fleet: Fleet) -> None:
     model = fleet.model("bent")
     answers: dict[int, object] = {}

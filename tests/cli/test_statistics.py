@@ -9,14 +9,11 @@ from pathlib import Path
 import duckdb
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import fleet_slip
 from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.cli.app import app
-from fleet_slip.errors import FleetSlipError
 from fleet_slip.resources import find_config
-from tests.support.commands import Finished, RunCommand, done_on
+from tests.support.commands import RunCommand, done_on
 from tests.support.once import made_once
 
 NOISE = {
@@ -28,21 +25,6 @@ NOISE = {
     "wheel_fr": 0.02,
 }
 """The smoke campaign's sensors, in SI units."""
-
-
-@pytest.fixture
-def run_command(tmp_path: Path) -> RunCommand:
-    """Run a command in this process, which saves the second that a process takes to start."""
-
-    def invoke(*arguments: str, root: Path | None = None) -> Finished:
-        data = str(root or tmp_path / "data")
-        done = CliRunner().invoke(app, ["--root", data, *arguments])
-        if isinstance(done.exception, FleetSlipError):
-            return Finished(done.exception.exit_code, done.stdout, f"error: {done.exception}")
-        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-        return Finished(done.exit_code, done.stdout, done.stderr)
-
-    return invoke
 
 
 @pytest.fixture(scope="session")
@@ -214,7 +196,6 @@ def test_what_if_agrees_with_a_campaign_of_doubled_noise(
     ("arguments", "exit_code", "message"),
     [
         (["gram", "--features", "mood"], 5, "Feature sets: signals, motion"),
-        (["select", "--features", "mood"], 5, "Feature sets: signals, motion"),
         (["select", "--nested", "curvature"], 5, "not an input"),
         (["select", "--rank", "luck"], 5, "Known rankings: declared"),
         (["select", "--criterion", "luck"], 5, "Known criteria: cv, cp"),
@@ -247,14 +228,6 @@ def test_noise_inside_a_feature_has_no_closed_form(
     done = run_command(*arguments, "--noise", "ay=0.1", root=every_set)
     assert done.exit_code == 5
     assert "ay_signed_square" in done.stderr
-
-
-def test_a_set_that_was_not_computed_says_how(run_command: RunCommand, tmp_path: Path) -> None:
-    run_command("simulate", "smoke", "--days", "1")
-    run_command("gram")
-    done = run_command("select", "--features", "motion")
-    assert done.exit_code == 5
-    assert "fleet-slip gram --features motion" in done.stderr
 
 
 def test_features_are_listed(run_command: RunCommand) -> None:
