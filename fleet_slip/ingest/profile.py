@@ -19,7 +19,7 @@ from fleet_slip.ingest.formats.reading import (
     FileFormats,
     file_errors,
     open_source,
-    require_unchanged_file,
+    require_unchanged_log,
 )
 from fleet_slip.ingest.formats.source import OWN_TIME, Channel, Source
 from fleet_slip.ingest.vocabulary import unit_called, vocabulary
@@ -242,7 +242,7 @@ class FileProfile:
 
 def profile_file(file: Path, formats: FileFormats) -> FileProfile:
     """Look at the first `MOST_ROWS` rows of every channel. Raises `InputError`."""
-    with require_unchanged_file(file), file_errors(file), ExitStack() as opened:
+    with require_unchanged_log(file), file_errors(file), ExitStack() as opened:
         if formats.can is None and formats.duckdb is None:
             layout, units = guess_layout(file)
             formats = FileFormats(csv=layout)

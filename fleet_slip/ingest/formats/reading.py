@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
@@ -75,31 +75,28 @@ class FileFormats:
 
 @contextmanager
 def require_unchanged_log(log: Path) -> Iterator[None]:
-    """Raise `InputError` if a part of a log is written to, or comes, while it is read."""
+    """Raise `InputError` if a part of a log is no regular file, or changes while it is read."""
     parts = parts_of(log)
-    with ExitStack() as unchanged:
-        for part in parts:
-            unchanged.enter_context(require_unchanged_file(part))
-        yield
+    for part in parts:
+        if not part.is_file():
+            what = "is not a regular file" if part.exists() else "no such file"
+            raise InputError(f"{shown(part)}: {what}. Give the path of a file.")
+    before = [_size_and_time(part) for part in parts]
+    yield
+    for part, state in zip(parts, before, strict=True):
+        if _size_and_time(part) != state:
+            raise InputError(
+                f"{shown(part)}: it changed while it was read. Wait until it is complete."
+            )
     if parts_of(log) != parts:
         raise InputError(
             f"{shown(log)}: files came or went while it was read. Wait until it is complete."
         )
 
 
-@contextmanager
-def require_unchanged_file(file: Path) -> Iterator[None]:
-    """Raise `InputError` if this is no regular file, or if it is written to while it is read."""
-    if not file.is_file():
-        what = "is not a regular file" if file.exists() else "no such file"
-        raise InputError(f"{shown(file)}: {what}. Give the path of a file.")
+def _size_and_time(file: Path) -> tuple[int, int]:
     with file_errors(file):
-        before = file.stat()
-    yield
-    with file_errors(file):
-        after = file.stat()
-    if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
-        raise InputError(f"{shown(file)}: it changed while it was read. Wait until it is complete.")
+        return file.stat().st_size, file.stat().st_mtime_ns
 
 
 def log_digest(log: Path) -> "hashlib._Hash":

@@ -103,10 +103,8 @@ def partition_keys(file: Path) -> dict[str, str]:
 
 
 def _require_sane_footer(stream: pa.NativeFile, file: Path) -> None:
-    size = stream.seek(0, 2)
-    stream.seek(max(0, size - 8))
-    tail = stream.read(8)
-    stream.seek(0)
+    size = stream.size()
+    tail = stream.read_at(8, max(0, size - 8))
     if tail[4:] != PARQUET_MAGIC or size < 12:
         raise InputError(
             f"{shown(file)}: begins as a Parquet file but has no footer: it is truncated. "
@@ -121,12 +119,9 @@ def _require_sane_footer(stream: pa.NativeFile, file: Path) -> None:
 def _require_within(budget: Budget, metadata: pq.FileMetaData) -> None:
     """Raise `InputError` for more rows or bytes than a file can have, or those of another file."""
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-    values = [
-        max((group.column(i).num_values for i in range(group.num_columns)), default=0)
-        for group in groups
-    ]
-    rows = (metadata.num_rows, sum(group.num_rows for group in groups), sum(values))
-    budget.require_rows(max(rows))
+    values = [[group.column(i).num_values for i in range(group.num_columns)] for group in groups]
+    rows = sum(max([group.num_rows, *of]) for group, of in zip(groups, values, strict=True))
+    budget.require_rows(max(rows, metadata.num_rows))
     budget.require_unfolded(sum(group.total_byte_size for group in groups))
     if any(group.num_columns and group.column(0).file_path for group in groups):
         raise InputError(
