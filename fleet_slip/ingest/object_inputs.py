@@ -20,7 +20,6 @@ from fleet_slip.storage.objects import (
     ObjectFolder,
     client,
     fetch_parts,
-    profile_of,
 )
 from fleet_slip.storage.storage_errors import (
     NoSuchObjectError,
@@ -47,15 +46,12 @@ def list_any_names(bucket: ObjectFolder, path: str) -> Iterator[StoredFile]:
         from botocore.config import Config  # noqa: PLC0415 - a fifth of a second
         from botocore.exceptions import BotoCoreError, ClientError  # noqa: PLC0415
         from botocore.session import Session  # noqa: PLC0415
-    profile = profile_of(bucket.bucket)
-    endpoint = environ.get("AWS_ENDPOINT_URL_S3") or environ.get("AWS_ENDPOINT_URL")
-    style = "path" if endpoint else "auto"
+    # It finds credentials and endpoints where we do. Paths hold for stores of all makers.
     limits = {"connect_timeout": CONNECT_TIMEOUT_S, "read_timeout": TIMEOUT_S}
     store = Session().create_client(
         "s3",
-        region_name=(profile and profile.region) or environ.get("AWS_REGION"),
-        endpoint_url=(profile and profile.endpoint) or endpoint,
-        config=Config(s3={"addressing_style": style}, **limits),
+        region_name=environ.get("AWS_REGION"),
+        config=Config(s3={"addressing_style": "path"}, **limits),
     )
     name = bucket.bucket.removeprefix("s3://")
     try:

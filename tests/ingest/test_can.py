@@ -141,16 +141,6 @@ def test_multiplexed_signals_have_the_values_of_their_own_frames(tmp_path: Path)
     assert log.drives["ay"].to_pylist()[1::2] == [100 * i for i in range(1, 50, 2)]
 
 
-def test_messages_that_come_late_twice_or_not_at_all(tmp_path: Path) -> None:
-    frames = [motion(i) for i in range(50) if i not in {10, 11}]
-    frames.insert(20, frames[20])  # twice
-    frames[30], frames[31] = frames[31], frames[30]  # late
-    log = read(write_trace(tmp_path, frames, "log.log"))
-    assert log.counts.quarantined == {"time_backwards": 1, "time_duplicate": 1}
-    assert log.counts.rows_kept == 47
-    assert ticks(log)[:12] == [*range(10), 12, 13]
-
-
 def test_a_value_with_a_name_is_no_number(tmp_path: Path) -> None:
     frames = [motion(i, **({"beta": "SNA"} if i % 5 == 0 else {})) for i in range(50)]
     for frame in frames[::5]:

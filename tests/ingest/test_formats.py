@@ -184,15 +184,6 @@ def test_a_channel_of_two_groups_must_be_told_apart(tmp_path: Path) -> None:
     require_the_drive(read_measured(file, mdf_mapping(signals=signals("a_x", "beta@0"))))
 
 
-def test_the_clock_of_one_group_that_jumps_back_costs_its_rows_only(tmp_path: Path) -> None:
-    jumping = TIME_S.copy()
-    jumping[50:55] -= 0.3
-    slow = beta(samples=BETA_DEG[::2], timestamps=TIME_S[::2])
-    log = read_measured(write_mdf(tmp_path, [a_x(timestamps=jumping)], [slow]), mdf_mapping())
-    assert log.counts.quarantined == {"time_backwards": 5}
-    assert log.counts.rows_kept == 145
-
-
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8, 0.999])
 def test_a_truncated_mdf_file_is_refused(
     tmp_path: Path, share: float, capfd: pytest.CaptureFixture[str]
@@ -244,12 +235,6 @@ def test_a_signal_that_reaches_no_tick_is_named(tmp_path: Path) -> None:
     assert "sideslip has 3 values in 'beta', and none is on a tick of 100 Hz" in message
     bridged = mdf_mapping(signals=signals("a_x", "beta", longest_gap_s=0.4))
     assert read_measured(file, bridged).drives["sideslip"].null_count == 100 - 80
-
-
-def test_ten_thousand_channels_do_not_matter(tmp_path: Path) -> None:
-    many = [Signal(np.zeros(2), TIME_S[:2], name=f"c{i}") for i in range(10_000)]
-    file = write_mdf(tmp_path, [a_x(), beta()], many)
-    require_the_drive(read_measured(file, mdf_mapping()))
 
 
 def mat_mapping(**changes: Any) -> Mapping:
@@ -397,20 +382,6 @@ def test_a_damaged_matlab_file_does_not_bring_its_reader_down(
     data[offset : offset + 4] = value.to_bytes(4, "little")
     file.write_bytes(data)
     assert str(file) in failure(file, mat_mapping())
-
-
-def test_matlab_files_of_all_kinds_are_sound(tmp_path: Path) -> None:
-    kinds = {
-        "text": "words", "cell": np.array([1, "a", [2, 3]], dtype=object), "flag": np.array([True]),
-        "number": 1 + 2j, "nested": {"a": {"b": [1.0, 2.0], "none": np.zeros((0, 0))}},
-        "wide": np.zeros((3, 200), dtype="f4"), "sparse": scipy.sparse.eye(4).tocsc(),
-    }  # fmt: skip
-    for compressed in (False, True):
-        file = tmp_path / f"{compressed}.mat"
-        scipy.io.savemat(file, {**kinds, "t": TIME_S, "ax": AX}, do_compression=compressed)
-        only = {"ax": {"column": "ax", "unit": "m/s^2"}}
-        log = read_measured(file, a_mapping(signals=only))
-        assert log.drives["ax"].to_pylist() == AX_COUNTS
 
 
 def test_columns_of_matlab_5_are_listed(tmp_path: Path) -> None:
