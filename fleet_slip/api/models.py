@@ -9,7 +9,7 @@ from typing_extensions import Doc
 
 from fleet_slip.api.calls import Rooted, ShowProgress, count_from_start, open_workers, record_call
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.api.requests import ALIAS, MODEL, VERSION
+from fleet_slip.api.requests import ALIAS, MODEL, UNEXAMINED, VERSION
 from fleet_slip.base import needed
 from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import RefusedError, UsageError
@@ -279,15 +279,24 @@ class PublishedModels(Rooted):
 # The part of a `Fleet` that judges models: scores, evaluations, the report, pages of drives.
 
 
+WATCH_PAGE = Path("watch.html")
+
+
 class JudgedModels(PublishedModels):
     """How good published models are. A model is given as `PublishedModels` has it."""
 
     def score(
         self,
-        model: str | ModelVersion | None = None,
-        cohort: str | None = None,
+        model: Annotated[str | ModelVersion | None, MODEL] = None,
+        cohort: Annotated[
+            str | None,
+            Doc(
+                "SQL condition on the view drives. Default: what the model was not trained on, or "
+                "all if there is nothing else."
+            ),
+        ] = None,
         *,
-        unexamined: bool = False,
+        unexamined: Annotated[bool, UNEXAMINED] = False,
     ) -> "Score":
         """Evaluate a model on the rows of a cohort; angles are in degrees.
 
@@ -330,20 +339,25 @@ class JudgedModels(PublishedModels):
     @record_call
     def evaluate(
         self,
-        model: str | ModelVersion | None = None,
-        others: Sequence[str | ModelVersion] = (),
+        model: Annotated[str | ModelVersion | None, MODEL] = None,
+        others: Annotated[
+            Sequence[str | ModelVersion],
+            Doc("Another model, to be compared with the first. May be repeated."),
+        ] = (),
         *,
-        scenarios: Sequence[str] = (),
+        scenarios: Annotated[
+            Sequence[str],
+            Doc("A scenario of configs/scenarios, or a TOML file. May be repeated. Default: all."),
+        ] = (),
         threads: int | None = None,
         progress: ShowProgress | None = None,
     ) -> "Document":
         """Evaluate models on the paper's test drives and on others; simulate those missing.
 
-        Models of Table I are fitted on the cohort of each and evaluated beside it. `scenarios` are
-        names or paths, by default all that ship. Progress is in simulated rows. Returns the
-        document kept below `evaluations/`. Raises `ConfigError` for an invalid scenario,
-        `RefusedError` for one that changed since it was simulated, `DataError`, and what `model`
-        raises.
+        Models of Table I are fitted on the cohort of each and evaluated beside it. Progress is in
+        simulated rows. Returns the document kept below `evaluations/`. Raises `ConfigError` for an
+        invalid scenario, `RefusedError` for one that changed since it was simulated, `DataError`,
+        and what `model` raises.
         """
         from fleet_slip.evaluation.drives import simulate_scenarios
         from fleet_slip.evaluation.evaluate import evaluate, evaluations_of, keep
@@ -366,17 +380,18 @@ class JudgedModels(PublishedModels):
         cohort: str = TRAINING_DRIVES,
         others: Sequence[str | ModelVersion] = (),
         *,
-        vehicle: str | None = None,
+        vehicle: Annotated[
+            str | None,
+            Doc("With `cohort`: the car's file, for filters. Its mass and geometry suffice."),
+        ] = None,
         threads: int | None = None,
     ) -> "Document":
         """Evaluate models on measured drives with a label, beside Table I and filters.
 
         What is fitted or tuned never saw what it is judged by: a quarter of the drives after the
-        other, or of their time, is left out. `vehicle` names the car's file, of which mass and
-        geometry suffice for a car that is identified; without it no filter competes, unless a file
-        ships for the drives' class. Returns the document kept below `evaluations/measured/`.
-        Raises `DataError` without a label, `ConfigError` for an unknown
-        car, and what `model` raises.
+        other, or of their time, is left out. Without a `vehicle` no filter competes, unless a file
+        ships for the drives' class. Returns the document kept below `evaluations/measured/`. Raises
+        `DataError` without a label, `ConfigError` for an unknown car, and what `model` raises.
         """
         from fleet_slip.evaluation.evaluate import evaluations_of, keep
         from fleet_slip.evaluation.measured import evaluate_measured
@@ -408,11 +423,13 @@ class JudgedModels(PublishedModels):
             return evaluate_blindly(self.warehouse, first, rest, executor)
 
     def report(
-        self, model: str | ModelVersion | None = None, output: Path | None = None
+        self,
+        model: Annotated[str | ModelVersion | None, MODEL] = None,
+        output: Annotated[Path | None, Doc("Folder. Default: report/ in the data root.")] = None,
     ) -> "Written":
         """Write one page that lays our figures beside the paper's, from the latest evaluation.
 
-        `output` is a folder, by default `report` in the root. Raises `DataError` without an
+        Raises `DataError` without an
         evaluation on today's data, and what `model` raises.
         """
         from fleet_slip.storage.local import LocalFolder
@@ -426,17 +443,18 @@ class JudgedModels(PublishedModels):
     @record_call
     def watch(
         self,
-        what: str,
-        model: str | ModelVersion | None,
-        output: Path,
+        what: Annotated[
+            str, Doc("A scenario of configs/scenarios, the path of one, or a drive of the logs.")
+        ],
+        model: Annotated[str | ModelVersion | None, MODEL] = None,
+        output: Annotated[Path, Doc("The page, .html, which plays in a browser.")] = WATCH_PAGE,
         *,
-        from_s: float = 0.0,
-        until_s: float | None = None,
+        from_s: Annotated[float, Doc("First second that is shown.")] = 0.0,
+        until_s: Annotated[float | None, Doc("Last second. Default: the last.")] = None,
     ) -> Path:
-        """Write a drive as a page that plays, `.html`; return the file.
+        """Write a drive as a page that plays; return the file.
 
-        `what` is a scenario's name or path, which is simulated, or a drive of the logs, shown
-        from `from_s` until `until_s`. Raises `UsageError` for another suffix or an empty part,
+        A scenario is simulated for it. Raises `UsageError` for another suffix or an empty part,
         `QuestionError` for an unknown drive, `ExtraError` without the extra `watch`, and what
         `model` raises.
         """

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fleet_slip.api.cohort import FleetCohort
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import needed, number_of
-from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
-from fleet_slip.cli.app import record_run
+from fleet_slip.catalogue.facts import ALL_DRIVES
 from fleet_slip.cli.models import score_against
-from fleet_slip.cli.options import Cohort, OnlyModel, Threads, Unexamined, complete_config
+from fleet_slip.cli.options import command
 from fleet_slip.cli.output import (
     Json,
     print_json,
@@ -31,7 +32,7 @@ from fleet_slip.resources import folder
 from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
-    from fleet_slip.evaluation.identify import Identified
+    from fleet_slip.evaluation.report import Written
 
 
 # What `evaluate` prints for people: a screen, and with --all the errors of all on every drive.
@@ -128,51 +129,31 @@ def _print_measured(content: Mapping[str, Any]) -> None:
         )
 
 
-FleetModels = Annotated[
-    list[str] | None,
-    typer.Option(help="Another model, to be compared with the first. May be repeated."),
-]
-Scenarios = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--scenario",
-        help="A scenario of configs/scenarios, or a TOML file. May be repeated. Default: all.",
-        autocompletion=complete_config("scenarios"),
-        show_default=False,
-    ),
-]
-
-
+@command(Fleet.score, arguments=["model"])
 def score(
-    context: typer.Context,
-    model: OnlyModel = None,
-    cohort: Annotated[
-        str | None,
-        typer.Option(
-            help="SQL condition on the view drives. Default: what the model was not trained on, or "
-            "all if there is nothing else."
-        ),
-    ] = None,
+    fleet: Fleet,
+    model: str | None,
+    cohort: str | None,
+    unexamined: bool,
     against: Annotated[
         str | None,
         typer.Option(help="Another version of the model, such as champion, on the same rows."),
     ] = None,
-    unexamined: Unexamined = False,
     json: Json = False,
 ) -> None:
     """Evaluate a model on the rows of a cohort: also the largest error and percentiles.
 
     Example: **fleet-slip score waterford --cohort "speed_factor > 0.9"**
     """
-    version = context.obj.model(model)
+    version = fleet.model(model)
     if against is not None:
         name = against if "@" in against else f"{version.manifest.name}@{against}"
-        other = context.obj.model(name)
-        rows, examined = context.obj.scored_rows(cohort, unexamined=unexamined)
+        other = fleet.model(name)
+        rows, examined = fleet.scored_rows(cohort, unexamined=unexamined)
         say_examined(str(examined))
-        score_against(context.obj.warehouse, version, other, rows, json)
+        score_against(fleet.warehouse, version, other, rows, json)
         return
-    found: Score = context.obj.score(version, cohort, unexamined=unexamined)
+    found: Score = fleet.score(version, cohort, unexamined=unexamined)
     say_examined(found.examined)
     result = found.as_dict()
     if json:
@@ -206,12 +187,21 @@ def _say_trained(found: Score, reference: str) -> None:
         )
 
 
-@record_run
+@command(
+    Fleet.evaluate_measured,
+    Fleet.evaluate,
+    arguments=["model"],
+    without=["cohort"],
+    others="--fleet",
+    scenarios="--scenario",
+)
 def evaluate(
-    context: typer.Context,
-    model: OnlyModel = None,
-    fleet: FleetModels = None,
-    scenario: Scenarios = None,
+    fleet: Fleet,
+    model: str | None,
+    others: list[str],
+    scenarios: list[str],
+    vehicle: str | None,
+    threads: int | None,
     blind: Annotated[
         bool,
         typer.Option(
@@ -229,15 +219,6 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
-    vehicle: Annotated[
-        str | None,
-        typer.Option(
-            help="With --cohort: the car's file, for filters. Its mass and geometry suffice.",
-            autocompletion=complete_config("vehicles"),
-            show_default=False,
-        ),
-    ] = None,
-    threads: Threads = None,
     everything: Annotated[
         bool, typer.Option("--all", help="Print the errors of all estimators on every drive.")
     ] = False,
@@ -252,42 +233,37 @@ def evaluate(
 
     Example: **fleet-slip evaluate waterford --scenario nominal**
     """
-    model, others = model or context.obj.registry().only(), fleet or ()
-    if (cohort is None and vehicle) or (cohort is not None and (scenario or blind)):
+    if (cohort is None and vehicle) or (cohort is not None and (scenarios or blind)):
         raise UsageError(
             "--cohort judges measured drives, for filters in the car of --vehicle: leave out "
             "--scenario and --blind, and name a cohort."
         )
-    if blind and scenario:
+    if blind and scenarios:
         raise UsageError("--blind has drives of its own: leave out --scenario.")
     if blind:
-        content = context.obj.evaluate_blind(model, others, threads=threads)
-        if json:
-            print_json(content)
-        else:
-            print_evaluation(content, everything)
-        return
+        content = fleet.evaluate_blind(model, others, threads=threads)
+        return print_json(content) if json else print_evaluation(content, everything)
     if cohort is not None:
-        kept = context.obj.evaluate_measured(
-            model, cohort, others, vehicle=vehicle, threads=threads
-        )
+        kept = fleet.evaluate_measured(model, cohort, others, vehicle=vehicle, threads=threads)
     else:
         with progress("simulate scenarios", "rows") as show:
-            kept = context.obj.evaluate(
-                model, others, scenarios=scenario or (), threads=threads, progress=show
+            kept = fleet.evaluate(
+                model, others, scenarios=scenarios, threads=threads, progress=show
             )
     if json:
-        print_json({"number": kept.number, "sha256": kept.sha256, **kept.content})
-    else:
-        print_evaluation(kept.content, everything)
-        say(f"kept as evaluations/{'' if cohort is None else 'measured/'}{kept.number}.json")
+        return print_json({"number": kept.number, "sha256": kept.sha256, **kept.content})
+    print_evaluation(kept.content, everything)
+    say(f"kept as evaluations/{'' if cohort is None else 'measured/'}{kept.number}.json")
 
 
 # The command that identifies a car from labelled drives: identify.
 
 
+@command(Fleet.cohort, FleetCohort.identify, without=["unexamined"])
 def identify(
-    context: typer.Context,
+    fleet: Fleet,
+    condition: str,
+    threads: int | None,
     name: Annotated[str, typer.Argument(help="What the car is to be called.")],
     mass: Annotated[float, typer.Option(help="Of the whole car, kg.", min=1)],
     front_axle: Annotated[
@@ -302,11 +278,9 @@ def identify(
     front_drive: Annotated[
         float, typer.Option(help="Share of the drive torque in front.", min=0, max=1)
     ] = 1.0,
-    cohort: Cohort = TRAINING_DRIVES,
     output: Annotated[
         Path | None, typer.Option(help="Write the vehicle file here.", show_default=False)
     ] = None,
-    threads: Threads = None,
     json: Json = False,
 ) -> None:
     """Identify a car's tyres and inertia from labelled drives, as a vehicle file for filters.
@@ -316,7 +290,7 @@ def identify(
 
     Example: **fleet-slip identify hatchback --mass 1776 --front-axle 1.19 --rear-axle 1.44**
     """
-    found: Identified = context.obj.cohort(cohort).identify(
+    found = fleet.cohort(condition).identify(
         name,
         mass_kg=mass,
         front_axle_m=front_axle,
@@ -351,58 +325,34 @@ def identify(
 # Commands that show: report, watch, explore.
 
 
-def report(
-    context: typer.Context,
-    model: OnlyModel = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(help="Folder. Default: report/ in the data root.", show_default=False),
-    ] = None,
-    json: Json = False,
-) -> None:
+@command(Fleet.report, arguments=["model"])
+def report(written: "Written") -> None:
     """Write one page that lays our figures beside the paper's, from the latest evaluation.
 
     The page needs nothing but itself; the same figures stand beside it as SVG and PNG files.
 
     Example: **fleet-slip report waterford**
     """
-    written = context.obj.report(model, output)
-    if json:
-        print_json(written)
-    else:
-        say(
-            f"{written.page}: {written.size_bytes / 1e6:.1f} MB, {written.figures} figures, "
-            f"which are in {written.figures_folder} too"
-        )
+    say(
+        f"{written.page}: {written.size_bytes / 1e6:.1f} MB, {written.figures} figures, "
+        f"which are in {written.figures_folder} too"
+    )
 
 
-def watch(
-    context: typer.Context,
-    what: Annotated[
-        str,
-        typer.Argument(
-            help="A scenario of configs/scenarios, the path of one, or a drive of the logs.",
-            metavar="SCENARIO|DRIVE",
-            autocompletion=complete_config("scenarios"),
-            show_default=False,
-        ),
-    ],
-    model: OnlyModel = None,
-    output: Annotated[Path, typer.Option(help="The page, .html, which plays in a browser.")] = Path(
-        "watch.html"
-    ),
-    begin: Annotated[float, typer.Option("--from", help="First second that is shown.")] = 0.0,
-    until: Annotated[
-        float | None, typer.Option(help="Last second. Default: the last.", show_default=False)
-    ] = None,
-) -> None:
+@command(
+    Fleet.watch,
+    arguments=["what", "model"],
+    without=["json"],
+    from_s="--from",
+    until_s="--until",
+)
+def watch(file: Path) -> None:
     """Show a drive: the car on its track, its true and its estimated angle, wheels and gates.
 
     The page is one file and needs no server.
 
     Example: **fleet-slip watch adhesion_0_4 --output slippery.html**
     """
-    file = context.obj.watch(what, model, output, from_s=begin, until_s=until)
     from fleet_slip.pages.page import size  # noqa: PLC0415 - of the extra, which is there now
 
     say(f"{file}: {size(file.stat().st_size)}")

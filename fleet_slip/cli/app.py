@@ -1,19 +1,18 @@
 """The commands of `fleet-slip` as one program: its options, and how it ends."""
 
-import functools
 import inspect
 import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cache, cached_property
 from importlib import import_module
 from importlib.abc import InspectLoader
 from importlib.util import find_spec
 from pathlib import Path
 from types import CodeType, FunctionType
-from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -33,7 +32,6 @@ from fleet_slip.errors import (
 from fleet_slip.limits import memory_bytes
 from fleet_slip.resources import CONFIG_VARIABLE, own_configs
 from fleet_slip.storage.data_root import ROOT_VARIABLE
-from fleet_slip.storage.runs import recording
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
@@ -308,21 +306,3 @@ def _choose_font_folder() -> None:
     folder = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
     if folder:
         os.environ.setdefault("MPLCONFIGDIR", folder)
-
-
-# Marks the commands that change the warehouse: each leaves a record in the history of runs.
-
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
-def record_run(command: Callable[P, R]) -> Callable[P, R]:
-    """Return the command, recorded. Its `context` parameter carries the warehouse."""
-
-    @functools.wraps(command)
-    def run(*arguments: P.args, **options: P.kwargs) -> R:
-        context = cast(typer.Context, options["context"])
-        with recording(context.obj.root, command.__name__, sys.argv[1:]):
-            return command(*arguments, **options)
-
-    return run

@@ -90,7 +90,10 @@ DETAILS: dict[str, dict[str, Any]] = {
     "most": {"min": 1, "max": 200},
     "repeat": {"min": 2},
     "retention_hours": {"min": 1, "max": 168},
+    "scenarios": {"autocompletion": complete_config("scenarios")},
     "target_rows": {"min": 1},
+    "vehicle": {"autocompletion": complete_config("vehicles")},
+    "what": {"metavar": "SCENARIO|DRIVE", "autocompletion": complete_config("scenarios")},
 }
 """What options need on the command line beside what is said of them in the API."""
 
@@ -111,7 +114,9 @@ READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "noise": (list[str] | None, lambda values: quantities(values, "--noise")),
     "one": (str, str),
     "other": (str, str),
+    "others": (list[str] | None, lambda names: names or ()),
     "over": (str | None, lambda over: [one.strip() for one in over.split(",")] if over else ()),
+    "scenarios": (list[str] | None, lambda names: names or ()),
     "since": (str | None, lambda since: date_of(since, "--since")),
     "through": (str | None, last_day),
 }
@@ -259,10 +264,6 @@ def _plain(name: str, annotation: Any, default: Any = None) -> inspect.Parameter
     )
 
 
-Cohort = Annotated[
-    str,
-    typer.Option(help="SQL condition on the view drives, such as \"track = 'waterford_hills'\"."),
-]
 Unexamined = Annotated[
     bool,
     typer.Option(
@@ -303,20 +304,6 @@ Cluster = Annotated[
         metavar="ADDRESS",
         help="Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers do the work; "
         "they must share the data root. Default: threads of this machine.",
-        show_default=False,
-    ),
-]
-
-
-# The argument that names a published model, for commands that wait for nothing else.
-
-OnlyModel = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="MODEL",
-        help="NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. "
-        "Default: the only one that there is.",
-        autocompletion=complete_model,
         show_default=False,
     ),
 ]
