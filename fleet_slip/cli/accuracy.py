@@ -175,7 +175,7 @@ def score(
 def _say_trained(found: Score, reference: str) -> None:
     """Say which drives made the model: on these its error is that of a fit."""
     if found.drives_trained is None:
-        say(f"{reference} does not tell which drives made it: some of these may have.")
+        say(f"{reference} does not say which drives it was trained on: these may be among them.")
     elif found.drives_left_out:
         left = number_of(found.drives_left_out, "drive")
         say(f"left out: {left} of {found.drives:,} that {reference} was trained on.")

@@ -128,7 +128,7 @@ class Facts:
     def unstable_section(self) -> dict[str, Any]:
         """Return the figures within and without the unstable section of the slippery drive."""
         what = "unstable section at an adhesion of 0.4"
-        choice, part = self.data.choice, self._evaluated.part
+        choice, part = self.data.choice, self._evaluated.figures
         return {
             "inside": _complete(part(SLIPPERY, choice, "inside", "unstable"), what),
             "outside": _complete(part(SLIPPERY, choice, "outside", "unstable"), what),
@@ -136,7 +136,7 @@ class Facts:
 
     def while_stable(self) -> Any:
         """Return the figures of the slippery drive where the car is stable."""
-        outside = self._evaluated.part(SLIPPERY, self.data.choice, "outside", "unstable")
+        outside = self._evaluated.figures(SLIPPERY, self.data.choice, "outside", "unstable")
         return self[SLIPPERY] if outside is None else _complete(outside, "stable section")
 
     def further_drives(self) -> dict[str, float]:
@@ -186,15 +186,15 @@ class Facts:
 
     def in_outages(self) -> list[str]:
         """Tell the errors while satellite navigation is out."""
-        told = []
+        found = []
         for name, place in OUTAGES.items():
             ours, theirs = (
-                self._evaluated.part(name, estimator, "inside", "gps_outage")
+                self._evaluated.figures(name, estimator, "inside", "gps_outage")
                 for estimator in (self.data.choice, "kalman_tuned")
             )
             if ours and theirs:
-                told.append(f"{place} {degrees(theirs.rmse_deg)} against {degrees(ours.rmse_deg)}")
-        return told
+                found.append(f"{place} {degrees(theirs.rmse_deg)} against {degrees(ours.rmse_deg)}")
+        return found
 
 
 AS_THEY_ARE = ("figures", "unstable", "scenarios", "models", "ordering", "block_s")

@@ -59,7 +59,7 @@ class EkfNoise(Config):
     """Cornering stiffness of the front axle over what the car's parameters say."""
     stiffness_rear_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
     adhesion: FiniteFloat = Field(default=1.0, gt=0)
-    """What the filter is told of the road."""
+    """What the filter knows of the road."""
     yaw_rate: YawRateNoise = YawRateNoise()
 
 

@@ -337,7 +337,7 @@ def _tuned(
 IDENTIFIED_NAME = "ekf_identified"
 
 DRIVES_OF_A_CLASS = 12
-"""Of each class of cars a dozen tell as much, in half the time."""
+"""Of each class of cars; a dozen give as good a car in half the time."""
 
 
 @dataclass(frozen=True)
@@ -433,7 +433,7 @@ class TuningDrives:
         return [name for name, _, _ in self.known]
 
     def key(self) -> list[Any]:
-        """Return what tells these from others, for a JSON document."""
+        """Return what identifies these, for a JSON document."""
         return [TUNING_S, *(list(known) for known in self.known)]
 
     def kept_or_found(

@@ -228,7 +228,7 @@ def _scaled(parameters: P, name: str, factor: float) -> P:
 
 
 class Fitted(Config):
-    """What drives tell of a car, within what cars are, and the noise of the filter in it."""
+    """What is estimated from drives, within what cars are, and the noise of the filter."""
 
     stiffness_front: FiniteFloat = Field(default=1.0, ge=0.4, le=2.5)
     """Of the axle, over `STIFFNESS_PER_LOAD`."""

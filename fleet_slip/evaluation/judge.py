@@ -205,8 +205,8 @@ CLOSE = 1.25
 def rank(runs: Sequence[EvaluatedScenario], estimator: str, gps: Collection[str]) -> dict[str, Any]:
     """Rank an estimator on every drive against all that use no GPS; it wins a tie.
 
-    Returns what a document says. Drives that differ in satellite navigation alone, which nobody who
-    competes tells apart, count once: `same_as` names the first.
+    Returns what a document says. Drives that differ in satellite navigation alone count once:
+    `same_as` names the first.
     """
     standings = [
         {

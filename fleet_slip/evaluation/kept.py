@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -85,20 +85,15 @@ class Evaluated:
             if about["group"] == self.group and "table_one" in about
         }
 
-    def figures(self, scenario: str, estimator: str) -> ErrorFigures | None:
-        """Return the error figures over a whole drive; None if that was not evaluated."""
-        return _figures(self._result(scenario, estimator))
-
-    def part(
-        self, scenario: str, estimator: str, side: Literal["inside", "outside"], section: str
+    def figures(
+        self, scenario: str, estimator: str, side: str = "", section: str = ""
     ) -> ErrorFigures | None:
-        """Return the error figures inside or outside of a section; None if there is none."""
-        return _figures(self._result(scenario, estimator).get(side, {}).get(section, {}))
-
-    def _result(self, scenario: str, estimator: str) -> Mapping[str, Any]:
-        results: Mapping[str, Mapping[str, Any]]
-        results = self.scenarios.get(scenario, {}).get("results", {})
-        return results.get(estimator, {})
+        """Return the error figures over a drive, or `inside` or `outside` of a section of it."""
+        found = self.scenarios.get(scenario, {}).get("results", {}).get(estimator, {})
+        if side:
+            found = found.get(side, {}).get(section)
+        names = ErrorFigures.__dataclass_fields__
+        return ErrorFigures(**{name: found[name] for name in names}) if found else None
 
     def stretches(self, scenario: str, section: str) -> list[tuple[float, float]]:
         """Return begin and end in s of the stretches of a section; none if there is no such."""
@@ -133,12 +128,6 @@ class Evaluated:
             f"{what} has changed since evaluation {self.document.number}. Run: fleet-slip "
             f"evaluate {self.group}"
         )
-
-
-def _figures(found: Mapping[str, Any]) -> ErrorFigures | None:
-    if not found:
-        return None
-    return ErrorFigures(**{name: found[name] for name in ErrorFigures.__dataclass_fields__})
 
 
 def latest_of(warehouse: Warehouse, version: ModelVersion) -> Evaluated:

@@ -206,7 +206,7 @@ def evaluate_measured(
 
 
 def _judged(one: MeasuredDrive, vehicle: VehicleParameters | None) -> BoolArray:
-    """Return the rows with a label where the car moves, as far as wheels tell."""
+    """Return the rows with a label where the car moves, by its wheel speeds."""
     labelled: BoolArray = np.isfinite(one.drive.sideslip_rad)
     if vehicle is None:
         return labelled

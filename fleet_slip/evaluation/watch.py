@@ -117,7 +117,7 @@ def frames_of(
 ) -> DriveFrames:
     """Return the frames of a drive. Raises `DataError` if nothing of it can be shown.
 
-    The columns are those of the catalogue, shape (ticks,), NaN where null; `facts` tell the model
+    The columns are those of the catalogue, shape (ticks,), NaN where null; `facts` are the model
     and mass of the car, its `drive_id`, and its `track` if that is known.
     """
     seen = np.flatnonzero(np.diff(np.floor((time_s - time_s[0]) * FRAMES_PER_S + 1e-6), prepend=-1))

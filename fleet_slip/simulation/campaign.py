@@ -148,10 +148,7 @@ class Campaign(Config):
     def _inherit(cls, content: Any) -> Any:
         if not isinstance(content, dict) or not isinstance(content.get("base"), str):
             return content
-        try:
-            base = load_toml(find_config("campaigns", content["base"]))
-        except ConfigError as error:
-            raise ValueError(str(error)) from None
+        base = load_base("campaigns", content["base"])
         if "base" in base:
             raise ValueError(f"the base {content['base']!r} has a base itself: take that one")
         plan = content.get("plan", {})
@@ -236,6 +233,14 @@ class Campaign(Config):
             receiver=receiver,
             drawn_as=self.base or "",
         )
+
+
+def load_base(kind: str, name: str) -> dict[str, Any]:
+    """Return what the file of a base says. Raises `ValueError` if there is none."""
+    try:
+        return load_toml(find_config(kind, name))
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

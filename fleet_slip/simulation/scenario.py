@@ -16,10 +16,9 @@ from pydantic import Field, FiniteFloat, model_validator
 from fleet_slip.base import sha256_of
 from fleet_slip.catalogue.facts import SCENARIO
 from fleet_slip.catalogue.signals import Identifier, catalogue
-from fleet_slip.config import Config, load_config, load_toml
-from fleet_slip.errors import ConfigError
+from fleet_slip.config import Config, load_config
 from fleet_slip.resources import config_names, find_config
-from fleet_slip.simulation.campaign import Batch, DriveSpec, merged
+from fleet_slip.simulation.campaign import Batch, DriveSpec, load_base, merged
 from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative, Positive
 from fleet_slip.simulation.plan import NamedTrack, NamedVehicle
 from fleet_slip.simulation.roads import SpeedLimits, SpeedProfile
@@ -193,11 +192,7 @@ def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str,
         return {**content, "drive": name}
     if base == name or base in derived:
         raise ValueError(f"the base {base!r} leads back to this scenario")
-    try:
-        settings = load_toml(find_config("scenarios", str(base)))
-    except ConfigError as error:
-        raise ValueError(str(error)) from None
-    inherited = _complete(settings, (*derived, str(name)))
+    inherited = _complete(load_base("scenarios", str(base)), (*derived, str(name)))
     changes = sorted(set(content) - NOT_INHERITED)
     if "failures" in content and changes:
         raise ValueError(
