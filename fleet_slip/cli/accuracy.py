@@ -74,7 +74,7 @@ def print_errors(title: str, drives: Sequence[Mapping[str, Any]], names: Sequenc
         shown = names[first : first + at_once]
         rows = [
             [
-                one["name"].replace("_", " "),
+                one["name"],
                 f"{one.get('truth', one)['sideslip_std_deg']:.2f}",
                 *(_error_cell(one["results"][name]) for name in shown),
             ]
