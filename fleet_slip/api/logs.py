@@ -94,9 +94,10 @@ class LogsAndGrams(Rooted):
         Without a cluster, threads read a folder's small files; large ones are read one by one, by
         all cores.
 
-        A recording that is there already is told by its bytes and samples. With `replace="all"` its
-        drives give way to the new ones, in one commit; with `corrected` those of the same file and
-        an older state of the same mapping do. Raises `ConfigError` for an invalid mapping;
+        A recording that is there already is recognised by its bytes and samples. With
+        `replace="all"` its drives give way to the new ones, in one commit; with `corrected` those
+        of the same file and an older state of the same mapping do. Raises `ConfigError` for an
+        invalid mapping;
         `InputError`, when all others are in, for files that cannot be used, or `RepeatedError`
         where these are all in already; `StorageError` and `ClusterError`.
         """
@@ -105,7 +106,7 @@ class LogsAndGrams(Rooted):
         from fleet_slip.operations.rewriting import take_out
 
         plan, logs, folders = _chosen_logs(files, mapping, as_one=as_one)
-        told = count_from_start(progress)
+        count = count_from_start(progress)
         failures: list[InputError] = []
         reports: list[IngestReport] = []
         with open_workers(self.root, workers) as executor, step("ingest") as figures:
@@ -117,13 +118,13 @@ class LogsAndGrams(Rooted):
             by_file = folders and not as_one
             threads = executor if by_file else elsewhere
             out = partial(take_out, self.warehouse)
-            read = no_progress if by_file or progress is None else _bytes_of(logs, told)
+            read = no_progress if by_file or progress is None else _bytes_of(logs, count)
             known = KnownFiles.of(self.warehouse, plan) if folders else None
             wanted = logs
-            if known is not None and not as_one:  # what is in a folder its size does not tell
+            if known is not None and not as_one:  # what is in a folder its size does not show
                 wanted = known.without_landed(logs, warehouse)
             if landed := len(logs) - len(wanted):
-                told(landed, len(logs))
+                count(landed, len(logs))
             try:
                 for report in ingest_files(
                     warehouse, wanted, plan, threads, known, read, replace, out, failures
@@ -133,7 +134,7 @@ class LogsAndGrams(Rooted):
                     if each is not None:
                         each(report)
                     if by_file:
-                        told(1, len(logs))
+                        count(1, len(logs))
             finally:
                 if known is not None:
                     known.save()

@@ -163,7 +163,7 @@ AXLES = ("front wheels", "rear wheels")
 FEWEST_WITNESSES = 3
 """Of a Gram row, which has the rows of a car that stands or drives backwards too."""
 _CLEAR = 0.2
-"""A loading nearer to zero tells no sign."""
+"""A loading nearer to zero has no clear sign."""
 _ROUNDING = 1e-12
 """Part of the variances of two signals that is left of their difference where they are equal."""
 
@@ -282,7 +282,7 @@ def find_magnitudes(moments: MeanMoments) -> dict[int, Fault]:
 
 
 def axes_swapped(moments: MeanMoments) -> dict[int, Fault]:
-    """Return the drives in which `ax` tells the turns, and `ay` does not."""
+    """Return the drives in which `ax` follows the turns, and `ay` does not."""
     rest = [name for name in ("yaw_rate", "steering_wheel") if name in moments.signals]
     if not {"ax", "ay"} <= set(moments.signals) or not rest:
         return {}
@@ -310,7 +310,7 @@ def steering_swapped(moments: MeanMoments) -> dict[int, Fault]:
     With Ackermann's geometry cot(right) - cot(left) = track / wheelbase in a left turn, so that
     the mean of left - right is about that ratio times the mean of left * right, in radians.
     `STEERING_RATIO` bounds the ratio with the sign turned: beyond it a sensor is biased instead.
-    Where the sensors of many drives are, the ratio tells nothing of the others.
+    Where the sensors of many drives are, the ratio says nothing of the others.
     """
     left, right = "steer_fl", "steer_fr"
     if not {left, right} <= set(moments.signals):

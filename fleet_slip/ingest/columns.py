@@ -137,7 +137,7 @@ class SignalColumn(Config):
     component: Component | None = added(None)
     """Of the velocity over ground, if it is one: set for `course = { north = …, east = … }`."""
     clockwise_from_north: bool | None = added(None)
-    """Whether the course is told so; False: counterclockwise from east."""
+    """Whether the course is given so; False: counterclockwise from east."""
     antenna_x_m: OffsetM | None = added(None)
     """How far the receiver's antenna is before the centre of gravity."""
     antenna_y_m: OffsetM | None = added(None)
@@ -146,8 +146,8 @@ class SignalColumn(Config):
     @property
     def is_of_satellites(self) -> bool:
         """Whether it has keys that are for the course."""
-        told = (self.clockwise_from_north, self.antenna_x_m, self.antenna_y_m, self.component)
-        return any(one is not None for one in told)
+        given = (self.clockwise_from_north, self.antenna_x_m, self.antenna_y_m, self.component)
+        return any(one is not None for one in given)
 
     @model_validator(mode="after")
     def _gain_is_something(self) -> "SignalColumn":
@@ -210,7 +210,7 @@ def split_components(signals: Any) -> Any:
     if missing := [key for key in ("north", "east") if key not in course]:
         raise ValueError(f"course: {missing[0]} is missing: it needs both velocities")
     if SPEED in signals or "column" in course:
-        raise ValueError("course: north and east tell the speed too: leave the other columns out")
+        raise ValueError("course: north and east give the speed too: leave the other columns out")
     shared = {key: value for key, value in course.items() if key not in {"north", "east"}}
     return {
         **signals,
@@ -229,7 +229,7 @@ def require_satellites(signals: Named[str, SignalColumn]) -> None:
         return
     if course.component is None and course.clockwise_from_north is None:
         raise ValueError(
-            "signals.course: say whether it is clockwise_from_north = true, as receivers tell it, "
+            "signals.course: say whether it is clockwise_from_north = true, as receivers give it, "
             "or false, counterclockwise from east"
         )
     if course.antenna_x_m is None or course.antenna_y_m is None:
@@ -278,7 +278,7 @@ class TimeBase(Config):
     date: DateColumn | None = added(None)
     rate_hz: Annotated[float, Field(ge=1, le=100_000)] | None = None
     epoch: bool = added(False)
-    """Numbers are counted from 1970, in UTC, so that they tell the date."""
+    """Numbers are counted from 1970, in UTC, so that they have the date."""
     zone: str | None = added(None)
     """Where the clock of timestamps without a zone stands, such as `Europe/Berlin`."""
     assumed: bool = added(False)
@@ -336,7 +336,7 @@ class TimeBase(Config):
 
     @property
     def is_dated(self) -> bool:
-        """Whether times can tell the day."""
+        """Whether times have the date."""
         if self.unit is not None or self.rate_hz is not None:
             return self.epoch
         if self.date is not None:
@@ -357,7 +357,7 @@ class TimeBase(Config):
 def as_moments(text: pl.Expr, timestamp_format: str) -> pl.Expr:
     """Return texts as timestamps, null where they are none.
 
-    Polars warns of `%f` with the place in our code; what comes of a wrong one, ingest tells.
+    Polars warns of `%f` with the place in our code; what comes of a wrong one, ingest reports.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", pl.exceptions.ChronoFormatWarning)

@@ -53,7 +53,7 @@ class Draft:
     questions: dict[str, Guess]
     """Those with doubts, or with rivals."""
     drive: dict[str, dict[str, str]]
-    """The columns that tell cars and trips apart, by key of `[drive]`."""
+    """The columns that identify cars and trips, by key of `[drive]`."""
     open_questions: tuple[str, ...]
     """What looks wrong in what it makes of the file, or why it makes nothing."""
 
@@ -143,7 +143,7 @@ def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
     for name in headings(profile.profiles, taken) if COURSE not in guesses else ():
         yield (
             f"{shown(name)}: is it where the car points, or where it goes? If a satellite receiver "
-            f"tells it from motion: course = {{ column = {_value(name)}, "
+            f"derives it from motion: course = {{ column = {_value(name)}, "
             'unit = "deg", clockwise_from_north = true, antenna_x_m = ..., antenna_y_m = ... }, '
             "with satellite_speed beside it. A heading says nothing of side-slip."
         )
@@ -154,7 +154,7 @@ def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
         )
     if {"vx", "vy"} <= set(guesses) and "sideslip" not in guesses:
         yield (
-            "there is no side-slip angle, and vx and vy tell it if they are a sensor's: [label] "
+            "there is no side-slip angle, and vx and vy give it if they are a sensor's: [label] "
             "from_velocities = true, sensor_x_m = ... before the centre of gravity."
         )
     elif "sideslip" in guesses:
@@ -185,7 +185,10 @@ def as_mapping(
         signals[COURSE] |= {"antenna_x_m": 0.0, "antenna_y_m": 0.0}
     formats = profile.formats
     given: dict[str, Any] = {"csv": formats.csv, "can": formats.can, "duckdb": formats.duckdb}
-    drive = {**_STAND_IN, **{key: told.get("drive", told) for key, told in drive_keys.items()}}
+    drive = {
+        **_STAND_IN,
+        **{key: source.get("drive", source) for key, source in drive_keys.items()},
+    }
     given |= {"missing": profile.absent.texts, "drive": drive}
     return Mapping.model_validate({"name": "draft", "time": time.keys, "signals": signals, **given})
 
@@ -251,7 +254,7 @@ def name_of(stem: str) -> str:
 
 
 def write_draft(draft: Draft, name: str, place: Path | str | None = None) -> str:
-    """Return a mapping in TOML. It lacks what the file does not tell: the day, the car.
+    """Return a mapping in TOML. It lacks what the file does not contain: the day, the car.
 
     `place` is what a person calls the file, if that is not where it was read.
     """
@@ -334,8 +337,8 @@ def _line(name: str, guess: Guess, guesses: dict[str, Guess]) -> str:
     if guess.component:
         east = guesses[SPEED].column
         keys = {"north": keys["column"], "east": east, "unit": keys["unit"]}
-    told = ", ".join(f"{key} = {_value(value)}" for key, value in keys.items())
-    return f"{name} = {{ {told} }}"
+    text = ", ".join(f"{key} = {_value(value)}" for key, value in keys.items())
+    return f"{name} = {{ {text} }}"
 
 
 def _in_other_units(guess: Guess) -> Iterator[Guess]:
@@ -351,6 +354,6 @@ def _table(name: str, keys: dict[str, Any]) -> str:
 def _value(value: object) -> str:
     """Return a TOML value; its strings are those of JSON."""
     if isinstance(value, dict):
-        told = ", ".join(f"{key} = {_value(one)}" for key, one in value.items())
-        return f"{{ {told} }}"
+        text = ", ".join(f"{key} = {_value(one)}" for key, one in value.items())
+        return f"{{ {text} }}"
     return json.dumps(value, ensure_ascii=False)

@@ -115,7 +115,7 @@ class DriveCutter:
     def _isolated(
         self, rows: pl.DataFrame, *, last: bool
     ) -> tuple[BoolArray, BoolArray, FloatArray]:
-        """Return which rows are isolated, which wait for the next, and which row tells that."""
+        """Return which rows are isolated, which wait for the next, and which row shows that."""
         group, time = rows["group"].to_numpy(), rows["time"].to_numpy()
         first, end = _ends(group)
         before = np.concatenate([[np.nan], time[:-1]])
@@ -129,7 +129,7 @@ class DriveCutter:
             waiting[end] = alone[end]
             alone[end] = False
         self._state["last"][group[end]] = np.where(waiting[end], before[end], time[end])
-        # Of several time bases only times tell what comes first.
+        # Of several time bases only times show what comes first.
         number = time if "base" in rows.columns else rows["row"].to_numpy().astype(np.float64)
         known_at = np.concatenate([number[1:], [np.inf]])
         known_at[end] = np.inf
@@ -140,7 +140,7 @@ class DriveCutter:
     ) -> tuple[pl.DataFrame, FloatArray]:
         """Return the rows with their parts, and the latest time of its stretch before each.
 
-        Ended parts are told in the order in which it becomes known that they have ended.
+        Ended parts are listed in the order in which it becomes known that they have ended.
         """
         group, time, seen = rows["group"].to_numpy(), rows["time"].to_numpy(), self._state
         first, end = _ends(group)
@@ -380,7 +380,7 @@ class MeasuredDrive:
 
     @cached_property
     def counts_digest(self) -> str:
-        """What tells it by its counts."""
+        """Fingerprint of its counts."""
         car, day = str(self.metadata["vehicle_id"]), str(self.metadata["day"])
         return digest_drive(car, day, self.ticks, self.counts)
 
@@ -521,7 +521,7 @@ def _metadata(
     known = {key: value for key, value in given.items() if not isinstance(value, FromColumn)}
     if given["day"] is None:  # then time is in timestamps, or those of the file's own clock
         if mapping.time.own_clock and start_s < _EARLIEST_S:
-            raise InputError("its clock does not tell the date. Give it in the mapping: drive.day.")
+            raise InputError("its clock has no date. Give it in the mapping: drive.day.")
         known["day"] = date.fromordinal(_EPOCH.toordinal() + int(start_s // _SECONDS_PER_DAY))
     known |= {key: value for key, value in of_drive.items() if key in given or key in _FROM_FILE}
     dated = mapping.time.is_dated and start_s >= _EARLIEST_S

@@ -80,7 +80,7 @@ class Guess:
 
     @property
     def is_without_unit(self) -> bool:
-        """Whether nothing but the values tell the unit."""
+        """Whether the unit is inferred from the values alone."""
         return any(reason.startswith(NO_UNIT) for reason in self.reasons)
 
     def because(self, reason: str, **keys: Any) -> "Guess":
@@ -260,7 +260,7 @@ def _keys_of_values(signal: str, largest: float) -> dict[str, Any]:
     return {"unit": small if largest < limit else large}
 
 
-# Guesses where the times of a log are, and which columns tell its cars and trips apart.
+# Guesses where the times of a log are, and which columns identify its cars and trips.
 
 _UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
 _STEPS = ((0.5, "s"), (500.0, "ms"), (500_000.0, "us"), (np.inf, "ns"))
@@ -279,7 +279,7 @@ class TimeGuess:
     reason: str
     rate_hz: float | None
     day: date | None = None
-    """What times tell of it; None if they tell nothing, or each drive's own."""
+    """The date that times have; None without one, or if each drive has its own."""
 
 
 def guess_cars(profiles: Iterable[Profile]) -> tuple[dict[str, dict[str, str]], NDArray[np.int64]]:
@@ -388,11 +388,11 @@ def _numbers(one: Profile, values: FloatArray) -> TimeGuess:
         return TimeGuess(clock, "it counts hours, minutes and seconds of the day", rate_hz)
     step = float(np.median(np.diff(present)))
     ends = parts_of(name)[-1]
-    told = _UNITS.get((one.channel.unit or in_brackets).lower()) or _UNITS.get(ends)
+    named = _UNITS.get((one.channel.unit or in_brackets).lower()) or _UNITS.get(ends)
     since_1970 = [u for u, s in _SECONDS.items() if _EPOCH_S[0] < present[0] * s < _EPOCH_S[1]]
-    unit = told or (since_1970[0] if since_1970 else _unit_of_step(step))
+    unit = named or (since_1970[0] if since_1970 else _unit_of_step(step))
     reason = f"its name, it goes on in steps of {step:g}" + (
-        f", its unit is {told}" if told else ""
+        f", its unit is {named}" if named else ""
     )
     rate_hz = sample_rate_hz(present * _SECONDS[unit])
     keys: dict[str, Any] = {"column": one.channel.name, "unit": unit}
@@ -425,7 +425,7 @@ def _gaps(rate_hz: float | None) -> dict[str, float]:
 # Chooses the units that a file does not say, those of all signals together, by how a car moves.
 #
 # The relations are products: the lateral acceleration is yaw rate times speed, so a wrong unit
-# shows as a factor of 3.6, 9.8 or 57, and which signals share it tells whose it is.
+# shows as a factor of 3.6, 9.8 or 57, and which signals share it shows whose it is.
 
 _UNLIKELY = 0.7
 """What it costs not to take the unit that the largest value suggests."""
@@ -451,12 +451,12 @@ def choose_units(guesses: dict[str, Guess], drive: Signals) -> dict[str, Guess]:
     names = {name for one in related for name in (*one.powers, by)}
     found = dict(guesses)
     for group in groups:
-        # A car's speed in km/h is that of a faster one in m/s: the largest value does not tell.
+        # A car's speed in km/h is that of a faster one in m/s: the largest value does not show it.
         is_speed = catalogue()[group[0]].unit == "m/s" or group[0] in WHEELS
         if is_speed and group != [SPEED] and not set(group) & names:
             units = " or ".join(keys["unit"] for keys in unit_choices(guesses[group[0]]))
             for name in group:
-                found[name] = found[name].doubted(f"nothing tells whether it is in {units}")
+                found[name] = found[name].doubted(f"nothing shows whether it is in {units}")
     if not related or not groups:
         return found
     choices = itertools.product(*(unit_choices(guesses[group[0]]) for group in groups))

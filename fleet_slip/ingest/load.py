@@ -154,7 +154,7 @@ def ingest_files(
     unless it is to be replaced: then `take_out` takes it out in the same commit. `progress` counts
     bytes of each file that this process reads.
 
-    Errors of files come at the end: `failures` takes them, or `InputError` tells of all, or
+    Errors of files come at the end: `failures` takes them, or `InputError` names all, or
     `RepeatedError` where all are there already. Raises `ClusterError` for files that workers died
     of.
     """
@@ -235,7 +235,7 @@ def _finished(warehouse: Warehouse, one: WrittenFile, *, is_new: bool) -> Ingest
 
 
 def joined(failures: list[InputError]) -> InputError:
-    """Return one error that tells of all."""
+    """Return one error that names all."""
     if len(failures) == 1:
         return failures[0]
     first = " ".join(map(str, failures[:FAILURES_SHOWN]))

@@ -43,14 +43,14 @@ _LIMITS = {
 _STANDING = {**dict.fromkeys(WHEELS, 2 / RADIUS_M), "vx": 2.0, "vehicle_speed": 2.0}
 """A speed below, as any 0, is that of a car that stands, or of a sensor lost for a while."""
 FEWEST_JUMPS, FEWEST_A_MINUTE = 10, 3.0
-MOST_TOLD = 0.15
+MOST_SINGLE = 0.15
 """Where more neighbours than this part jump, these are no single values that went wrong."""
 OVERLAP_S = 1.0
 MOST_NAMES, LEAST_ROWS_A_NAME = 1000, 20
 
 
 class LogFaults:
-    """What looks wrong in one log, of whose drives it is told one by one."""
+    """What looks wrong in one log, whose drives are added one by one."""
 
     def __init__(self, file: Path, mapping: Mapping) -> None:
         """Begin without drives."""
@@ -74,10 +74,10 @@ class LogFaults:
     ) -> Iterator[Fault]:
         """Yield what looks wrong, once all drives were looked at; see `find_refusals`."""
         yield from find_refusals(refused, rows, reasons)
-        remedy = "Map the column that tells cars or trips apart."
+        remedy = "Map the column that identifies the car or trip."
         for name, jumps in self._jumps.most_common(1):
             if jumps:
-                figure = f"from row to row it jumps {jumps:,} times as that of no car does"
+                figure = f"{jumps:,} jumps from row to row are larger than any car can make"
                 yield Fault("cars", (name,), figure, remedy)
         twice = sum(_overlaps(under_way) for under_way in self._under_way.values())
         if twice:
@@ -113,14 +113,14 @@ def find_refusals(
     if reason.startswith(_OF_TIME):
         remedy = "Check the column of times, its unit and its format"
         if reason in {"time_duplicate", "time_backwards"}:
-            remedy += ", and map the column that tells cars or trips apart if there are several"
+            remedy += ", and map the column that identifies the car or trip if there are several"
         yield Fault("values", ("time",), figure, f"{remedy}.")
     else:
         yield Fault("values", ("rows",), figure, "Look at the view quarantine.")
 
 
 def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]:
-    """Yield columns named as cars or trips are that tell rows apart, and that a mapping passes by.
+    """Yield columns named as cars or trips are of several values, and that a mapping passes by.
 
     `drives` is what the file fell into. Logs that have clocks of their own are those of one car.
     """
@@ -173,9 +173,9 @@ def _count_jumps(name: str, time_s: FloatArray, values: FloatArray) -> int:
     if time_s.size < FEWEST_JUMPS or not time_s[-1] > time_s[0]:
         return 0
     if np.count_nonzero(np.abs(np.diff(values)) > _LIMITS[name][0]) < FEWEST_JUMPS:
-        return 0  # of most drives this tells it, at a third of the cost of all below
+        return 0  # for most drives this is enough, at a third of the cost of all below
     jumps = _jumps(name, time_s, values)
-    if jumps.sum() < max(FEWEST_JUMPS, MOST_TOLD * jumps.size):  # values that are wrong alone
+    if jumps.sum() < max(FEWEST_JUMPS, MOST_SINGLE * jumps.size):  # values that are wrong alone
         alone = np.zeros(values.size, dtype=np.bool_)
         alone[1:-1] = jumps[:-1] & jumps[1:]
         jumps = _jumps(name, time_s[~alone], values[~alone])

@@ -142,7 +142,7 @@ def _read(opened: PartBases, stretches: list[_Stretch]) -> Iterator[pl.DataFrame
 def read_batches(log: Path, mapping: Mapping, meter: Meter | None = None) -> Iterator[pl.DataFrame]:
     """Yield the columns of a log that a mapping uses, in its order, in bounded batches.
 
-    Rows of several time bases come as `merge_bases` says. The meter is told how many rows come.
+    Rows of several time bases come as `merge_bases` says. The meter gets how many rows come.
     Raises `InputError` if a file cannot be read, or a column is missing or ambiguous.
     """
     meter = meter or Meter()
@@ -429,13 +429,13 @@ def _explain(bad: pl.DataFrame, fields: list[Field]) -> pl.DataFrame:
 RADIUS_M = 0.31
 """Of a wheel whose mapping names none; a tenth more moves the correction by a tenth."""
 LEAST_SPEED_MPS = 2.0
-"""Below it two velocities tell no angle, and an angle is not moved."""
+"""Below it two velocities give no angle, and an angle is not moved."""
 
 
 def physical(counts: Named[str, pa.Array], name: str) -> FloatArray:
     """Return a signal in SI units, NaN where there is none."""
-    told = pl.Series(counts[name]).cast(pl.Float64).fill_null(float("nan")).to_numpy()
-    return np.asarray(told * float(catalogue()[name].scale))
+    values = pl.Series(counts[name]).cast(pl.Float64).fill_null(float("nan")).to_numpy()
+    return np.asarray(values * float(catalogue()[name].scale))
 
 
 def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.Array]:

@@ -50,10 +50,10 @@ SPEEDS = ("vx", "vehicle_speed")
 
 
 class LabelSensor(Config):
-    """The sensor that tells side-slip: its place, and whether it tells velocities or the angle.
+    """The sensor of side-slip: its place, and whether it measures velocities or the angle.
 
     A car that turns drives sideways before and behind its centre of gravity, so that an optical
-    sensor on the rear bumper tells another angle.
+    sensor on the rear bumper measures another angle.
     """
 
     from_velocities: bool = False
@@ -184,7 +184,7 @@ class Mapping(Config):
         dict[str, SignalColumn], BeforeValidator(split_components), Field(min_length=1)
     ]
     label: LabelSensor | None = added(None)
-    """Where the label's sensor is, and whether it tells two velocities instead of an angle."""
+    """Where the label's sensor is, and whether it measures two velocities instead of an angle."""
     where: tuple[RowCondition, ...] = added(())
     """Conditions that a row meets, all of them, or is left out and only counted; also as text."""
     vehicles: tuple[VehicleFacts, ...] | Name = added(())

@@ -94,7 +94,7 @@ def _regularity(lines: list[str], separator: str) -> tuple[float, bool, float, i
 
 
 def _header_and_data(rows: list[list[str]]) -> tuple[int, int]:
-    """Return the places of the header and of the first line of data; 0 and 1 if nothing tells.
+    """Return the places of the header and of the first line of data; 0 and 1 if they are not clear.
 
     Above the data are lines of as many fields, the first of which is the header; a blank line or a
     title in brackets may be between.
@@ -125,8 +125,8 @@ def _units(header: list[str], between: list[list[str]]) -> dict[str, str]:
     """Return the units of columns, from a line of as many fields in which one is a unit."""
     for row in between:
         if len(row) == len(header) and any(unit_called(field) for field in row):
-            told = zip(header, row, strict=True)
-            return {name.strip(): unit.strip(" []()") for name, unit in told}
+            pairs = zip(header, row, strict=True)
+            return {name.strip(): unit.strip(" []()") for name, unit in pairs}
     return {}
 
 
@@ -188,7 +188,7 @@ def without_absent(values: FloatArray, absent: Absent) -> FloatArray:
 MOST_ROWS = 200_000
 """Rows of each time base that are looked at."""
 _LOOKED_AT = 200
-"""Texts that tell whether a column has times, and of which format."""
+"""Texts that show whether a column has times, and of which format."""
 
 
 @dataclass(frozen=True)
@@ -254,8 +254,8 @@ def profile_file(file: Path, formats: FileFormats) -> FileProfile:
             source.bases([channel.name for channel in channels])
         bases: dict[str, list[Channel]] = defaultdict(list)
         for channel in channels:
-            told = replace(channel, unit=channel.unit or units.get(channel.name, ""))
-            bases[channel.base].append(told)
+            known = replace(channel, unit=channel.unit or units.get(channel.name, ""))
+            bases[channel.base].append(known)
         refused: list[str] = []
         found = tuple(
             p for of in bases.values() for p in _profile_base(source, of, formats.csv, refused)

@@ -203,7 +203,7 @@ class KnownFiles:
         return cls(cache)
 
     def without_landed(self, files: Iterable[Log], warehouse: Warehouse) -> list[Log]:
-        """Return the files that are not in the logs, as far as size and time of change tell."""
+        """Return the files that are not in the logs, as far as size and time of change show."""
         landed = warehouse.logs.snapshot().landed_among(len(self.digests))
 
         def is_there(file: Log) -> bool:

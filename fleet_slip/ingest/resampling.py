@@ -17,7 +17,7 @@ from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.ingest.columns import SignalColumn
 
-# Which fixes of a satellite receiver tell where the car goes, and at which ticks.
+# Which fixes of a satellite receiver show where the car goes, and at which ticks.
 
 STEP_S = float(SAMPLE_TIME_S)
 SAME_RAD = 1e-6
@@ -42,8 +42,8 @@ LONGEST_BESIDE = 5
 def is_held(course: FloatArray, yaw_rate: FloatArray, place: IntArray) -> BoolArray:
     """Return which fixes repeat a course from before the car turned on.
 
-    Receivers hold the course when they are slow, or tell it less often than the speed. `place` says
-    at which tick each fix is; `course` is of the fixes, and `yaw_rate` of the ticks.
+    Receivers hold the course when they are slow, or report it less often than the speed. `place`
+    says at which tick each fix is; `course` is of the fixes, and `yaw_rate` of the ticks.
     """
     if not course.size:
         return np.zeros(0, dtype=np.bool_)
@@ -60,7 +60,7 @@ def is_backwards(
     """Return at which fixes the car drives backwards: it is pushed to the outside of its bend.
 
     The lateral acceleration is the yaw rate times the forward speed, here by least squares over the
-    second around a fix. Straight on it does not tell, and the course is right all the same.
+    second around a fix. Straight on it does not show it, and the course is right all the same.
     """
     second = np.ones(2 * round(0.5 / STEP_S) + 1)
     if not place.size:
@@ -142,7 +142,7 @@ TIME_EPSILON_S = 1e-6
 """Times that differ by less are equal: a float64 of seconds since 1970 resolves 0.24 µs."""
 
 LEAST_SPEED_MPS = 2.0
-"""Below, receivers freeze the course or tell noise."""
+"""Below, receivers freeze the course or report noise."""
 
 
 def choose_method(time_s: FloatArray, interval_s: float) -> Method:

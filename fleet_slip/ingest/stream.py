@@ -135,7 +135,7 @@ class MeasuredStream:
         """Return the first blocks, and the usual time between samples of each time base in them.
 
         It is that of rows up to a number that is the same however a file is cut into blocks. Of a
-        time base that is not among them, its first drive tells it.
+        time base that is not among them, its first drive gives it.
         """
         early: list[CheckedBlock] = []
         enough = RATE_ROWS
@@ -316,7 +316,7 @@ def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
 
 
 def _reach(blocks: list[CheckedBlock]) -> int:
-    """Return how many rows tell the usual time; of several bases good ones are counted."""
+    """Return of how many rows the usual time can be taken; of several bases, of good ones."""
     if "base" in blocks[-1].rows.columns:
         return sum(block.rows.height for block in blocks)
     return blocks[-1].read

@@ -37,7 +37,7 @@ MOST_LAG, FAR_LAG = 50, 150
 HALF_CHANGE = 25
 """The lateral velocity changes over twice so many ticks: the label's noise matters less."""
 EACH = 5
-"""Of what is that smooth, each fifth tick tells as much."""
+"""Of what is that smooth, each fifth tick is enough."""
 
 LEAST_EXPLAINED = 0.6
 """Where accelerations explain less of the change of lateral velocity, they are no witness."""
@@ -181,7 +181,7 @@ def course_fault(signals: "Signals") -> Fault | None:
     slope, correlation = slope_of(
         change, turned[SECOND:] - turned[:-SECOND], np.ones(change.size, dtype=np.bool_)
     )
-    if (slope, correlation) != (1.0, 0.0):  # else it is too little to tell
+    if (slope, correlation) != (1.0, 0.0):  # else it is too little to judge
         figure = f"over a second it changes by {slope:+.2f} times what the yaw rate adds up to"
         if correlation < -LEAST_CORRELATION:
             remedy = "Turn clockwise_from_north, or swap north and east."
@@ -205,7 +205,9 @@ def _of_fixes(signals: "Signals") -> Fault | None:
     if own >= LEAST_OF_THEIR_OWN:
         return None
     figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of backwards"
-    return Fault("values", (COURSE,), figure, "They are left out. Map it as the receiver tells it.")
+    return Fault(
+        "values", (COURSE,), figure, "They are left out. Map it as the receiver reports it."
+    )
 
 
 def _of_relation(relation: CourseRelation | None) -> Fault | None:
@@ -254,7 +256,7 @@ def find_one_sided(
 ) -> Iterator[tuple[str, str]]:
     """Yield the signals that never change their sign, and the figure that shows it.
 
-    `moving` are the ticks to look at, None for all. Nothing is said of a car whose rear wheels tell
+    `moving` are the ticks to look at, None for all. Nothing is said of a car whose rear wheels show
     that it does turn to one side, as on an oval.
     """
     if {"wheel_rl", "wheel_rr"} <= set(signals) and _side(
@@ -362,12 +364,12 @@ def _still(signals: Signals) -> Iterator[Fault]:
 
 
 def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Fault]:
-    """Compare the signs of all that tells left from right, and both accelerations with the turns.
+    """Compare the signs of all that is positive to the left, and both accelerations with the turns.
 
     The checks are those of Gram rows, here of the rows in which the car moves.
     """
-    told = {"ax", *(name for parts in WITNESSES.values() for name in parts)}
-    some = {name: values for name, values in signals.items() if name in told}
+    names = {"ax", *(name for parts in WITNESSES.values() for name in parts)}
+    some = {name: values for name, values in signals.items() if name in names}
     if not some:
         return
     rows = moving(speed) & np.isfinite(list(some.values())).all(axis=0)
@@ -414,7 +416,7 @@ def relations(signals: Signals, speed: FloatArray) -> Iterator[SignalRelation]:
     yaw_rate, ay = signals.get("yaw_rate"), signals.get("ay")
     if yaw_rate is not None and {"wheel_rl", "wheel_rr"} <= set(signals):
         turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M
-        yield relate_to(turn, yaw_rate, {"yaw_rate": 1}, -1, "what the rear wheels tell")
+        yield relate_to(turn, yaw_rate, {"yaw_rate": 1}, -1, "the yaw rate of the rear wheels")
     if yaw_rate is not None and ay is not None:
         powers = {"ay": 1, "yaw_rate": -1}
         yield relate_to(yaw_rate * speed, ay, powers, -1, "yaw rate times speed")
@@ -439,7 +441,7 @@ def relations(signals: Signals, speed: FloatArray) -> Iterator[SignalRelation]:
 
 
 def _scales_differ(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
-    """Compare the size of signals with that of others that tell the same; and the sign of `ax`."""
+    """Compare the size of signals with that of others of the same; and the sign of `ax`."""
     for one in relations(signals, speed):
         names = tuple(one.powers)
         low, high = _SOUND_RATIOS.get(names[0], (0.4, 2.5))
@@ -508,7 +510,7 @@ def _lever(signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool)
 
     Turning slowly it is the distance to the rear axle times the yaw rate over the speed, less what
     the rear tyres slip, and 0 on a straight (Milliken and Milliken, Race Car Vehicle Dynamics,
-    chapter 5). The same fit of the road wheels tells the wheelbase, which is longer. At one speed
+    chapter 5). The same fit of the road wheels gives the wheelbase, which is longer. At one speed
     the two inputs are one, and nothing is said.
     """
     label = catalogue().label

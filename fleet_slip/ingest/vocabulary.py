@@ -20,15 +20,15 @@ _NUMBERING = {"id", "nr", "no", "num", "number", "nummer", "name", "code"}
 def vocabulary() -> dict[str, Any]:
     """Return the words by section, those of wheels at each corner under `signals`."""
     text = (files(__package__) / "vocabulary.toml").read_text(encoding="utf-8")
-    told = tomllib.loads(text)
-    wheels = told["wheels"]
+    words = tomllib.loads(text)
+    wheels = words["wheels"]
     for corner in CORNERS:
         places = [f"{word} {alias}" for word in wheels["words"] for alias in wheels[corner]]
-        told["signals"][f"wheel_{corner}"] = places
-        told["never"][f"wheel_{corner}"] = told["never"]["wheels"]
+        words["signals"][f"wheel_{corner}"] = places
+        words["never"][f"wheel_{corner}"] = words["never"]["wheels"]
     for corner in ("fl", "fr"):
-        told["signals"][f"steer_{corner}"] = [f"steer {alias}" for alias in wheels[corner]]
-    return told
+        words["signals"][f"steer_{corner}"] = [f"steer {alias}" for alias in wheels[corner]]
+    return words
 
 
 def parts_of(name: str) -> list[str]:
@@ -46,9 +46,9 @@ def split_unit(name: str) -> tuple[str, str]:
 @lru_cache(maxsize=2**10)
 def unit_called(text: str) -> str | None:
     """Return a unit as a mapping writes it, None for what is not known."""
-    told = text.strip().strip("[]()<>{} ").lower().replace("·", "*")
+    plain = text.strip().strip("[]()<>{} ").lower().replace("·", "*")
     called = {alias: unit for unit, aliases in vocabulary()["units"].items() for alias in aliases}
-    return called.get(told)
+    return called.get(plain)
 
 
 @lru_cache(maxsize=2**10)

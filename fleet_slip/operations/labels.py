@@ -1,7 +1,7 @@
 """Days and files whose labels have another factor, or another zero, than all others.
 
 In one drive the car, its tyres and the road hide a label that is half as large again. But a mapping
-or a logger that changes does so for many cars at once: the median over the drives of a day tells
+or a logger that changes does so for many cars at once: the median over the drives of a day shows
 what none of them does. So each drive's label is compared with what the relation of all drives
 predicts, and the medians of a day, and of a file, with those of all others. Where the road is icy
 or all cars are laden, medians differ as well, by less than `FACTOR` and `LEAST_OFFSET`.
@@ -51,7 +51,7 @@ def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> d
     if gains is None:
         return {}
     return {
-        int(drive): Fault("reversed", (label,), f"gain {gain:.3f} on what the others tell")
+        int(drive): Fault("reversed", (label,), f"gain {gain:.3f} on the prediction of the others")
         for drive, gain in zip(drives.rows, gains, strict=True)
         if gain < REVERSED_GAIN
     }

@@ -245,9 +245,9 @@ def _unlike_peers(
     table: GramTable, group: BoolArray, in_order: BoolArray, limits: QualityThresholds
 ) -> dict[int, Fault]:
     """Return the faults of the drives of a group that are not as the others of it."""
-    members = table.take(group)
-    peers, suspects = settle(members, in_order[group], catalogue().label, limits)
+    peers_table = table.take(group)
+    peers, suspects = settle(peers_table, in_order[group], catalogue().label, limits)
     if not suspects.any():
         return {}
-    faults = peers.explain(DriveBatches.of(members, suspects))
+    faults = peers.explain(DriveBatches.of(peers_table, suspects))
     return dict(zip(np.flatnonzero(group)[suspects].tolist(), faults, strict=True))

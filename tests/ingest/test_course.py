@@ -145,7 +145,7 @@ def test_a_course_comes_with_speed_and_yaw_rate() -> None:
         some = {name: column for name, column in ANGLE.items() if name != needed}
         with pytest.raises(ValidationError, match=f"it needs {needed} beside it"):
             a_mapping(signals=some)
-    with pytest.raises(ValidationError, match="tell the speed too"):
+    with pytest.raises(ValidationError, match="give the speed too"):
         a_mapping(signals={**VELOCITIES, "satellite_speed": ANGLE["satellite_speed"]})
     with pytest.raises(ValidationError, match="name the column of the file"):
         a_mapping(signals=VELOCITIES, where="satellite_speed > 5 m/s")
