@@ -254,7 +254,9 @@ def test_a_number_of_folds_that_cannot_be_is_named(
     assert f"error: folds = {asked}: choose a number from 2 to 1000" in done.stderr
 
 
-@pytest.mark.parametrize("extra", [(), pytest.param(("--rank", "t"), marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "extra", [("--models", "table1"), pytest.param(("--rank", "t"), marks=pytest.mark.long)]
+)
 def test_as_many_folds_as_drives_leave_out_each(
     run_command: RunCommand, every_set: Path, extra: tuple[str, ...]
 ) -> None:

@@ -309,6 +309,13 @@ TAKING_AWAY: dict[str, Callable[[Fleet], int]] = {
 }
 
 
+def ways(*usual: str) -> list[Any]:
+    """Return all ways to take something away; others than the usual ones are for long runs."""
+    return [
+        way if way in usual else pytest.param(way, marks=pytest.mark.long) for way in TAKING_AWAY
+    ]
+
+
 def corrected() -> Mapping:
     turned = {"column": "beta", "unit": "deg", "negate": True}
     return a_mapping(drive=LAPS, signals={**SIGNALS, "sideslip": turned})
@@ -327,7 +334,7 @@ def laps(tmp_path: Path) -> Fleet:
 
 
 @pytest.mark.parametrize("table", ["quarantine", "logs"])
-@pytest.mark.parametrize("way", TAKING_AWAY)
+@pytest.mark.parametrize("way", ways("undo", "forget a name"))
 def test_what_replaced_a_file_meanwhile_goes_with_it(
     laps: Fleet, way: str, table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -342,7 +349,7 @@ def test_what_replaced_a_file_meanwhile_goes_with_it(
     assert not laps.verify(full=True).damage
 
 
-@pytest.mark.parametrize("way", TAKING_AWAY)
+@pytest.mark.parametrize("way", ways("undo", "forget the file"))
 def test_what_is_taken_away_while_it_is_replaced_is_not_doubled(
     laps: Fleet, way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -355,7 +362,7 @@ def test_what_is_taken_away_while_it_is_replaced_is_not_doubled(
     assert not laps.verify(full=True).damage
 
 
-@pytest.mark.parametrize("way", TAKING_AWAY)
+@pytest.mark.parametrize("way", ways("undo", "forget the file"))
 def test_what_was_superseded_is_no_drive(laps: Fleet, way: str, tmp_path: Path) -> None:
     laps.gram()
     laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
