@@ -41,23 +41,21 @@ def data_needed() -> int:
 
 def require_limits() -> None:
     """Raise `StorageError` under limits of the shell that libraries do not survive."""
-    needed = LIBRARIES_BYTES + THREAD_BYTES * len(os.sched_getaffinity(0))
-    allowed, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if allowed != resource.RLIM_INFINITY and allowed < needed:
-        raise StorageError(
-            f"this process may have {allowed // 2**20:,} MiB of address space and needs "
-            f"{needed // 2**20:,} MiB, most of it reserved and never used. Raise the limit: "
-            f"ulimit -v {needed // 2**10}. To limit memory itself use a control group, such as "
-            "systemd's MemoryMax=."
-        )
+    address_space = LIBRARIES_BYTES + THREAD_BYTES * len(os.sched_getaffinity(0))
+    unused, silent = "most of it reserved and never used", "or its libraries end it without a word"
+    for kind, flag, needed, what, why in (
+        (resource.RLIMIT_AS, "-v", address_space, "address space", unused),
+        (resource.RLIMIT_DATA, "-d", data_needed(), "data", silent),
+    ):
+        allowed, _ = resource.getrlimit(kind)
+        if allowed != resource.RLIM_INFINITY and allowed < needed:
+            raise StorageError(
+                f"this process may have {allowed // 2**20:,} MiB of {what} and needs "
+                f"{needed // 2**20:,} MiB, {why}. Raise the limit: ulimit {flag} "
+                f"{needed // 2**10}. To limit memory itself use a control group, such as "
+                "systemd's MemoryMax=."
+            )
     data, _ = resource.getrlimit(resource.RLIMIT_DATA)
-    if data != resource.RLIM_INFINITY and data < data_needed():
-        raise StorageError(
-            f"this process may have {data // 2**20:,} MiB of data and needs "
-            f"{data_needed() // 2**20:,} MiB: with less its libraries end it without a word. "
-            f"Raise the limit: ulimit -d {data_needed() // 2**10}. To limit memory itself use a "
-            "control group, such as systemd's MemoryMax=."
-        )
     if data != resource.RLIM_INFINITY:
         # Else Arrow's allocator takes a GiB of it before anybody asks, and leaves none to others.
         os.environ.setdefault("MIMALLOC_ARENA_EAGER_COMMIT", "0")
