@@ -114,11 +114,17 @@ class _Client(Client):
 def _connect(address: str) -> Client:
     """Connect, again if Dask takes two first messages that came together for a fault."""
     usual_s = float(parse_timedelta(dask.config.get("distributed.comm.timeouts.connect")))
-    settings: Any = {"set_as_default": False, "name": "fleet-slip"}
+    connect: Callable[[], Client] = partial(
+        _Client,
+        address,
+        timeout=min(FIRST_S, usual_s),
+        set_as_default=False,
+        name="fleet-slip",
+    )
     for _ in range(CONNECT_ATTEMPTS - 1):
         with contextlib.suppress(AssertionError):
-            return _Client(address, timeout=min(FIRST_S, usual_s), **settings)
-    return _Client(address, timeout=min(FIRST_S, usual_s), **settings)
+            return connect()
+    return connect()
 
 
 @dataclass(frozen=True)
