@@ -106,9 +106,8 @@ class OpenedGrams:
     def course_delays(self, condition: Condition) -> Iterator[tuple[str, tuple[int, int]]]:
         """Yield cars with a course, and the least and largest delay of their Gram rows in ticks."""
         statement = self.statement("course_delays.sql", condition, turned=TURNED)
-        with asking(self.database, condition):
-            for car, least, largest in self.database.execute(statement).fetchall():
-                yield car, (least, largest)
+        for car, least, largest in self._rows(statement, condition):
+            yield car, (least, largest)
 
     @property
     def _batch_rows(self) -> int:
