@@ -1,7 +1,4 @@
-"""The linear model and the two observers on it: steady cornering, poles, convergence, symmetry."""
-
-from collections.abc import Callable
-from typing import Any
+"""The linear model of the two observers: steady cornering and poles."""
 
 import numpy as np
 import pytest
@@ -10,22 +7,13 @@ from hypothesis import strategies as st
 
 from benchmarks.rivals.observers import (
     ObserverPoles,
-    SlidingGains,
     gains,
-    luenberger,
-    sliding_mode,
     state_space,
 )
-from fleet_slip.arrays import FloatArray
-from fleet_slip.evaluation.single_track import STEP_S, DriveSignals
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.support.drives import axle_stiffness_n, rolling_drive, steady_sideslip_rad
+from tests.support.drives import axle_stiffness_n, steady_sideslip_rad
 
 CAR = load_vehicle("d_class_sedan")
-OBSERVERS: list[tuple[Callable[..., FloatArray], Any]] = [
-    (luenberger, ObserverPoles()),
-    (sliding_mode, SlidingGains()),
-]
 
 
 def steady_state(vx: float, steer: float) -> tuple[float, float]:
@@ -34,18 +22,6 @@ def steady_state(vx: float, steer: float) -> tuple[float, float]:
     a = np.array([[s.a11[0], s.a12[0]], [s.a21[0], s.a22[0]]])
     vy, rate = np.linalg.solve(a, -steer * np.array([s.b1[0], s.b2[0]]))
     return float(vy), float(rate)
-
-
-def linear_drive(vx: FloatArray, steer: FloatArray) -> tuple[DriveSignals, FloatArray]:
-    """Return what exact sensors read of the linear model, and its side-slip."""
-    s = state_space(CAR, vx)
-    vy, rate = np.zeros(len(vx)), np.zeros(len(vx))
-    vy[0], rate[0] = steady_state(vx[0], steer[0])
-    for k in range(len(vx) - 1):
-        vy_rate = s.a11[k] * vy[k] + s.a12[k] * rate[k] + s.b1[k] * steer[k]
-        yaw = s.a21[k] * vy[k] + s.a22[k] * rate[k] + s.b2[k] * steer[k]
-        vy[k + 1], rate[k + 1] = vy[k] + STEP_S * vy_rate, rate[k] + STEP_S * yaw
-    return rolling_drive(CAR, vx, vy, rate, steer), np.arctan2(vy, vx)
 
 
 @given(vx=st.floats(6, 45), steer=st.floats(-0.1, 0.1))
@@ -70,14 +46,3 @@ def test_gains_place_the_poles_at_every_speed(vx: float, p1: float, p2: float) -
     scale = np.abs(a).max() + p1 + p2
     expected = np.diag([-p1, -p2])
     np.testing.assert_allclose(a - gain @ c, expected, rtol=0, atol=1e-12 * scale)
-
-
-@pytest.mark.parametrize(("estimate", "parameters"), OBSERVERS)
-@pytest.mark.parametrize("vx", [8.0, 15.0, 30.0])
-def test_converges_to_steady_cornering(
-    estimate: Callable[..., FloatArray], parameters: Any, vx: float
-) -> None:
-    constant = np.ones(3000)
-    drive, _ = linear_drive(vx * constant, 0.02 * constant)
-    expected = steady_sideslip_rad(CAR, vx, drive.yaw_rate_rad_s[-1])
-    assert estimate(drive, CAR, parameters)[-1] == pytest.approx(expected, abs=1e-5)
