@@ -114,7 +114,7 @@ def tune(
     Each estimator's module lists its own as `TUNABLE`; "yaw_rate.gyro_std_rad_s" is a nested one.
     A compass finds the right valley, derivatives its bottom. Raises as `rmse_rad`.
     """
-    search = Search(estimator, names, drives, car, executor)
+    search = ParameterSearch(estimator, names, drives, car, executor)
     first, wide = search.descend(start), search.compass(start)
     last = search.descend(wide.parameters)
     evaluations = sum(one.evaluations for one in (first, wide, last))
@@ -123,7 +123,7 @@ def tune(
 
 
 @dataclass(frozen=True)
-class Search(Generic[P]):
+class ParameterSearch(Generic[P]):
     """Two ways to the positive parameters `names` with which an estimator errs least on drives."""
 
     estimator: Estimator[P]
@@ -404,7 +404,7 @@ def identify(measured: Measured, drives: Sequence[LabelledDrive], executor: Exec
 
     start = Fitted()
     car = measured.car(start)
-    found = Search(estimate, (*CAR, *NOISE), drives, car, executor).descend(start)
+    found = ParameterSearch(estimate, (*CAR, *NOISE), drives, car, executor).descend(start)
     car = measured.car(found.parameters)
     return Identified(car, found.parameters.noise, found.rmse_rad, drives=len(drives))
 

@@ -68,7 +68,7 @@ class Design:
 
 
 @dataclass(frozen=True)
-class MeasuredDrive:
+class HeldOutDrive:
     """A drive: its signals and label, each design's columns (rows, n), and the part of each row."""
 
     drive: LabelledDrive
@@ -105,9 +105,9 @@ def designs_of(
 
 def read_measured_drives(
     warehouse: Warehouse, names: Sequence[str], designs: Mapping[str, Design]
-) -> list[MeasuredDrive]:
+) -> list[HeldOutDrive]:
     """Read drives with their designs' columns. Raises `DataError` where none has a label."""
-    drives: list[MeasuredDrive] = []
+    drives: list[HeldOutDrive] = []
     cars: CarCounts = {}
     if any(design.plan.numbers for design in designs.values()):
         cars = calibrated_cars(warehouse)
@@ -132,7 +132,7 @@ def read_measured_drives(
                 else:
                     scales = np.array(one.scales)[:, None]
                     columns[model] = (DriveColumns(one.plan, counts).compute() * scales).T
-            drives.append(MeasuredDrive(drive, columns, np.full(len(rows), len(drives) % FOLDS)))
+            drives.append(HeldOutDrive(drive, columns, np.full(len(rows), len(drives) % FOLDS)))
     if not drives:
         raise DataError(
             "no drive of the cohort has side-slip, by which estimators are judged. Choose drives "
@@ -205,7 +205,7 @@ def evaluate_measured(
     }
 
 
-def _judged(one: MeasuredDrive, vehicle: VehicleParameters | None) -> BoolArray:
+def _judged(one: HeldOutDrive, vehicle: VehicleParameters | None) -> BoolArray:
     """Return the rows with a label where the car moves, by its wheel speeds."""
     labelled: BoolArray = np.isfinite(one.drive.sideslip_rad)
     if vehicle is None:
@@ -216,7 +216,7 @@ def _judged(one: MeasuredDrive, vehicle: VehicleParameters | None) -> BoolArray:
         return labelled
 
 
-def fit_left_out(drives: Sequence[MeasuredDrive], name: str, design: Design) -> list[FloatArray]:
+def fit_left_out(drives: Sequence[HeldOutDrive], name: str, design: Design) -> list[FloatArray]:
     """Estimate each part by least squares on the rows of the others."""
     if design.published is not None:
         return [one.columns[name][:, 0] for one in drives]
@@ -243,7 +243,7 @@ Known = tuple[str, Callable[[DriveSignals], FloatArray]]
 
 
 def _filtered(
-    drives: Sequence[MeasuredDrive], vehicle: VehicleParameters, executor: Executor
+    drives: Sequence[HeldOutDrive], vehicle: VehicleParameters, executor: Executor
 ) -> dict[str, tuple[str, list[FloatArray]]]:
     """Estimate each part by filters that are tuned, in cars identified, on the others."""
     found: dict[str, tuple[str, list[FloatArray]]] = {}

@@ -22,7 +22,7 @@ from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import find_config
 from fleet_slip.simulation.imperfections import NONE, Imperfections
-from fleet_slip.simulation.plan import Drawn, FleetPlan, GridPlan, TrialPlan
+from fleet_slip.simulation.plan import DriveDraw, FleetPlan, GridPlan, TrialPlan
 from fleet_slip.simulation.receivers import Receiver, Receivers
 from fleet_slip.simulation.roads import (
     Manoeuvre,
@@ -209,7 +209,7 @@ class Campaign(Config):
         drive_id, vehicle_id = self.name + of_day, self.name + of_plan
         drawn_as = self.base or self.name
         assignment = plan.assignment(
-            Drawn(
+            DriveDraw(
                 number,
                 self.sensors,
                 random_generator(self.seed, "car", drawn_as + of_plan),

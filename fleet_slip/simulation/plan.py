@@ -73,7 +73,7 @@ class CarOnRoad:
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DriveDraw:
     """From what a plan makes a drive: its number, its car's sensors, and generators of both.
 
     Since the campaign's beginning so many `days` have passed.
@@ -141,7 +141,7 @@ class GridPlan(Plan):
         """Return the car that drives the drive of this number: one for each vehicle and mass."""
         return self._combination(number) // math.prod(map(len, self._axes[2:]))
 
-    def assignment(self, drawn: Drawn) -> CarOnRoad:
+    def assignment(self, drawn: DriveDraw) -> CarOnRoad:
         """Return what the drive of this number is to be."""
         index = np.unravel_index(
             self._combination(drawn.number), [len(axis) for axis in self._axes]
@@ -209,7 +209,7 @@ class FleetPlan(DrawnPlan):
         """Return the car that drives the drive of this number."""
         return number % self.cars
 
-    def assignment(self, drawn: Drawn) -> CarOnRoad:
+    def assignment(self, drawn: DriveDraw) -> CarOnRoad:
         """Draw a car with worn tyres from one generator, and its drive from another."""
         of_car, of_drive = drawn.of_car, drawn.of_drive
         vehicle = self.vehicles[of_car.integers(len(self.vehicles))]
@@ -363,7 +363,7 @@ class TrialPlan(DrawnPlan):
         turn, within = divmod(number, self.other_every)
         return TESTED if within < self.other_every - 1 else 1 + turn % self.others
 
-    def assignment(self, drawn: Drawn) -> CarOnRoad:
+    def assignment(self, drawn: DriveDraw) -> CarOnRoad:
         """Draw a car from one generator and its drive from another, in a fixed order."""
         sensors, of_car, of_drive = drawn.sensors, drawn.of_car, drawn.of_drive
         vehicle = self.vehicles[0]

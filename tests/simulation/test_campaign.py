@@ -10,7 +10,7 @@ import pytest
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import Campaign, load_campaign
-from fleet_slip.simulation.plan import Drawn, GridPlan
+from fleet_slip.simulation.plan import DriveDraw, GridPlan
 from fleet_slip.simulation.roads import random_generator
 
 SMOKE = find_config("campaigns", "smoke").read_text(encoding="utf-8")
@@ -106,7 +106,7 @@ def test_grid_takes_every_combination_once_before_any_twice() -> None:
     sensors = load_campaign("waterford").sensors
     count = len(plan.lateral_mps2) * len(plan.speed_factor)
     none = random_generator(0)
-    taken = [plan.assignment(Drawn(n, sensors, none, none)) for n in range(2 * count)]
+    taken = [plan.assignment(DriveDraw(n, sensors, none, none)) for n in range(2 * count)]
     times = Counter((a.limits.lateral_mps2, a.speed_factor) for a in taken[:count])
     assert len(times) == count
     assert set(times.values()) == {1}

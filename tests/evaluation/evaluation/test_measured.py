@@ -14,7 +14,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.evaluation import ekf, filters, measured
 from fleet_slip.evaluation.identify import Fitted, Identified, Tuned
-from fleet_slip.evaluation.measured import Design, MeasuredDrive, accelerated, fit_left_out
+from fleet_slip.evaluation.measured import Design, HeldOutDrive, accelerated, fit_left_out
 from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.commands import done_on, run_on
@@ -26,12 +26,12 @@ LINE = Design(ColumnPlan.of(("ay",), {}, {}), (1.0,))
 NO_SIGNALS = DriveSignals(*[np.full(ROWS, np.nan)] * 11)
 
 
-def a_drive(number: int, part: int, *, shifted_rad: float = 0.0) -> MeasuredDrive:
+def a_drive(number: int, part: int, *, shifted_rad: float = 0.0) -> HeldOutDrive:
     ay = np.sin(np.arange(ROWS) / (20 + number))
     label: FloatArray = -ay / 200 + shifted_rad
     columns = {"line": ay[:, None]}
     drive = LabelledDrive(f"drive-{number}", NO_SIGNALS, label)
-    return MeasuredDrive(drive, columns, np.full(ROWS, part))
+    return HeldOutDrive(drive, columns, np.full(ROWS, part))
 
 
 def test_a_drive_is_estimated_by_what_never_saw_it() -> None:
@@ -45,7 +45,7 @@ def test_a_part_of_a_single_drive_is_estimated_by_the_others() -> None:
     whole = a_drive(0, 0)
     part = np.arange(ROWS) * 4 // ROWS
     label = np.where(part == 1, 1.0, whole.drive.sideslip_rad)
-    drive = MeasuredDrive(LabelledDrive("one", NO_SIGNALS, label), whole.columns, part)
+    drive = HeldOutDrive(LabelledDrive("one", NO_SIGNALS, label), whole.columns, part)
     (estimate,) = fit_left_out([drive], "line", LINE)
     assert np.abs((estimate - whole.drive.sideslip_rad)[part == 1]).max() < 1e-9
     assert np.isnan(drive.without(1).sideslip_rad).sum() == ROWS // 4
