@@ -60,15 +60,10 @@ class Worth:
         share = self.amount * (2 + self.amount) * rmse**2  # ((1 + amount) rmse)^2 - rmse^2
         return share if self.relative else self.amount**2
 
-    @property
-    def text(self) -> str:
-        """The gain in words."""
+    def __str__(self) -> str:
         if self.relative:
             return f"{100 * self.amount:.3g} % of the best"
         return f"{math.degrees(self.amount):.4g} deg"
-
-    def __str__(self) -> str:
-        return self.text
 
 
 DEFAULT_WORTH = Worth(math.radians(0.025))

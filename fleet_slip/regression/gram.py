@@ -13,15 +13,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.arrays import FloatArray, IntArray, ObjectArray
+from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.errors import DataError
 
 SomeSize = TypeVar("SomeSize", int, IntArray)
-
-BLOCK_ROWS = 2**18
-"""Most rows of one matrix product. 16-bit counts would allow 2^21; this keeps the block small."""
-
-_SMALLEST_BLOCK = 2**10
 
 
 def packed_size(k: SomeSize) -> SomeSize:
@@ -61,23 +56,17 @@ class Gram:
 
     @classmethod
     def from_counts(cls, signals: Sequence[str], counts: NDArray[Any]) -> "Gram":
-        """Return the Gram of rows of integer counts, shape (n, k).
-
-        Counts up to 2^21 take float64 products of at most `BLOCK_ROWS` rows, whose partial sums
-        stay below 2^53 and so are exact in any order; larger ones take Python integers.
-        """
+        """Return the Gram of rows of integer counts of any size, shape (n, k)."""
         if counts.ndim != 2 or counts.shape[1] != len(signals):
             raise ValueError(f"counts of shape {counts.shape} do not have {len(signals)} columns")
         if counts.dtype.kind not in "iuO":
             raise ValueError(f"counts must be integers, not {counts.dtype}")
-        largest = max(1, -int(counts.min()), int(counts.max())) if counts.size else 1
-        rows = min(BLOCK_ROWS, 2**53 // largest**2)
-        if rows < _SMALLEST_BLOCK:
-            return _gram_of_integers(signals, counts.astype(object))
-        total = cls.zero(signals)
-        for start in range(0, len(counts), rows):
-            total += _gram_of_block(signals, counts[start : start + rows])
-        return total
+        largest = max(-int(counts.min()), int(counts.max())) if counts.size else 0
+        fits = len(counts) * largest**2 < 2**63
+        exact: NDArray[Any] = counts.astype(np.int64 if fits else object)
+        products = (exact.T @ exact)[np.tril_indices(len(signals))]
+        sums = exact.sum(axis=0)
+        return cls(tuple(signals), len(exact), tuple(map(int, sums)), tuple(map(int, products)))
 
     def __add__(self, other: "Gram") -> "Gram":
         """Return the Gram of both sets of rows. Raises `DataError` if the signals differ."""
@@ -215,31 +204,6 @@ def packed_positions(at: tuple[int, ...]) -> tuple[int, ...]:
     larger = np.maximum(places[row], places[column])
     found = packed_size(larger) + np.minimum(places[row], places[column])
     return tuple(found.tolist())
-
-
-def _gram_of_block(signals: Sequence[str], counts: NDArray[Any]) -> Gram:
-    block = counts.astype(np.float64)
-    matrix = block.T @ block
-    return Gram(
-        tuple(signals),
-        len(block),
-        tuple(int(total) for total in block.sum(axis=0)),
-        tuple(int(total) for total in matrix[np.tril_indices(len(signals))]),
-    )
-
-
-def _gram_of_integers(signals: Sequence[str], counts: ObjectArray) -> Gram:
-    columns = [[int(count) for count in column] for column in counts.T]
-    return Gram(
-        tuple(signals),
-        len(counts),
-        tuple(sum(column) for column in columns),
-        tuple(
-            sum(a * b for a, b in zip(columns[i], columns[j], strict=True))
-            for i in range(len(columns))
-            for j in range(i + 1)
-        ),
-    )
 
 
 # Gram matrices of many drives side by side, and their exact sums.

@@ -17,7 +17,6 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import dependence, moments
 
 Matrix = list[list[int]]
-Score = Callable[[list[int], int], Fraction]
 Ranking = Callable[[Gram, Sequence[str], str], tuple[str, ...]]
 """Orders inputs, given a Gram with them and the label. Raises `DataError` if dependent."""
 
@@ -42,7 +41,7 @@ def t_value(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
 
 def forward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
     """Add, at each step, the signal that reduces the residual sum of squares most."""
-    order = _pivot(_moments(gram, inputs, label), _gain, largest=True)
+    order = _pivot(_moments(gram, inputs, label), largest=True)
     return tuple(inputs[i] for i in order)
 
 
@@ -52,19 +51,8 @@ def backward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
     matrix = _moments(gram, inputs, label)
     later_first = [*reversed(range(k)), k]
     rows, determinant = _full_model([[matrix[i][j] for j in later_first] for i in later_first])
-    removed = _pivot(rows, _gain, largest=False, divisor=determinant)
+    removed = _pivot(rows, largest=False, divisor=determinant)
     return tuple(inputs[k - 1 - i] for i in reversed(removed))
-
-
-def pivoted_cholesky(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Take the signal that those before it explain least, as a column-pivoted QR does."""
-    matrix = _moments(gram, inputs, label)
-    squares = [matrix[i][i] for i in range(len(inputs))]
-
-    def remaining(row: list[int], i: int) -> Fraction:
-        return Fraction(row[i], squares[i])
-
-    return tuple(inputs[i] for i in _pivot(matrix, remaining, largest=True))
 
 
 RANKINGS: dict[str, Ranking] = {
@@ -73,7 +61,6 @@ RANKINGS: dict[str, Ranking] = {
     "t": t_value,
     "forward": forward,
     "backward": backward,
-    "pivoted-cholesky": pivoted_cholesky,
 }
 
 
@@ -104,14 +91,14 @@ def _gain(row: list[int], i: int) -> Fraction:
     return Fraction(row[-1] ** 2, row[i])
 
 
-def _pivot(matrix: Matrix, score: Score, *, largest: bool, divisor: int = 1) -> list[int]:
-    """Eliminate inputs by the best score, fraction-free: entries share one positive factor."""
+def _pivot(matrix: Matrix, *, largest: bool, divisor: int = 1) -> list[int]:
+    """Eliminate inputs by the best gain, fraction-free: entries share one positive factor."""
     sign = -1 if largest else 1
     inputs = len(matrix[0]) - 1
     work = {i: matrix[i] for i in range(inputs)}
     order = []
     while work:
-        scores = {i: sign * score(row, i) for i, row in work.items()}
+        scores = {i: sign * _gain(row, i) for i, row in work.items()}
         pivot = min(work, key=lambda i: (scores[i], i))
         pivot_row = work.pop(pivot)
         d = pivot_row[pivot]

@@ -26,7 +26,6 @@ ORDERS = {
     "backward": "backward_order_kept_first",
     "t": "tstat_order",
     "correlation": "corr_order",
-    "pivoted-cholesky": "pivoted_cholesky_order",
 }
 
 
