@@ -290,12 +290,8 @@ def _require_same_features(version: ModelVersion) -> None:
             raise DataError(f"the column {name} of {version.reference} is not defined as then.")
 
 
-# Examines drives before a model learns from them: a fault of all shows in no comparison.
-#
-# A first champion has only its data, and where these are wrong alike, such as a label with the
-# other sign, no drive is unlike its peers. A label that is late on a new day hardly changes what
-# Gram rows tell. So a few of the longest drives that are new to the champion, or of all if there
-# is none, are looked at as a file is at `ingest`: for what contradicts any car.
+# A fault of all drives, such as a label with the other sign, shows in no comparison: so a few of
+# the longest that are new to the champion are examined as `ingest` does, for what contradicts cars.
 
 DRIVES = 5
 """That are looked at, of as many cars if there are so many."""
@@ -383,11 +379,9 @@ def _signals(columns: Mapping[str, Any]) -> Signals:
     return on_every_tick(np.asarray(columns["tick"], dtype=np.int32), some)
 
 
-# Whether a challenger is better on the drives that vouch for the champion, or on odd ones alone.
-#
-# A challenger that has learned from odd drives is better on them, held out or not, and where they
-# are many that outweighs what it loses elsewhere. So where the champion meets new drives on which
-# it is much more wrong than on those that made it, both are compared on these alone.
+# A challenger that was trained on unusual drives is better on them, held out or not. Where the
+# champion's error on new drives is much larger than on those that made it, both are compared on the
+# latter alone.
 
 ODD = 2.0
 """Drives on which the champion's error is so many times that on the others are odd."""
@@ -559,9 +553,7 @@ def _incumbents(registry: Registry, champion: ModelVersion) -> list[ModelVersion
     return [champion, *others]
 
 
-# Whether the course that a model learned from moves as cars do, and came in time.
-#
-# A late one looks like a side-slip angle, in all figures, and so does a heading.
+# A course that is late looks like a side-slip angle, in all figures, and so does a heading.
 
 MOST_S, SURE_S = 0.01, 0.005
 """Delay that may be left, and its standard error: 20 ms cost 0.4 deg on a real car."""

@@ -1,14 +1,9 @@
-"""Fraction-free elimination of integer matrices (Bareiss 1968, Math. Comp. 22:565).
+"""Exact linear algebra of integers, and eigenvalues with the same bits on every machine.
 
-Every value is a minor, so each division is exact and numbers stay as small as can be.
-
-Eigenvalues of small symmetric matrices, the same bits on every machine, unlike LAPACK's.
-
-Exact solution of large integer systems by p-adic lifting (Dixon 1982, Numer. Math. 40:137).
-
-It inverts once, modulo a prime, and finds the solution digit by digit with k^2 small products,
-where elimination multiplies huge numbers k^3 times. Solutions are proven: they hold modulo a power
-of the prime that is greater than what the two sides of any equation could differ by.
+Elimination is fraction-free (Bareiss 1968, Math. Comp. 22:565): every value is a minor, so each
+division is exact. Large systems are solved by p-adic lifting (Dixon 1982, Numer. Math. 40:137): an
+inverse modulo a prime gives the solution digit by digit. Solutions are proven: they hold modulo a
+power of the prime that is greater than what the two sides of any equation could differ by.
 """
 
 import math

@@ -25,10 +25,6 @@ from fleet_slip.regression.figures import f_upper, student_t_two_sided
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import Fit, Scales, dependence, moments
 
-# Standard errors, tests and collinearity of a fit.
-#
-# Rows at 100 Hz depend on each other: cluster-robust errors take each drive as one piece.
-#
 # A test of two sets of coefficients that holds its level with few clusters, from Gram rows alone.
 #
 # Residuals of a cluster shrink with its leverage, and a sandwich of few is uncertain. CR2 (Bell
@@ -164,15 +160,12 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Inference:
-    """Coefficients, the intercept first if any, and the residual deviation in units of the label.
-
-    `kind` is "classical" (independent rows) or "cluster"; t has `degrees_of_freedom`.
-    """
+    """Coefficients, the intercept first if any, and the standard deviation of residuals."""
 
     estimates: tuple[Estimate, ...]
     residual_std: float
     degrees_of_freedom: int
-    kind: Literal["classical", "cluster"]
+    """Of t."""
 
 
 def noise_variance(fitted: Fit) -> Fraction:
@@ -211,9 +204,7 @@ def infer_classically(fitted: Fit, scales: Scales) -> Inference:
         exact.sqrt(v * unit**2)
         for v, unit in zip(classical_variances(fitted, sigma2), units, strict=True)
     ]
-    return _inference(
-        fitted, scales, sigma2, errors, degrees=fitted.degrees_of_freedom, kind="classical"
-    )
+    return _inference(fitted, scales, sigma2, errors, fitted.degrees_of_freedom)
 
 
 def infer_by_clusters(fitted: Fit, drives: DriveMoments, scales: Scales) -> Inference:
@@ -228,9 +219,7 @@ def infer_by_clusters(fitted: Fit, drives: DriveMoments, scales: Scales) -> Infe
     variances = np.diag(covariance)[int(not fitted.has_intercept) :]
     errors = [math.sqrt(v) * u for v, u in zip(variances, units, strict=True)]
     sigma2 = noise_variance(fitted)
-    return _inference(
-        fitted, scales, sigma2, errors, degrees=len(drives.clusters) - 1, kind="cluster"
-    )
+    return _inference(fitted, scales, sigma2, errors, len(drives.clusters) - 1)
 
 
 def cluster_covariance(fitted: Fit, drives: DriveMoments) -> FloatArray:
@@ -316,9 +305,7 @@ def _inference(
     scales: Scales,
     sigma2: Fraction,
     errors: Sequence[float],
-    *,
     degrees: int,
-    kind: Literal["classical", "cluster"],
 ) -> Inference:
     model = fitted.model.physical(scales)
     names = [INTERCEPT] if fitted.has_intercept else []
@@ -331,7 +318,7 @@ def _inference(
         p = student_t_two_sided(t, degrees)
         estimates.append(Estimate(name, value, error, t, p))
     residual_std = exact.sqrt(sigma2 * scales[fitted.model.label] ** 2)
-    return Inference(tuple(estimates), residual_std, degrees, kind)
+    return Inference(tuple(estimates), residual_std, degrees)
 
 
 @dataclass(frozen=True)
