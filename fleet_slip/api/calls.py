@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
-from dataclasses import fields
+from dataclasses import KW_ONLY, dataclass
 from datetime import date
 from pathlib import Path
 from typing import (
@@ -23,7 +23,9 @@ from typing import (
 from typing_extensions import Doc
 
 from fleet_slip.base import Progress, needed, no_progress
+from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.compute.tasks import LocalThreads
+from fleet_slip.models.request import DEFAULT_MODELS, WORTH
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import current_run_id, recording
 
@@ -92,19 +94,9 @@ def takes(
         given = inspect.signature(options).parameters.values()
         signature = own.replace(parameters=[first, *given])
         call.__signature__ = signature  # type: ignore[attr-defined]
-        told = (f"    {name}: {text}" for name, text in documented(options).items())
-        call.__doc__ = "\n".join([inspect.getdoc(method) or "", "", "Args:", *told])
         return call
 
     return expand
-
-
-def documented(options: Any) -> dict[str, str]:
-    """Return what is said of the fields of a dataclass, by name; those without `Doc` are left out.
-
-    Commands take the same fields and texts: there, a field in backticks is an option.
-    """
-    return {one.name: text for one in fields(options) if (text := doc_of(one.type))}
 
 
 def doc_of(annotation: Any) -> str | None:
@@ -191,3 +183,51 @@ def within_reach(warehouse: "Warehouse", executor: Executor) -> "Warehouse":
     from fleet_slip.warehouse.tables import Warehouse
 
     return warehouse if unless_local(executor) is None else Warehouse(absolute(warehouse.root))
+
+
+# What is said of parameters of several methods; with a `Doc` they are options of commands, too.
+
+COHORT = Doc("SQL condition on the view drives, such as \"track = 'waterford_hills'\".")
+UNEXAMINED = Doc(
+    "Take drives whose sensors are not in order, too. As a rule all are examined first."
+)
+MODEL = Doc(
+    "NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. Default: "
+    "the only one that there is."
+)
+VERSION = Doc("NAME, NAME@VERSION or NAME@ALIAS. NAME alone is its champion.")
+ALIAS = Doc("The alias to move.")
+CAMPAIGN = Doc("A campaign of configs/campaigns, or the path of a TOML file.")
+DAYS = Doc("Simulate the first N days only. Default: all.")
+THROUGH = Doc("Last day to simulate, YYYY-MM-DD or today. Default: all days.")
+MODELS = Doc("A model list of configs/models, or a TOML file.")
+
+
+@dataclass(frozen=True)
+class NightRequest:
+    """What `Fleet.nightly` takes."""
+
+    landing: Annotated[
+        Path | str, Doc("The folder where logs land, or s3://…; what is new in it is taken.")
+    ]
+    mapping: Annotated[
+        str,
+        Doc("A mapping: of configs/mappings, or a TOML file."),
+    ]
+    name: Annotated[str, Doc("Name of the model.")]
+    _: KW_ONLY
+    cohort: Annotated[str, Doc("SQL condition on the view drives: which drives train it.")] = (
+        TRAINING_DRIVES
+    )
+    models: Annotated[str, MODELS] = DEFAULT_MODELS
+    worth: Annotated[str | None, WORTH] = None
+    candidate: Annotated[bool, Doc("Publish as a candidate, even what is not worse.")] = False
+    retention: Annotated[
+        str | None, Doc("A retention file. Default: retention.toml of the configs.")
+    ] = None
+    night: Annotated[date | str | None, Doc("Date of the night, YYYY-MM-DD. Default: today.")] = (
+        None
+    )
+    workers: Workers = None
+    progress: ShowStep | None = None
+    waiting: Callable[[], None] = lambda: None

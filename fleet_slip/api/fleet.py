@@ -7,11 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from typing_extensions import Doc
 
-from fleet_slip.api.calls import ShowStep, Workers, of_step, open_workers, record_call, takes
-from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.api.logs import LogsAndGrams
-from fleet_slip.api.operations import HealthAndUpkeep
-from fleet_slip.api.requests import (
+from fleet_slip.api.calls import (
     CAMPAIGN,
     COHORT,
     DAYS,
@@ -19,7 +15,16 @@ from fleet_slip.api.requests import (
     THROUGH,
     UNEXAMINED,
     NightRequest,
+    ShowStep,
+    Workers,
+    of_step,
+    open_workers,
+    record_call,
+    takes,
 )
+from fleet_slip.api.cohort import FleetCohort
+from fleet_slip.api.logs import LogsAndGrams
+from fleet_slip.api.operations import HealthAndUpkeep
 from fleet_slip.catalogue.facts import CALIBRATION, DELAY, TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.models.manifest import require_model_name

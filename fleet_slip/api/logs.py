@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 from typing_extensions import Doc
 
 from fleet_slip.api.calls import (
+    CAMPAIGN,
+    DAYS,
+    THROUGH,
     Rooted,
     ShowProgress,
     Workers,
@@ -18,7 +21,6 @@ from fleet_slip.api.calls import (
     unless_local,
     within_reach,
 )
-from fleet_slip.api.requests import CAMPAIGN, DAYS, THROUGH
 from fleet_slip.base import Progress, last_day, no_progress
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import InputError

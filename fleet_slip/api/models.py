@@ -7,9 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typing_extensions import Doc
 
-from fleet_slip.api.calls import Rooted, ShowProgress, count_from_start, open_workers, record_call
+from fleet_slip.api.calls import (
+    ALIAS,
+    MODEL,
+    UNEXAMINED,
+    VERSION,
+    Rooted,
+    ShowProgress,
+    count_from_start,
+    open_workers,
+    record_call,
+)
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.api.requests import ALIAS, MODEL, UNEXAMINED, VERSION
 from fleet_slip.base import needed
 from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import RefusedError, UsageError

@@ -9,8 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fleet_slip.api.calls import of_step
-from fleet_slip.api.requests import NightRequest
+from fleet_slip.api.calls import NightRequest, of_step
 from fleet_slip.api.session import Training
 from fleet_slip.base import date_of, number_of
 from fleet_slip.catalogue.facts import CALIBRATION, DELAY

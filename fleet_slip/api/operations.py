@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, cast
 from typing_extensions import Doc
 
 from fleet_slip.api.calls import (
+    COHORT,
+    MODEL,
     ShowProgress,
     Workers,
     count_from_start,
@@ -17,7 +19,6 @@ from fleet_slip.api.calls import (
     within_reach,
 )
 from fleet_slip.api.models import JudgedModels
-from fleet_slip.api.requests import COHORT, MODEL
 from fleet_slip.base import Record, date_of
 from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
@@ -130,6 +131,7 @@ class HealthAndUpkeep(JudgedModels):
         Progress is in bytes. `damage` is what is wrong, after a repair what is left. Raises
         `StorageError` without a data root, and `ClusterError`.
         """
+        from fleet_slip.grams.check import check_grams
         from fleet_slip.operations.verify import verify
 
         def look() -> "Verification":
@@ -147,7 +149,7 @@ class HealthAndUpkeep(JudgedModels):
                 found = look()
                 found.rebuilt = rebuilt
         if grams and not found.damage:
-            found.compared = self.check()
+            found.compared = check_grams(self.warehouse)
         return found
 
     @record_call

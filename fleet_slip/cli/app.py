@@ -74,8 +74,8 @@ GROUPS = {
         "report": "accuracy",
         "watch": "accuracy",
         "explore": "accuracy",
-        "diagnose": "statistics",
-        "what-if": "statistics",
+        "diagnose": "selection",
+        "what-if": "selection",
     },
     "Operations": {
         "nightly": "operations",

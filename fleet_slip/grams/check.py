@@ -38,7 +38,7 @@ class CheckReport:
 
 def check_grams(
     warehouse: Warehouse,
-    count: int,
+    count: int = 4,
     progress: Progress = no_progress,
     begin: int = 0,
 ) -> CheckReport:

@@ -9,11 +9,14 @@ from pathlib import Path
 import duckdb
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import fleet_slip
 from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.cli.app import app
+from fleet_slip.errors import FleetSlipError
 from fleet_slip.resources import find_config
-from tests.support.commands import RunCommand, done_on
+from tests.support.commands import Finished, RunCommand, done_on
 from tests.support.once import made_once
 
 NOISE = {
@@ -25,6 +28,21 @@ NOISE = {
     "wheel_fr": 0.02,
 }
 """The smoke campaign's sensors, in SI units."""
+
+
+@pytest.fixture
+def run_command(tmp_path: Path) -> RunCommand:
+    """Run a command in this process, on roots that other tests share, too."""
+
+    def invoke(*arguments: str, root: Path | None = None) -> Finished:
+        data = str(root or tmp_path / "data")
+        done = CliRunner().invoke(app, ["--root", data, *arguments])
+        if isinstance(done.exception, FleetSlipError):
+            return Finished(done.exception.exit_code, done.stdout, f"error: {done.exception}")
+        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+        return Finished(done.exit_code, done.stdout, done.stderr)
+
+    return invoke
 
 
 @pytest.fixture(scope="session")
