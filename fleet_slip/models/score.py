@@ -14,7 +14,7 @@ from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.compute import counts_of, drives_of_stream
 from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.predict import Predictor
+from fleet_slip.models.predict import Predictor, predict
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.runs import log_event
 from fleet_slip.warehouse.condition import Condition, asking, parse_cohort, row_columns
@@ -100,6 +100,7 @@ def _estimate_rows(
     label = manifest.label.signal
     needed = [*predictor.plan.signals, label, *predictor.plan.facts, "vehicle_id"]
     cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
+    needed += () if manifest.definitions else manifest.columns
     counts = ", ".join(dict.fromkeys(needed))
     text = read_sql("jobs", "drives_in_time.sql").format(
         columns=counts, rows=_si_rows(), condition=condition.sql
@@ -115,7 +116,10 @@ def _estimate_rows(
         stream = database.sql(text).to_arrow_reader(BATCH_ROWS)
         for rows in drives_of_stream(stream):
             numbers = cars.get(rows["vehicle_id"][0].as_py())
-            estimate = predictor(counts_of(rows, predictor.plan, None, numbers), workspace)
+            if manifest.definitions:
+                estimate = predictor(counts_of(rows, predictor.plan, None, numbers), workspace)
+            else:  # needs no compiled code
+                estimate = predict(manifest, rows).to_numpy(zero_copy_only=False)
             truth = rows[label].to_numpy(zero_copy_only=False).astype(np.float64) * unit
             chosen = rows["chosen"].to_numpy(zero_copy_only=False).astype(np.bool_)
             given = chosen & np.isfinite(estimate) & np.isfinite(truth)
