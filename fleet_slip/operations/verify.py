@@ -205,11 +205,6 @@ def verify_names(
             else:
                 continue
             report.note("name", f"{table}/{one.file.path}", problem)
-        if many := sum(bool(_unused(one)) for one in files):
-            problem = (
-                f"{number_of(many, 'file')} with names that no row has; run: fleet-slip migrate"
-            )
-            report.note("backlog", table, problem)
 
 
 def _all(read: Mapping[str, Sequence[ReadFile]]) -> Iterator[ReadFile]:
