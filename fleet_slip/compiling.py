@@ -33,7 +33,7 @@ CHECKSUMS = "checksums.json"
 LEAST_FREE_BYTES = 2**25
 PREFIX = "fleet-slip-"
 KEPT_VERSIONS = 8
-"""So many folders of other sources stay, newest first."""
+"""So many folders of other sources stay, those used last first."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -112,6 +112,7 @@ def code_folder(versions: str) -> Path | None:
             error,
         )
         return None
+    os.utime(folder)  # in use: others' go first
     sums = _delete_damaged(folder)
     atexit.register(_write_checksums, folder, sums)
     for old in sorted(base.glob(f"{PREFIX}*"), key=os.path.getmtime)[:-KEPT_VERSIONS]:
