@@ -10,6 +10,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib.util import find_spec
 from typing import Literal, TypeAlias
 
 import pyarrow as pa
@@ -29,7 +30,7 @@ from fleet_slip.grams.check import (
     grams_of,
     stored_grams,
 )
-from fleet_slip.grams.compute import wide_grams
+from fleet_slip.grams.compute import by_sql, wide_grams
 from fleet_slip.grams.gram_rows import by_signals, gram_table, is_received
 from fleet_slip.grams.on_board import CountedSet, counted_by_identity, find_impossible
 from fleet_slip.models.registry import Registry
@@ -319,7 +320,8 @@ def _impossible_among(
 
 
 def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:
-    return grams_of(wide_grams(warehouse, [file], PLAIN))
+    compiled = find_spec("numba") is not None  # an extra
+    return grams_of((wide_grams if compiled else by_sql)(warehouse, [file], PLAIN))
 
 
 def verify_documents(root: Folder, report: Verification) -> None:
