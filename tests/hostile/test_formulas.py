@@ -115,6 +115,21 @@ def test_powers_of_powers_end() -> None:
         assert np.isinf(compute_formula("pow(9, pow(9, pow(9, 9^9)))", X)).all()
 
 
+@pytest.mark.parametrize("version", ["3.30", "4.10"])
+@pytest.mark.parametrize("nested", [False, True])
+def test_no_formula_is_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str, nested: bool
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    conversion: Any = {"formula": EVIL}
+    if nested and version >= "4":
+        inner = conversion_utils.from_dict(conversion)
+        conversion = {"val_0": 99, "text_0": "SNA", "default_addr": inner}
+    file = write_mdf(tmp_path, conversion, version=version)
+    assert "__import__" in refusal(file, "ax")
+    assert not (tmp_path / "pwned").exists()
+
+
 def test_times_are_not_computed_by_a_formula(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

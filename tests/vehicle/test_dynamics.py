@@ -79,6 +79,27 @@ def test_steady_side_slip_is_that_of_the_rear_axle(vx: float) -> None:
     assert last.vy / last.vx == pytest.approx(expected, rel=0.02, abs=2e-5)
 
 
+def test_side_slip_after_a_step_steer_changes_sign_at_the_theoretical_speed() -> None:
+    speed = math.sqrt(KNOWN.rear / KNOWN.rear_slip)
+    slow, fast = steady_corner(0.93 * speed, 0.05), steady_corner(1.07 * speed, 0.05)
+    assert slow.last.vy > 0 > fast.last.vy
+
+
+def test_yaw_rate_gain_is_greatest_at_the_characteristic_speed() -> None:
+    """r / δ = v / (L + K v²), greatest at v = √(L / K)."""
+    characteristic = math.sqrt(KNOWN.wheelbase / KNOWN.understeer)
+    gains = []
+    for vx in (0.6 * characteristic, characteristic, 1.5 * characteristic):
+        last = steady_corner(vx, 0.02).last
+        gain = last.yaw_rate / (last.steering_wheel / RATIO)
+        assert gain == pytest.approx(
+            last.vx / (KNOWN.wheelbase + KNOWN.understeer * last.vx**2), rel=0.02
+        )
+        gains.append(gain)
+    assert gains[1] > gains[0]
+    assert gains[1] > gains[2]
+
+
 def inverse_brush(force: float, load: float, peak: float) -> float:
     """Return the slip at which F = μ Fz (1 − (1 − C σ / (3 μ Fz))³) is the force."""
     limit = (CAR.friction - CAR.friction_per_load * load) * load
@@ -102,6 +123,16 @@ def test_straight_braking_has_the_slips_and_forces_of_the_brush_tyre() -> None:
         force = CAR.mass * share * -4.0 - CAR.rolling_resistance * load - slowing
         slip = 1 - x.vx / (CAR.radius * spin)
         assert slip == pytest.approx(inverse_brush(force, load, peak), rel=0.02)
+
+
+def test_straight_acceleration_slips_the_driven_wheels_only() -> None:
+    run = Run(rolling(15.0), Controls(0.0, 2.5), seconds=2.0)
+    x, ax = run.last, run.forces[-1, 0]
+    inertia = 4 / CAR.inverse_spin_inertia / CAR.radius**2
+    assert ax == pytest.approx((2.5 - holding(x.vx)) / (1 + inertia / CAR.mass), rel=0.02)
+    assert x.wheel_fl == x.wheel_fr
+    assert CAR.radius * x.wheel_fl / x.vx - 1 > 0.02
+    assert abs(CAR.radius * x.wheel_rl / x.vx - 1) < 0.005
 
 
 def test_engine_power_limits_the_force() -> None:
@@ -148,6 +179,22 @@ def test_tyres_never_give_energy(x: State, u: Controls) -> None:
     assert body + wheels <= 1e-6
 
 
+@pytest.mark.parametrize(
+    "start",
+    [
+        rolling(30.0, steering_wheel=1.0),
+        rolling(25.0, vy=6.0, yaw_rate=-1.5),
+        rolling(15.0, yaw_rate=4.0),
+        rolling(1.5, vy=0.5),
+    ],
+)
+def test_energy_never_grows_in_coasting(start: State) -> None:
+    run = Run(start, Controls(start.steering_wheel, 0.0), seconds=6.0)
+    energy = kinetic_energy(run.states)
+    assert (np.diff(energy) <= 1e-7 * energy[0]).all()
+    assert energy[-1] < energy[0]
+
+
 @settings(max_examples=60)
 @given(x=STATES, u=CONTROLS, adhesion=st.sampled_from([0.05, 0.1, 0.4, 1.0, 1.2]))
 def test_nothing_blows_up_in_any_spin(x: State, u: Controls, adhesion: float) -> None:
@@ -156,6 +203,22 @@ def test_nothing_blows_up_in_any_spin(x: State, u: Controls, adhesion: float) ->
     assert np.isfinite(run.states).all()
     assert np.isfinite(run.forces).all()
     assert kinetic_energy(run.states).max() <= 1.01 * start + SEDAN.drivetrain.power_w * 3.0 + 1
+
+
+@pytest.mark.parametrize("adhesion", [0.1, 1.0])
+@pytest.mark.parametrize("vx", [0.0, 0.3, 1.0, 5.0, 60.0])
+def test_from_standstill_to_60_mps_all_is_finite(vx: float, adhesion: float) -> None:
+    c = constants(SEDAN, adhesion)
+    for traction in (-10.0, 0.0, 6.0):
+        for steering_wheel in (0.0, 8.7):
+            run = Run(rolling(vx), Controls(steering_wheel, traction), seconds=2.0, c=c)
+            assert np.isfinite(run.states).all()
+            assert np.abs(run.forces).max() < 1.6 * GRAVITY_MPS2
+
+
+@given(x=STATES, u=CONTROLS)
+def test_rates_are_pure(x: State, u: Controls) -> None:
+    assert rates(x, u, CAR) == rates(x, u, CAR)
 
 
 @pytest.mark.parametrize("name", ["compact_hatchback", "d_class_sedan", "rear_drive_sedan", "suv"])

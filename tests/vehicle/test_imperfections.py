@@ -138,6 +138,14 @@ def test_compliance_adds_its_share_to_the_understeer_gradient() -> None:
     assert abs(end(soft.lateral_offset_m) - end(rigid.lateral_offset_m)) < 0.05
 
 
+def test_compliance_shows_in_the_wheels_and_not_in_what_the_sideslip_is() -> None:
+    road, flaws = circle(100.0, 15.0), CarImperfections(steering_compliance_deg_per_kn=0.2)
+    soft, rigid = drive(road, flaws), drive(road)
+    assert end(soft.sideslip_rad) == pytest.approx(end(rigid.sideslip_rad), abs=2e-5)
+    assert end(soft.steer_fl_rad) == pytest.approx(end(rigid.steer_fl_rad), abs=2e-4)
+    assert end(soft.steering_wheel_rad) > 1.1 * end(rigid.steering_wheel_rad)
+
+
 def test_a_rack_with_play_rests_until_the_column_has_crossed_it() -> None:
     t = traits(SEDAN, CarImperfections(steering_lash_deg=4.0), SAMPLE_S)
     half, still = np.radians(2.0), GiveRates(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -150,6 +158,16 @@ def test_a_rack_with_play_rests_until_the_column_has_crossed_it() -> None:
     np.testing.assert_allclose(rack[:6], expected, atol=1e-12)
     assert rack[6] == pytest.approx(np.radians(0.9) + half)
     assert rack[7] == pytest.approx(np.radians(-3.0) + half)
+
+
+def test_lash_lets_the_road_wheels_lag_behind_the_steering_wheel() -> None:
+    bends = np.concatenate([np.sin(np.arange(1201) / 30) / 60])
+    road = Road(1.0, bends, np.full(1201, 15.0), 1200.0, False)
+    loose = drive(road, CarImperfections(steering_lash_deg=6.0))
+    gap = loose.steering_wheel_rad - SEDAN.steering.ratio * np.tan(
+        (loose.steer_fl_rad + loose.steer_fr_rad) / 2
+    )
+    assert np.degrees(np.abs(gap).max()) == pytest.approx(3.0, abs=0.15)
 
 
 @pytest.mark.parametrize("wheel", ["fl", "fr", "rl", "rr"])
@@ -185,6 +203,13 @@ def test_the_thrust_angle_is_side_slip_of_a_car_going_straight() -> None:
     found = drive(straight(20.0), CarImperfections(thrust_angle_deg=0.3))
     assert np.degrees(end(found.sideslip_rad)) == pytest.approx(0.3, abs=0.02)
     assert np.degrees(end(found.steer_fl_rad)) == pytest.approx(0.3, abs=0.03)
+
+
+def test_toe_turns_the_wheels_against_each_other() -> None:
+    found = drive(straight(20.0), CarImperfections(toe_front_deg=0.2))
+    assert np.degrees(end(found.steer_fl_rad)) == pytest.approx(-0.2, abs=0.01)
+    assert np.degrees(end(found.steer_fr_rad)) == pytest.approx(0.2, abs=0.01)
+    assert abs(end(found.sideslip_rad)) < 1e-4
 
 
 @pytest.mark.parametrize("length_m", [0.2, 0.6])
@@ -244,6 +269,21 @@ def test_a_side_wind_is_held_by_the_tyres() -> None:
     c = constants(SEDAN, 1.0)
     per_force = handling(SEDAN).rear_slip * GRAVITY_MPS2 / (2 * c.static_rear)
     assert end(found.sideslip_rad) == pytest.approx(rear * per_force, rel=0.05)
+
+
+def test_a_slippery_side_shifts_no_line_but_the_slip() -> None:
+    road = circle(80.0, 20.0)
+    usual, split = drive(road), drive(circle(80.0, 20.0, grip_right=0.7))
+    assert end(split.sideslip_rad) < end(usual.sideslip_rad) - np.radians(0.1)
+
+
+def test_imperfect_drives_do_not_depend_on_their_neighbours() -> None:
+    flaws = [CarImperfections(relaxation_length_m=0.1 * i) for i in range(6)]
+    drives = [LaneDrive(SEDAN, circle(60.0 + i, 12.0), 1.0, 1.0, f) for i, f in enumerate(flaws)]
+    together = simulate_drives(drives)
+    for i, lane_drive in enumerate(drives):
+        (alone,) = simulate_drives([lane_drive])
+        np.testing.assert_array_equal(alone.sideslip_rad, together[i].sideslip_rad)
 
 
 def test_the_body_s_motion_is_recorded_for_its_sensors() -> None:
