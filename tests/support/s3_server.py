@@ -5,6 +5,7 @@ key, since moto takes any.
 """
 
 import io
+import os
 import random
 import re
 import threading
@@ -143,8 +144,11 @@ class Server:
 
 
 def command_on(root: object, *arguments: str) -> Finished:
-    """Run a command as a user would, and look for keys in what it prints."""
-    done = run_on(root, *arguments)
+    """Run a command as a user would, and look for keys in what it prints.
+
+    In a process of its own: deltalake keeps Python's lock while it waits, which the server needs.
+    """
+    done = run_on(root, *arguments, env=dict(os.environ))
     for text in (done.stdout, done.stderr):
         assert not [secret for secret in (ACCESS_KEY, SECRET_KEY) if secret in text]
     return done
