@@ -13,7 +13,6 @@ from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import needed, number_of
 from fleet_slip.catalogue.facts import ALL_DRIVES
-from fleet_slip.cli.models import score_against
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import (
     Json,
@@ -27,9 +26,11 @@ from fleet_slip.cli.output import (
 from fleet_slip.cli.progress import progress
 from fleet_slip.cli.selection import say_examined, say_without_information
 from fleet_slip.errors import UsageError
+from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.score import Score
 from fleet_slip.resources import folder
 from fleet_slip.storage.storage_errors import storage_errors
+from fleet_slip.warehouse.condition import parse_condition, row_columns
 
 if TYPE_CHECKING:
     from fleet_slip.evaluation.report import Written
@@ -148,28 +149,61 @@ def score(
     version = fleet.model(model)
     if against is not None:
         name = against if "@" in against else f"{version.manifest.name}@{against}"
-        other = fleet.model(name)
-        rows, examined = fleet.scored_rows(cohort, unexamined=unexamined)
-        say_examined(str(examined))
-        score_against(fleet.warehouse, version, other, rows, json)
+        _score_against(fleet, version, fleet.model(name), cohort, unexamined=unexamined, json=json)
         return
     found: Score = fleet.score(version, cohort, unexamined=unexamined)
     say_examined(found.examined)
-    result = found.as_dict()
     if json:
-        print_json({"model": version.reference, "cohort": cohort or ALL_DRIVES, **result})
-        return
-    print_table(
-        f"{version.reference} on {number_of(result['rows'], 'row')}",
-        ["figure", "value"],
-        [
-            [name.replace("_deg", ", deg").replace("_", " "), f"{value:.4f}"]
-            for name, value in result.items()
-            if name.startswith(("error", "rmse", "correlation")) and value is not None
-        ],
-    )
+        return print_json(
+            {"model": version.reference, "cohort": cohort or ALL_DRIVES, **found.as_dict()}
+        )
+    _print_scores({version.reference: found.as_dict()})
     say_without_information(found.rows_without, found.rows + found.rows_without)
     _say_trained(found, version.reference)
+
+
+def _score_against(
+    fleet: Fleet,
+    one: ModelVersion,
+    other: ModelVersion,
+    cohort: str | None,
+    *,
+    unexamined: bool,
+    json: bool,
+) -> None:
+    """Print the figures of two versions on the rows that have the signals of both."""
+    from fleet_slip.models.score import score as score_rows  # noqa: PLC0415 - compiled code
+
+    rows, examined = fleet.scored_rows(cohort, unexamined=unexamined)
+    say_examined(str(examined))
+    columns = sorted({*one.manifest.columns, *other.manifest.columns})
+    complete = " AND ".join(f"{name} IS NOT NULL" for name in columns)
+    both = rows & parse_condition(complete, row_columns())
+    scores = {
+        version.reference: score_rows(fleet.warehouse, version.manifest, both).as_dict()
+        for version in (one, other)
+    }
+    if json:
+        return print_json({"cohort": rows.text, "models": scores})
+    _print_scores(scores)
+
+
+def _print_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
+    """Print a row for each figure that all models have."""
+    first, *_ = scores.values()
+    print_table(
+        f"{' and '.join(scores)} on {number_of(first['rows'], 'row')}",
+        ["figure", *scores],
+        [
+            [
+                name.replace("_deg", ", deg").replace("_", " "),
+                *(f"{one[name]:.4f}" for one in scores.values()),
+            ]
+            for name in first
+            if name.startswith(("error", "rmse", "correlation"))
+            and None not in [one[name] for one in scores.values()]
+        ],
+    )
 
 
 def _say_trained(found: Score, reference: str) -> None:

@@ -1,19 +1,18 @@
 """Reducing logs to Gram rows, and what can be reduced: the commands gram and features."""
 
-from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, FeatureSet
+from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.options import command
-from fleet_slip.cli.output import All, Json, print_json, print_records, print_table, say
+from fleet_slip.cli.output import All, Json, print_json, print_table, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.columns.sql import column_query
 from fleet_slip.config import read_named_file
@@ -139,25 +138,14 @@ def features(
             }
         )
     elif sets:
-        rows = [[n, " ".join(one.inputs), _parts(one), one.description] for n, one in named.items()]
-        print_table("", ["set", "columns", "rows of a drive", "description"], rows, left=4)
+        rows = [[name, " ".join(one.inputs), one.description] for name, one in named.items()]
+        print_table("", ["set", "columns", "description"], rows, left=3)
     else:
-        header, row = "feature|unit|description", "{name}|{unit}|{description}"
-        if everything:
-            header, row = "feature|unit|scale|description", "{name}|{unit}|{scale}|{description}"
-        print_records("", header, row, _named(known.features), left=4)
-        if everything:
-            title = "\ncolumns over time"
-            print_records(
-                title, header.replace("feature", "column"), row, _named(known.time_columns), left=4
-            )
-        else:
+        shown = {**known.features, **(known.time_columns if everything else {})}
+        rows = [[name, one.unit, str(one.scale), one.description] for name, one in shown.items()]
+        print_table("", ["column", "unit", "scale", "description"], rows, left=4)
+        if not everything:
             _print_families(known)
-
-
-def _named(columns: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    for name, one in columns.items():
-        yield {"name": name, "unit": one.unit, "scale": one.scale, "description": one.description}
 
 
 def _print_families(known: FeatureCatalogue) -> None:
@@ -190,13 +178,3 @@ def _print_files(json: bool) -> None:
         heading = f"own configs: {own or 'none'}\nshipped ones: {folder('configs')}"
         rows = [[name, one["from"]] for name, one in found.items()]
         print_table(heading, ["file", "from"], rows, left=2)
-
-
-def _parts(one: FeatureSet) -> str:
-    if one.regimes:
-        return f"by {' and '.join(one.regimes)}"
-    if one.block_s:
-        return f"in blocks of {one.block_s:f} s"
-    if one.row_folds:
-        return f"{number_of(one.row_folds, 'fold')} of rows"
-    return "together"

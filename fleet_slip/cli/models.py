@@ -1,6 +1,6 @@
 """Commands that serve models: models, show, promote, pin, diff, export."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -8,14 +8,11 @@ import typer
 
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import All, Json, print_json, print_records, print_table, print_text, say
 from fleet_slip.errors import UsageError
-from fleet_slip.models.manifest import CrossValidated, LearnedFrom, ModelTerm
+from fleet_slip.models.manifest import CrossValidated, LearnedFrom
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.warehouse.condition import Condition, parse_condition, row_columns
-from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
     from fleet_slip.models.diff import Difference, Term
@@ -31,7 +28,6 @@ def models(
         ),
     ] = None,
     file: Annotated[Path | None, typer.Argument(help="The file to import.")] = None,
-    everything: All = False,
     json: Json = False,
 ) -> None:
     """List the published model versions, or bring one in from elsewhere: models import FILE.
@@ -51,7 +47,17 @@ def models(
     if not rows:
         say("no model has been published yet. Run: fleet-slip publish NAME")
         return
-    _print_models(rows, everything)
+    print_records(
+        "",
+        "model|aliases|signals|published|correlation|RMSE deg|drives",
+        "{name}@{version}|{aliases}|{inputs}|{published_at:%Y-%m-%d %H:%M}|"
+        "{correlation:.4f}|{rmse_deg:.4f}|{drives:,}",
+        (
+            {**row, "aliases": row["aliases"].split(","), "inputs": row["signals"].count(",") + 1}
+            for row in rows
+        ),
+        left=4,
+    )
     for row in rows:
         if row["trained_on_forgotten"]:
             say(f"{row['name']}@{row['version']} was trained on drives that were forgotten since")
@@ -61,24 +67,6 @@ def models(
         print_records(
             "\nhistory of aliases", header, row, fleet.registry().history(name).moves(), 3
         )
-
-
-def _print_models(rows: Sequence[Mapping[str, Any]], everything: bool) -> None:
-    """Print a line for each version; with the names of its signals if all is asked for."""
-    header = "model|aliases|signals|published|correlation|RMSE deg|drives"
-    row = (
-        "{name}@{version}|{aliases}|{signals}|{published_at:%Y-%m-%d %H:%M}|"
-        "{correlation:.4f}|{rmse_deg:.4f}|{drives:,}"
-    )
-    if everything:
-        header += "|error std deg|rows"
-        row += "|{error_std_deg:.4f}|{rows:,}"
-    shown = []
-    for one in rows:
-        signals = one["signals"].split(",")
-        told = {"signals": signals if everything else len(signals)}
-        shown.append({**one, **told, "aliases": one["aliases"].replace(",", ", ")})
-    print_records("", header, row, shown, left=4)
 
 
 def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> None:
@@ -98,7 +86,7 @@ def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> Non
 def show(version: ModelVersion, everything: All = False, json: Json = False) -> None:
     """Show one model version: figures, the data that made it, and coefficients.
 
-    With --all, coefficients to the last digit, and what each column is.
+    With --all, coefficients to the last digit, and the SQL of features.
 
     Example: **fleet-slip show waterford**
     """
@@ -116,15 +104,6 @@ def show(version: ModelVersion, everything: All = False, json: Json = False) -> 
         _print_version(version, everything)
 
 
-def _definition_row(term: ModelTerm, one: Definition) -> list[str]:
-    times = [one.fact.name] if one.fact else []
-    if gate := one.gate:
-        knots = [str(knot) for knot in (gate.low, gate.peak, gate.high) if knot is not None]
-        times.append(f"{gate.by.over or ''} {gate.by.of} {gate.by.ticks or ''}: {' '.join(knots)}")
-    window = [one.of, one.over or "", str(one.ticks or ""), str(one.bits)]
-    return [term.signal, f"{term.scale} {term.unit}", *window, ", ".join(times).strip()]
-
-
 def _teacher(learned: LearnedFrom) -> str:
     """Say what stood for a label, and where the intercept is from."""
     times = learned.change_s
@@ -136,8 +115,7 @@ def _teacher(learned: LearnedFrom) -> str:
     uncertain = "not known how surely" if unsure is None else f"uncertain by {unsure:.2g} deg"
     return (
         f"{told}. Intercept where {number_of(learned.cars, 'car')} "
-        f"{'goes' if learned.cars == 1 else 'go'} straight, {uncertain}, between cars "
-        f"{learned.intercept_spread_deg:.3f} deg"
+        f"{'goes' if learned.cars == 1 else 'go'} straight, {uncertain}"
     )
 
 
@@ -167,13 +145,6 @@ def _print_version(version: ModelVersion, everything: bool) -> None:
             ["feature", "scale", "SQL"],
             [[t.signal, f"{t.scale} {t.unit}", t.sql] for t in manifest.terms if t.sql],
             left=3,
-        )
-    if manifest.definitions:
-        print_table(
-            "\ncolumns over time (docs/memory.md): counts, times the scale",
-            ["column", "scale", "of", "over", "ticks", "bits", "times"],
-            [_definition_row(term, own) for term in manifest.terms if (own := term.definition)],
-            left=4,
         )
 
 
@@ -242,7 +213,7 @@ def pin(version: ModelVersion, name: str, alias: str, off: bool) -> None:
     say(f"{name}@{alias} {done.format(version.version)}")
 
 
-# Two model versions beside each other: the command diff, and score --against.
+# Two model versions beside each other: the command diff.
 
 
 @command(Fleet.diff, arguments=["one", "other"])
@@ -291,37 +262,6 @@ def _shown(value: Any) -> str:
             return f"{value:.6g}"
         case _:
             return str(value)
-
-
-def score_against(
-    warehouse: Warehouse, one: ModelVersion, other: ModelVersion, rows: Condition, json: bool
-) -> None:
-    """Print the figures of two versions on the rows that have the signals of both."""
-    from fleet_slip.models.score import score as score_rows  # noqa: PLC0415 - compiled code
-
-    needed = {*one.manifest.columns, *other.manifest.columns}
-    complete = " AND ".join(f"{name} IS NOT NULL" for name in sorted(needed))
-    both = rows & parse_condition(complete, row_columns())
-    first, second = (
-        score_rows(warehouse, version.manifest, both).as_dict() for version in (one, other)
-    )
-    if json:
-        models = {one.reference: first, other.reference: second}
-        print_json({"cohort": rows.text, "models": models})
-        return
-    print_table(
-        f"{one.reference} and {other.reference} on the same {number_of(first['rows'], 'row')}",
-        ["figure", one.reference, other.reference, "difference"],
-        [
-            [
-                name.replace("_deg", ", deg").replace("_", " "),
-                *(f"{number:,}" if isinstance(number, int) else f"{number:.4f}" for number in pair),
-                f"{pair[0] - pair[1]:+.4f}",
-            ]
-            for name, pair in ((name, (first[name], second[name])) for name in first)
-            if name != "rows" and None not in pair and any(pair)
-        ],
-    )
 
 
 # The command that brings a published version into other programs: export.

@@ -132,7 +132,7 @@ def test_an_evaluation_is_a_screen(shown: Shown) -> None:
     assert "nominal 0.70 0.200 (35%)" in whole
 
 
-@pytest.mark.parametrize("command", ["select", "models", "show smoke"])
+@pytest.mark.parametrize("command", ["select", "show smoke"])
 def test_what_a_newcomer_asks_first_is_a_screen_of_80_columns(
     smoke_root: Path, shown: Shown, command: str
 ) -> None:
