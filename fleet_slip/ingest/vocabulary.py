@@ -8,7 +8,7 @@ from importlib.resources import files
 from typing import Any
 
 CORNERS = ("fl", "fr", "rl", "rr")
-_PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_PARTS = re.compile(r"[FRVH][LR](?=wh|rad|sp)|[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _UMLAUTS = str.maketrans(
     {"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss"}
 )

@@ -67,6 +67,34 @@ def test_the_unit_of_a_speed_is_told_by_the_wheels(tmp_path: Path) -> None:
     assert {name: signals[name]["unit"] for name in WHEELS} == dict.fromkeys(WHEELS, "km/h")
 
 
+_AXLE = "Vehicle.Chassis.Axle.Row"
+IN_COVESA = {
+    "ax": "Vehicle.Acceleration.Longitudinal", "ay": "Vehicle.Acceleration.Lateral",
+    "yaw_rate": "Vehicle.AngularVelocity.Yaw",
+    "steering_wheel": "Vehicle.Chassis.SteeringWheel.Angle",
+    "wheel_fl": f"{_AXLE}1.Wheel.Left.Speed", "wheel_fr": f"{_AXLE}1.Wheel.Right.Speed",
+    "wheel_rl": f"{_AXLE}2.Wheel.Left.Speed", "wheel_rr": f"{_AXLE}2.Wheel.Right.Speed",
+}  # fmt: skip
+ON_A_VOLVO = {
+    "ax": "ALgt1", "ay": "ALat1", "yaw_rate": "YawRate1", "steering_wheel": "SteerWhlAg",
+    "wheel_fl": "FLwhlspd", "wheel_fr": "FRwhlspd", "wheel_rl": "RLwhlspd", "wheel_rr": "RRwhlspd",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("names", [IN_COVESA, ON_A_VOLVO])
+def test_the_names_of_departments_are_understood(tmp_path: Path, names: dict[str, str]) -> None:
+    """Row 1 of COVESA is the front axle; what counts the car is its VIN."""
+    car = a_car()
+    rows = as_logged({name: car[name] for name in names}, names, {**IN_DEGREES, **IN_KMH})
+    rows.insert_column(0, pl.Series("t", np.arange(rows.height) / 100))
+    vin = "Vehicle.VehicleIdentification.VIN"
+    rows = rows.with_columns(pl.lit("YV1").alias(vin))
+    rows.write_parquet(tmp_path / "log.parquet")
+    draft = suggest(tmp_path, tmp_path / "log.parquet")
+    assert {name: keys["column"] for name, keys in draft["signals"].items()} == names
+    assert draft["drive"]["vehicle_id"] == {"column": vin}
+
+
 def test_names_from_strangers_stay_names(tmp_path: Path) -> None:
     car = a_car()
     odd = 'ay "\\ # é [signals]'
@@ -118,6 +146,7 @@ def test_what_cannot_be_drafted_says_so(tmp_path: Path) -> None:
         ("VelFR_obd", ["vel", "fr", "obd"]),
         ("ESP_02.YawRate", ["esp", "02", "yaw", "rate"]),
         ("a_x", ["a", "x"]),
+        ("RLwhlspd", ["rl", "whlspd"]),
     ],
 )
 def test_parts_of_a_name(name: str, parts: list[str]) -> None:
