@@ -45,6 +45,8 @@ _STANDING = {**dict.fromkeys(WHEELS, 2 / RADIUS_M), "vx": 2.0, "vehicle_speed": 
 FEWEST_JUMPS, FEWEST_A_MINUTE = 10, 3.0
 MOST_SINGLE = 0.15
 """Where more neighbours than this part jump, these are no single values that went wrong."""
+LONGEST_HELD_S = 0.1
+"""A bus repeats a value until its next message: what stays for longer does not change so fast."""
 OVERLAP_S = 1.0
 MOST_NAMES, LEAST_ROWS_A_NAME = 1000, 20
 
@@ -186,7 +188,10 @@ def _count_jumps(name: str, time_s: FloatArray, values: FloatArray) -> int:
 def _jumps(name: str, time_s: FloatArray, values: FloatArray) -> BoolArray:
     noise, rate = _LIMITS[name]
     slower = np.minimum(np.abs(values[1:]), np.abs(values[:-1]))
-    jumps = np.abs(np.diff(values)) > noise + rate * np.diff(time_s)
+    step_s, changes = np.diff(time_s), np.diff(values) != 0
+    since = np.maximum.accumulate(np.where(np.r_[True, changes[:-1]], time_s[:-1], -np.inf))
+    held_s = np.where(time_s[1:] - since <= LONGEST_HELD_S, time_s[1:] - since, step_s)
+    jumps = np.abs(np.diff(values)) > noise + rate * held_s
     return np.asarray(jumps & (slower > _STANDING.get(name, 0.0)))
 
 

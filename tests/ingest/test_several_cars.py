@@ -11,6 +11,7 @@ import pytest
 
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.errors import AlarmError
+from fleet_slip.ingest.log_faults import _count_jumps
 from fleet_slip.ingest.stream import open_measured
 from fleet_slip.ingest.suspicion import WHEELS
 from tests.ingest.test_strange_logs import a_mapping
@@ -120,6 +121,23 @@ def test_a_poor_log_of_one_car_is_of_one_car(
     time = 'column = "t"\nunit = "s"\nlongest_gap_s = 0.2'
     rows = changed(cars(1)[0])
     assert said_of(rows, tmp_path, a_mapping(tmp_path, TABLE, time)) == []
+
+
+@pytest.mark.parametrize("held_ms", [10, 20, 40, 50])
+@pytest.mark.parametrize("late_ms", [0, 5, 30])
+@pytest.mark.parametrize("steps_a_turn", [60, 720])
+def test_signals_as_a_bus_sends_them_are_of_one_car(
+    held_ms: int, late_ms: int, steps_a_turn: int
+) -> None:
+    """Held between messages, some of which are late, and coarse: of a driver who turns fast."""
+    time_s = np.arange(ROWS) / 100
+    random = np.random.default_rng(held_ms + late_ms)
+    sent = np.arange(0.0, 60.0, held_ms / 1000)
+    arrived = np.maximum.accumulate(sent + random.uniform(0, late_ms / 1000, sent.size))
+    last = sent[np.maximum(np.searchsorted(arrived, time_s, "right") - 1, 0)]
+    steering_wheel = 6.0 * np.sin(20.0 / 6.0 * last)  # to 1150 degrees a second
+    step = 2 * np.pi / steps_a_turn
+    assert _count_jumps("steering_wheel", time_s, np.round(steering_wheel / step) * step) == 0
 
 
 @pytest.mark.parametrize("jumps", [9, 10])
