@@ -6,9 +6,10 @@ import re
 import shlex
 import sys
 import tempfile
-from enum import StrEnum
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -127,7 +128,7 @@ def ingest(
 
     def tell(report: "IngestReport") -> None:
         if not (json or folders):
-            say(_ingested(report))
+            say(_ingested(report.file, [report]))
         for one in report.suspicions:
             if (one.kind, one.signals) not in seen:
                 seen.add((one.kind, one.signals))
@@ -149,7 +150,8 @@ def ingest(
     if json:
         print_json(reports)
     elif folders:
-        say(_summed_up(reports))
+        new = sum(report.new for report in reports)
+        say(_ingested(number_of(new, "new file"), reports) if new else "nothing new")
     _require_sound(reports)
 
 
@@ -203,32 +205,23 @@ def _take_back(fleet: Fleet, what: str, json: bool, *, alone: bool) -> None:
     )
 
 
-def _summed_up(reports: "list[IngestReport]") -> str:
-    new = [report for report in reports if report.new]
+def _ingested(what: str, reports: "Sequence[IngestReport]") -> str:
+    """Return a sentence on what came of files."""
+    new = [report for report in reports if report.new or report.drives_forgotten]
     if not new:
-        return "nothing new"
-    held = sum(sum(report.counts.quarantined.values()) for report in new)
+        return f"{what}: nothing to do, it was ingested before"
+    refused: Counter[str] = Counter()
+    for report in new:
+        refused.update(report.counts.quarantined)
+    reasons = ", ".join(f"{rows:,} {reason}" for reason, rows in refused.items())
+    left_out = sum(report.counts.rows_left_out for report in new)
+    ticks, drives = (sum(getattr(one.counts, name) for one in new) for name in ("ticks", "drives"))
     return _joined(
-        f"{number_of(len(new), 'new file')}: {number_of(sum(r.counts.ticks for r in new), 'row')} "
-        f"in {number_of(sum(r.counts.drives for r in new), 'drive')}",
-        f"in quarantine: {number_of(held, 'row')}" if held else "",
+        f"{what}: {number_of(ticks, 'row')} in {number_of(drives, 'drive')}",
+        f"not as the mapping's conditions ask: {number_of(left_out, 'row')}" if left_out else "",
+        f"in quarantine: {number_of(refused.total(), 'row')} ({reasons})" if refused else "",
         replaced=sum(report.drives_replaced for report in new),
         forgotten=sum(report.drives_forgotten for report in new),
-    )
-
-
-def _ingested(report: "IngestReport") -> str:
-    if not report.new and not report.drives_forgotten:
-        return f"{report.file}: nothing to do, it was ingested before"
-    counts = report.counts
-    left_out, refused = counts.rows_left_out, counts.quarantined
-    reasons = ", ".join(f"{n:,} {reason}" for reason, n in refused.items())
-    return _joined(
-        f"{report.file}: {number_of(counts.ticks, 'row')} in {number_of(counts.drives, 'drive')}",
-        f"not as the mapping's conditions ask: {number_of(left_out, 'row')}" if left_out else "",
-        f"in quarantine: {number_of(sum(refused.values()), 'row')} ({reasons})" if refused else "",
-        replaced=report.drives_replaced,
-        forgotten=report.drives_forgotten,
     )
 
 
@@ -260,14 +253,8 @@ def _show_previews(previews: "list[Preview]", json: bool) -> None:
 # The command that helps to write mappings.
 
 
-class Action(StrEnum):
-    """What to do."""
-
-    SUGGEST = "suggest"
-
-
 def mapping(
-    _action: Annotated[Action, typer.Argument(metavar="suggest", show_default=False)],
+    _action: Annotated[Literal["suggest"], typer.Argument(metavar="suggest", show_default=False)],
     file: Annotated[
         str, typer.Argument(help="A measured log; also s3://, gs:// and az://.", show_default=False)
     ],

@@ -1,7 +1,7 @@
 """Reducing logs to Gram rows, and what can be reduced: the commands gram and features."""
 
 from concurrent.futures import Executor
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -66,7 +66,7 @@ def gram(
 def _run_gram(
     fleet: Fleet, executor: Executor, feature_set: str, cohort: str | None
 ) -> "GramReport":
-    with progress(f"gram {feature_set}", "rows", executor) as show:
+    with progress(f"gram {feature_set}", "rows") as show:
         return fleet.gram(feature_set, cohort=cohort, workers=executor, progress=show)
 
 
@@ -141,7 +141,7 @@ def features(
         rows = [[name, " ".join(one.inputs), one.description] for name, one in named.items()]
         print_table("", ["set", "columns", "description"], rows, left=3)
     else:
-        shown = {**known.features, **(known.time_columns if everything else {})}
+        shown: dict[str, Any] = {**known.features, **(known.time_columns if everything else {})}
         rows = [[name, one.unit, str(one.scale), one.description] for name, one in shown.items()]
         print_table("", ["column", "unit", "scale", "description"], rows, left=4)
         if not everything:

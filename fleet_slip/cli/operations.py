@@ -196,12 +196,6 @@ def _say_of_roads(roads: Roads) -> None:
             "bends look banked, and roads may always lean to one side, which fewer than "
             f"{FEWEST_CARS} cars with offsets cannot tell from their own: no car has ay_offset"
         )
-    elif roads.banked and roads.lean:
-        say(
-            f"bends are banked, and the roads lean: {float(roads.lean):+.3f} m/s^2 +- "
-            f"{roads.uncertainty:.2g} of ay in all {number_of(roads.cars, 'car')}, which ay_offset "
-            "is without"
-        )
     elif not roads.banked:
         say(
             "bends are seen not to be banked: a road that always leans to one side counts as "

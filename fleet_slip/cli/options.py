@@ -225,15 +225,15 @@ def _doing(
     """Yield what calls need while they work: where tasks run, what shows how far they are."""
     found: dict[str, Any] = {}
     with ExitStack() as stack:
-        executor = None
         if "workers" in asked:
             where = typed.get("cluster") or typed.get("threads")
-            executor = stack.enter_context(open_workers(fleet.root, where))
-            found["workers"] = executor
-        if doing:
-            from fleet_slip.cli.progress import progress  # noqa: PLC0415 - others wait for no bar
+            found["workers"] = stack.enter_context(open_workers(fleet.root, where))
+        if unit:
+            from fleet_slip.cli import progress as bars  # noqa: PLC0415 - others wait for no bar
 
-            found["progress"] = stack.enter_context(progress(doing.format(**typed), unit, executor))
+            named = doing.format(**typed)
+            bar = bars.progress(named, unit) if named else bars.progress_of_steps(unit)
+            found["progress"] = stack.enter_context(bar)
         yield found
 
 

@@ -4,10 +4,8 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING
 
 from rich.progress import (
     BarColumn,
@@ -21,14 +19,9 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from fleet_slip.base import number_of
+from fleet_slip.cli.output import say
 from fleet_slip.cli.streams import drawing_on, for_people, stderr
 from fleet_slip.storage.runs import log_event
-
-if TYPE_CHECKING:
-    pass
-
-from fleet_slip.cli.output import say
 
 TOLD_EVERY_S = 30.0
 """How often the log tells the progress of a job."""
@@ -43,14 +36,6 @@ class _Rate(ProgressColumn):
         return Text(f"{_short(speed)} {unit}/s" if speed else "")
 
 
-class _Workers(ProgressColumn):
-    """How many workers a cluster has at the moment."""
-
-    def render(self, task: Task) -> Text:
-        number = getattr(task.fields.get("executor"), "workers", None)
-        return Text("" if number is None else f"{number_of(number, 'worker')}")
-
-
 def _short(value: float) -> str:
     for limit, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if value >= limit:
@@ -59,24 +44,20 @@ def _short(value: float) -> str:
 
 
 @contextmanager
-def progress(
-    doing: str, unit: str, executor: Executor | None = None
-) -> Iterator[Callable[[int, int], None]]:
+def progress(doing: str, unit: str) -> Iterator[Callable[[int, int], None]]:
     """Show a bar while one thing is done; see `progress_of_steps`."""
-    with progress_of_steps(unit, executor, doing) as show:
+    with progress_of_steps(unit, doing) as show:
         yield partial(show, doing)
 
 
 @contextmanager
 def progress_of_steps(
-    unit: str, executor: Executor | None = None, first: str | None = None
+    unit: str, first: str | None = None
 ) -> Iterator[Callable[[str, int, int], None]]:
     """Show bars with rate and time left on stderr while steps are done, if a person watches.
 
-    And the number of workers, if the executor is of a cluster. Machines are told by an event now
-    and then. Yields the callback: what is being done, how much is done, and how much there is. The
-    bar of the first step is there before it is called. At Ctrl-C a line says how much of each step
-    was done.
+    Machines are told by an event now and then. Yields the callback: what is being done, how much is
+    done, and how much there is. At Ctrl-C a line says how much of each step was done.
     """
     console = stderr()
     bar = Progress(
@@ -84,7 +65,6 @@ def progress_of_steps(
         BarColumn(),
         TextColumn("{task.percentage:>3.0f}%"),
         _Rate(),
-        _Workers(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         console=console,
@@ -96,7 +76,7 @@ def progress_of_steps(
     told = time.monotonic()
 
     def begin(doing: str) -> tuple[TaskID, float]:
-        task = bar.add_task(doing, total=None, unit=unit, executor=executor)
+        task = bar.add_task(doing, total=None, unit=unit)
         return task, time.monotonic()
 
     def show(doing: str, done: int, total: int) -> None:
@@ -109,8 +89,7 @@ def progress_of_steps(
         if (now := time.monotonic()) - told > TOLD_EVERY_S:
             told = now
             rate = {f"{unit}_per_s": round(done / (now - since))}
-            workers = getattr(executor, "workers", None)
-            log_event("progress", doing=doing, done=done, total=total, workers=workers, **rate)
+            log_event("progress", doing=doing, done=done, total=total, **rate)
 
     try:
         with drawing_on(console), bar:
