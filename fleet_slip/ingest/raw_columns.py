@@ -24,7 +24,7 @@ from fleet_slip.ingest.columns import (
     conversion_factor,
     count_range,
 )
-from fleet_slip.ingest.formats.csv import EXTRA_FIELDS
+from fleet_slip.ingest.formats.csv import CUT, EXTRA_FIELDS
 from fleet_slip.ingest.formats.source import BASE, Base
 from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
 
@@ -195,6 +195,7 @@ REASONS = (
     "not_finite",
     "out_of_range",
     "extra_fields",
+    "cut_line",
     "no_value",
     "time_backwards",
     "time_duplicate",
@@ -389,8 +390,10 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
     fields += [*signals, somewhere]
     if RAW + EXTRA_FIELDS in schema:
         name = RAW + EXTRA_FIELDS
-        extra = _condition(pl.col(name).is_not_null(), "extra_fields", pl.col(name))
-        fields.append(replace(extra, is_sound=lambda rows: rows[name].null_count() == rows.height))
+        extra = pl.col(name)
+        problem = find_problems((extra == CUT, "cut_line"), (extra.is_not_null(), "extra_fields"))
+        field = Field("", "condition", extra, extra, problem)
+        fields.append(replace(field, is_sound=lambda rows: rows[name].null_count() == rows.height))
     return fields
 
 

@@ -102,6 +102,24 @@ def test_a_line_with_more_fields_than_the_header_is_quarantined(tmp_path: Path) 
     assert log.quarantine["value"].to_pylist() == ["7"]
 
 
+@pytest.mark.parametrize(
+    ("end", "reason", "signal"), [("0.2,1", "cut_line", None), ("0.2", "no_value", None)]
+)
+def test_a_last_line_that_is_cut_is_quarantined(
+    tmp_path: Path, end: str, reason: str, signal: str | None
+) -> None:
+    log = read_text(tmp_path, GOOD.rstrip() + "\n" + end)
+    assert reasons(log) == [(21, reason, signal)]
+    assert ticks(log) == list(range(20))
+
+
+def test_a_last_line_that_is_as_short_as_others_is_whole(tmp_path: Path) -> None:
+    lines = GOOD.splitlines()
+    log = read_text(tmp_path, "\n".join([lines[0] + ",note", *lines[1:]]))
+    assert log.counts.quarantined == {}
+    assert len(ticks(log)) == 20
+
+
 def test_other_columns_may_have_one_name(tmp_path: Path) -> None:
     assert read_text(tmp_path, GOOD.replace("beta", "beta,x,x")).counts.rows_kept == 20
 

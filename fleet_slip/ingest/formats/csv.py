@@ -112,6 +112,9 @@ LINE_BLOCKS = 4
 EXTRA_FIELDS = "\0extra fields"
 """Column of a CSV batch: what a line has after the header's last column, null if nothing."""
 
+CUT = "the file ends within this line"
+"""What stands there for a last line that is cut: no line break, and fewer fields than others."""
+
 
 @dataclass(frozen=True)
 class PlainNumbers:
@@ -249,13 +252,14 @@ def _whole_lines(stream: BinaryIO, file: Path, padding: bytes) -> Iterator[bytes
 
     Each begins with the padding, a line of its own: put here, the block is not copied for it.
     """
-    rest = padding
+    rest = before = padding
     while more := stream.read(BLOCK_BYTES):
         block = rest + more
         end = _end_of_lines(block)
         if end > len(padding):
             whole, rest = block[:end], padding + block[end:]
             _require_text(whole, file)
+            before = whole[whole.rfind(b"\n", 0, -1) + 1 :]
             yield whole
             continue
         if len(block) > LINE_BLOCKS * BLOCK_BYTES:
@@ -266,7 +270,18 @@ def _whole_lines(stream: BinaryIO, file: Path, padding: bytes) -> Iterator[bytes
         rest = block
     if len(rest) > len(padding):
         _require_text(rest, file)
-        yield rest
+        yield _with_cut_marked(rest, before, padding)
+
+
+def _with_cut_marked(rest: bytes, before: bytes, padding: bytes) -> bytes:
+    """Return the last line, which says in `EXTRA_FIELDS` if it is cut."""
+    last, separator, fields = rest[len(padding) :], padding[:1], len(padding) - 1
+    found = last.count(separator)
+    if not last.strip() or b'"' in before + last:
+        return rest
+    if found >= min(before.count(separator), fields - 1):
+        return rest
+    return rest + separator * (fields - found) + CUT.encode()
 
 
 def _end_of_lines(block: bytes) -> int:
