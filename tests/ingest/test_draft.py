@@ -3,6 +3,7 @@
 import re
 import shlex
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,16 @@ IN_KMH = dict.fromkeys(WHEELS, 3.6 * RADIUS_M)
 @pytest.mark.parametrize("name", LOGS)
 def test_files_of_every_format_are_guessed_right(tmp_path: Path, name: str) -> None:
     assert wrong_guesses(LOGS[name], suggest_of(LOGS[name], tmp_path)) == []
+
+
+def test_wheels_of_a_ros_topic_are_never_drafted_in_kmh(tmp_path: Path) -> None:
+    """Of a slow car 1 rad/s is as likely as 1 km/h, which is 1.1 times as fast."""
+    name = "MCAP, sensor_msgs/Imu and a message of the car"
+    draft = suggest_of(replace(LOGS[name], least_mps=2.5), tmp_path)
+    assert "ay" in draft.guesses
+    assert set(WHEELS) <= draft.guesses.keys() | draft.questions.keys()
+    drafted = [draft.guesses[one].keys["unit"] for one in WHEELS if one in draft.guesses]
+    assert "km/h" not in drafted
 
 
 def test_the_unit_of_a_speed_is_told_by_the_wheels(tmp_path: Path) -> None:
