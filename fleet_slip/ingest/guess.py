@@ -467,12 +467,12 @@ def choose_units(guesses: dict[str, Guess], drive: Signals) -> dict[str, Guess]:
             if {key: guess.keys.get(key) for key in keys} != keys:
                 changed = guess.because(f"with {keys['unit']} it fits the other signals", **keys)
                 found[name] = replace(changed, doubts=())
-    for name in WHEELS:
+    for name in found.keys() & set(WHEELS):
         # A wheel of .31 m at 1 rad/s goes 1.1 km/h: the way a car moves does not tell these apart.
-        guess = found.get(name)
-        if guess and guess.is_without_unit and guess.column.startswith("/"):
-            if not guess.doubts and guess.keys["unit"] == "km/h":
-                found[name] = guess.doubted("it may be rad/s as well, and ROS has SI units")
+        guess = found[name]
+        is_unsure = guess.is_without_unit and guess.keys["unit"] == "km/h" and not guess.doubts
+        if is_unsure and guess.column.startswith("/"):
+            found[name] = guess.doubted("it may be rad/s as well, and ROS has SI units")
     return found
 
 
