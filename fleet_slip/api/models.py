@@ -371,7 +371,6 @@ class JudgedModels(PublishedModels):
         from fleet_slip.evaluation.drives import simulate_scenarios
         from fleet_slip.evaluation.evaluate import evaluate, evaluations_of, keep
         from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
-        from fleet_slip.storage.documents import Document
 
         chosen = tuple(map(load_scenario, scenarios)) if scenarios else shipped_scenarios()
         first, *rest = [self.resolve(one) for one in (model, *others)]
@@ -379,8 +378,7 @@ class JudgedModels(PublishedModels):
             told = count_from_start(progress)
             simulate_scenarios(self.warehouse, chosen, executor, told)
             content = evaluate(self.warehouse, chosen, first, rest, executor)
-        kept = keep(evaluations_of(self.warehouse), content)
-        return Document(kept.number, content, kept.sha256)
+        return keep(evaluations_of(self.warehouse), content)
 
     @record_call
     def evaluate_measured(
@@ -404,13 +402,11 @@ class JudgedModels(PublishedModels):
         """
         from fleet_slip.evaluation.evaluate import evaluations_of, keep
         from fleet_slip.evaluation.measured import evaluate_measured
-        from fleet_slip.storage.documents import Document
 
         versions = [self.resolve(one) for one in (model, *others)]
         with open_workers(self.root, threads) as executor:
             content = evaluate_measured(self.warehouse, versions, cohort, vehicle, executor)
-        kept = keep(evaluations_of(self.warehouse, "measured"), content)
-        return Document(kept.number, content, kept.sha256)
+        return keep(evaluations_of(self.warehouse, "measured"), content)
 
     def evaluate_blind(
         self,

@@ -21,7 +21,6 @@ from fleet_slip.cli.output import (
     print_table,
     print_text,
     say,
-    stdout,
 )
 from fleet_slip.cli.progress import progress
 from fleet_slip.cli.selection import say_examined, say_without_information
@@ -69,25 +68,17 @@ BLIND_NAMES = 5
 
 
 def print_errors(title: str, drives: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
-    """Print RMSE by drive and estimator; as many tables as the terminal's width makes of it."""
-    at_once = max(1, (stdout().width - NAMES_WIDTH) // ESTIMATOR_WIDTH)
-    for first in range(0, len(names), at_once):
-        shown = names[first : first + at_once]
-        rows = [
-            [
-                one["name"],
-                f"{one.get('truth', one)['sideslip_std_deg']:.2f}",
-                *(_error_cell(one["results"][name]) for name in shown),
-            ]
-            for one in drives
+    """Print RMSE by drive and estimator."""
+    rows = [
+        [
+            one["name"],
+            f"{one.get('truth', one)['sideslip_std_deg']:.2f}",
+            *(_error_cell(one["results"][name]) for name in names),
         ]
-        titled = f"{title}, continued" if first else title
-        words = [name.replace("_", " ") for name in shown]  # which a heading can wrap
-        print_table(titled, ["drive", "side-slip std", *words], rows)
-
-
-NAMES_WIDTH, ESTIMATOR_WIDTH = 33, 15
-"""Of the columns with a drive's name and its side-slip, and of an estimator's."""
+        for one in drives
+    ]
+    words = [name.replace("_", " ") for name in names]  # which a heading can wrap
+    print_table(title, ["drive", "side-slip std", *words], rows)
 
 
 def _error_cell(found: Mapping[str, Any]) -> str:

@@ -45,44 +45,37 @@ def complete_model(context: typer.Context, incomplete: str) -> list[str]:
     return [one for one in found if one.startswith(incomplete)]
 
 
-def complete_config(kind: str) -> Complete:
-    """Return what completes the names of the configs of one kind, such as `campaigns`."""
+def complete_names(names: Callable[[], Sequence[str]]) -> Complete:
+    """Return what completes names of configs."""
 
     def complete(context: typer.Context, incomplete: str) -> list[str]:
-        _lay_over_configs(context)
+        own = context.find_root().params.get("config")
+        if own is not None:
+            os.environ[CONFIG_VARIABLE] = str(Path(own).absolute())
         try:
-            return [name for name in config_names(kind) if name.startswith(incomplete)]
+            return [name for name in names() if name.startswith(incomplete)]
         except (FleetSlipError, OSError):
             return []
 
     return complete
 
 
-def complete_feature_set(context: typer.Context, incomplete: str) -> list[str]:
-    """Return the feature sets that a word may become."""
-    from fleet_slip.catalogue.features import (  # noqa: PLC0415
-        PLAIN,
-        features,
-    )
-
-    _lay_over_configs(context)
-    try:
-        return [name for name in (PLAIN, *features().sets) if name.startswith(incomplete)]
-    except (FleetSlipError, OSError):
-        return []
+def complete_config(kind: str) -> Complete:
+    """Return what completes the names of the configs of one kind, such as `campaigns`."""
+    return complete_names(lambda: config_names(kind))
 
 
-def _lay_over_configs(context: typer.Context) -> None:
-    own = context.find_root().params.get("config")
-    if own is not None:
-        os.environ[CONFIG_VARIABLE] = str(Path(own).absolute())
+def _feature_sets() -> list[str]:
+    from fleet_slip.catalogue.features import PLAIN, features  # noqa: PLC0415 - others need none
+
+    return [PLAIN, *features().sets]
 
 
 DETAILS: dict[str, dict[str, Any]] = {
     "bootstrap": {"min": 100},
     "campaign": {"autocompletion": complete_config("campaigns")},
     "days": {"min": 1},
-    "features": {"autocompletion": complete_feature_set},
+    "features": {"autocompletion": complete_names(_feature_sets)},
     "folds": {"metavar": "NUMBER|each"},
     "mapping": {"autocompletion": complete_config("mappings")},
     "max_age_hours": {"min": 0},

@@ -25,7 +25,7 @@ from fleet_slip.models.select import Selection, Uncertainty, WithoutLabel
 from fleet_slip.regression.choice import CROSS_VALIDATION, NestedDistances
 from fleet_slip.regression.drives import Influential
 from fleet_slip.regression.folds import CrossValidation
-from fleet_slip.regression.inference import INTERCEPT, Estimate, Evidence
+from fleet_slip.regression.inference import INTERCEPT, Evidence
 
 # Says which drives of a cohort what was computed leaves out.
 
@@ -140,16 +140,13 @@ def _print_models(selection: Selection, everything: bool) -> None:
     header, row = "model", "{model.name}"
     if listed := selection.choice is None:
         header, row = f"{header}|signals", f"{row}|{{signals}}"
+    header += "|correlation|RMSE deg"
+    row += "|{pooled.correlation:.4f}|{pooled.rmse_deg:.4f}"
     if everything:
-        header, row = f"{header}|drives", f"{row}|{{model.drives:,}}"
-    header, row = (
-        f"{header}|correlation|RMSE deg",
-        f"{row}|{{pooled.correlation:.4f}}|{{pooled.rmse_deg:.4f}}",
-    )
-    if everything:
-        header += "|error mean deg|error std deg|condition number"
+        header += "|error mean deg|error std deg|condition number|drives"
         row += (
-            "|{pooled.error_mean_deg:+.4f}|{pooled.error_std_deg:.4f}|{model.condition_number:.3g}"
+            "|{pooled.error_mean_deg:+.4f}|{pooled.error_std_deg:.4f}"
+            "|{model.condition_number:.3g}|{model.drives:,}"
         )
     rows = (
         {
@@ -318,13 +315,25 @@ def diagnose(result: Diagnosis) -> None:
 
     Example: **fleet-slip diagnose waterford**
     """
-    coefficients = _coefficients(result)
-    print_table(
+    both = zip(result.robust.estimates, result.naive.estimates, strict=True)
+    units = {INTERCEPT: catalogue()[catalogue().label].unit}
+    rows = (
+        {
+            "robust": robust,
+            "naive": naive,
+            "unit": units.get(robust.name) or features().of(robust.name).unit,
+            "vif": result.inflation.get(robust.name),
+        }
+        for robust, naive in both
+    )
+    print_records(
         f"{number_of(result.drives, 'drive')}, {number_of(result.fitted.gram.n, 'row')}, worth "
         f"{result.evidence.rows:,.0f} independent ones; R squared {result.fitted.r_squared:.4f}, "
         f"condition number {result.condition_number:.3g} (1: no signal tells what another tells)",
-        list(coefficients[0]),
-        [list(row.values()) for row in coefficients],
+        f"signal|unit|coefficient|s.e. by {result.cluster}s|t|s.e. by rows|VIF",
+        "{robust.name}|{unit}|{robust.value:.6g}|{robust.standard_error:.2g}|{robust.t:.1f}|"
+        "{naive.standard_error:.2g}|{vif:.3g}",
+        rows,
         left=2,
     )
     if result.cluster == "row":
@@ -337,39 +346,13 @@ def diagnose(result: Diagnosis) -> None:
         _print_comparison(result, result.comparison)
 
 
-def _coefficients(result: Diagnosis) -> list[dict[str, str]]:
-    """Return what is told of each coefficient, by heading."""
-    rows = []
-    both = zip(result.robust.estimates, result.naive.estimates, strict=True)
-    for robust, naive in both:
-        name, constant = robust.name, robust.name == INTERCEPT
-        row = {
-            "signal": name,
-            "unit": (catalogue()[catalogue().label] if constant else features().of(name)).unit,
-            "coefficient": f"{robust.value:.6g}",
-            f"s.e. by {result.cluster}s": f"{robust.standard_error:.2g}",
-            "t": f"{robust.t:.1f}",
-            "s.e. by rows": f"{naive.standard_error:.2g}",
-            "VIF": "" if constant else f"{result.inflation[name]:.3g}",
-        }
-        rows.append(row)
-    return rows
-
-
 def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
-    print_table(
+    both = zip(result.robust.estimates, found.other.estimates, strict=True)
+    print_records(
         f"\nthe same signals where {found.condition}",
-        ["signal", "coefficient here", "there", "s.e. there", "difference / s.e."],
-        [
-            [
-                here.name,
-                f"{here.value:.6g}",
-                f"{there.value:.6g}",
-                f"{there.standard_error:.2g}",
-                f"{_standardised(here, there):+.1f}",
-            ]
-            for here, there in zip(result.robust.estimates, found.other.estimates, strict=True)
-        ],
+        "signal|coefficient here|there|s.e. there",
+        "{here.name}|{here.value:.6g}|{there.value:.6g}|{there.standard_error:.2g}",
+        ({"here": here, "there": there} for here, there in both),
     )
     test = found.test
     if test is None:
@@ -379,20 +362,11 @@ def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
             "fewer signals, or more drives."
         )
         return
-    degrees = f"{test.numerator}, {_degrees(test.denominator)}"
+    degrees = f"{test.numerator}, {test.denominator:.4g}"
     print_line(
         f"the same coefficients? Wald, by {result.cluster}s: F({degrees}) = {test.f:,.2f}, "
         f"p = {test.p:.2g}."
     )
-
-
-def _degrees(many: float) -> str:
-    return f"{many:.0f}" if many == round(many) else f"{many:.1f}"
-
-
-def _standardised(here: Estimate, there: Estimate) -> float:
-    spread = float((here.standard_error**2 + there.standard_error**2) ** 0.5)
-    return (there.value - here.value) / spread
 
 
 # The command that predicts a model's error with worse sensors: what-if.
