@@ -230,4 +230,3 @@ class NightRequest:
     )
     workers: Workers = None
     progress: ShowStep | None = None
-    waiting: Callable[[], None] = lambda: None

@@ -1,8 +1,8 @@
 """A fleet's warehouse in Python."""
 
 import time
-from collections.abc import Callable
 from datetime import date
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 from typing_extensions import Doc
@@ -29,7 +29,7 @@ from fleet_slip.catalogue.facts import CALIBRATION, DELAY, TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.request import DEFAULT_MODELS, WORTH
-from fleet_slip.storage.runs import step
+from fleet_slip.storage.runs import LOGGER, step
 
 if TYPE_CHECKING:
     import duckdb
@@ -103,15 +103,13 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         worth: Annotated[str | None, WORTH] = None,
         workers: Workers = None,
         progress: ShowStep | None = None,
-        waiting: Callable[[], None] = lambda: None,
     ) -> "RunReport":
         """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
 
         It can be repeated at any time, and after any interruption: what is done is not done again.
-        A second run of the campaign on this machine waits for the first; `waiting` is called once
-        before. A winner that is worse than the champion is no error: the report says so. Progress
-        is in rows of each step. Raises what `simulate`, `gram`, `FleetCohort.select` and `publish`
-        raise.
+        A second run of the campaign on this machine waits for the first, and says so. A winner that
+        is worse than the champion is no error: the report says so. Progress is in rows of each
+        step. Raises what `simulate`, `gram`, `FleetCohort.select` and `publish` raise.
         """
         from fleet_slip.api.session import RunReport, Training
         from fleet_slip.catalogue.features import features
@@ -123,6 +121,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         model_name = require_model_name(name or chosen.name)
         parse_worth(worth)  # before anything is written
         condition = f"campaign = '{chosen.name}'"
+        waiting = partial(LOGGER.info, "%s: waiting for another run", chosen.name)
         with self.root.exclusive(f".run-{chosen.name}.lock", waiting):
             with open_workers(self.root, workers) as executor:
                 simulation = self.simulate(
@@ -176,7 +175,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         champion's error, train again without the faulty drives, and verify some log files, the next
         ones on the next night. The winner becomes champion if it is not worse, else a candidate. A
         night that was killed and is given again ends where it would have ended. A second one of the
-        model on this machine waits for the first; `waiting` is called once before.
+        model on this machine waits for the first, and says so.
 
         What goes wrong in a step is in the report, whose `problem` is what a command fails with;
         later steps go on where they can. Raises `UsageError` for an invalid name or worth, and
@@ -187,5 +186,6 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
 
         parse_worth(request.worth)
         require_model_name(request.name)
-        with self.root.exclusive(f".nightly-{request.name}.lock", request.waiting):
+        waiting = partial(LOGGER.info, "%s: waiting for another night", request.name)
+        with self.root.exclusive(f".nightly-{request.name}.lock", waiting):
             return Night(self, request).run()
