@@ -1,6 +1,7 @@
 """What the pages say of the repository holds, and leads somewhere."""
 
 import inspect
+import pkgutil
 import re
 import tomllib
 from pathlib import Path
@@ -105,6 +106,8 @@ def test_the_reference_has_what_is_public_and_no_more() -> None:
     own = public - {"Any", "Document", "DuckDBPyRelation", "Path", "Table"}
     assert shown[:2] == ["fleet_slip", "fleet_slip.errors"]
     assert {name.rpartition(".")[2] for name in shown[2:]} == own
+    for name in shown[2:]:
+        assert pkgutil.resolve_name(name).__module__ == name.rpartition(".")[0]
 
 
 def targets(page: Path) -> list[str]:
