@@ -66,11 +66,14 @@ R = TypeVar("R")
 
 
 def record_call(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
-    """Return the method, each call of which leaves a record, unless a command has one already."""
+    """Return the method, each call of which leaves a record, unless a command has one already.
+
+    A dry run changes nothing, and leaves none.
+    """
 
     @functools.wraps(method)
     def call(self: S, /, *arguments: P.args, **options: P.kwargs) -> R:
-        if current_run_id() is not None:
+        if current_run_id() is not None or options.get("dry_run"):
             return method(self, *arguments, **options)
         with recording(self.root, method.__name__, _as_typed(arguments, options)):
             return method(self, *arguments, **options)

@@ -179,7 +179,8 @@ def command(
                 name: READ[name][1](one) if name in READ and name in asked else one
                 for name, one in typed.items()
             }
-            recorded = any(hasattr(call, "recorded") for call in calls)
+            dry_run = {**values, **typed}.get("dry_run")
+            recorded = not dry_run and any(hasattr(call, "recorded") for call in calls)
             record = recording(fleet.root, show.__name__, sys.argv[1:]) if recorded else None
             known = {**values, "fleet": fleet, "json": json}
             known = {name: one for name, one in known.items() if name in own or rest}
