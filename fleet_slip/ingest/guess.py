@@ -122,9 +122,9 @@ def guess_signals(profiles: tuple[Profile, ...]) -> dict[str, Guess]:
 
 def _scored(profile: Profile) -> Iterator[tuple[float, Guess]]:
     """Yield what a channel may be, with how well it fits."""
-    name = profile.channel.name
-    if not name.isprintable():
+    if not profile.channel.name.isprintable():
         return
+    name = profile.channel.title or profile.channel.name
     for signal in vocabulary()["signals"]:
         score, words = best_words(signal, name)
         weak = not score
@@ -212,7 +212,8 @@ def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
         if not fitting:
             return None
         keys = {"unit": unit, **fitting[0]}
-    guess = Guess(signal, profile, keys, (f"its name has {words!r}", reason))
+    named = f"the format calls it {words!r}" if profile.channel.title else f"its name has {words!r}"
+    guess = Guess(signal, profile, keys, (named, reason))
     if signal not in catalogue().signals or catalogue()[signal].cyclic:
         return guess
     known, in_si = catalogue()[signal], guess.largest()

@@ -22,6 +22,7 @@ from fleet_slip.ingest.formats.reading import (
     require_unchanged_log,
 )
 from fleet_slip.ingest.formats.source import OWN_TIME, Channel, Source
+from fleet_slip.ingest.formats.vbo import BEGINS as VBO_BEGINS
 from fleet_slip.ingest.vocabulary import unit_called, vocabulary
 
 # Guesses how a text file is written: encoding, separator, and where header, units and data are.
@@ -36,7 +37,9 @@ _BOMS = (b"\xff\xfe", b"\xfe\xff")
 def guess_layout(file: Path) -> tuple[CsvFormat, dict[str, str]]:
     """Return how a text file is written, and the units of its columns if a line has them."""
     encoding = _guess_encoding(file)
-    if encoding is None:
+    with file.open("rb") as stream:
+        is_vbo = VBO_BEGINS.match(stream.read(2**10))
+    if encoding is None or is_vbo:
         return CsvFormat(), {}
     lines = first_lines(file, CsvFormat(encoding=encoding), _LINES)
     if not lines:

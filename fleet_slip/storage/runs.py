@@ -190,7 +190,8 @@ _PRIVATE_OPTION = re.compile(
 )
 _NAMES = re.compile(r"(?i)\b(?:vehicle_id|drive_id|drive_name|source_file|trip_id)\b")
 _DATA_FILE = re.compile(
-    r"(?is).*(\.(?:csv|parquet|mf4|mdf|dat|mat|blf|asc|log|trc|mcap|duckdb|ddb)(?:\.\w+)?)"
+    r"(?is).*(\.(?:csv|parquet|pq|mf4|mdf|dat|mat|h5|hdf5|blf|asc|log|trc|mcap|duckdb|ddb|tdms|vbo)"
+    r"(?:\.\w+)?)"
 )
 _ADDRESS = re.compile(r"(--?[\w-]+=)?[^\s:/@=]+:\S*@([^\s@]+)")
 """Of a user with a password, without a scheme."""

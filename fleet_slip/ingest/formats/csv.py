@@ -281,7 +281,7 @@ def _with_cut_marked(rest: bytes, before: bytes, padding: bytes) -> bytes:
         return rest
     if found >= min(before.count(separator), fields - 1):
         return rest
-    return rest + separator * (fields - found) + CUT.encode()
+    return rest + separator * (fields - found) + f'"{CUT}"'.encode()
 
 
 def _end_of_lines(block: bytes) -> int:

@@ -37,6 +37,8 @@ from fleet_slip.ingest.formats.source import Base, Budget, Channel, Source
 from fleet_slip.ingest.formats.tables import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.formats.tables import MAGIC_AT as DUCKDB_AT
 from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, DuckdbRows, open_duckdb, open_parquet
+from fleet_slip.ingest.formats.vbo import BEGINS as VBO_BEGINS
+from fleet_slip.ingest.formats.vbo import VboSource
 from fleet_slip.ingest.log_files import parts_of
 
 [_HDF5], _HDF5_AT = FORMATS["mat73"].begins, 512
@@ -155,6 +157,8 @@ def _opened(
                 f"{shown(file)}: not {kind}, whatever its name says. Export it again, or name it "
                 "as what it is."
             )
+    if VBO_BEGINS.match(start) and formats.csv == CsvFormat():
+        return nullcontext(VboSource(budget, formats.plain_numbers))
     return nullcontext(CsvSource(budget, formats.csv, formats.plain_numbers))
 
 

@@ -44,11 +44,13 @@ class Channel:
         name: as a mapping names it.
         unit: as the file names it, empty if it does not.
         base: which time base it is of; what has the same stands in one table.
+        title: what it is, where the format fixes that by its name.
     """
 
     name: str
     unit: str = ""
     base: str = ""
+    title: str = ""
 
 
 @dataclass(frozen=True)

@@ -145,6 +145,16 @@ def _csv(file: Path) -> None:
     pl.DataFrame({"t": TIME_S, "ax": AX, "beta": BETA}).write_csv(file)
 
 
+def _vbo(file: Path) -> None:
+    head = ["File created on 31/05/2024 at 12:00:00", "[header]", "", "[column names]"]
+    head += ["sats time lat long velocity heading ax beta", "", "[data]"]
+    rows = [
+        f"009 1200{t:05.2f} +03120.0 +00060.0 040.0 093.5 {ax:+.4f} {beta:+.4f}"
+        for t, ax, beta in zip(TIME_S, AX, BETA, strict=True)
+    ]
+    file.write_text("\r\n".join([*head, *rows, ""]))
+
+
 def _compressed(file: Path) -> None:
     plain = io.BytesIO()
     pl.DataFrame({"t": TIME_S, "ax": AX, "beta": BETA}).write_csv(plain)
@@ -174,6 +184,7 @@ FORMATS: dict[str, Format] = {
     ),
     "mat73": Format(".mat", _mat73, _mapping("ax", "Data.beta")),
     "duckdb": Format(".duckdb", _duckdb, _mapping("ax", "beta", duckdb={"table": "log"})),
+    "vbo": Format(".vbo", _vbo, _mapping("ax", "beta", **_OWN)),
     "csv_zst": Format(".csv.zst", _compressed, _mapping("ax", "beta")),
 }
 

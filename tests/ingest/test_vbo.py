@@ -1,0 +1,180 @@
+"""VBO files of Racelogic: their clock, their units, and what may be wrong with them."""
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleet_slip.ingest.formats.reading import FileFormats, open_source
+from fleet_slip.ingest.mapping import Mapping
+from tests.support.measured import DRIVE, failure, physical, read_measured, reasons
+from tests.support.reported import call
+
+HEAD = """File created on 31/05/2024 at {created}
+
+[header]
+satellites
+time
+latitude
+longitude
+velocity knots
+heading
+height
+Lat accel g
+Yaw
+
+[channel units]
+deg/s
+
+[comments]
+(c) 2001 2003 Racelogic, Prüfstand
+Log Rate (Hz) : 100.00
+
+[column names]
+sats time lat long velocity heading height Latacc Yaw
+
+[data]
+"""
+ROWS = 100
+
+
+def write(
+    file: Path, first_s: float = 33_270.0, created: str = "09:14:30", head: str = HEAD
+) -> str:
+    """Write a second of a drive at 100 Hz; return its text."""
+    lines = []
+    for i in range(ROWS):
+        hours, rest = divmod((first_s + i / 100) % 86_400, 3600)
+        clock = f"{hours:02.0f}{rest // 60:02.0f}{rest % 60:05.2f}"
+        lines.append(f"137 {clock} +03120.0 +00060.0 040.0 093.5 +0152.6 +{i / 100:.2f} -{i:.1f}")
+    text = head.format(created=created) + "\n".join(lines) + "\n"
+    file.write_text(text, encoding="utf-8")
+    return text
+
+
+def mapping(**changes: Any) -> Mapping:
+    signals = {
+        "vehicle_speed": {"column": "velocity", "unit": "knot"},
+        "ay": {"column": "Latacc", "unit": "g"},
+        "yaw_rate": {"column": "Yaw", "unit": "deg/s"},
+    }
+    known = {name: value for name, value in DRIVE.items() if name != "day"}
+    whole = {"name": "m", "time": {"own_clock": True}, "drive": known, "signals": signals}
+    return Mapping.model_validate(whole | changes)
+
+
+def test_columns_have_their_units_and_the_clock_its_date(tmp_path: Path) -> None:
+    write(tmp_path / "a.vbo")
+    log = read_measured(tmp_path / "a.vbo", mapping())
+    assert log.drives["started_at"][0].as_py() == datetime(2024, 5, 31, 9, 14, 30, tzinfo=UTC)
+    assert (log.counts.rows_kept, log.counts.drives) == (ROWS, 1)
+    np.testing.assert_allclose(
+        physical(log, "ay", 0.001)[::33], [0, 3.236, 6.472, 9.709], atol=1e-3
+    )
+    with open_source(tmp_path / "a.vbo", FileFormats()) as source:
+        units = {one.name: one.unit for one in source.channels()}
+        (rows,) = source.batches(["sats", "lat", "long"])
+    assert units == {
+        **{"sats": "", "lat": "deg", "long": "deg", "velocity": "knot", "heading": "deg"},
+        **{"height": "m", "Latacc": "g", "Yaw": "deg/s"},
+    }
+    names = ("sats", "lat", "long")
+    assert [rows[name][0] for name in names] == [9.0, 52.0, -1.0]  # 128 is of a correction
+
+
+@pytest.mark.parametrize(
+    ("created", "first", "began"),
+    [
+        ("23:59:59", "235959.50", datetime(2024, 5, 31, 23, 59, 59, 500_000, tzinfo=UTC)),
+        ("00:00:03", "235959.50", datetime(2024, 5, 30, 23, 59, 59, 500_000, tzinfo=UTC)),
+        ("23:59:58", "000001.00", datetime(2024, 6, 1, 0, 0, 1, tzinfo=UTC)),
+    ],
+)
+def test_a_drive_goes_on_over_midnight(
+    tmp_path: Path, created: str, first: str, began: datetime
+) -> None:
+    hours, minutes, seconds = int(first[:2]), int(first[2:4]), float(first[4:])
+    write(tmp_path / "a.vbo", 3600 * hours + 60 * minutes + seconds, created)
+    log = read_measured(tmp_path / "a.vbo", mapping())
+    assert (log.counts.rows_kept, log.counts.drives) == (ROWS, 1)
+    assert log.drives["started_at"][0].as_py() == began
+
+
+@pytest.mark.parametrize(
+    ("change", "refused"),
+    [
+        (lambda text: text.replace("\n", "\r\n"), []),
+        (lambda text: text.replace("[data]\n", "[DATA] \n"), []),
+        (lambda text: text.partition("[data]")[0] + "[data]" + _comma(text), []),
+        (lambda text: text.replace("091430.10", " 091430.10"), [(11, "missing", "time")]),
+        (lambda text: text.replace("091430.10", "0914_0.10"), [(11, "missing", "time")]),
+        (lambda text: text.replace("091430.10", "091470.10"), [(11, "missing", "time")]),
+        (lambda text: text.replace("+0.10", "+0_10"), [(11, "not_a_number", "ay")]),
+        (lambda text: text[:-20], [(100, "cut_line", None)]),
+        (lambda text: text[:-90], [(99, "cut_line", None)]),
+    ],
+)
+def test_every_line_is_read_or_refused_for_itself(
+    tmp_path: Path, change: Callable[[str], str], refused: list[Any]
+) -> None:
+    text = write(tmp_path / "a.vbo")
+    sound = read_measured(tmp_path / "a.vbo", mapping())
+    (tmp_path / "b.vbo").write_bytes(change(text).encode())
+    log = read_measured(tmp_path / "b.vbo", mapping())
+    assert [(row, reason, signal) for row, reason, signal in reasons(log)] == refused
+    kept = [
+        tick for tick in range(log.counts.rows_read) if tick + 1 not in {r for r, *_ in refused}
+    ]
+    for name in ("tick", "ay", "yaw_rate", "vehicle_speed"):
+        assert log.drives[name].to_pylist() == [sound.drives[name][i].as_py() for i in kept]
+
+
+def _comma(text: str) -> str:
+    return text.partition("[data]")[2].replace(".", ",")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[data]", "[dat]", "a VBO file without the section [data]"),
+        ("[column names]", "", "a VBO file without the section [column names]"),
+        ("sats time", "sats clock", "no column 'time'"),
+        ("velocity heading", "velocity velocity", "2 columns are called 'velocity'"),
+        ("File created on 31/05/2024 at 09:14:30", "", "its clock has no date"),
+        ("31/05/2024", "31/06/2024", "its clock has no date"),
+    ],
+)
+def test_what_a_file_lacks_is_said(tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = write(tmp_path / "a.vbo")
+    (tmp_path / "a.vbo").write_text(text.replace(old, new))
+    assert message in failure(tmp_path / "a.vbo", mapping())
+    if "date" in message:
+        dated = mapping(drive=DRIVE)
+        assert read_measured(tmp_path / "a.vbo", dated).drives["day"][0].as_py() == DRIVE["day"]
+
+
+def test_a_mapping_that_reads_it_as_csv_still_does(tmp_path: Path) -> None:
+    text = write(tmp_path / "a.vbo")
+    lines = text.split("\n")
+    csv = {"header_line": lines.index("[column names]") + 2, "data_line": lines.index("[data]") + 2}
+    clock = {"column": "time", "format": "%H%M%S%.f"}
+    as_csv = mapping(csv={"separator": " ", **csv}, time=clock, drive=DRIVE)
+    rows, also = (read_measured(tmp_path / "a.vbo", one) for one in (mapping(), as_csv))
+    for name in ("tick", "ay", "yaw_rate", "vehicle_speed"):
+        assert rows.drives[name].to_pylist() == also.drives[name].to_pylist()
+
+
+def test_a_draft_takes_speed_and_heading_for_the_receivers(tmp_path: Path) -> None:
+    write(tmp_path / "a.vbo")
+    draft = call(tmp_path, "mapping", "suggest", str(tmp_path / "a.vbo"))
+    for line in (
+        "own_clock = true",
+        'course = { column = "heading", unit = "deg", clockwise_from_north = true',
+        'satellite_speed = { column = "velocity", unit = "knot"',
+        'ay = { column = "Latacc", unit = "g"',
+    ):
+        assert line in draft
+    assert "day = " not in draft
