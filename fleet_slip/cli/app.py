@@ -184,11 +184,32 @@ class LaterOpened:
 
     @cached_property
     def _fleet(self) -> "Fleet":
-        return fleet_slip.open(self._root)
+        fleet = fleet_slip.open(self._root)
+        _leave_pandas()
+        return fleet
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the fleet."""
         return getattr(self._fleet, name)
+
+
+def _leave_pandas() -> None:
+    """Let pyarrow find no pandas when it looks for it, at its first array of Python's values.
+
+    Importing it takes a quarter of a small command. What asks for a data frame still gets one.
+    """
+    import pyarrow as pa  # noqa: PLC0415 - help needs no table
+
+    sys.meta_path.insert(0, _WithoutPandas)
+    pa.array([])
+    sys.meta_path.remove(_WithoutPandas)
+
+
+class _WithoutPandas:
+    @staticmethod
+    def find_spec(name: str, _path: Any = None, _target: Any = None) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError(name, name=name)
 
 
 def _print_version(wanted: bool) -> None:

@@ -8,13 +8,11 @@ import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import duckdb
 import pyarrow as pa
-import pyarrow.compute as pc
 import typer
-from pyarrow.csv import write_csv
 
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.session import Session
@@ -102,9 +100,8 @@ def sql(
             if json:
                 print_json(_rows(session, statement, limit).to_pylist())
             elif csv:
-                rows = _rows(session, statement, limit)
                 sys.stdout.flush()
-                write_csv(rows if exact else _mark_formulas(rows), sys.stdout.buffer)
+                _write_csv(_rows(session, statement, limit), sys.stdout.buffer, exact)
                 sys.stdout.buffer.flush()
             else:
                 _show(session, statement, limit, everything)
@@ -126,12 +123,18 @@ def _write(rows: pa.Table, file: Path, exact: bool) -> None:
 
             pq.write_table(rows, file)
         elif file.suffix == ".csv":
-            write_csv(rows if exact else _mark_formulas(rows), file)
+            _write_csv(rows, file, exact)
         else:
             file.write_text(json_text(rows.to_pylist()), "utf-8")
     except OSError as error:
         raise StorageError(f"{file}: {error.strerror or error}.") from None
     say(f"{file}: {number_of(rows.num_rows, 'row')}, {file.stat().st_size:,} bytes")
+
+
+def _write_csv(rows: pa.Table, to: Any, exact: bool) -> None:
+    from pyarrow.csv import write_csv  # noqa: PLC0415 - with what computes, a tenth of a second
+
+    write_csv(rows if exact else _mark_formulas(rows), to)
 
 
 _CUT = re.compile(r"│ … │|\S… │|rows .*shown\)|columns .*shown\)")
@@ -179,6 +182,8 @@ def _mark_formulas(answer: pa.Table) -> pa.Table:
 
     Logs of others may hold names such as `=HYPERLINK(…)`. After OWASP, "CSV Injection".
     """
+    import pyarrow.compute as pc  # noqa: PLC0415 - see above
+
     marked = 0
     for i, field in enumerate(answer.schema):
         if pa.types.is_string(field.type) or pa.types.is_large_string(field.type):

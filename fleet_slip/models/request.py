@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 from typing_extensions import Doc
@@ -14,13 +14,15 @@ from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.folding import Folding, FoldKey
 from fleet_slip.regression.choice import DEFAULT_WORTH, Worth
 from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.regression.orders import METHODS, RANKINGS
 from fleet_slip.regression.subsets import CRITERIA
 from fleet_slip.resources import find_config
+
+if TYPE_CHECKING:
+    from fleet_slip.grams.cohort import Cohort
 
 DEFAULT_MODELS = "estimator"
 """The model list that is compared unless another is named, by `run` and every night too."""
@@ -316,7 +318,7 @@ WHOLE_SET = "catalogue"
 """As an order of signals: all inputs of the feature set, in its order."""
 
 
-def inputs_of(cohort: Cohort, order: str) -> tuple[str, ...]:
+def inputs_of(cohort: "Cohort", order: str) -> tuple[str, ...]:
     """Return the order of inputs in a text, `catalogue` being all; raises as `require_inputs`."""
     if order == WHOLE_SET:
         return cohort.inputs

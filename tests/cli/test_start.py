@@ -54,6 +54,12 @@ def test_a_command_does_not_wait_for_what_it_does_not_need(
     assert not imported & spared
 
 
+def test_no_command_waits_for_pandas_where_it_is_installed(smoke_root: Path) -> None:
+    """Looking for it, pyarrow imports it: a quarter of what a small command takes."""
+    for arguments in (["models"], ["sql", "SELECT 1"], ["sql", "--csv", "FROM models"]):
+        assert not imported_by(smoke_root, *arguments) & {"pandas"}
+
+
 def test_every_command_is_listed_in_its_own_words() -> None:
     listed = CommandGroup().commands
     assert list(listed) == list(COMMANDS)
