@@ -24,14 +24,14 @@ import duckdb
 import fsspec
 import obstore
 import pyarrow as pa
-from obstore.exceptions import AlreadyExistsError, BaseError
+from obstore.exceptions import AlreadyExistsError
 from obstore.store import from_url
 
 from fleet_slip.base import needed
 from fleet_slip.errors import StorageError
 from fleet_slip.storage.checksums import require_content
 from fleet_slip.storage.folder import Content, StoredFile
-from fleet_slip.storage.storage_errors import is_timeout, object_errors
+from fleet_slip.storage.storage_errors import object_errors
 
 if TYPE_CHECKING:
     from botocore.credentials import Credentials
@@ -55,7 +55,10 @@ HTTP_VARIABLE = "AWS_ALLOW_HTTP"
 """Environment variable, which the Delta library reads too: true lets an endpoint be http."""
 
 TIMEOUT_S = 60
-"""Longest that one request may take: a log file has up to 40 MB."""
+"""Longest that nothing may come of an answer, and that sending may take: of up to 40 MB."""
+
+LONGEST_S = 3600
+"""Longest that an answer may take to come, however slowly."""
 
 CONNECT_TIMEOUT_S = 5
 RETRIES = 5
@@ -147,7 +150,8 @@ def client(bucket: str) -> "ObjectStore":
             bucket,
             client_options={
                 "allow_http": os.environ.get(HTTP_VARIABLE, "").lower() in ("1", "true"),
-                "timeout": timedelta(seconds=TIMEOUT_S),
+                "timeout": timedelta(seconds=LONGEST_S),
+                "read_timeout": timedelta(seconds=TIMEOUT_S),
                 "connect_timeout": timedelta(seconds=CONNECT_TIMEOUT_S),
             },
             retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(seconds=RETRY_S)},
@@ -171,13 +175,10 @@ def delta_options(bucket: str) -> dict[str, str]:
 # Objects as files that can be read anywhere in them: for DuckDB and for pyarrow.
 #
 # They never change. One is fetched whole, compared with the checksum in its name, and read from
-# those bytes. Large ones come in parts within a request's time limit, retried smaller.
+# those bytes.
 
-FIRST_BYTES, MOST_BYTES, LEAST_BYTES = 2**20, 2**23, 2**15
-"""Bytes that a request asks for: at first, and within what limits it adapts to the network."""
-
-QUICK_S = 2.0
-"""After a request that took less the next asks for twice as much."""
+PART_BYTES = 2**22
+"""Bytes of an object that are handed on at once."""
 
 KEPT_BYTES = 2**27
 """Of the objects that were fetched last, so many bytes are kept."""
@@ -186,37 +187,13 @@ KEPT_BYTES = 2**27
 def fetch_parts(store: "ObjectStore", key: str, where: str) -> Iterator[tuple[Any, bytes]]:
     """Yield an object's parts in order, each with what the store says of it.
 
-    `where` names it in errors. Raises `StorageError`, as when not even `LEAST_BYTES` come in time.
+    The library goes on where an answer breaks off, if the object is still the same. `where` names
+    it in errors. Raises `StorageError`, as when nothing comes for `TIMEOUT_S`.
     """
-    position, length = 0, FIRST_BYTES
     with object_errors(where):
-        whole = obstore.get(store, key)
-        size = whole.meta["size"]
-        if size <= length and (content := _in_time(whole)) is not None:
-            yield whole.meta, content
-            return
-        while position < size:
-            begun = time.monotonic()
-            end = min(position + length, size)
-            part = obstore.get(store, key, options={"range": (position, end)})
-            content = _in_time(part, may_fail=length > LEAST_BYTES)
-            if content is None:
-                length //= 4
-                continue
-            yield part.meta, content
-            position += len(content)
-            if time.monotonic() - begun < QUICK_S:
-                length = min(2 * length, MOST_BYTES)
-
-
-def _in_time(answer: Any, *, may_fail: bool = True) -> bytes | None:
-    """Return what an answer brings; None if it does not come within the time limit."""
-    try:
-        return bytes(answer.bytes())
-    except (BaseError, OSError) as error:
-        if may_fail and is_timeout(error):
-            return None
-        raise
+        answer = obstore.get(store, key)
+        for part in answer.stream(min_chunk_size=PART_BYTES):
+            yield answer.meta, bytes(part)
 
 
 def _fetch(store: "ObjectStore", key: str, where: str) -> bytes:

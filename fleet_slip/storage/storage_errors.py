@@ -15,8 +15,6 @@ _CREDENTIALS = (
     "GOOGLE_APPLICATION_CREDENTIALS, or AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY"
 )
 
-_TIMEOUT = r"timed out|TimedOut|kind: Timeout"
-
 _MEANINGS: tuple[tuple[str, str], ...] = (
     (
         r"169\.254\.169\.254|computeMetadata|metadata\.google|Account must be specified|"
@@ -55,7 +53,7 @@ _MEANINGS: tuple[tuple[str, str], ...] = (
         "the name of an object there is no path: a part of it is empty, `.` or `..`. Rename it.",
     ),
     (
-        _TIMEOUT,
+        r"timed out|TimedOut|kind: Timeout",
         "the store does not answer in time, after several attempts. Check the network, and run "
         "the same command again.",
     ),
@@ -73,11 +71,6 @@ def known_meaning(error: BaseException) -> str | None:
     """Return what a failure of an object store means, in one line; None if it is not known."""
     text = str(error)
     return next((meaning for pattern, meaning in _MEANINGS if re.search(pattern, text)), None)
-
-
-def is_timeout(error: BaseException) -> bool:
-    """Whether a request was given up because an answer did not come in time."""
-    return re.search(_TIMEOUT, str(error)) is not None
 
 
 def meaning_of(error: BaseException) -> str:

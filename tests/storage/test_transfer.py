@@ -12,7 +12,6 @@ from fleet_slip.errors import InputError, StorageError
 from fleet_slip.ingest import object_inputs
 from fleet_slip.ingest.object_inputs import copy_object, find_below, find_object
 from fleet_slip.storage import objects
-from fleet_slip.storage import objects as object_files
 from fleet_slip.storage.objects import ObjectFolder, client
 from tests.ingest.test_folders import MAPPING, write_log
 from tests.support.commands import run_on
@@ -28,11 +27,9 @@ def bucket(server: Server) -> str:
 
 @pytest.fixture
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A client that gives a request a second, and asks for little at once."""
+    """A client that waits a second for something to come."""
     monkeypatch.setattr(objects, "TIMEOUT_S", 1)
     monkeypatch.setattr(objects, "RETRIES", 0)
-    monkeypatch.setattr(object_files, "FIRST_BYTES", 2**16)
-    monkeypatch.setattr(object_files, "LEAST_BYTES", 2**12)
     forget_clients()
 
 
@@ -42,19 +39,16 @@ def amazon(server: Server) -> Any:
     return Session().create_client("s3", "us-east-1", endpoint_url=address, **keys)
 
 
-@pytest.mark.parametrize("bytes_per_s", [200_000, 60_000])
-def test_an_object_that_takes_longer_than_a_request_may_is_read_in_parts(
-    bytes_per_s: int, bucket: str, server: Server, hasty: None, tmp_path: Path
+def test_an_object_may_come_slowly_as_long_as_it_comes(
+    bucket: str, server: Server, hasty: None, tmp_path: Path
 ) -> None:
-    content = CONTENT[: 2 * bytes_per_s]
-    obstore.put(client(bucket), "a/log.csv", content)
+    obstore.put(client(bucket), "a/log.csv", CONTENT)
     found = find_object(f"{bucket}/a/log.csv")
     assert found is not None
-    with server.misbehaving(bytes_per_s=bytes_per_s) as faults:
+    with server.misbehaving(bytes_per_s=200_000):
         copy_object(found, tmp_path / "log.csv")
-        assert ObjectFolder(bucket, "a").read("log.csv") == content
-    assert (tmp_path / "log.csv").read_bytes() == content
-    assert len([one for one in faults.seen if "log.csv" in one]) > 4
+        assert ObjectFolder(bucket, "a").read("log.csv") == CONTENT
+    assert (tmp_path / "log.csv").read_bytes() == CONTENT
 
 
 def test_a_store_that_brings_nothing_is_given_up(
@@ -64,7 +58,7 @@ def test_a_store_that_brings_nothing_is_given_up(
     found = find_object(f"{bucket}/log.csv")
     assert found is not None
     with (
-        server.misbehaving(bytes_per_s=2000),
+        server.misbehaving(bytes_per_s=0.2),
         pytest.raises(StorageError, match="does not answer in time"),
     ):
         copy_object(found, tmp_path / "log.csv")

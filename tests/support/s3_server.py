@@ -167,10 +167,10 @@ def _answer(start: StartResponse, status: str, code: str) -> Iterable[bytes]:
 
 
 def _slowly(content: bytes, bytes_per_s: float) -> Iterator[bytes]:
-    """Yield an answer as a slow network brings it, twenty times in a second."""
+    """Yield an answer as a slow network brings it, twenty times in a second, or byte by byte."""
     step = max(1, int(bytes_per_s / 20))
     for first in range(0, len(content), step):
-        time.sleep(1 / 20)
+        time.sleep(step / bytes_per_s)
         yield content[first : first + step]
 
 
