@@ -138,3 +138,20 @@ def hostile_drive(program: Program, ticks: int, seed: int) -> list[Sample]:
     counts[np.repeat(random.random(ticks // 10 + 1) < 0.1, 10)[:ticks]] = -32768
     counts[: ticks // 5] = np.clip(counts[: ticks // 5], 20_000, 30_000)  # sums at their largest
     return [tuple(None if one == -32768 else one for one in row) for row in counts.tolist()]
+
+
+LONGEST = "n" + "_" * 39 + "1"
+TEXTS = ("a-b", "a.b", "a_b_2", "A_B", "-" * 60, "." * 60)
+"""Facts whose names are the same, once they are names of C."""
+
+
+def hostile_version() -> ModelVersion:
+    plain_model = model_of({"ay": Fraction(1, 3), "of_suv": Fraction(1, 700)}, name=LONGEST)
+    signal, suv = plain_model.terms
+    facts = [Definition(of="ax", fact=Fact(name="vehicle_model", equals=text)) for text in TEXTS]
+    terms = [
+        suv.model_copy(update={"signal": f"f{i}", "column": f"f{i}", "definition": one})
+        for i, one in enumerate(facts)
+    ]
+    manifest = plain_model.model_copy(update={"terms": (signal, *terms)})
+    return ModelVersion(1, manifest, "0123" * 16)

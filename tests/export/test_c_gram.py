@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import UsageError
 from fleet_slip.export.files import export_files
 from fleet_slip.grams.on_board import counted_sets
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.regression.gram import Gram
-from tests.export.compiled import SANITIZED, can_sanitize, compile_c, needs_cc, run_compiled
+from tests.export.compiled import compile_c, needs_cc, run_compiled
 from tests.export.models import MODELS, model_of
 from tests.support.counted_rows import parse_messages
 
@@ -91,28 +90,6 @@ def parts_of(content: bytes) -> dict[tuple[str, ...], Gram]:
     return found
 
 
-def test_simulated_drives_have_the_gram_rows_of_the_warehouse(
-    smoke_root: Path, counter: Path
-) -> None:
-    fleet = fleet_slip.open(smoke_root)
-    rows = (
-        fleet.sql("SELECT * FROM grams WHERE feature_set = 'signals' ORDER BY drive_id")
-        .to_arrow_table()
-        .to_pylist()
-    )
-    assert len(rows) > 3
-    for row in rows[:4]:
-        counts = fleet.sql(
-            f"SELECT {', '.join(SIGNALS)} FROM log_counts WHERE drive_id = '{row['drive_id']}'"
-        ).fetchnumpy()
-        drive = np.column_stack([np.ma.filled(counts[name], MISSING) for name in SIGNALS])
-        content = count_drives(counter, [("VIN1", 1_700_000_000, drive)])
-        names = tuple(row["signals"].split(","))
-        whole = Gram(names, row["n"], tuple(row["sums"]), tuple(row["products"]))
-        assert parts_of(content) == {names: whole}
-        assert len(content) == 676
-
-
 def test_each_set_of_signals_has_a_message_and_extremes_are_exact(counter: Path) -> None:
     random = np.random.default_rng(5)
     counts = random.choice([-32767, 32767, 30000, -30000, 0, 1, -1], (5000, len(SIGNALS)))
@@ -154,14 +131,6 @@ def test_the_layout_is_what_the_page_says(counter: Path) -> None:
     assert struct.unpack_from("<QIII", content, 36) == (1_700_000_000, 2**11 - 1, 3, 0)
     assert set(np.frombuffer(content[56:-4], "<i8").tolist()) == {3}
     assert zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], "little")
-
-
-def test_nothing_overflows(tmp_path: Path) -> None:
-    if not can_sanitize(tmp_path):
-        pytest.skip("the compiler's sanitizers are not here")
-    sanitized = build_counter(tmp_path, *SANITIZED)
-    counts = np.random.default_rng(1).integers(-(2**15), 2**15, (3000, len(SIGNALS)))
-    assert count_drives(sanitized, [("VIN", 2**64 - 1, counts)])
 
 
 def test_gram_rows_go_with_c_alone() -> None:

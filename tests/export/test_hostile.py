@@ -4,13 +4,11 @@ import json
 import subprocess
 import zipfile
 from collections.abc import Mapping
-from fractions import Fraction
 from io import BytesIO
 from pathlib import Path
 from xml.etree import ElementTree
 
 import cantools
-import duckdb
 import numpy as np
 import onnxruntime
 import pandas as pd
@@ -18,7 +16,6 @@ import polars as pl
 import pytest
 from cantools.database.can.database import Database
 
-from fleet_slip.catalogue.definitions import Definition, Fact
 from fleet_slip.errors import InputError
 from fleet_slip.export import fmu
 from fleet_slip.export.files import export_files
@@ -27,26 +24,10 @@ from fleet_slip.export.templating import different
 from fleet_slip.models.registry import ModelVersion
 from tests.export import plain
 from tests.export.compiled import compile_c, needs_cc
-from tests.export.models import MODELS, model_of
+from tests.export.models import LONGEST, MODELS, TEXTS, hostile_version, model_of
 from tests.export.sql_rows import by_duckdb, by_sqlite
 
-LONGEST = "n" + "_" * 39 + "1"
-TEXTS = ("a-b", "a.b", "a_b_2", "A_B", "-" * 60, "." * 60)
-"""Facts whose names are the same, once they are names of C."""
-
 EMPTY = model_of(MODELS["every_kind"], name="empty")
-
-
-def hostile_version() -> ModelVersion:
-    plain_model = model_of({"ay": Fraction(1, 3), "of_suv": Fraction(1, 700)}, name=LONGEST)
-    signal, suv = plain_model.terms
-    facts = [Definition(of="ax", fact=Fact(name="vehicle_model", equals=text)) for text in TEXTS]
-    terms = [
-        suv.model_copy(update={"signal": f"f{i}", "column": f"f{i}", "definition": one})
-        for i, one in enumerate(facts)
-    ]
-    manifest = plain_model.model_copy(update={"terms": (signal, *terms)})
-    return ModelVersion(1, manifest, "0123" * 16)
 
 
 VERSION = hostile_version()
@@ -106,19 +87,6 @@ def test_the_json_document_gives_the_angles_of_its_checks() -> None:
         given = (check["facts"], check["numbers"], check["samples"])
         assert plain.angles(document["program"], *given) == check["angles"]
     assert len({angle for check in document["checks"] for angle in check["angles"]}) > 50
-
-
-def test_sql_gives_the_angles_of_its_checks(tmp_path: Path) -> None:
-    files = exported("sql")
-    (tmp_path / "checks.csv").write_bytes(files[f"sideslip_{LONGEST}_checks.csv"])
-    with duckdb.connect() as database:
-        database.execute(f"CREATE TABLE checks AS FROM read_csv('{tmp_path / 'checks.csv'}')")
-        database.execute(files[f"sideslip_{LONGEST}_macro.sql"].decode())
-        right = database.sql(
-            "SELECT count(*) FILTER (angle IS NOT DISTINCT FROM expected_angle) "
-            f"FROM checks JOIN sideslip_{LONGEST}('checks') USING (drive_id, tick)"
-        ).fetchall()
-    assert right == [(900,)]
 
 
 def test_onnx_takes_no_car_at_all() -> None:

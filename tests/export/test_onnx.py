@@ -55,23 +55,6 @@ def test_a_feature_of_one_value_stands_beside_others(monkeypatch: pytest.MonkeyP
     assert np.allclose(found, expected, rtol=0, atol=1e-12, equal_nan=True)
 
 
-def test_a_whole_drive_is_that_of_predict(smoke_root: Path) -> None:
-    fleet = fleet_slip.open(smoke_root)
-    version = fleet.model("smoke")
-    program = compile_program(version.manifest)
-    drive = fleet.sql(
-        "SELECT * FROM log WHERE drive_id = 'smoke-2024-05-01-0003' AND tick < 600 ORDER BY tick"
-    ).pl()
-    predicted = version.predict(drive).to_numpy()
-    signals = drive.select([one.column for one in program.signals]).to_numpy()[None]
-    in_64 = run_drives(open_session(version, "float64"), program, CARS[:1], signals)[0]
-    assert np.abs(in_64 - predicted).max() < 1e-14
-    in_32 = run_drives(
-        open_session(version, "float32"), program, CARS[:1], signals.astype(np.float32)
-    )[0]
-    assert 0 < np.abs(in_32 - predicted).max() < 1e-6
-
-
 def test_the_files_say_what_they_are_of(smoke_root: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     version = fleet.model("smoke")

@@ -4,14 +4,23 @@ from fractions import Fraction
 from pathlib import Path
 
 import duckdb
-import numpy as np
 import pytest
 
-import fleet_slip
 from fleet_slip.export.compile import angles_by_kernel, compile_program
+from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
-from tests.export.models import CARS, DEFINITIONS, MODELS, export_texts, hostile_drive, model_of
+from tests.export.models import (
+    CARS,
+    DEFINITIONS,
+    MODELS,
+    export_texts,
+    hostile_drive,
+    hostile_version,
+    model_of,
+)
 from tests.export.sql_rows import by_duckdb, by_sqlite, table
+
+EVERY_KIND = model_of(MODELS["every_kind"], name="every_kind")
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -36,22 +45,6 @@ def test_hostile_drives_give_the_angles_of_the_kernel(name: str) -> None:
     assert len({*expected.values()}) > 10
 
 
-def test_the_macro_gives_the_angles_of_score(smoke_root: Path) -> None:
-    fleet = fleet_slip.open(smoke_root)
-    version = fleet.model("smoke")
-    macro = export_texts(version, fleet.warehouse, "sql")["sideslip_smoke_macro.sql"]
-    log = fleet.sql("SELECT * FROM log WHERE drive_id = 'smoke-2024-05-01-0003'").pl().sort("tick")
-    with duckdb.connect() as database:
-        database.register("my_log", log.to_arrow())
-        database.execute(macro)
-        found = database.sql(
-            "SELECT angle, sideslip_rad FROM sideslip_smoke('my_log') ORDER BY tick"
-        ).fetchall()
-    estimates = [np.floor(one / 1e-5 + 0.5) for one in version.predict(log)]
-    assert [angle for angle, _ in found] == estimates
-    assert np.allclose([rad for _, rad in found], np.array(estimates) * 1e-5, rtol=1e-12)
-
-
 def test_the_statement_says_what_it_is_of() -> None:
     manifest = model_of(dict.fromkeys(DEFINITIONS, Fraction(1, 10**6)))
     files = export_texts(ModelVersion(3, manifest, "ab" * 32), None, "sql")
@@ -60,18 +53,19 @@ def test_the_statement_says_what_it_is_of() -> None:
         assert "ab" * 32 in text
 
 
-def test_the_table_of_checks_holds(tmp_path: Path) -> None:
+@pytest.mark.parametrize("manifest", [EVERY_KIND, hostile_version().manifest])
+def test_the_table_of_checks_holds(tmp_path: Path, manifest: Manifest) -> None:
     """Every kind of column: `car` of the check `extremes` knows all facts and numbers."""
-    manifest = model_of(MODELS["every_kind"], name="every_kind")
+    name = manifest.name
     files = export_texts(ModelVersion(1, manifest, "0" * 64), None, "sql")
     checks = tmp_path / "checks.csv"
-    checks.write_text(files["sideslip_every_kind_checks.csv"])
+    checks.write_text(files[f"sideslip_{name}_checks.csv"])
     with duckdb.connect() as database:
         database.execute(f"CREATE TABLE checks AS FROM read_csv('{checks}')")
-        database.execute(files["sideslip_every_kind_macro.sql"])
+        database.execute(files[f"sideslip_{name}_macro.sql"])
         rows, right, angles = database.sql(
             "SELECT count(*), count(*) FILTER (angle IS NOT DISTINCT FROM expected_angle), "
-            "count(DISTINCT angle) FROM checks JOIN sideslip_every_kind('checks') "
+            f"count(DISTINCT angle) FROM checks JOIN sideslip_{name}('checks') "
             "USING (drive_id, tick)"
         ).fetchall()[0]
     assert rows == right == 900

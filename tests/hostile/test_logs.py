@@ -65,24 +65,16 @@ def secret(folder: Path) -> Path:
     return file
 
 
-def test_values_in_another_file_are_not_read(tmp_path: Path) -> None:
-    other = secret(tmp_path)
-
-    def make(root: h5py.File, column: str) -> None:
-        outside = [(str(other), 0, h5py.h5f.UNLIMITED)]
-        root.create_dataset(column, (ROWS,), dtype="f8", external=outside)
-
-    assert "are in other files" in failure(hdf5(tmp_path, make))
-
-
-def test_values_in_a_pipe_are_not_waited_for(tmp_path: Path) -> None:
+@pytest.mark.parametrize("place", ["{}", "below/{}"])
+def test_values_in_another_file_or_a_pipe_are_not_read(tmp_path: Path, place: str) -> None:
     os.mkfifo(tmp_path / "pipe")
+    for other in (secret(tmp_path), tmp_path / "pipe"):
+        outside = [(str(other), 0, h5py.h5f.UNLIMITED)]
 
-    def make(root: h5py.File, column: str) -> None:
-        outside = [(str(tmp_path / "pipe"), 0, h5py.h5f.UNLIMITED)]
-        root.create_dataset(f"below/{column}", (ROWS,), dtype="f8", external=outside)
+        def make(root: h5py.File, column: str, outside: Any = outside) -> None:
+            root.create_dataset(place.format(column), (ROWS,), dtype="f8", external=outside)
 
-    assert "are in other files" in failure(hdf5(tmp_path, make))
+        assert "are in other files" in failure(hdf5(tmp_path, make))
 
 
 @pytest.mark.parametrize("is_unlimited", [False, True])

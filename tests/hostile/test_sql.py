@@ -18,8 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.base import no_progress
-from fleet_slip.errors import FleetSlipError, QuestionError, StorageError
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
@@ -111,55 +110,6 @@ def test_a_statement_in_a_string_is_refused(root: Path) -> None:
             with pytest.raises(QuestionError, match="json_execute_serialized_sql"):
                 one_query(database, attack)
     assert contents(root) == before
-
-
-@pytest.mark.parametrize(
-    "condition",
-    [
-        "true) OR (true",
-        "1; DROP VIEW grams",
-        "true /*",
-        "true) FROM grams; COPY (SELECT 1) TO 'stolen.csv'; SELECT (true",
-        "EXISTS (WITH x AS (COPY (SELECT 1) TO 'stolen.csv') FROM x)",
-        "EXISTS (FROM query('SELECT 1'))",
-        "EXISTS (FROM read_text('/etc/passwd'))",
-        "EXISTS (FROM read_parquet('/etc/passwd'))",
-        "{condition}",
-        "drive_id = '\0'",
-        "drive_id = $feature_set",
-        "error('x')",
-        "\ud800",
-    ],
-)
-def test_a_cohort_condition_cannot_break_out(
-    root: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, condition: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    before = contents(root)
-    with pytest.raises(FleetSlipError) as refused:
-        load_cohort(Warehouse(LocalFolder(root)), condition)
-    assert str(refused.value).isprintable()
-    assert not list(tmp_path.iterdir())
-    assert contents(root) == before
-
-
-@pytest.mark.parametrize("condition", ["true --", "1/0"])
-def test_a_strange_condition_is_one_condition(root: Path, condition: str) -> None:
-    assert load_cohort(Warehouse(LocalFolder(root)), condition).drive_count == 2
-
-
-@pytest.mark.parametrize(
-    "condition",
-    ["(" * 3000 + "true" + ")" * 3000, "true" + " AND true" * 20_000],
-    ids=["brackets", "and"],
-)
-def test_a_condition_of_any_length_is_answered_or_refused(root: Path, condition: str) -> None:
-    try:
-        drives = load_cohort(Warehouse(LocalFolder(root)), condition).drive_count
-    except FleetSlipError as error:
-        assert "condition" in str(error)
-    else:
-        assert drives == 2
 
 
 @pytest.mark.parametrize(

@@ -40,24 +40,19 @@ def test_a_written_file_is_not_part_of_the_table_before_its_commit(warehouse: Wa
     assert (snapshot.landed("u"), snapshot.landed("other")) == (7, None)
 
 
-def test_the_same_rows_make_the_same_bytes(warehouse: Warehouse) -> None:
-    action = warehouse.logs.write_file("one", rows("a"), DAY)
-    path = path_of(warehouse.logs.folder) / action.path
-    first = path.read_bytes()
-    again = warehouse.logs.write_file("one", rows("a"), DAY).path
-    assert checksum_in(again) == checksum_in(action.path)
-    assert (path_of(warehouse.logs.folder) / again).read_bytes() == first
-    assert again != action.path  # each name has one writer, who may delete it until its commit
-    assert not list(path.parent.glob(f"{TEMPORARY_PREFIX}*"))
-
-
-def test_a_file_is_named_by_its_checksum(warehouse: Warehouse) -> None:
-    action = warehouse.logs.write_file("one", rows("a"), DAY)
-    content = (path_of(warehouse.logs.folder) / action.path).read_bytes()
-    fast, checksum = xxhash.xxh3_64_hexdigest(content), hashlib.sha256(content).hexdigest()[:32]
-    assert action.path == f"day=2024-05-01/one-x{fast}-{checksum}.parquet"
-    assert checksum_in(action.path) == checksum_of(content)
+def test_the_same_rows_make_the_same_bytes_by_which_their_file_is_named(
+    warehouse: Warehouse,
+) -> None:
+    paths = [warehouse.logs.write_file("one", rows("a"), DAY).path for _ in range(2)]
+    contents = [(path_of(warehouse.logs.folder) / path).read_bytes() for path in paths]
+    assert contents[0] == contents[1]
+    fast, checksum = xxhash.xxh3_64_hexdigest(contents[0]), checksum_of(contents[0])
+    assert checksum == hashlib.sha256(contents[0]).hexdigest()[:32]
+    assert paths[0] == f"day=2024-05-01/one-x{fast}-{checksum}.parquet"
+    assert checksum_in(paths[1]) == checksum
+    assert paths[1] != paths[0]  # each name has one writer, who may delete it until its commit
     assert checksum_in("day=2024-05-01/smoke-0000-0123456789ab.parquet") is None
+    assert not list(path_of(warehouse.root).rglob(f"{TEMPORARY_PREFIX}*"))
 
 
 def test_a_unit_lands_once_however_many_try(warehouse: Warehouse) -> None:

@@ -39,6 +39,7 @@ LASTING = [
     "TRY_CAST(substring(drive_id FROM 2) AS INT) > 1",
     "md5(drive_id) < '8'",
     "adhesion IS TRUE",
+    "1/0",
     "\"DAY\" = '2024-05-01' OR vehicle_model = 'it''s'",
 ]
 
@@ -56,6 +57,7 @@ NOT_ALONE = [
     "true USING SAMPLE 1",
     "true; SELECT 1",
     "true;",
+    "true) FROM grams; COPY (SELECT 1) TO 'stolen.csv'; SELECT (true",
     "true, true",
     "true /*",
     "true OR",
@@ -89,6 +91,8 @@ MORE_THAN_COLUMNS = [
     "EXISTS (SELECT 1)",
     "mass_kg > ALL (SELECT 1)",
     "EXISTS (FROM read_text('/etc/passwd'))",
+    "EXISTS (FROM query('SELECT 1'))",
+    "EXISTS (WITH x AS (COPY (SELECT 1) TO 'stolen.csv') FROM x)",
     "*",
     "COLUMNS('mass.*') > 1",
     "drive_id = $1",
