@@ -167,6 +167,12 @@ def test_a_mapping_that_reads_it_as_csv_still_does(tmp_path: Path) -> None:
         assert rows.drives[name].to_pylist() == also.drives[name].to_pylist()
 
 
+def test_rows_may_be_chosen_by_the_time_and_the_satellites(tmp_path: Path) -> None:
+    write(tmp_path / "a.vbo")
+    log = read_measured(tmp_path / "a.vbo", mapping(where="time > 91430.5 and sats < 10"))
+    assert log.counts.rows_kept == ROWS // 2 - 1
+
+
 def test_a_draft_takes_speed_and_heading_for_the_receivers(tmp_path: Path) -> None:
     write(tmp_path / "a.vbo")
     draft = call(tmp_path, "mapping", "suggest", str(tmp_path / "a.vbo"))

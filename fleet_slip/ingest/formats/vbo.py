@@ -6,6 +6,7 @@ those of CSV are. Times are of the day in UTC and go on over midnight; the first
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import takewhile
 from typing import Any
@@ -57,7 +58,7 @@ class VboSource(CsvSource):
         layout = CsvFormat(
             separator=" ", decimal_comma=comma, header_line=names, data_line=max(data, names + 1)
         )
-        super().__init__(budget, layout, numbers)
+        super().__init__(budget, layout, replace(numbers, columns=numbers.columns - {_TIME}))
         self._lines, self._created = lines, _CREATED.search(lines[0])
 
     def _section(self, name: str) -> list[str]:
