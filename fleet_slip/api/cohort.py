@@ -155,16 +155,10 @@ class FleetCohort(Rooted):
         stands beside. Raises `DataError` if the drives lack the label or what the filter needs, and
         `UsageError` for a name or number that no car can have.
         """
-        from pydantic import ValidationError
-
-        from fleet_slip.config import faults_of
         from fleet_slip.evaluation.filters import TuningDrives
-        from fleet_slip.evaluation.identify import Measured, identify_held_out
+        from fleet_slip.evaluation.identify import identify_held_out, measured_car
 
-        try:
-            car = Measured.model_validate({"name": name, **measured})
-        except ValidationError as error:
-            raise UsageError(f"what was measured of the car: {faults_of(error)}.") from None
+        car = measured_car(name, measured)
         chosen = TuningDrives.of(self.warehouse, self._load("signals"), weighed=False)
         with open_workers(self.root, threads) as executor:
             return identify_held_out(car, chosen.read(), executor)

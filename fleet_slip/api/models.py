@@ -388,24 +388,35 @@ class JudgedModels(PublishedModels):
         others: Sequence[str | ModelVersion] = (),
         *,
         vehicle: Annotated[
-            str | None,
-            Doc("With `cohort`: the car's file, for filters. Its mass and geometry suffice."),
+            str | Mapping[str, float] | None,
+            Doc(
+                "With `cohort`: the car's file, for filters; or what scales and a tape measure say "
+                "of it, in the words of `fleet_slip.evaluation.identify.Measured`."
+            ),
         ] = None,
         threads: int | None = None,
     ) -> "Document":
         """Evaluate models on measured drives with a label, beside Table I and filters.
 
-        What is fitted or tuned never saw what it is judged by: a quarter of the drives after the
-        other, or of their time, is left out. Without a `vehicle` no filter competes, unless a file
-        ships for the drives' class. Returns the document kept below `evaluations/measured/`. Raises
-        `DataError` without a label, `ConfigError` for an unknown car, and what `model` raises.
+        What is chosen, fitted, tuned or identified never saw what it is judged by: each drive is
+        left out in turn, or each quarter of the time of one or two, and each kind of driving.
+        Without a `vehicle` no filter competes, unless a file ships for the drives' class. Returns
+        the document kept below `evaluations/measured/`. Raises `DataError` without a label,
+        `ConfigError` for an unknown car, `UsageError` for one that no car can be, and what `model`
+        raises.
         """
         from fleet_slip.evaluation.evaluate import evaluations_of, keep
+        from fleet_slip.evaluation.identify import Measured, measured_car
         from fleet_slip.evaluation.measured import evaluate_measured
+        from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 
         versions = [self.resolve(one) for one in (model, *others)]
+        if isinstance(vehicle, Mapping):
+            car: VehicleParameters | Measured | None = measured_car("measured", vehicle)
+        else:
+            car = load_vehicle(vehicle) if vehicle else None
         with open_workers(self.root, threads) as executor:
-            content = evaluate_measured(self.warehouse, versions, cohort, vehicle, executor)
+            content = evaluate_measured(self.warehouse, versions, cohort, car, executor)
         return keep(evaluations_of(self.warehouse, "measured"), content)
 
     def evaluate_blind(

@@ -35,6 +35,17 @@ if TYPE_CHECKING:
     from fleet_slip.evaluation.report import Written
 
 
+# What scales and a tape measure say of a car.
+
+MASS = typer.Option(help="Of the whole car, kg.", min=1)
+FRONT_AXLE = typer.Option(help="From the centre of gravity to the front axle, m.", min=0.01)
+REAR_AXLE = typer.Option(help="To the rear axle, m.", min=0.01)
+TRACK = typer.Option(help="m.", min=0.01)
+HEIGHT = typer.Option(help="Of the centre of gravity above the road, m.", min=0.01)
+RADIUS = typer.Option(help="Rolling radius, m.", min=0.01)
+FRONT_DRIVE = typer.Option(help="Share of the drive torque in front.", min=0, max=1)
+
+
 # What `evaluate` prints for people: a screen, and with --all the errors of all on every drive.
 
 
@@ -105,20 +116,38 @@ def print_ranking(ranking: Mapping[str, Any]) -> None:
 
 def _print_measured(content: Mapping[str, Any]) -> None:
     """Print figures on measured drives, the best estimator first."""
+    drives = number_of(len(content["drives"]), "drive")
+    left_out = "quarters of their time" if content["parts_of"] == "time" else "whole"
+    kinds = ", ".join(f"{one['name']} ({len(one['drives'])})" for one in content["kinds"])
     print_records(
-        f"{content['cohort']}: each quarter of the {content['parts_of']} left out in turn, "
-        f"{number_of(len(content['drives']), 'drive')}",
-        "estimator|knows|RMSE deg|mean|std|correlation|rows",
-        "{name}|{told}|{rmse_deg:.3f}|{error_mean_deg:+.3f}|{error_std_deg:.3f}|"
-        "{correlation:.3f}|{coverage:.0%}",
-        ({**one, "name": name} for name, one in content["estimators"].items()),
+        f"{content['cohort']}: {drives}, left out {left_out} in turn, in {content['parts']} parts",
+        "estimator|knows|RMSE deg|±|mean|std|correlation|rows|worst|kinds left out",
+        "{name}|{told}|{rmse_deg:.3f}|{error}|{error_mean_deg:+.3f}|{error_std_deg:.3f}|"
+        "{correlation:.3f}|{coverage:.0%}|{worst_drive_rmse_deg:.3f}|{kinds}",
+        (
+            {
+                **one,
+                "name": name,
+                "error": _optional(one["rmse_standard_error_deg"]),
+                "kinds": _optional((one["kinds_left_out"] or {}).get("rmse_deg")),
+            }
+            for name, one in content["estimators"].items()
+        ),
         left=2,
+    )
+    print_text(
+        "±: standard error over drives; worst: RMSE of the drive that is estimated worst.\n"
+        + (f"Kinds of driving: {kinds}." if kinds else "All drives are of one kind of driving.")
     )
     if content["vehicle"] is None:
         print_text(
-            "No filter competes: no vehicle file is known. Make one: fleet-slip identify, and name "
-            "it with --vehicle."
+            "No filter competes: no car is known. Say what it measures (--mass, --front-axle, "
+            "--rear-axle), or name a vehicle file with --vehicle."
         )
+
+
+def _optional(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"
 
 
 @command(Fleet.score, arguments=["model"])
@@ -244,6 +273,13 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
+    mass: Annotated[float | None, MASS] = None,
+    front_axle: Annotated[float | None, FRONT_AXLE] = None,
+    rear_axle: Annotated[float | None, REAR_AXLE] = None,
+    track: Annotated[float, TRACK] = 1.55,
+    height: Annotated[float, HEIGHT] = 0.55,
+    radius: Annotated[float, RADIUS] = 0.315,
+    front_drive: Annotated[float, FRONT_DRIVE] = 1.0,
     everything: Annotated[
         bool, typer.Option("--all", help="Print the errors of all estimators on every drive.")
     ] = False,
@@ -258,18 +294,32 @@ def evaluate(
 
     Example: **fleet-slip evaluate waterford --scenario nominal**
     """
-    if (cohort is None and vehicle) or (cohort is not None and (scenarios or blind)):
+    car = vehicle or mass
+    if (cohort is None and car) or (cohort is not None and (scenarios or blind)):
         raise UsageError(
-            "--cohort judges measured drives, for filters in the car of --vehicle: leave out "
-            "--scenario and --blind, and name a cohort."
+            "--cohort judges measured drives, for filters in the car of --vehicle or --mass: leave "
+            "out --scenario and --blind, and name a cohort."
         )
+    if mass and (vehicle or front_axle is None or rear_axle is None):
+        raise UsageError("--mass is for --front-axle and --rear-axle too: leave out --vehicle.")
     if blind and scenarios:
         raise UsageError("--blind has drives of its own: leave out --scenario.")
     if blind:
         content = fleet.evaluate_blind(model, others, threads=threads)
         return print_json(content) if json else print_evaluation(content, everything)
     if cohort is not None:
-        kept = fleet.evaluate_measured(model, cohort, others, vehicle=vehicle, threads=threads)
+        known: str | dict[str, float] | None = vehicle
+        if mass and front_axle and rear_axle:
+            known = {
+                "mass_kg": mass,
+                "front_axle_m": front_axle,
+                "rear_axle_m": rear_axle,
+                "track_m": track,
+                "height_m": height,
+                "rolling_radius_m": radius,
+                "front_drive_share": front_drive,
+            }
+        kept = fleet.evaluate_measured(model, cohort, others, vehicle=known, threads=threads)
     else:
         with progress("simulate scenarios", "rows") as show:
             kept = fleet.evaluate(
@@ -290,19 +340,13 @@ def identify(
     condition: str,
     threads: int | None,
     name: Annotated[str, typer.Argument(help="What the car is to be called.")],
-    mass: Annotated[float, typer.Option(help="Of the whole car, kg.", min=1)],
-    front_axle: Annotated[
-        float, typer.Option(help="From the centre of gravity to the front axle, m.", min=0.01)
-    ],
-    rear_axle: Annotated[float, typer.Option(help="To the rear axle, m.", min=0.01)],
-    track: Annotated[float, typer.Option(help="m.", min=0.01)] = 1.55,
-    height: Annotated[
-        float, typer.Option(help="Of the centre of gravity above the road, m.", min=0.01)
-    ] = 0.55,
-    radius: Annotated[float, typer.Option(help="Rolling radius, m.", min=0.01)] = 0.315,
-    front_drive: Annotated[
-        float, typer.Option(help="Share of the drive torque in front.", min=0, max=1)
-    ] = 1.0,
+    mass: Annotated[float, MASS],
+    front_axle: Annotated[float, FRONT_AXLE],
+    rear_axle: Annotated[float, REAR_AXLE],
+    track: Annotated[float, TRACK] = 1.55,
+    height: Annotated[float, HEIGHT] = 0.55,
+    radius: Annotated[float, RADIUS] = 0.315,
+    front_drive: Annotated[float, FRONT_DRIVE] = 1.0,
     output: Annotated[
         Path | None, typer.Option(help="Write the vehicle file here.", show_default=False)
     ] = None,

@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
-from pydantic import Field, FiniteFloat
+from pydantic import Field, FiniteFloat, ValidationError
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.base import sha256_of
 from fleet_slip.catalogue.signals import Identifier
-from fleet_slip.config import Config
-from fleet_slip.errors import DataError
+from fleet_slip.config import Config, faults_of
+from fleet_slip.errors import DataError, UsageError
 from fleet_slip.evaluation import ekf
 from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters
@@ -335,6 +335,14 @@ class Measured(Config):
             "aerodynamics": {"drag_area_m2": 0.65},
         }
         return VehicleParameters.model_validate(content)
+
+
+def measured_car(name: str, measured: Mapping[str, float]) -> Measured:
+    """Return what was measured of a car. Raises `UsageError` for what no car can have."""
+    try:
+        return Measured.model_validate({"name": name, **measured})
+    except ValidationError as error:
+        raise UsageError(f"what was measured of the car: {faults_of(error)}.") from None
 
 
 @dataclass(frozen=True)

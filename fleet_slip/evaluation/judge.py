@@ -1,5 +1,6 @@
 """Judges estimators on drives: how far each is off, where, and who wins."""
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -110,6 +111,29 @@ def judge(drives: Sequence[JudgedDrive]) -> dict[str, ErrorFigures]:
     return {
         name: error_figures(np.concatenate([one.estimates[name] for one in drives]), truth, rows)
         for name in drives[0].estimates
+    }
+
+
+def spread_over(drives: Sequence[JudgedDrive], name: str) -> dict[str, Any]:
+    """Return the standard error of an estimator's RMSE over drives, and the drive it errs most on.
+
+    The mean squared error is a quotient of sums over drives, Σ Sd / Σ nd, whose variance is that
+    of Sd − MSE nd (Cochran, "Sampling Techniques" (1977), section 6.4). None of a single drive.
+    """
+    found = [(one.name, judge([one])[name]) for one in drives]
+    kept = [(drive, one.rows * one.coverage, one.rmse_deg) for drive, one in found if one.rmse_deg]
+    rows, rmse = np.array([n for _, n, _ in kept]), np.array([rmse for *_, rmse in kept])
+    error = None
+    if len(kept) > 1:
+        mean_square = float(rows @ rmse**2 / rows.sum())
+        rest = rows * (rmse**2 - mean_square)
+        variance = len(kept) / (len(kept) - 1) * float(rest @ rest) / float(rows.sum()) ** 2
+        error = math.sqrt(variance) / (2 * math.sqrt(mean_square))
+    worst = max(kept, key=lambda one: one[2], default=None)
+    return {
+        "rmse_standard_error_deg": error,
+        "worst_drive": worst and worst[0],
+        "worst_drive_rmse_deg": worst and worst[2],
     }
 
 

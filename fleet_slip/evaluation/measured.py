@@ -1,25 +1,23 @@
-"""All estimators on measured drives with a label, each part of them held out in turn.
+"""All estimators on measured drives with a label, each part of them left out in turn.
 
-Models are fitted, filters tuned and a car identified on the other parts; whatever is estimated was
-not seen. A part is a quarter of the drives, or of each drive's time where there are few.
+On what is left in, columns are chosen by each model's own recipe and fitted, filters tuned and a
+car identified: whatever is estimated was seen by none of it, neither by a fit nor by a choice.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version as package_version
 from typing import Any
 
 import numpy as np
 
-from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.drive_columns import DriveColumns
-from fleet_slip.columns.plan import ColumnPlan
+from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.catalogue.features import features
 from fleet_slip.config import Config
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.belief import YawRateNoise
 from fleet_slip.evaluation.belief import estimate as estimate_yaw_rate
 from fleet_slip.evaluation.drives import SLOWEST_MPS
@@ -32,273 +30,292 @@ from fleet_slip.evaluation.filters import (
     choose_evenly,
     class_car,
 )
-from fleet_slip.evaluation.identify import FOLDS, IDENTIFIED, Measured, identify
-from fleet_slip.evaluation.judge import JudgedDrive, judge
+from fleet_slip.evaluation.identify import IDENTIFIED, Fitted, Measured, identify
+from fleet_slip.evaluation.judge import JudgedDrive, judge, spread_over
+from fleet_slip.evaluation.left_out import (
+    QUARTERS,
+    HeldOutDrive,
+    Learner,
+    LeftOut,
+    kinds_to_leave_out,
+    parts_to_leave_out,
+    predict_drive,
+    read_measured_drives,
+)
 from fleet_slip.evaluation.single_track import (
     STEP_S,
     DriveSignals,
     LabelledDrive,
     follow,
     measured_speed_mps,
-    read_drive,
 )
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.compute import counts_of
 from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.models.diff import find_seen
 from fleet_slip.models.predict import Predictor
+from fleet_slip.models.publish import recipe_of
 from fleet_slip.models.registry import ModelVersion, Registry
-from fleet_slip.models.request import load_model_list
+from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.score import calibrated_cars
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.runs import LOGGER
-from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
-from fleet_slip.views import connect
+from fleet_slip.vehicle.parameters import VehicleParameters
 from fleet_slip.warehouse.tables import Warehouse
 
-
-@dataclass(frozen=True)
-class Design:
-    """The columns of a model, to be fitted anew; `published`, a version as it is, needs no fit."""
-
-    plan: ColumnPlan
-    scales: tuple[float, ...]
-    intercept: bool = True
-    published: Predictor | None = None
-
-
-@dataclass(frozen=True)
-class HeldOutDrive:
-    """A drive: its signals and label, each design's columns (rows, n), and the part of each row."""
-
-    drive: LabelledDrive
-    columns: Mapping[str, FloatArray]
-    part: IntArray
-
-    def without(self, part: int) -> LabelledDrive:
-        """Return the drive without the labels of a part."""
-        label = np.where(self.part == part, np.nan, self.drive.sideslip_rad)
-        return replace(self.drive, sideslip_rad=label)
-
-
-def designs_of(
-    warehouse: Warehouse, versions: Sequence[ModelVersion], condition: str
-) -> dict[str, Design]:
-    """Return the models of Table I and versions; who saw none of the labels stays as it is."""
-    designs = {
-        f"table1/{one.name}": Design(
-            ColumnPlan.of(one.signals, {}, {}),
-            tuple(float(catalogue()[signal].scale) for signal in one.signals),
-        )
-        for one in load_model_list(TABLE_ONE).model
-    }
-    registry = Registry.of(warehouse)
-    for version in versions:
-        manifest, model = version.manifest, Predictor.of(version.manifest)
-        from_course = manifest.learned_from is not None and manifest.learned_from.weight is None
-        made = from_course or find_seen(warehouse, registry, manifest, condition).trained == 0
-        designs[version.reference] = Design(
-            model.plan, model.scales, not manifest.through_origin, model if made else None
-        )
-    return designs
-
-
-def read_measured_drives(
-    warehouse: Warehouse, names: Sequence[str], designs: Mapping[str, Design]
-) -> list[HeldOutDrive]:
-    """Read drives with their designs' columns. Raises `DataError` where none has a label."""
-    drives: list[HeldOutDrive] = []
-    cars: CarCounts = {}
-    if any(design.plan.numbers for design in designs.values()):
-        cars = calibrated_cars(warehouse)
-    needed = [
-        *(name for design in designs.values() for name in design.plan.signals),
-        *(name for design in designs.values() for name in design.plan.facts),
-    ]
-    wanted = ", ".join(dict.fromkeys(("tick", "vehicle_id", *needed)))
-    query = f"SELECT {wanted} FROM log_counts WHERE drive_id = $drive ORDER BY tick"
-    with connect(warehouse.root, query="SELECT 1 FROM log, log_counts") as database:
-        for name in names:
-            drive = read_drive(database, name)
-            if not np.isfinite(drive.sideslip_rad).any():
-                continue
-            rows = database.sql(query, params={"drive": name}).to_arrow_table()
-            numbers = cars.get(rows["vehicle_id"][0].as_py())
-            columns = {}
-            for model, one in designs.items():
-                counts = counts_of(rows, one.plan, None, numbers)
-                if one.published is not None:
-                    columns[model] = one.published(counts)[:, None]
-                else:
-                    scales = np.array(one.scales)[:, None]
-                    columns[model] = (DriveColumns(one.plan, counts).compute() * scales).T
-            drives.append(HeldOutDrive(drive, columns, np.full(len(rows), len(drives) % FOLDS)))
-    if not drives:
-        raise DataError(
-            "no drive of the cohort has side-slip, by which estimators are judged. Choose drives "
-            "with that label."
-        )
-    if len(drives) >= FOLDS:
-        return drives
-    return [replace(one, part=np.arange(len(one.part)) * FOLDS // len(one.part)) for one in drives]
-
-
-DRIVES_AT_MOST = 96
-"""Of a larger cohort so many are estimated, evenly chosen."""
+FITTED = "fitted without what is judged"
+CHOSEN = "chosen and fitted without what is judged"
 
 
 def evaluate_measured(
     warehouse: Warehouse,
     versions: Sequence[ModelVersion],
     condition: str,
-    file: str | None,
+    car: VehicleParameters | Measured | None,
     executor: Executor,
 ) -> dict[str, Any]:
     """Evaluate models, those of Table I and, in a car, filters on measured drives.
 
-    A model that was trained on labels of these drives is fitted anew; another is judged as it is.
-    The car is that of a vehicle `file`, or of the drives' class where one ships. Returns the
+    A model that was trained on labels of these drives is chosen and fitted anew; another is judged
+    as it is. Without a `car` it is that of the drives' class where one ships. Returns the
     evaluation's document, the best first. Raises `DataError` without drives that have a label,
-    `ConfigError` for an unknown car, and as `load_cohort`.
+    and as `load_cohort`.
     """
-    found = load_cohort(warehouse, condition).drives
-    names = sorted({*found["drive_id"].to_pylist()})
-    vehicle = load_vehicle(file) if file else class_car(found["vehicle_model"][0].as_py(), None)
-    designs = designs_of(warehouse, versions, condition)
-    drives = read_measured_drives(warehouse, choose_evenly(names, DRIVES_AT_MOST), designs)
-    knowing: dict[str, tuple[str, list[FloatArray]]] = {
-        name: (
-            "as published" if design.published else "fitted to labels of the other parts",
-            fit_left_out(drives, name, design),
-        )
-        for name, design in designs.items()
-    }
-    if vehicle is not None:
-        knowing |= _filtered(drives, vehicle, executor)
-    judged = [
-        JudgedDrive(
-            one.drive.drive_id,
-            one.drive.sideslip_rad,
-            _judged(one, vehicle),
-            {name: estimates[place] for name, (_, estimates) in knowing.items()},
-        )
-        for place, one in enumerate(drives)
-    ]
-    kept = {name: one for name, one in judge(judged).items() if one.rmse_deg is not None}
-    order = sorted(kept, key=lambda name: kept[name].rmse_deg or 0.0)
+    cohort = load_cohort(warehouse, condition)
+    drives = read_measured_drives(warehouse, cohort)
+    car = car or class_car(cohort.drives["vehicle_model"][0].as_py(), None)
+    competition = Competition.of(warehouse, versions, condition, drives, car, executor)
+    parts, kinds = parts_to_leave_out(drives), kinds_to_leave_out(drives)
+    whole = len(parts[0]) != len(drives)
+    judged = competition.judge_without(parts)
+    of_kinds = judge(competition.judge_without([*kinds.values()])) if kinds else {}
+    figures = {name: one for name, one in judge(judged).items() if one.rmse_deg is not None}
+    order = sorted(figures, key=lambda name: figures[name].rmse_deg or 0.0)
+    units = judged
+    if not whole:
+        units = [
+            replace(one, name=f"{one.name}, quarter {part + 1}", evaluated=one.evaluated & here)
+            for one, drive in zip(judged, drives, strict=True)
+            for part in range(QUARTERS)
+            for here in [drive.quarter == part]
+        ]
     return {
-        "format": 1,
+        "format": 2,
         "package_version": package_version("fleet-slip"),
         "model": versions[0].reference,
         "cohort": condition,
-        "vehicle": vehicle.name if vehicle else None,
-        "parts_of": "time" if len(drives) < FOLDS else "drives",
-        "estimators": {name: {"told": knowing[name][0], **asdict(kept[name])} for name in order},
+        "vehicle": car.name if car else None,
+        "parts_of": "drives" if whole else "time",
+        "parts": len(parts),
+        "kinds": [
+            {"name": kind, "drives": sorted({drives[i].drive.drive_id for i, _ in left_out})}
+            for kind, left_out in kinds.items()
+        ],
+        "estimators": {
+            name: {
+                "told": competition.told[name],
+                **asdict(figures[name]),
+                **spread_over(units, name),
+                "kinds_left_out": asdict(of_kinds[name]) if name in of_kinds else None,
+                "found": [competition.without(one).get(name, (None,))[0] for one in parts],
+            }
+            for name in order
+        },
         "drives": [
             {
                 "name": one.name,
+                "kind": drive.kind,
                 "sideslip_std_deg": one.sideslip_std_deg,
                 "results": {name: asdict(found[name]) for name in order},
             }
-            for one, found in ((one, judge([one])) for one in judged)
+            for drive, one, found in (
+                (drive, one, judge([one])) for drive, one in zip(drives, judged, strict=True)
+            )
         ],
     }
 
 
-def _judged(one: HeldOutDrive, vehicle: VehicleParameters | None) -> BoolArray:
-    """Return the rows with a label where the car moves, by its wheel speeds."""
-    labelled: BoolArray = np.isfinite(one.drive.sideslip_rad)
-    if vehicle is None:
-        return labelled
-    try:
-        return labelled & (measured_speed_mps(one.drive.signals, vehicle) > SLOWEST_MPS)
-    except DataError:
-        return labelled
+Known = tuple[str, Callable[[DriveSignals], FloatArray], Any]
+"""What an estimator knows, in words, what it makes of a drive, and what was found for it."""
 
 
-def fit_left_out(drives: Sequence[HeldOutDrive], name: str, design: Design) -> list[FloatArray]:
-    """Estimate each part by least squares on the rows of the others."""
-    if design.published is not None:
-        return [one.columns[name][:, 0] for one in drives]
-    rows = np.concatenate([one.columns[name] for one in drives])
-    label = np.concatenate([one.drive.sideslip_rad for one in drives])
-    part = np.concatenate([one.part for one in drives])
-    complete = np.isfinite(rows).all(axis=1)
-    estimate = np.full(len(rows), np.nan)
-    if complete.any():
-        rows = rows / np.maximum(np.abs(rows[complete]).max(axis=0), np.finfo(float).tiny)
-        if design.intercept:
-            rows = np.column_stack([rows, np.ones(len(rows))])
-        for left in range(FOLDS):
-            others = complete & np.isfinite(label) & (part != left)
-            if others.any():
-                weights = np.linalg.lstsq(rows[others], label[others], rcond=None)[0]
-                here = complete & (part == left)
-                estimate[here] = rows[here] @ weights
-    return np.split(estimate, np.cumsum([len(one.part) for one in drives])[:-1])
+Estimates = dict[str, tuple[Any, list[FloatArray]]]
+"""By estimator: what was found on what is left in, and the angle in rad by drive and row."""
 
 
-Known = tuple[str, Callable[[DriveSignals], FloatArray]]
-"""What an estimator knows, in words, and what it makes of a drive."""
+@dataclass(frozen=True)
+class Competition:
+    """Those who compete on some drives, and what each made of what was left out.
 
+    Attributes:
+        published: models that are judged as they are.
+        learners: models that are chosen and fitted anew.
+        vehicle: the car of a file, for filters.
+        measured: what scales and a tape measure say, to identify the car by.
+        cars: numbers of each car, for calibrated columns.
+        told: what each estimator knows, in words.
+    """
 
-def _filtered(
-    drives: Sequence[HeldOutDrive], vehicle: VehicleParameters, executor: Executor
-) -> dict[str, tuple[str, list[FloatArray]]]:
-    """Estimate each part by filters that are tuned, in cars identified, on the others."""
-    found: dict[str, tuple[str, list[FloatArray]]] = {}
-    drives = [replace(one, drive=accelerated(one.drive, vehicle)) for one in drives]
-    for left in range(FOLDS):
-        others = [one.without(left) for one in drives]
+    drives: Sequence[HeldOutDrive]
+    published: Mapping[str, Predictor]
+    learners: Mapping[str, Learner]
+    vehicle: VehicleParameters | None
+    measured: Measured | None
+    cars: CarCounts
+    executor: Executor
+    told: dict[str, str]
+    _without: dict[LeftOut, Estimates] = field(default_factory=dict)
+    _failed: set[str] = field(default_factory=set)
+
+    @classmethod
+    def of(
+        cls,
+        warehouse: Warehouse,
+        versions: Sequence[ModelVersion],
+        condition: str,
+        drives: Sequence[HeldOutDrive],
+        car: VehicleParameters | Measured | None,
+        executor: Executor,
+    ) -> "Competition":
+        """Return who competes: Table I, versions, and filters in a car if there is one."""
+        registry = Registry.of(warehouse)
+        recipes = {
+            f"table1/{one.name}": (SelectionRequest(model=",".join(one.signals)), condition)
+            for one in load_model_list(TABLE_ONE).model
+        }
+        told = dict.fromkeys(recipes, FITTED)
+        published: dict[str, Predictor] = {}
+        for version in versions:
+            manifest, name = version.manifest, version.reference
+            of_course = manifest.learned_from is not None and manifest.learned_from.weight is None
+            if of_course or find_seen(warehouse, registry, manifest, condition).trained == 0:
+                published[name], told[name] = Predictor.of(manifest), "as published"
+            else:
+                recipes[name], told[name] = recipe_of(version), CHOSEN
+        learners = {
+            name: Learner.of(warehouse, name, request, condition, own, drives)
+            for name, (request, own) in recipes.items()
+        }
+        numbered = any(one.plan.numbers for one in published.values()) or any(
+            features().feature_set(one.asked.feature_set).calibrated for one in learners.values()
+        )
+        vehicle = car if isinstance(car, VehicleParameters) else None
+        measured = Measured.of(car) if isinstance(car, VehicleParameters) else car
+        cars = calibrated_cars(warehouse) if numbered else {}
+        if measured is not None:
+            drives = [replace(one, drive=accelerated(one.drive, measured)) for one in drives]
+        return cls(drives, published, learners, vehicle, measured, cars, executor, told)
+
+    def judge_without(self, parts: Sequence[LeftOut]) -> list[JudgedDrive]:
+        """Return the drives with what everybody makes of each part without having seen it."""
+        blank = [np.full(len(one.rows), np.nan) for one in self.drives]
+        found: dict[str, list[FloatArray]] = {}
+        for left_out in parts:
+            here = [
+                np.isin(one.quarter, [quarter for i, quarter in left_out if i == number])
+                for number, one in enumerate(self.drives)
+            ]
+            for name, (_, estimates) in self.without(left_out).items():
+                before = found.get(name, blank)
+                found[name] = list(map(np.where, here, estimates, before))
+        return [
+            JudgedDrive(
+                one.drive.drive_id,
+                one.drive.sideslip_rad,
+                _judged(one.drive, self.measured),
+                {name: estimates[number] for name, estimates in found.items()},
+            )
+            for number, one in enumerate(self.drives)
+        ]
+
+    def without(self, left_out: LeftOut) -> Estimates:
+        """Return what everybody estimates who learned from what is left in."""
+        if left_out not in self._without:
+            self._without[left_out] = {
+                **{
+                    name: (None, [predict_drive(model, one, self.cars) for one in self.drives])
+                    for name, model in self.published.items()
+                },
+                **self._learned(left_out),
+                **self._filtered(left_out),
+            }
+        return self._without[left_out]
+
+    def _learned(self, left_out: LeftOut) -> Estimates:
+        found: Estimates = {}
+        for name, learner in self.learners.items():
+            try:
+                found[name] = learner.estimate(left_out, self.cars)
+            except (DataError, QuestionError) as error:
+                if name not in self._failed:
+                    LOGGER.warning("%s does not compete everywhere: %s", name, error)
+                self._failed.add(name)
+        return found
+
+    def _filtered(self, left_out: LeftOut) -> Estimates:
+        """Estimate by filters that are tuned, in cars identified, on what is left in."""
+        if self.measured is None:
+            return {}
+        others = [
+            one.without([quarter for i, quarter in left_out if i == number])
+            for number, one in enumerate(self.drives)
+        ]
         others = [one for one in others if np.isfinite(one.sideslip_rad).any()]
-        if len(drives) >= FOLDS:
+        if sum(len(one.signals) for one in others) > TUNING_DRIVES * TUNING_S * SAMPLE_RATE_HZ:
             begin = TUNING_S * SAMPLE_RATE_HZ
             others = [one.beginning(begin) for one in choose_evenly(others, TUNING_DRIVES)]
-        ready = _tuned(vehicle, others, executor)
-        for name, (knows, estimate) in ready.items():
-            _, estimates = found.setdefault(
-                name, (knows, [np.full(len(one.part), np.nan) for one in drives])
-            )
-            for one, into in zip(drives, estimates, strict=True):
-                here = one.part == left
-                if here.any():
-                    with suppress(DataError):  # this drive lacks a sensor: no estimate
-                        into[here] = estimate(one.drive.signals)[here]
-    return found
+        found: Estimates = {}
+        for name, (knows, estimate, about) in self._tuned(self.measured, others).items():
+            self.told[name] = knows
+            found[name] = about, [np.full(len(one.rows), np.nan) for one in self.drives]
+            for i in {i for i, _ in left_out}:
+                with suppress(DataError):  # this drive lacks a sensor: no estimate
+                    found[name][1][i] = estimate(self.drives[i].drive.signals)
+        return found
+
+    def _tuned(self, measured: Measured, others: Sequence[LabelledDrive]) -> dict[str, Known]:
+        """Return each filter by name, tuned on drives in the car of the file and the identified."""
+        ready: dict[str, Known] = {
+            "kinematic": ("geometry", partial(_rolling, measured.car(Fitted())), None)
+        }
+        cars: dict[str, tuple[str, VehicleParameters]] = {}
+        if self.vehicle is not None and self.vehicle.description != IDENTIFIED:
+            cars["tuned"] = ("the vehicle's file", self.vehicle)
+        try:
+            identified = identify(measured, others, self.executor)
+        except DataError as error:
+            LOGGER.warning("no car is identified: %s", error)
+            if self.vehicle is not None:
+                cars["tuned"] = ("the vehicle's file", self.vehicle)
+        else:
+            cars["identified"] = ("the identified car", identified.car)
+            knows = "geometry, and a car identified from the other parts"
+            ready["ekf_identified"] = (knows, identified.estimate, identified.as_dict()["found"])
+        navigated = any(np.isfinite(one.signals.gps_vx_mps).any() for one in others)
+        for one in FILTERS:
+            for how, (knows, car) in cars.items():
+                name = f"{one.module}_{how}"
+                if one.informed or name in ready or (one.gps and not navigated):
+                    continue
+                try:
+                    tuned = one.tune(others, car, self.executor).parameters
+                except DataError as error:
+                    LOGGER.warning("%s does not compete: %s", name, error)
+                else:
+                    estimate = partial(_estimate, one, car, tuned)
+                    about = tuned.model_dump(mode="json")
+                    ready[name] = (f"{knows}, and labels to be tuned by", estimate, about)
+        return ready
 
 
-def _tuned(
-    vehicle: VehicleParameters, others: Sequence[LabelledDrive], executor: Executor
-) -> dict[str, Known]:
-    """Return each filter by name, tuned on drives in the car of the file and in that identified."""
-    ready: dict[str, Known] = {
-        "kinematic": ("geometry", lambda signals: _rolling(signals, vehicle))
-    }
-    cars = {"tuned": ("the vehicle's file", vehicle)}
+def _judged(drive: LabelledDrive, car: Measured | None) -> BoolArray:
+    """Return the rows with a label where the car moves, by its wheel speeds."""
+    labelled: BoolArray = np.isfinite(drive.sideslip_rad)
+    if car is None:
+        return labelled
     try:
-        identified = identify(Measured.of(vehicle), others, executor)
-    except DataError as error:
-        LOGGER.warning("no car is identified: %s", error)
-    else:
-        if vehicle.description == IDENTIFIED:
-            del cars["tuned"]
-        cars["identified"] = ("the identified car", identified.car)
-        knows = "geometry, and a car identified from the other parts"
-        ready["ekf_identified"] = (knows, identified.estimate)
-    navigated = any(np.isfinite(one.signals.gps_vx_mps).any() for one in others)
-    for one in FILTERS:
-        for how, (knows, car) in cars.items():
-            name = f"{one.module}_{how}"
-            if one.informed or name in ready or (one.gps and not navigated):
-                continue
-            try:
-                tuned = one.tune(others, car, executor).parameters
-            except DataError as error:
-                LOGGER.warning("%s does not compete: %s", name, error)
-            else:
-                estimate = partial(_estimate, one, car, tuned)
-                ready[name] = (f"{knows}, and labels to be tuned by", estimate)
-    return ready
+        return labelled & (measured_speed_mps(drive.signals, car.car(Fitted())) > SLOWEST_MPS)
+    except DataError:
+        return labelled
 
 
 def _estimate(
@@ -311,20 +328,20 @@ WHEELS_LAG = 0.1
 """Of the change of wheel speeds in a step, what an acceleration made of them follows."""
 
 
-def accelerated(drive: LabelledDrive, vehicle: VehicleParameters) -> LabelledDrive:
+def accelerated(drive: LabelledDrive, car: Measured) -> LabelledDrive:
     """Return the drive with ax from its wheels where none is logged, as many a car has it."""
     signals = drive.signals
     if np.isfinite(signals.ax_mps2).any():
         return drive
     try:
-        speed = measured_speed_mps(signals, vehicle)
+        speed = measured_speed_mps(signals, car.car(Fitted()))
     except DataError:
         return drive
     ax_mps2 = follow(np.diff(speed, prepend=speed[:1]) / STEP_S, WHEELS_LAG)
     return replace(drive, signals=replace(signals, ax_mps2=ax_mps2))
 
 
-def _rolling(signals: DriveSignals, vehicle: VehicleParameters) -> FloatArray:
+def _rolling(vehicle: VehicleParameters, signals: DriveSignals) -> FloatArray:
     """Return side-slip in rad where the rear wheels roll without slip, arctan(b r / vx)."""
     turning = estimate_yaw_rate(signals, vehicle, YawRateNoise()).yaw_rate_rad_s
     return np.arctan2(vehicle.body.rear_axle_m * turning, measured_speed_mps(signals, vehicle))

@@ -140,8 +140,8 @@ def measured_drives(data: ReportData) -> list[ReportTable]:
             ["estimator", "knows", "RMSE", "mean", "error std", "correlation", "rows"],
             rows,
             left=2,
-            note=f"Each quarter of the {found['parts_of']} of {count(len(found['drives']))} drives "
-            f"left out in turn: {found['cohort']}. Green: the smallest.",
+            note=f"{count(len(found['drives']))} drives, left out in parts of their "
+            f"{found['parts_of']} in turn: {found['cohort']}. Green: the smallest.",
         )
     ]
 

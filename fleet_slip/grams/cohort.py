@@ -243,14 +243,32 @@ def load_cohort(
 def _read_rows(opened: OpenedGrams, condition: Condition) -> dict[str, Any]:
     rows = opened.rows(condition)
     require_training(rows["source"].unique().to_pylist(), condition)
+    kept = _expand_rows(opened, rows)
+    if not kept["tables"]:  # no row, or none of changes
+        raise empty_cohort_error(opened, condition)
+    return kept
+
+
+def _expand_rows(opened: OpenedGrams, rows: pa.Table) -> dict[str, Any]:
     expansion = expansion_of(opened, features().name_of(opened.identity))
     parts = list(expansion.tables(rows))
-    if not parts:  # no row, or none of changes
-        raise empty_cohort_error(opened, condition)
     lines = rows.drop_columns(["sums", "products", "signals"])
     # Rows whose calibrated columns are not the same are apart now: their lines follow them.
     some = [_with_signals(lines.filter(pa.array(here)), signals) for signals, _, here in parts]
-    return {"tables": tuple(table for _, table, _ in parts), "drives": pa.concat_tables(some)}
+    drives = pa.concat_tables(some) if some else lines
+    return {"tables": tuple(table for _, table, _ in parts), "drives": drives}
+
+
+def with_gram_rows(cohort: Cohort, rows: pa.Table) -> Cohort:
+    """Return a cohort of other Gram rows, such as those of parts of its drives.
+
+    Beside the columns of `Cohort.drives` these have `sums`, `products` and `signals`, and are
+    sorted by signals.
+    """
+    if cohort.source is None:
+        raise ValueError("it is not known where the cohort was read")
+    with open_grams(cohort.source, cohort.feature_set, cohort.condition) as opened:
+        return replace(cohort, **_expand_rows(opened, rows))
 
 
 def _with_signals(lines: pa.Table, signals: str) -> pa.Table:

@@ -74,7 +74,7 @@ def recipe_for(
         wanted = request
         told = f"not as {before.reference}, chosen from {chosen_from}"
     else:
-        kept, was = _kept(before)
+        kept, was = recipe_of(before)
         wanted = replace(kept, **asked)
         told = f"trained as {before.reference}, chosen from {chosen_from}"
     if cohort is None or cohort == was:
@@ -94,7 +94,8 @@ def _newest(registry: Registry, name: str) -> ModelVersion | None:
     return registry.champion(name) or (registry.load(name, numbers[-1]) if numbers else None)
 
 
-def _kept(version: ModelVersion) -> tuple[SelectionRequest, str]:
+def recipe_of(version: ModelVersion) -> tuple[SelectionRequest, str]:
+    """Return what a version was chosen by, and on which drives. Raises `QuestionError`."""
     manifest = version.manifest
     chosen = manifest.selected_by
     cohort = with_all_drives(manifest.trained_on.cohort)

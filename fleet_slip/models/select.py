@@ -450,31 +450,60 @@ def _answer_usual(warehouse: Warehouse, request: SelectionRequest, condition: st
     return replace(_answer(warehouse, logged, condition), remark=remark)
 
 
-def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> Selection:
-    request.check()
-    name = request.models or (COURSE if request.label and not request.chosen_by_inputs else None)
-    model_list = _given(request) or (load_model_list(name) if name else None)
-    if model_list and model_list.label and not request.label:
-        request = replace(request, label=model_list.label)
+@dataclass(frozen=True)
+class SelectionPlan:
+    """What a request compares: its list, if any, in which folds, and of which feature set."""
+
+    request: SelectionRequest
+    model_list: ModelList | None
+    folds: Folding
+    feature_set: str
+
+    @classmethod
+    def of(cls, request: SelectionRequest) -> "SelectionPlan":
+        """Return what a request asks for. Raises `UsageError` and `QuestionError`."""
         request.check()
-    folds = _folding(request, model_list)
-    feature_set = _feature_set(request, model_list)
-    if request.label == BOTH:
-        folds = folds if request.by else folds.model_copy(update={"by": "vehicle"})
-        mixed = load_mixed_labels(warehouse, condition, feature_set, folds.by)
-        return weigh(mixed, request, model_list, folds)
-    if request.robust:
-        return _answer_without(warehouse, request, condition, model_list, feature_set)
-    distances = bool(request.nested and not request.ordered and not _search_of(request, model_list))
-    if not (request.ordered or request.bootstrap or distances):
-        return _compare_listed(
-            load_cohort(warehouse, condition, feature_set, folds), request, model_list, folds
+        name = request.models or (
+            COURSE if request.label and not request.chosen_by_inputs else None
         )
-    cohort = load_cohort(warehouse, condition, feature_set)
-    if request.ordered:
-        answer = _search(cohort, request, folds)
-    else:
-        answer = _compare_listed(cohort, request, model_list, folds)
+        model_list = _given(request) or (load_model_list(name) if name else None)
+        if model_list and model_list.label and not request.label:
+            request = replace(request, label=model_list.label)
+            request.check()
+        folds = _folding(request, model_list)
+        if request.label == BOTH and not request.by:
+            folds = folds.model_copy(update={"by": "vehicle"})
+        return cls(request, model_list, folds, _feature_set(request, model_list))
+
+    def load(self, warehouse: Warehouse, condition: str) -> Cohort:
+        """Return the Gram rows that it is made on. Raises as `load_cohort`."""
+        if self.request.label == BOTH:
+            return load_mixed_labels(warehouse, condition, self.feature_set, self.folds.by)
+        return load_cohort(warehouse, condition, self.feature_set)
+
+    def choose(self, cohort: Cohort) -> Selection:
+        """Compare and choose on a cohort, whatever drives it is of. Raises as `select`."""
+        if cohort.unlabelled:
+            return weigh(cohort, self.request, self.model_list, self.folds)
+        if self.request.ordered:
+            return _search(cohort, self.request, self.folds)
+        return _compare_listed(cohort, self.request, self.model_list, self.folds)
+
+
+def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> Selection:
+    asked = SelectionPlan.of(request)
+    request, folds = asked.request, asked.folds
+    if request.robust and request.label != BOTH:
+        return _answer_without(warehouse, asked, condition)
+    if request.label == BOTH:
+        return asked.choose(asked.load(warehouse, condition))
+    distances = bool(
+        request.nested and not request.ordered and not _search_of(request, asked.model_list)
+    )
+    if not (request.ordered or request.bootstrap or distances):  # the sum of each fold suffices
+        return asked.choose(load_cohort(warehouse, condition, asked.feature_set, folds))
+    cohort = asked.load(warehouse, condition)
+    answer = asked.choose(cohort)
     if distances:
         inputs = inputs_of(cohort, request.nested or WHOLE_SET)
         answer = replace(answer, distances=try_distances(cohort, inputs, folds, request))
@@ -515,15 +544,10 @@ def _may_be_as_good(model: CrossValidation, best: CrossValidation) -> bool:
     return student_t_two_sided(short.rmse / short.standard_error, len(best.folds) - 1) > 0.05
 
 
-def _answer_without(
-    warehouse: Warehouse,
-    request: SelectionRequest,
-    condition: str,
-    model_list: ModelList | None,
-    feature_set: str,
-) -> Selection:
+def _answer_without(warehouse: Warehouse, asked: SelectionPlan, condition: str) -> Selection:
     """Select without the cars whose influence on a model of all compared inputs is unusual."""
-    cohort = load_cohort(warehouse, condition, feature_set)
+    request, model_list = asked.request, asked.model_list
+    cohort = asked.load(warehouse, condition)
     inputs = inputs_of(cohort, request.nested or WHOLE_SET)
     if model_list and model_list.model and not (request.nested or request.search):
         listed = {name for one in model_list.model for name in one.signals}

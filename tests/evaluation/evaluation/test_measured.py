@@ -7,60 +7,83 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 import fleet_slip
-from fleet_slip.arrays import FloatArray
-from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.evaluation import ekf, filters, measured
-from fleet_slip.evaluation.identify import Fitted, Identified, Tuned
-from fleet_slip.evaluation.measured import Design, HeldOutDrive, accelerated, fit_left_out
+from fleet_slip.evaluation.identify import Fitted, Identified, Measured, Tuned
+from fleet_slip.evaluation.left_out import (
+    HeldOutDrive,
+    Learner,
+    LeftOut,
+    kinds_to_leave_out,
+    parts_to_leave_out,
+    read_measured_drives,
+)
+from fleet_slip.evaluation.measured import accelerated
 from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.models.request import SelectionRequest
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.commands import done_on, run_on
 from tests.support.drives import rolling_drive
+from tests.support.measured import csv_text
 from tests.support.own_logs import ingest_own
 
 ROWS = 400
-LINE = Design(ColumnPlan.of(("ay",), {}, {}), (1.0,))
 NO_SIGNALS = DriveSignals(*[np.full(ROWS, np.nan)] * 11)
 
 
-def a_drive(number: int, part: int, *, shifted_rad: float = 0.0) -> HeldOutDrive:
-    ay = np.sin(np.arange(ROWS) / (20 + number))
-    label: FloatArray = -ay / 200 + shifted_rad
-    columns = {"line": ay[:, None]}
-    drive = LabelledDrive(f"drive-{number}", NO_SIGNALS, label)
-    return HeldOutDrive(drive, columns, np.full(ROWS, part))
+def a_drive(number: int, *, trip: str | None = None, speed_mps: float = 10.0) -> HeldOutDrive:
+    wheels = np.full(ROWS, speed_mps / 0.31)
+    signals = replace(NO_SIGNALS, wheel_rl_rad_s=wheels, ay_mps2=np.ones(ROWS))
+    drive = LabelledDrive(f"drive-{number}", signals, np.zeros(ROWS))
+    rows = pa.table({"tick": np.arange(ROWS)})
+    return HeldOutDrive(drive, rows, trip or drive.drive_id)
 
 
-def test_a_drive_is_estimated_by_what_never_saw_it() -> None:
-    drives = [a_drive(n, n % 4, shifted_rad=1.0 if n == 2 else 0.0) for n in range(4)]
-    estimates = fit_left_out(drives, "line", LINE)
-    assert np.abs(estimates[2] - (drives[2].drive.sideslip_rad - 1.0)).max() < 1e-9
-    assert estimates[0].mean() == pytest.approx(1 / 3, abs=0.01), "one of the three others is off"
+def drives_of(left_out: LeftOut) -> list[int]:
+    assert all((drive, quarter) in left_out for drive, _ in left_out for quarter in range(4))
+    return sorted({drive for drive, _ in left_out})
 
 
-def test_a_part_of_a_single_drive_is_estimated_by_the_others() -> None:
-    whole = a_drive(0, 0)
-    part = np.arange(ROWS) * 4 // ROWS
-    label = np.where(part == 1, 1.0, whole.drive.sideslip_rad)
-    drive = HeldOutDrive(LabelledDrive("one", NO_SIGNALS, label), whole.columns, part)
-    (estimate,) = fit_left_out([drive], "line", LINE)
-    assert np.abs((estimate - whole.drive.sideslip_rad)[part == 1]).max() < 1e-9
-    assert np.isnan(drive.without(1).sideslip_rad).sum() == ROWS // 4
+def test_whole_drives_are_left_out_with_all_of_their_trip() -> None:
+    drives = [a_drive(n, trip=f"trip-{n // 2}") for n in range(6)]
+    assert [drives_of(one) for one in parts_to_leave_out(drives)] == [[0, 1], [2, 3], [4, 5]]
+    many = parts_to_leave_out([a_drive(n) for n in range(20)])
+    assert sorted(drive for one in many for drive in drives_of(one)) == [*range(20)]
+    assert len(many) == 8
+
+
+def test_of_few_drives_quarters_of_their_time_are_left_out() -> None:
+    drives = [a_drive(0), a_drive(1)]
+    first, *_ = parts = parts_to_leave_out(drives)
+    assert len(parts) == 4
+    assert first == {(0, 0), (1, 0)}
+    assert np.isnan(drives[0].without([0]).sideslip_rad).sum() == ROWS // 4
+
+
+def test_kinds_of_driving_are_left_out_whole() -> None:
+    drives = [a_drive(n, speed_mps=speed) for n, speed in enumerate((5.0, 20.0, 24.0))]
+    found = {kind: drives_of(one) for kind, one in kinds_to_leave_out(drives).items()}
+    assert found == {
+        "below 8 m/s, ay 1 to 2.5 m/s²": [0],
+        "15 to 25 m/s, ay 1 to 2.5 m/s²": [1, 2],
+    }
+    assert kinds_to_leave_out(drives[1:]) == {}
 
 
 def test_an_acceleration_that_is_not_logged_is_made_of_the_wheels() -> None:
     car, still = load_vehicle("d_class_sedan"), np.zeros(ROWS)
     speed = still + np.linspace(10.0, 18.0, ROWS)  # 2 m/s²
     signals = rolling_drive(car, speed, still, still, still)
-    logged = LabelledDrive("logged", signals, still)
-    assert accelerated(logged, car) is logged
+    logged, measured = LabelledDrive("logged", signals, still), Measured.of(car)
+    assert accelerated(logged, measured) is logged
     missing = replace(logged, signals=replace(signals, ax_mps2=np.full(ROWS, np.nan)))
-    assert accelerated(missing, car).signals.ax_mps2[100:] == pytest.approx(2.0, abs=0.01)
+    assert accelerated(missing, measured).signals.ax_mps2[100:] == pytest.approx(2.0, abs=0.01)
     blind = replace(logged, signals=NO_SIGNALS)
-    assert accelerated(blind, car) is blind
+    assert accelerated(blind, measured) is blind
 
 
 @pytest.fixture(scope="module")
@@ -76,10 +99,12 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_drives_without_a_vehicle_are_judged_by_models_alone(own: Path) -> None:
     found = json.loads(done_on(own, "evaluate", "own", "--cohort", "true", "--json").stdout)
     assert found["vehicle"] is None
-    assert found["estimators"]["own@1"]["told"] == "fitted to labels of the other parts"
+    assert found["estimators"]["own@1"]["told"] == "chosen and fitted without what is judged"
     assert found["estimators"]["own@1"]["rmse_deg"] < 0.05
     assert {name for name in found["estimators"] if "/" not in name} == {"own@1"}
-    assert len(found["drives"]) == 6
+    assert (len(found["drives"]), found["parts"], found["parts_of"]) == (6, 6, "drives")
+    assert 0 < found["estimators"]["own@1"]["rmse_standard_error_deg"] < 0.01
+    assert found["estimators"]["own@1"]["worst_drive"] in [one["name"] for one in found["drives"]]
     told = done_on(own, "evaluate", "own", "--cohort", "true")
     assert "No filter competes" in told.stdout
     assert f"kept as evaluations/measured/{found['number']}.json" in told.stderr, "kept once"
@@ -90,9 +115,76 @@ def test_a_model_that_saw_none_of_the_drives_is_judged_as_it_is(own: Path) -> No
     assert json.loads(done.stdout)["estimators"]["own@1"]["told"] == "as published"
 
 
+NOISE = """
+name = "noise"
+[time]
+column = "t"
+unit = "s"
+[drive]
+vehicle_id = { column = "car" }
+vehicle_model = "own"
+day = 2026-05-04
+[signals]
+ax = { column = "ax", unit = "m/s^2" }
+ay = { column = "ay", unit = "m/s^2" }
+yaw_rate = { column = "r", unit = "rad/s" }
+steering_wheel = { column = "steer", unit = "rad" }
+steer_fl = { column = "left", unit = "rad" }
+steer_fr = { column = "right", unit = "rad" }
+sideslip = { column = "beta", unit = "rad" }
+"""
+
+
+def test_a_choice_that_saw_the_drives_flatters_and_one_made_again_does_not(tmp_path: Path) -> None:
+    generator = np.random.default_rng(2)
+    cars, rows = 9, 200
+    sizes = {"ax": 1, "ay": 2, "r": 0.1, "steer": 0.3, "left": 0.02, "right": 0.02, "beta": 0.02}
+    columns: dict[str, Any] = {
+        "t": list(np.tile(np.arange(rows) / 100, cars)),
+        "car": list(np.repeat([f"car-{one}" for one in range(cars)], rows)),
+    }
+    for name, size in sizes.items():  # nothing has to do with the label: each drive is one draw
+        of_drive = np.repeat(generator.standard_normal(cars), rows)
+        noise = 0.1 * generator.standard_normal(cars * rows)
+        columns[name] = list((size * (of_drive + noise)).round(5))
+    (tmp_path / "log.csv").write_text(csv_text(columns))
+    (tmp_path / "noise.toml").write_text(NOISE)
+    root = tmp_path / "data"
+    done_on(root, "ingest", tmp_path / "log.csv", "--mapping", tmp_path / "noise.toml")
+    done_on(root, "gram")
+    search = ("--search", "exchange", "--most", "3", "--worth", "0deg", "--folds", "each")
+    done_on(root, "publish", "again", *search, "--force")
+    chosen = fleet_slip.open(root).model("again").manifest.signals
+    done_on(root, "publish", "once", "--model", ",".join(chosen), "--force")
+    found = fleet_slip.open(root).evaluate_measured("again", "true", ["once"]).content
+    spread_deg = float(np.degrees(np.std(columns["beta"])))
+    errors = {name: one["rmse_deg"] for name, one in found["estimators"].items()}
+    assert errors["once@1"] < 0.7 * spread_deg
+    assert errors["again@1"] > spread_deg
+    columns_of_parts = found["estimators"]["again@1"]["found"]
+    assert len({tuple(one) for one in columns_of_parts}) > 1
+
+
+def test_gram_rows_of_quarters_add_up_to_those_of_drives(own: Path) -> None:
+    fleet = fleet_slip.open(own)
+    cohort = load_cohort(fleet.warehouse, "true")
+    drives = read_measured_drives(fleet.warehouse, cohort)
+    request = SelectionRequest(model="ax,ay,yaw_rate")
+    learner = Learner.of(fleet.warehouse, "one", request, "true", "true", drives)
+    (whole,), (quarters,) = cohort.tables, learner.divided.tables
+    assert len(quarters) == 4 * len(whole)
+    assert quarters.total() == whole.total()
+    of_quarters = learner.choose(frozenset((drive, 3) for drive in range(6)))
+    assert of_quarters.winner.model.pooled.rows == 6 * 375
+
+
 @pytest.mark.parametrize(
     "words",
-    [("--vehicle", "suv"), ("--cohort", "true", "--blind")],
+    [
+        ("--vehicle", "suv"),
+        ("--cohort", "true", "--blind"),
+        ("--cohort", "true", "--mass", "1500", "--vehicle", "suv"),
+    ],
 )
 def test_what_does_not_go_together_is_refused(own: Path, words: tuple[str, ...]) -> None:
     done = run_on(own, "evaluate", "own", *words)
