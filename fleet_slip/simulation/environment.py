@@ -19,15 +19,13 @@ from fleet_slip.compiling import equation
 from fleet_slip.errors import UsageError
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.vehicle.dynamics import (
-    Acceleration,
     Derivative,
-    ackermann,
     braked_spins,
-    build_wheel_forces,
     driven_body,
     driver_brakes,
     rates_of,
     transferred_loads,
+    wheel_forces,
 )
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
 from fleet_slip.vehicle.parameters import Constants, Controls, State, constants, load_vehicle
@@ -51,15 +49,12 @@ class Moved(NamedTuple):
     ay: float
 
 
-_forces = build_wheel_forces(True, True)
-
-
 @equation
 def braked_derivative(x: State, u: Controls, brakes: Brakes, c: Constants) -> Derivative:
-    """Return the rates of a car with all extensions and a brake at each wheel."""
+    """Return the rates of a car with a brake at each wheel."""
     load = transferred_loads(x, c)
-    force = _forces(x, ackermann(x, u, c), load, c)
-    motion: Acceleration = driven_body(x, u, force, c)
+    force = wheel_forces(x, load, c)
+    motion = driven_body(x, force, c)
     front, rear = driver_brakes(x, c)
     each = (front + brakes.fl, front + brakes.fr, rear + brakes.rl, rear + brakes.rr)
     return rates_of(x, u, motion, braked_spins(x, force, load, each, c), c)

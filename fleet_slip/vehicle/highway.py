@@ -5,8 +5,7 @@ positive steering angle turns to the right of the picture.
 """
 
 import math
-from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import needed
 from fleet_slip.compiling import equation
-from fleet_slip.vehicle.dynamics import NO_EXTENSIONS, Extensions, build_derivative
+from fleet_slip.vehicle.dynamics import Derivative, derivative
 from fleet_slip.vehicle.integration import (
     FIRST_ORDER,
     SECOND_ORDER,
@@ -58,44 +57,33 @@ class Motion(NamedTuple):
     drift: Place
 
 
-@cache
-def _compiled_derivative(extensions: Extensions) -> Callable[..., Any]:
-    derivative = build_derivative(extensions)
-
-    @numba.njit(error_model="numpy")
-    def evaluate(x: State, u: Controls, c: Constants) -> Any:
-        return derivative(x, u, c)
-
-    return evaluate
+@numba.njit(error_model="numpy")
+def _rates(x: State, u: Controls, c: Constants) -> Derivative:
+    return derivative(x, u, c)
 
 
-@cache
-def _compiled_steps(extensions: Extensions) -> Callable[..., Motion]:
-    derivative = build_derivative(extensions)
+@equation
+def _drift_of(x: State, place: Place) -> Place:
+    cosine, sine = math.cos(place.heading), math.sin(place.heading)
+    return Place(x.vx * cosine - x.vy * sine, x.vx * sine + x.vy * cosine, x.yaw_rate)
 
-    @equation
-    def drift_of(x: State, place: Place) -> Place:
-        cosine, sine = math.cos(place.heading), math.sin(place.heading)
-        return Place(x.vx * cosine - x.vy * sine, x.vx * sine + x.vy * cosine, x.yaw_rate)
 
-    @numba.njit(error_model="numpy", nogil=True)
-    def steps(
-        motion: Motion, u: Controls, c: Constants, step: float, count: int, order: float
-    ) -> Motion:
-        x, place, slopes, before = motion
-        for _ in range(count):
-            drift = drift_of(x, place)
-            place = Place(
-                place.x + step * extrapolate(drift.x, before.x, order),
-                place.y + step * extrapolate(drift.y, before.y, order),
-                place.heading + step * extrapolate(drift.heading, before.heading, order),
-            )
-            before = drift
-            x, slopes = advance(x, derivative(x, u, c), slopes, c, step, order)
-            order = SECOND_ORDER
-        return Motion(x, place, slopes, before)
-
-    return steps
+@numba.njit(error_model="numpy", nogil=True)
+def _steps(
+    motion: Motion, u: Controls, c: Constants, step: float, count: int, order: float
+) -> Motion:
+    x, place, slopes, before = motion
+    for _ in range(count):
+        drift = _drift_of(x, place)
+        place = Place(
+            place.x + step * extrapolate(drift.x, before.x, order),
+            place.y + step * extrapolate(drift.y, before.y, order),
+            place.heading + step * extrapolate(drift.heading, before.heading, order),
+        )
+        before = drift
+        x, slopes = advance(x, derivative(x, u, c), slopes, c, step, order)
+        order = SECOND_ORDER
+    return Motion(x, place, slopes, before)
 
 
 @lru_cache(maxsize=256)
@@ -108,12 +96,11 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
 
     Of highway-env's actions `steering` is the road wheels' angle in rad, `acceleration` the
     tractive force per mass in m/s². `speed` is longitudinal, as in `BicycleVehicle`; `velocity` has
-    both parts. A class for another car sets `PARAMETERS`, `ADHESION` or `EXTENSIONS`.
+    both parts. A class for another car sets `PARAMETERS` or `ADHESION`.
     """
 
     PARAMETERS: VehicleParameters = load_vehicle("d_class_sedan")
     ADHESION: float = 1.0
-    EXTENSIONS: Extensions = Extensions()
     MAX_SPEED: float = 70.0
     MIN_SPEED: float = -70.0
 
@@ -131,12 +118,10 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         speed: float = 0,
         parameters: VehicleParameters | None = None,
         adhesion: float | None = None,
-        extensions: Extensions | None = None,
     ) -> None:
         """Put the car on a road, or none, straight ahead, in m, rad and m/s."""
         self.parameters = self.PARAMETERS if parameters is None else parameters
         self.adhesion = self.ADHESION if adhesion is None else adhesion
-        self.extensions = self.EXTENSIONS if extensions is None else extensions
         c = self.constants
         self.MASS = c.mass
         self.INERTIA_Z = c.yaw_inertia
@@ -162,7 +147,6 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
             vehicle.speed,
             vehicle.parameters,
             vehicle.adhesion,
-            vehicle.extensions,
         )
         copy.lateral_speed, copy.yaw_rate = vehicle.lateral_speed, vehicle.yaw_rate
         copy._hidden = vehicle._hidden
@@ -195,7 +179,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
     @property
     def specific_force(self) -> tuple[float, float]:
         """What an accelerometer at the centre of gravity reads: ax, ay in m/s²."""
-        rates = _compiled_derivative(self.extensions)(self.motion, self.controls, self.constants)
+        rates = _rates(self.motion, self.controls, self.constants)
         return rates.ax, rates.ay
 
     @property
@@ -203,8 +187,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         """The present action as demands on steering wheel and drivetrain."""
         steering = self.parameters.steering
         angle = steering.ratio * math.tan(float(self.action["steering"]))
-        if self.extensions.steering:
-            angle = min(max(angle, -steering.limit_rad), steering.limit_rad)
+        angle = min(max(angle, -steering.limit_rad), steering.limit_rad)
         return Controls(angle, float(self.action["acceleration"]))
 
     @property
@@ -219,24 +202,19 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         del time
         heading, vx, vy, yaw_rate = (float(value) for value in state[2:, 0])
         x = self._hidden._replace(vx=vx, vy=vy, yaw_rate=yaw_rate)
-        rates = _compiled_derivative(self.extensions)(x, self.controls, self.constants)
+        rates = _rates(x, self.controls, self.constants)
         cosine, sine = math.cos(heading), math.sin(heading)
         place = (vx * cosine - vy * sine, vx * sine + vy * cosine, yaw_rate)
         return np.array([*place, rates.vx, rates.vy, rates.yaw_rate])[:, np.newaxis]
 
     def step(self, dt: float) -> None:
-        """Move on by `dt` s in steps of at most `STEP_S`; without extensions, as highway-env."""
-        if self.extensions == NO_EXTENSIONS:
-            super().step(dt)
-            rolling = self.speed * self.constants.inverse_radius
-            self._hidden = State(*self.motion[:-4], *(rolling,) * 4)
-            return
+        """Move on by `dt` s in steps of at most `STEP_S`."""
         self.clip_actions()
         count = max(1, math.ceil(dt / STEP_S - 1e-9))
         step_s = dt / count
         order = SECOND_ORDER if step_s == self._step_s else FIRST_ORDER
         place = Place(float(self.position[0]), float(self.position[1]), float(self.heading))
-        moved = _compiled_steps(self.extensions)(
+        moved = _steps(
             Motion(self.motion, place, self._slopes, self._drift),
             self.controls,
             self.constants,

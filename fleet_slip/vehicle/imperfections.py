@@ -285,7 +285,7 @@ def imperfect_derivative(
     """Return the rates of a car with imperfections; accelerometers feel wind, not weight."""
     load = transferred_loads(x, c)
     force, give_rates = _wheels(x, give, around, load, c, t)
-    still = driven_body(x, u, force, c)
+    still = driven_body(x, force, c)
     push = x.vx * around.wind
     motion = Acceleration(
         still.ax,
@@ -294,7 +294,7 @@ def imperfect_derivative(
         still.vy + t.wind_force * push + around.gravity_y,
         still.yaw_rate + t.wind_moment * push,
     )
-    return rates_of(x, u, motion, driven_spins(x, force, load, motion, c), c), give_rates
+    return rates_of(x, u, motion, driven_spins(x, force, load, c), c), give_rates
 
 
 @equation

@@ -100,19 +100,6 @@ def brush_force(
     )
 
 
-@equation
-def linear_force(
-    slip_angle: float, along: float, rolling: float, load: float, peak: float, c: Constants
-) -> TyreForce:
-    """Return the force of a linear tyre: stiffness times slip angle (rad) and slip, no limit."""
-    stiffness = cornering_stiffness(load, peak, c)
-    per_speed = 1.0 / max(abs(rolling), CREEP_SPEED_MPS)
-    bristle = c.stiffness_ratio * stiffness * per_speed
-    slip = (rolling - along) * per_speed
-    along_force, lateral = bristle * (rolling - along), stiffness * slip_angle
-    return TyreForce(along_force, lateral, bristle, slip, per_speed, 1.0)
-
-
 TAN_PI_8 = math.sqrt(2.0) - 1.0
 SMALLEST = 1e-300
 

@@ -1,30 +1,25 @@
-"""The car among highway-env's vehicles, and without extensions as its own bicycle."""
+"""The car among highway-env's vehicles, and its body beside that of its own bicycle."""
 
 from typing import Any
 
 import gymnasium
 import highway_env
+import numba
 import numpy as np
 import pytest
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.dynamics import BicycleVehicle
 
-from fleet_slip.vehicle.dynamics import NO_EXTENSIONS
+from fleet_slip.vehicle.dynamics import Acceleration, WheelForce, WheelForces, driven_body
 from fleet_slip.vehicle.highway import FourWheelVehicle
-from fleet_slip.vehicle.parameters import Controls, load_vehicle
+from fleet_slip.vehicle.parameters import Constants, Controls, State, load_vehicle
 from tests.support.rolling import SEDAN, Run, rolling
 
 gymnasium.register_envs(highway_env)
 
 
-def plain_car(**kwargs: Any) -> FourWheelVehicle:
-    return FourWheelVehicle(
-        None, [3.0, -2.0], heading=0.3, speed=20.0, extensions=NO_EXTENSIONS, **kwargs
-    )
-
-
-def bicycle_like(car: FourWheelVehicle) -> BicycleVehicle:
+def highway_env_s(car: FourWheelVehicle) -> BicycleVehicle:
     """Return highway-env's own vehicle with the same mass, inertia and tyres."""
     twin = BicycleVehicle(None, car.position, car.heading, car.speed)
     for name in ("MASS", "INERTIA_Z", "LENGTH_A", "LENGTH_B", "FRICTION_FRONT", "FRICTION_REAR"):
@@ -32,38 +27,47 @@ def bicycle_like(car: FourWheelVehicle) -> BicycleVehicle:
     return twin
 
 
-def test_without_extensions_the_derivative_is_highway_env_s() -> None:
+@numba.njit
+def body_on_axles(x: State, front: float, rear: float, c: Constants) -> Acceleration:
+    """Return how the body moves under lateral forces of its axles."""
+    half_front = WheelForce(0.0, front / 2, 0.0, 0.0, 0.0, 0.0)
+    half_rear = WheelForce(0.0, rear / 2, 0.0, 0.0, 0.0, 0.0)
+    return driven_body(x, WheelForces(half_front, half_front, half_rear, half_rear), c)
+
+
+def test_under_the_forces_of_its_axles_the_body_moves_as_highway_env_s() -> None:
+    """Rajamani, equations 2.21 to 2.28."""
     generator = np.random.default_rng(7)
-    car = plain_car()
-    twin = bicycle_like(car)
-    for trial in range(2000):
-        scale = np.array([100.0, 100.0, 3.0, 0.5 if trial % 3 == 0 else 25.0, 5.0, 1.0])
-        state = (generator.normal(size=6) * scale)[:, np.newaxis]
-        action = {
-            "steering": generator.uniform(-1.2, 1.2),
-            "acceleration": generator.normal(scale=4.0),
-        }
-        car.action = twin.action = action
-        ours, theirs = car.derivative_func(0.0, state), twin.derivative_func(0.0, state)
-        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
+    car = FourWheelVehicle(None, [3.0, -2.0], heading=0.3, speed=20.0)
+    twin, c = highway_env_s(car), car.constants
+    for _ in range(2000):
+        vx, vy, yaw_rate = generator.normal(size=3) * np.array([25.0, 5.0, 1.0])
+        vx = vx if abs(vx) > 1 else 25.0
+        steering = generator.uniform(-1.2, 1.2)
+        front = 2 * car.FRICTION_FRONT * (steering - np.arctan2(vy + c.front * yaw_rate, vx))
+        rear = -2 * car.FRICTION_REAR * np.arctan2(vy - c.rear * yaw_rate, vx)
+        moved = body_on_axles(rolling(vx, vy=vy, yaw_rate=yaw_rate), front, rear, c)
+        twin.action = {"steering": steering, "acceleration": 0.0}
+        theirs = twin.derivative_func(0.0, np.array([[0.0, 0.0, 0.3, vx, vy, yaw_rate]]).T)
+        np.testing.assert_allclose((moved.vy, moved.yaw_rate), theirs[4:, 0], rtol=1e-12)
 
 
-def test_without_extensions_ten_seconds_are_highway_env_s() -> None:
+def test_at_small_slip_the_car_moves_as_highway_env_s() -> None:
     generator = np.random.default_rng(8)
-    car = plain_car()
-    twin = bicycle_like(car)
-    twin.MAX_SPEED, twin.MIN_SPEED = car.MAX_SPEED, car.MIN_SPEED
-    for _ in range(50):
-        action = {
-            "steering": generator.normal(scale=0.05),
-            "acceleration": generator.normal(scale=3.0),
-        }
-        for vehicle in (car, twin):
-            vehicle.act(dict(action))
-            for _ in range(20):
-                vehicle.step(0.01)
-    np.testing.assert_allclose(car.state, twin.state, rtol=0, atol=1e-9)
-    assert abs(car.lateral_speed) > 1e-3
+    car = FourWheelVehicle(None, [3.0, -2.0], heading=0.3, speed=20.0)
+    twin, c = highway_env_s(car), car.constants
+    for _ in range(500):
+        vx, steering = generator.uniform(15.0, 40.0), generator.uniform(-1e-4, 1e-4)
+        vy, yaw_rate = generator.uniform(-1e-4, 1e-4, size=2) * np.array([vx, vx / 3])
+        turn = yaw_rate * np.array([-c.half_track_front, c.half_track_front] * 2)
+        wheels = dict(zip(State._fields[-4:], (vx + turn) * c.inverse_radius, strict=True))
+        at_wheel = SEDAN.steering.ratio * np.tan(steering)
+        car._hidden = rolling(vx, steering_wheel=at_wheel)._replace(**wheels)
+        car.action = twin.action = {"steering": steering, "acceleration": 0.0}
+        state = np.array([[100.0, 100.0, 0.3, vx, vy, yaw_rate]]).T
+        ours, theirs = car.derivative_func(0.0, state), twin.derivative_func(0.0, state)
+        np.testing.assert_allclose(ours[:3], theirs[:3], rtol=1e-12)
+        np.testing.assert_allclose(ours[4:], theirs[4:], rtol=0.01, atol=2e-4)
 
 
 def test_the_class_steps_as_the_equations_do() -> None:
