@@ -56,7 +56,7 @@ from fleet_slip.grams.on_board import (
     ROWS_IN_A_SUM,
     CountedSet,
     Range,
-    counted_by_identity,
+    counted_sets,
     most_rows,
 )
 from fleet_slip.grams.receiver_delay import delay_columns
@@ -116,7 +116,7 @@ def sets_on_board(manifest: Manifest) -> tuple[OnBoard, ...]:
     if manifest.learned_from is None:
         return (plain,)
     name = features().name_of(manifest.trained_on.feature_set)
-    counted = counted_by_identity().get(features().identity(name))
+    counted = counted_sets().get(features().identity(name))
     if counted is None:
         raise RefusedError(f"cars cannot count the feature set {name}: it has too many columns.")
     known = features().calibrated
@@ -146,7 +146,7 @@ def _whole(name: str) -> OnBoard:
 
 
 def _on_board_counted(name: str) -> CountedSet:
-    return counted_by_identity()[features().identity(name)]
+    return counted_sets()[features().identity(name)]
 
 
 def lower(sets: Sequence[OnBoard]) -> tuple[Steps, Mapping[str, int]]:

@@ -6,11 +6,11 @@ instead of a log file the row names `received/` and the digest of the table's fi
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import pyarrow as pa
@@ -104,17 +104,11 @@ class CountedSet:
 
 
 @cache
-def counted_sets() -> dict[int, CountedSet]:
-    """Return the sets by their definitions, the logged signals first."""
+def counted_sets() -> dict[str, CountedSet]:
+    """Return the sets by their identities, which Gram rows carry, the logged signals first."""
     known = features()
     found = [_counted(name) for name in (PLAIN, *known.sets) if _can_be(known.feature_set(name))]
-    return {one.definition: one for one in found}
-
-
-@cache
-def counted_by_identity() -> dict[str, CountedSet]:
-    """Return the sets by what their Gram rows carry."""
-    return {one.identity: one for one in counted_sets().values()}
+    return {one.identity: one for one in found}
 
 
 def _can_be(one: FeatureSet) -> bool:
@@ -214,6 +208,30 @@ def find_impossible(table: GramTable, ranges: Sequence[tuple[int, int]]) -> dict
             found[reason] = np.flatnonzero(bad & left)
             left &= ~bad
     return found
+
+
+def impossible_rows(
+    rows: pa.Table, sets: Mapping[str, CountedSet]
+) -> Iterator[tuple[dict[str, Any], str]]:
+    """Yield the Gram rows that no drive can have, and why, given the sets by their names there.
+
+    Rows of other sets, which were defined otherwise, are passed over.
+    """
+    for name in rows["feature_set"].unique().to_pylist():
+        one = sets.get(name)
+        if one is None:
+            continue
+        mine = rows.filter(pc.equal(rows["feature_set"], name)).combine_chunks()
+        for batch in mine.to_batches(BATCH_ROWS):
+            for signals, alike, _ in by_signals(batch):
+                names = signals.split(",") if signals else []
+                if not set(names) <= set(one.columns):
+                    found = {"has signals that there are not": np.arange(len(alike))}
+                else:
+                    table, ranges = gram_table(signals, alike), one.ranges_of(names)
+                    found = find_impossible(table, ranges) if names else {}
+                for reason, at in found.items():
+                    yield from ((alike.slice(i, 1).to_pylist()[0], reason) for i in at.tolist())
 
 
 def most_rows(ranges: Sequence[tuple[int, int]]) -> int:
@@ -370,7 +388,7 @@ _NEXT_FIELD_I32 = 0x15
 
 def _gram_rows(table: pa.Table, schema: pa.Schema, name: str) -> pa.Table:
     """Return rows of `grams`."""
-    identities = {one.key: one.identity for one in counted_sets().values()}
+    identities = {one.key: identity for identity, one in counted_sets().items()}
     sets = pa.array([identities[key] for key in table["feature_set"].to_pylist()])
     known = dict(zip(table.column_names, table.columns, strict=True)) | {"feature_set": sets}
     known |= {"file": pa.repeat(name, len(table)), "clipped": pa.repeat(0, len(table))}
@@ -410,16 +428,8 @@ def _require_possible(file: Path, table: pa.Table) -> None:
         wrong = database.execute(statement, {**late, "longest": LONGEST_ROWS}).fetchone()
     if wrong:
         _refuse(file, *wrong)
-    for key in table["feature_set"].unique().to_pylist():
-        of_set = _numbered(table).filter(pc.equal(table["feature_set"], key)).combine_chunks()
-        for batch in of_set.to_batches(BATCH_ROWS):
-            for signals, rows, _ in by_signals(batch):
-                if not signals:
-                    continue
-                ranges = sets[key].ranges_of(signals.split(","))
-                for reason, at in find_impossible(gram_table(signals, rows), ranges).items():
-                    row = rows.slice(int(at[0]), 1).to_pylist()[0]
-                    _refuse(file, row["number"], row["drive_id"], reason)
+    for row, reason in impossible_rows(_numbered(table), sets):
+        _refuse(file, row["number"], row["drive_id"], reason)
 
 
 def _require_allowed(file: Path, warehouse: Warehouse, rows: pa.Table) -> None:

@@ -14,7 +14,6 @@ from importlib.util import find_spec
 from typing import Literal, TypeAlias
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_slip.base import Progress, Record, no_progress, number_of
@@ -31,8 +30,8 @@ from fleet_slip.grams.check import (
     stored_grams,
 )
 from fleet_slip.grams.compute import by_sql, wide_grams
-from fleet_slip.grams.gram_rows import by_signals, gram_table, is_received
-from fleet_slip.grams.on_board import CountedSet, counted_by_identity, find_impossible
+from fleet_slip.grams.gram_rows import is_received
+from fleet_slip.grams.on_board import counted_sets, impossible_rows
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import find_temporary_files, find_unreferenced
 from fleet_slip.resources import read_sql
@@ -253,9 +252,10 @@ def verify_grams(
     `logs` and `grams` are files whose bytes are sound; `active` are the paths of all log files.
     """
     _verify_unique(warehouse, grams, report)
-    for file in grams:  # rows that cars counted, which no counts or drives can have
-        for drive, why in _impossible(warehouse.grams.read(file.path)):
-            problem = f"the Gram row that a car sent of drive {drive} {why}"
+    for file in grams:
+        rows = warehouse.grams.read(file.path)
+        for row, why in impossible_rows(rows.filter(is_received(rows)), counted_sets()):
+            problem = f"the Gram row that a car sent of drive {row['drive_id']} {why}"
             report.note("gram", f"grams/{file.path}", problem)
     where = find_gram_files(warehouse, grams)
     covered = [file for file in logs if file.path in where]
@@ -292,31 +292,6 @@ def _verify_unique(warehouse: Warehouse, grams: Sequence[TableFile], report: Ver
     for identity, file, drive, n in twice:
         problem = f"the Gram row {identity} of drive {drive} stands {n} times"
         report.note("gram", f"logs/{file}", problem)
-
-
-def _impossible(rows: pa.Table) -> Iterator[tuple[str, str]]:
-    """Yield the drives whose Gram rows, counted in the car, cannot be, and why."""
-    came = rows.filter(is_received(rows))
-    for identity in came["feature_set"].unique().to_pylist():
-        one = counted_by_identity().get(identity)
-        if one is None:  # it is defined otherwise today
-            continue
-        some = came.filter(pc.equal(came["feature_set"], identity)).combine_chunks()
-        for batch in some.to_batches():
-            for signals, alike, _ in by_signals(batch):
-                yield from _impossible_among(one, signals, alike)
-
-
-def _impossible_among(
-    one: CountedSet, signals: str, rows: pa.RecordBatch
-) -> Iterator[tuple[str, str]]:
-    drives, names = rows["drive_id"].to_pylist(), signals.split(",") if signals else []
-    if not set(names) <= set(one.columns):
-        yield from ((drive, "has signals that there are not") for drive in drives)
-    elif names:
-        found = find_impossible(gram_table(signals, rows), one.ranges_of(names))
-        for why, at in found.items():
-            yield from ((drives[place], why) for place in at.tolist())
 
 
 def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:

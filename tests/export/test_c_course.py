@@ -18,7 +18,7 @@ from fleet_slip.errors import RefusedError
 from fleet_slip.export.c_gram import sets_on_board
 from fleet_slip.export.files import export_files
 from fleet_slip.grams.compute import aggregate
-from fleet_slip.grams.on_board import counted_by_identity, counted_sets
+from fleet_slip.grams.on_board import counted_sets
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.folder import Folder
@@ -114,10 +114,8 @@ def three(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setitem(features().sets, "few", few)
     monkeypatch.setitem(features().sets, "three", three)
     counted_sets.cache_clear()
-    counted_by_identity.cache_clear()
     yield "three"
     counted_sets.cache_clear()
-    counted_by_identity.cache_clear()
 
 
 def test_several_times_are_parts_of_the_drive(tmp_path: Path, three: str) -> None:

@@ -125,7 +125,7 @@ def test_the_layout_is_what_the_page_says(counter: Path) -> None:
     counts = np.ones((3, len(SIGNALS)), np.int16)
     content = count_drives(counter, [("VIN-17", 1_700_000_000, counts)])
     assert content[:8] == b"FSGR\x01\x00" + len(content).to_bytes(2, "little")
-    assert int.from_bytes(content[8:16], "little") == next(iter(counted_sets()))
+    assert int.from_bytes(content[8:16], "little") == next(iter(counted_sets().values())).definition
     assert content[16:32] == b"VIN-17".ljust(16, b"\0")
     assert content[32:36] == b"\0\0\x01\0"
     assert struct.unpack_from("<QIII", content, 36) == (1_700_000_000, 2**11 - 1, 3, 0)

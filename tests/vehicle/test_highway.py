@@ -27,7 +27,7 @@ def highway_env_s(car: FourWheelVehicle) -> BicycleVehicle:
     return twin
 
 
-@numba.njit
+@numba.njit(error_model="numpy")
 def body_on_axles(x: State, front: float, rear: float, c: Constants) -> Acceleration:
     """Return how the body moves under lateral forces of its axles."""
     half_front = WheelForce(0.0, front / 2, 0.0, 0.0, 0.0, 0.0)
