@@ -8,9 +8,7 @@ import pyarrow.compute as pc
 from fleet_slip.catalogue.facts import RECEIVED_FILES
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import ConflictError
-from fleet_slip.grams.gram_files import (
-    is_of_received,
-)
+from fleet_slip.grams.gram_files import is_of_received
 from fleet_slip.storage.table import Snapshot, TableFile
 
 BEING_WRITTEN_HOURS = 1.0

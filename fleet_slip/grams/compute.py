@@ -376,8 +376,6 @@ Late = Mapping[str, int] | None
 def aggregate(
     warehouse: Warehouse,
     files: Sequence[TableFile],
-    progress: Progress = no_progress,
-    threads: int | None = None,
     feature_set: str = PLAIN,
     executor: Executor | None = None,
     late: Late = None,
@@ -385,47 +383,41 @@ def aggregate(
     """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive."""
     in_time = features().feature_set(feature_set).in_time
     empty = warehouse.computed_schema(in_time=in_time).empty_table()
-    return pa.concat_tables(
-        [empty, *compute_grams(warehouse, files, progress, threads, feature_set, executor, late)]
-    )
+    rows = compute_grams(warehouse, files, no_progress, feature_set, executor, late)
+    return pa.concat_tables([empty, *rows])
 
 
 def compute_grams(
     warehouse: Warehouse,
     files: Sequence[TableFile],
     progress: Progress = no_progress,
-    threads: int | None = None,
     feature_set: str = PLAIN,
     executor: Executor | None = None,
     late: Late = None,
 ) -> Iterator[pa.Table]:
     """Yield the Gram rows of log files, one file after the other, in the schema of `grams`.
 
-    `late` is the delay of each car's course in parts of a tick. The work is done here, on all cores
-    or `threads`, or by an executor as tasks of some files and one thread each.
+    `late` is the delay of each car's course in parts of a tick. The work is done here, on all
+    cores, or by an executor as tasks of some files and one thread each.
     """
-    if features().feature_set(feature_set).windows:
-        own = LocalThreads(threads or cpu_count() or 1) if executor is None else None
-        with own or nullcontext():
-            task = partial(wide_grams, warehouse, feature_set=feature_set, late=late)
-            yield from _by_tasks(executor or own, task, _groups(files, 1), progress)
+    wide = bool(features().feature_set(feature_set).windows)
+    if executor is None and not wide:
+        total = sum(file.rows for file in files)
+        with open_database(reading=warehouse.logs.folder) as database:
+            for group in _groups(files, FILES_PER_QUERY):
+                yield _query(database, warehouse, group, feature_set)
+                progress(sum(file.rows for file in group), total)
         return
-    if executor is not None:
-        groups = _groups(
-            files, min(FILES_PER_QUERY, max(1, ceil(len(files) / in_flight(executor))))
-        )
-        task = partial(_aggregate_group, warehouse, feature_set)
-        yield from _by_tasks(executor, task, groups, progress)
-        return
-    total = sum(file.rows for file in files)
-    with open_database(reading=warehouse.logs.folder, threads=threads) as database:
-        for group in _groups(files, FILES_PER_QUERY):
-            yield _query(database, warehouse, group, feature_set)
-            progress(sum(file.rows for file in group), total)
+    with nullcontext(executor) if executor else LocalThreads(cpu_count() or 1) as workers:
+        many = 1 if wide else ceil(len(files) / in_flight(workers))
+        groups = _groups(files, min(FILES_PER_QUERY, max(1, many)))
+        way = wide_grams if wide else partial(by_sql, threads=1)
+        task = partial(way, warehouse, feature_set=feature_set, late=late)
+        yield from _by_tasks(workers, task, groups, progress)
 
 
 def _by_tasks(
-    executor: Executor | None,
+    executor: Executor,
     task: Callable[[Sequence[TableFile]], pa.Table],
     groups: list[Sequence[TableFile]],
     progress: Progress,
@@ -451,18 +443,15 @@ def _group_name(group: Sequence[TableFile]) -> str:
     return f"the Gram rows of {number_of(len(group), 'log file')} from {group[0].path}"
 
 
-def _aggregate_group(
-    warehouse: Warehouse, feature_set: str, files: Sequence[TableFile]
-) -> pa.Table:
-    with open_database(reading=warehouse.logs.folder, threads=1) as database:
-        return _query(database, warehouse, files, feature_set)
-
-
 def by_sql(
-    warehouse: Warehouse, files: Sequence[TableFile], feature_set: str, late: Late = None
+    warehouse: Warehouse,
+    files: Sequence[TableFile],
+    feature_set: str,
+    late: Late = None,
+    threads: int | None = None,
 ) -> pa.Table:
     """Return the Gram rows of log files as `jobs/gram.sql` defines them, of any feature set."""
-    with open_database(reading=warehouse.logs.folder) as database:
+    with open_database(reading=warehouse.logs.folder, threads=threads) as database:
         return _query(database, warehouse, files, feature_set, late)
 
 
@@ -671,35 +660,23 @@ def wide_grams(
     plan = workspace.plan
     identity = features().identity(feature_set)
     schema = warehouse.computed_schema(in_time=one.in_time)
-    columns: dict[str, list[Any]] = {name: [] for name in schema.names}
+    rows: list[dict[str, Any]] = []
     # Files are shared out among threads; a BLAS with threads of its own would be in their way.
     with threadpool_limits(1, user_api="blas"):
         for file in sorted(files, key=lambda one: one.path):
             for drive in sorted(read_drives(warehouse, file, plan), key=lambda one: one.drive_id):
-                _append_rows(
-                    columns,
-                    workspace,
-                    one,
-                    drive,
-                    {
-                        "feature_set": identity,
-                        "file": file.path,
-                        "day": file.day,
-                        COURSE_LATE: (late or {}).get(drive.metadata["vehicle_id"]),
-                    },
-                )
-    return pa.table(columns, schema=schema)
+                delay = (late or {}).get(drive.metadata["vehicle_id"])
+                known = {**drive.metadata, "feature_set": identity, COURSE_LATE: delay}
+                known |= {"file": file.path, "day": file.day}
+                rows += _gram_rows(workspace, one, drive, known)
+    return pa.Table.from_pylist(rows, schema=schema)
 
 
-def _append_rows(
-    columns: dict[str, list[Any]],
-    workspace: Workspace,
-    one: FeatureSet,
-    drive: LoggedDrive,
-    known: Mapping[str, Any],
-) -> None:
+def _gram_rows(
+    workspace: Workspace, one: FeatureSet, drive: LoggedDrive, known: Mapping[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """Yield the Gram rows of a drive with what is known of it, sorted as by SQL."""
     parts = Parts.of_set(features(), one)
-    where = f"{known['file']}: drive {drive.drive_id}"
     try:
         if one.change_ticks:
             late = (known[COURSE_LATE] or 0) if one.in_time else 0
@@ -707,23 +684,19 @@ def _append_rows(
         else:
             found = drive_sums(workspace, parts, drive.counts)
     except DataError as error:
-        raise DataError(f"{where}: {error}") from None
+        raise DataError(f"{known['file']}: drive {drive.drive_id}: {error}") from None
     for absent, part in sorted(found, key=_last_if_unknown):
         sums = found[absent, part]
         names = [name for i, name in enumerate(one.columns) if not absent >> i & 1]
-        lower = np.tril_indices(len(names))
-        row = {
-            **drive.metadata,
+        yield {
             **known,
             "part": parts.name(part),
             "signals": ",".join(names),
             "n": sums.n,
             "clipped": sums.clipped,
             "sums": sums.sums,
-            "products": sums.products[lower],
+            "products": sums.products[np.tril_indices(len(names))],
         }
-        for name, values in columns.items():
-            values.append(row[name])
 
 
 @dataclass

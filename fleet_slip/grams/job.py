@@ -143,9 +143,7 @@ def _update_once(
     logs_version = logs.version
     dropped = 0
     if backlog.missing or backlog.stale:
-        new_rows = compute_grams(
-            warehouse, backlog.missing, progress, None, feature_set, executor, late
-        )
+        new_rows = compute_grams(warehouse, backlog.missing, progress, feature_set, executor, late)
         merged = _Merged(grams, backlog.stale, identity, others)
         grams.commit_or_discard(
             Change(

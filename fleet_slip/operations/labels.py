@@ -17,7 +17,7 @@ from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.facts import RECEIVED
 from fleet_slip.catalogue.faults import DriveBatches, Fault
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
-from fleet_slip.operations.peers import MAD_TO_STD, QualityThresholds
+from fleet_slip.operations.peers import MAD_TO_STD, QualityThresholds, solve
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import open_database
@@ -113,13 +113,6 @@ def _leading_signs(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
     directions = directions / np.where(lengths > 0, lengths, 1.0)
     _, vectors = np.linalg.eigh(directions.T @ directions)
     return np.where(directions @ vectors[:, -1] < 0, -1.0, 1.0)
-
-
-def solve(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
-    """Return the weights of least squares, scaled so that units do not matter."""
-    scale = np.sqrt(np.maximum(np.diagonal(inputs), np.finfo(np.float64).tiny))
-    solution, *_ = np.linalg.lstsq(inputs / np.outer(scale, scale), with_label / scale, rcond=1e-12)
-    return np.asarray(solution / scale)
 
 
 FACTOR = 1.4

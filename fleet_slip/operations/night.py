@@ -2,12 +2,14 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
-from fleet_slip.base import number_of
+from pydantic import PlainSerializer, TypeAdapter
+
+from fleet_slip.base import Record, number_of
 from fleet_slip.errors import AlarmError, FleetSlipError, printable
 from fleet_slip.operations.monitor import Chart, control_chart
 from fleet_slip.pages.drawing import Picture, draw
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 NIGHTS_FOLDER = "nights"
 """Of numbered documents, two of a night: its beginning and its end."""
 
+Hashes: TypeAlias = Annotated[frozenset[str], PlainSerializer(sorted)]
+
 
 @dataclass(frozen=True)
 class Beginning:
@@ -32,7 +36,7 @@ class Beginning:
     drives: int
     rows: int
     quarantined: int
-    known: frozenset[str] = frozenset()
+    known: Hashes = frozenset()
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,10 @@ class PastNight:
     rows: int
     champion: str | None
     steps: Mapping[str, str]
-    faulty: frozenset[str] = frozenset()
+    faulty: Hashes = frozenset()
+
+
+_BEGINNING, _PAST = TypeAdapter(Beginning), TypeAdapter(PastNight)
 
 
 @dataclass(frozen=True)
@@ -61,29 +68,25 @@ class Nights:
             if content["night"] < night.isoformat():
                 break
             if content["night"] == night.isoformat() and content["event"] == "begun":
-                kept = {name: content[name] for name in vars(now)}
-                return Beginning(**{**kept, "known": frozenset(content["known"])})
+                return _BEGINNING.validate_python(content)
         before = next(self.ended(before=night), None)
-        known = before.faulty if before else frozenset()
-        begun = replace(now, known=known)
-        self._append("begun", night, {**vars(begun), "known": sorted(begun.known)})
+        begun = replace(now, known=before.faulty if before else frozenset())
+        content = {"night": night.isoformat(), **_BEGINNING.dump_python(begun, mode="json")}
+        self._append("begun", content)
         return begun
 
     def end(self, past: PastNight) -> None:
         """Record how a night ended."""
-        content = {**vars(past), "steps": dict(past.steps), "faulty": sorted(past.faulty)}
-        self._append("ended", content.pop("night"), content)
+        self._append("ended", _PAST.dump_python(past, mode="json"))
 
-    def ended(self, before: date | None = None) -> Iterator[PastNight]:
+    def ended(self, before: date = date.max) -> Iterator[PastNight]:
         """Yield the nights that ended, the newest first and each once, as it ended at last."""
-        seen = {before.isoformat()} if before else set()
+        seen = set[str]()
         for content in self._newest_first():
-            late = before is not None and content["night"] > before.isoformat()
-            if content["event"] == "ended" and content["night"] not in seen and not late:
-                seen.add(content["night"])
-                kept = {field.name: content[field.name] for field in fields(PastNight)}
-                kept |= {"night": date.fromisoformat(content["night"])}
-                yield PastNight(**{**kept, "faulty": frozenset(content["faulty"])})
+            night = content["night"]
+            if content["event"] == "ended" and night not in seen and night < before.isoformat():
+                seen.add(night)
+                yield _PAST.validate_python(content)
 
     def _newest_first(self) -> Iterator[Mapping[str, Any]]:
         documents = DocumentFolder(self.root / NIGHTS_FOLDER)
@@ -92,8 +95,8 @@ class Nights:
             if content["model"] == self.model:
                 yield content
 
-    def _append(self, event: str, night: date, content: Mapping[str, Any]) -> None:
-        known = {"event": event, "model": self.model, "night": night.isoformat()}
+    def _append(self, event: str, content: Mapping[str, Any]) -> None:
+        known = {"event": event, "model": self.model}
         DocumentFolder(self.root / NIGHTS_FOLDER).append({**known, **content})
 
 
@@ -101,7 +104,7 @@ State: TypeAlias = Literal["done", "attention", "failed", "left out"]
 
 
 @dataclass(frozen=True)
-class NightStep:
+class NightStep(Record):
     """One step of a night.
 
     Attributes:
@@ -110,16 +113,13 @@ class NightStep:
         error: what it failed with.
     """
 
+    DOCUMENT = "name state told exit_code=error.exit_code"
+
     name: str
     state: State
     told: str
     seconds: float
     error: FleetSlipError | None = None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the step for a JSON document."""
-        known = {"name": self.name, "state": self.state, "told": self.told}
-        return {**known, "exit_code": self.error.exit_code if self.error else None}
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,7 @@ class Prediction:
         weights = np.zeros((len(at), len(total)))
         for row, target in enumerate(at.tolist()):
             used = [0, *(p for p in predictors if p != target)]
-            weights[row, used] = _least_squares(total, used, target)
+            weights[row, used] = solve(total[np.ix_(used, used)], total[used, target])
         bare = cls(at, weights, np.zeros((len(at), 3)), np.ones((len(at), 3)))
         figures = reference.each(bare.figures)
         middle, spread = _middle_and_spread(figures)
@@ -267,13 +267,10 @@ def _middle_and_spread(figures: FloatArray) -> tuple[FloatArray, FloatArray]:
     return middle, spread
 
 
-def _least_squares(total: FloatArray, used: Sequence[int], target: int) -> FloatArray:
-    matrix = total[np.ix_(used, used)]
-    scale = np.sqrt(np.diagonal(matrix))
-    scale = np.where(scale > 0, scale, 1.0)
-    solution, *_ = np.linalg.lstsq(
-        matrix / np.outer(scale, scale), total[used, target] / scale, rcond=1e-12
-    )
+def solve(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
+    """Return the weights of least squares, scaled so that units do not matter."""
+    scale = np.sqrt(np.maximum(np.diagonal(inputs), np.finfo(np.float64).tiny))
+    solution, *_ = np.linalg.lstsq(inputs / np.outer(scale, scale), with_label / scale, rcond=1e-12)
     return np.asarray(solution / scale)
 
 

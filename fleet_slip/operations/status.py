@@ -16,12 +16,7 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, Folder
-from fleet_slip.storage.runs import (
-    add_runs,
-    find_changed_lines,
-    find_missing_documents,
-    state_of,
-)
+from fleet_slip.storage.runs import add_runs, find_changed_lines, find_missing_documents, state_of
 from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.database import database_errors, open_database

@@ -5,11 +5,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.grams.job import update_grams
-from fleet_slip.operations.find_drives import (
-    find_old_files,
-    quarantined_of,
-    remove_old_files,
-)
+from fleet_slip.operations.find_drives import find_old_files, quarantined_of, remove_old_files
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse

@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.errors import StorageError
 from fleet_slip.grams import gram_files
 from fleet_slip.grams.backlog import find_backlog
@@ -86,7 +87,9 @@ def test_rows_do_not_depend_on_files_order_or_threads(
         for number, part in enumerate(np.array_split(np.arange(4), split)):
             rows = [shuffled[i].take(rng.permutation(len(shuffled[i]))) for i in part]
             land(warehouse, f"f{number}", *rows)
-        grams = grams_of(aggregate(warehouse, warehouse.logs.snapshot().files, threads=threads))
+        with LocalThreads(threads) as executor:
+            files = warehouse.logs.snapshot().files
+            grams = grams_of(aggregate(warehouse, files, executor=executor))
         expected = expected or grams
         assert grams == expected
 
