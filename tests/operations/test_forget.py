@@ -19,12 +19,11 @@ from fleet_slip.grams import job
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import compute_grams
 from fleet_slip.grams.job import update_grams
-from fleet_slip.operations.find_drives import Located, drives_by_file, find_unreferenced, locate
+from fleet_slip.operations.find_drives import Located, drives_by_file, locate
 from fleet_slip.operations.forget import Retention, forget, retain
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import Change
 from fleet_slip.warehouse.forgotten import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
@@ -160,21 +159,6 @@ def test_a_gram_job_under_way_does_not_bring_a_forgotten_drive_back(
     with fleet_slip.connect(warehouse.root) as database:
         cars = database.execute("SELECT DISTINCT vehicle_id FROM grams").fetchall()
     assert cars == [("alfa",)]
-
-
-def test_quarantined_rows_of_the_car_go_too(tmp_path: Path) -> None:
-    warehouse = fill(tmp_path, *CARS)
-    values: list[dict[str, Any]] = [
-        {"file": "x.csv", "row": row, "drive_id": name, "reason": "missing", "signal": None}
-        for row, name in enumerate(["beta-1", "alfa-1", None, "beta-10"])
-    ]
-    rows = pa.Table.from_pylist(values, schema=warehouse.quarantine.schema)
-    action = warehouse.quarantine.write_file("q", rows)
-    warehouse.quarantine.snapshot().commit(Change(add=[action]))
-    forget(warehouse, Forgettable("vehicle", "beta"), now=True)
-    (path,) = warehouse.quarantine.snapshot().paths
-    assert pq.read_table(path)["drive_id"].to_pylist() == ["alfa-1", None, "beta-10"]
-    assert not find_unreferenced(warehouse.quarantine)
 
 
 @pytest.mark.parametrize("subject", ["vehicle", "drive"])

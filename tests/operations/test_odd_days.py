@@ -12,7 +12,6 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.quality import examine_drives, find_wrong_labels
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import Signals, counts, drive
-from tests.support.commands import RunCommand
 from tests.support.logs import DAY, land, log_rows
 
 CARS, DAYS = 12, 3
@@ -85,27 +84,3 @@ def test_a_third_of_a_days_labels_is_found(
 def test_what_roads_and_loads_change_is_no_fault(warehouse: Warehouse) -> None:
     land_days(warehouse, iced)
     assert find_wrong_labels(load_cohort(warehouse)) == {}
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        multiplied(1 / 57.3),
-        *(pytest.param(change, marks=pytest.mark.long) for change in (multiplied(2), shifted(1))),
-    ],
-)
-def test_publishing_by_hand_leaves_the_day_out(
-    warehouse: Warehouse, run_command: RunCommand, change: Callable[[Signals], None]
-) -> None:
-    land_days(warehouse, change)
-    asked = ("publish", "beta", "--nested", "ay,yaw_rate,steer_fl", "--json")
-    done = run_command(*asked)
-    assert done.exit_code == 0, done.stderr
-    assert f"{CARS} drives of {CARS * DAYS} left out, not in order" in done.stderr
-    with_all = run_command(*asked, "--unexamined", "--candidate")
-    assert with_all.exit_code == 0, with_all.stderr
-    few, many = (
-        run_command("show", f"beta@{number}", "--json").json["trained_on"]["drives"]
-        for number in (1, 2)
-    )
-    assert (few, many) == (CARS * (DAYS - 1), CARS * DAYS)

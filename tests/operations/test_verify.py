@@ -233,12 +233,3 @@ def test_simulated_logs_are_rebuilt_to_the_bit(
     assert len(repair(warehouse, report, [str(tmp_path / "short.toml")])) == 2
     assert {path: Path(path).read_bytes() for path in whole} == whole
     assert not verify(warehouse, full=True).damage
-
-
-def test_the_exit_code_tells_damage(run_command: RunCommand, filled: Warehouse) -> None:
-    assert run_command("verify").exit_code == 0
-    flip(Path(filled.logs.snapshot().paths[0]), 999)
-    told = run_command("verify", "--json")
-    assert told.exit_code == 9
-    assert told.json["damage"][0]["problem"].startswith("its bytes do not match the checksum")
-    assert run_command("verify", "--repair").exit_code == 9

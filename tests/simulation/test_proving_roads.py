@@ -1,7 +1,6 @@
 """Trials on roads of every class: what is drawn, and that load and banks are in the signals."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -95,21 +94,3 @@ def test_load_behind_the_rear_axle_takes_understeer_away() -> None:
     }
     assert more[1620.0] < 0.7 * more[1320.0]
     assert fast[1620.0]["sideslip"].mean() < fast[1320.0]["sideslip"].mean()
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "reason"),
-    [
-        ("load_position_m", "# load_position_m", "need each other"),
-        ("tread_wear_per", "# tread_wear_per", "needs imperfections.tread_wear_per_100_days"),
-        ('"city_1"', '"waterford_hills"', "roads of a class, such as country_17, not waterford"),
-    ],
-)
-def test_a_plan_that_would_ignore_a_key_is_refused(
-    tmp_path: Path, old: str, new: str, reason: str
-) -> None:
-    file = tmp_path / "campaign.toml"
-    head, _, tail = TEXT.rpartition(old)
-    file.write_text(head + new + tail)
-    with pytest.raises(ConfigError, match=reason):
-        load_campaign(str(file))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fleet_slip.errors import ConfigError
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.receivers import Receiver, ReceiverFixes, ReceiverLog
@@ -127,13 +126,3 @@ def test_a_campaign_with_receivers_has_the_drives_of_its_base(received: Campaign
     true = before.measurement.counts["vx"] * 0.005
     speed = after.fixes.counts["satellite_speed"] * 0.005
     assert np.abs(speed - true)[after.fixes.fix].max() < 0.5
-
-
-def test_a_base_has_none_itself_and_exists(tmp_path: Path) -> None:
-    file = tmp_path / "further.toml"
-    file.write_text('name = "further"\nbase = "waterford_course"\ndescription = "x"\n')
-    with pytest.raises(ConfigError, match="has a base itself"):
-        load_campaign(str(file))
-    file.write_text('name = "further"\nbase = "nowhere"\ndescription = "x"\n')
-    with pytest.raises(ConfigError, match="nothing is called 'nowhere'"):
-        load_campaign(str(file))

@@ -2,7 +2,6 @@
 
 from decimal import Decimal
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.config import load_config
-from fleet_slip.errors import ConfigError
-from fleet_slip.simulation.sensors import Gps, Recorder, Sensors
+from fleet_slip.simulation.sensors import Gps, Sensors
 from tests.support.measuring import measure, quantise
 
 TICKS = 200_000
@@ -65,14 +62,6 @@ def test_noise_is_white_and_independent_between_signals() -> None:
         assert abs(np.corrcoef(row[:-1], row[1:])[0, 1]) < limit
 
 
-def test_truth_is_only_quantised() -> None:
-    truth = constant_truth(100)
-    measured = measure(truth, SENSORS, generator())
-    for name in ("vx", "vy", "station", "lateral_offset"):
-        signal = catalogue()[name]
-        assert np.all(measured.counts[name] == np.rint(truth[signal.column] / float(signal.scale)))
-
-
 def test_gps_has_its_own_rate_noise_and_outages() -> None:
     truth = constant_truth()
     measured = measure(truth, SENSORS, generator())
@@ -87,22 +76,6 @@ def test_gps_has_its_own_rate_noise_and_outages() -> None:
         error = velocity - truth[catalogue()[name.removeprefix("gps_")].column][0]
         assert np.std(error) == pytest.approx(0.05, rel=0.03)
         assert not measured.counts[name][~measured.gps_fix].any()
-
-
-def test_outages_and_fixes_go_on_from_block_to_block() -> None:
-    recorder = Recorder(SENSORS, generator())
-    lengths = [12_347, 1, 9, 70_003, 20_000]
-    for ticks in lengths:
-        recorder.record(constant_truth(ticks))
-    measured = recorder.measurement()
-    assert len(measured.gps_fix) == sum(lengths)
-    fixes = np.flatnonzero(measured.gps_fix)
-    assert np.all(fixes % 10 == 0)
-    lost = 1 - len(fixes) / (sum(lengths) / 10)
-    assert lost == pytest.approx(5 / 65, rel=0.6)
-    for name, counts in measured.counts.items():
-        assert len(counts) == sum(lengths), name
-    assert not measured.counts["gps_vx"][~measured.gps_fix].any()
 
 
 def test_values_out_of_range_saturate_and_are_counted() -> None:
@@ -144,40 +117,3 @@ def test_counts_are_the_nearest_within_the_valid_range(name: str, values: list[f
             nearest = signal.min_count if exact < 0 else signal.max_count
             assert count == nearest
     assert clipped <= len(values) - inside
-
-
-FILE = """
-ax_bias_mps2 = 0.15
-ay_bias_mps2 = 0.15
-acceleration_std_mps2 = 0.1
-yaw_rate_bias_rad_s = 0.01
-yaw_rate_std_rad_s = 0.01
-wheel_speed_std_rad_s = 0.05
-steering_wheel_std_rad = 0.002
-steer_std_rad = 0.0002
-sideslip_std_rad = 0.0005
-[gps]
-rate_hz = 10
-velocity_std_mps = 0.05
-time_between_outages_s = 60.0
-outage_duration_s = 5.0
-"""
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "complaint"),
-    [
-        ("acceleration_std_mps2 = 0.1", "acceleration_std_mps2 = -0.1", "acceleration_std_mps2"),
-        ("ax_bias_mps2 = 0.15", "ax_bias_mps2 = inf", "ax_bias_mps2"),
-        ("rate_hz = 10", "rate_hz = 30", "gps.rate_hz: 30 Hz does not divide 100 Hz"),
-        ("steer_std_rad", "steer_std_deg", "steer_std_deg: unknown key"),
-    ],
-)
-def test_faults_are_named(tmp_path: Path, old: str, new: str, complaint: str) -> None:
-    file = tmp_path / "sensors.toml"
-    file.write_text(FILE)
-    assert load_config(file, Sensors).gps.rate_hz == 10
-    file.write_text(FILE.replace(old, new))
-    with pytest.raises(ConfigError) as error:
-        load_config(file, Sensors)
-    assert complaint in str(error.value)

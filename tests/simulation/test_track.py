@@ -1,14 +1,12 @@
 """Tracks: curvature, centre line, closure, and what is refused."""
 
 import csv
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.special import fresnel
 
-from fleet_slip.errors import ConfigError
 from fleet_slip.simulation.roads import Segment, Track, load_track
 from tests.support.evidence import EVIDENCE
 
@@ -87,35 +85,3 @@ def test_grid_of_a_closed_track_leaves_out_its_end() -> None:
     assert station[-1] + spacing == pytest.approx(314.159265)
     station, spacing = load_track("straight").grid(1.0)
     assert (len(station), spacing, station[-1]) == (1001, 1.0, 1000.0)
-
-
-def toml(segments: str, closed: str = "false") -> str:
-    return f'name = "t"\ndescription = "a test"\nclosed = {closed}\nsegments = [{segments}]\n'
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        (toml(""), "segments"),
-        (toml("{ length_m = 0.0, curvature_1pm = [0, 0] }"), "segments.0.length_m"),
-        (toml("{ length_m = 1.0, curvature_1pm = [0, nan] }"), "segments.0.curvature_1pm.1"),
-        (toml("{ length_m = 1.0, curvature_1pm = [0] }"), "segments.0.curvature_1pm"),
-        (toml("{ length_m = 1.0, curvature_1pm = [0, 0], radius = 1 }"), "unknown key"),
-        (
-            toml(
-                "{ length_m = 9, curvature_1pm = [0, 0] }, "
-                "{ length_m = 9, curvature_1pm = [0.1, 0.1] }"
-            ),
-            "curvature jumps from 0.0 to 0.1 1/m after segment 0",
-        ),
-        (toml("{ length_m = 9.0, curvature_1pm = [0.0, 0.0] }", "true"), "does not close"),
-        ("name = 3", "description"),
-    ],
-)
-def test_faults_are_named_by_file_and_key(tmp_path: Path, text: str, complaint: str) -> None:
-    file = tmp_path / "bad.toml"
-    file.write_text(text)
-    with pytest.raises(ConfigError) as error:
-        load_track(str(file))
-    assert str(file) in str(error.value)
-    assert complaint in str(error.value)

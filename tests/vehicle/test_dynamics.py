@@ -79,27 +79,6 @@ def test_steady_side_slip_is_that_of_the_rear_axle(vx: float) -> None:
     assert last.vy / last.vx == pytest.approx(expected, rel=0.02, abs=2e-5)
 
 
-def test_side_slip_after_a_step_steer_changes_sign_at_the_theoretical_speed() -> None:
-    speed = math.sqrt(KNOWN.rear / KNOWN.rear_slip)
-    slow, fast = steady_corner(0.93 * speed, 0.05), steady_corner(1.07 * speed, 0.05)
-    assert slow.last.vy > 0 > fast.last.vy
-
-
-def test_yaw_rate_gain_is_greatest_at_the_characteristic_speed() -> None:
-    """r / δ = v / (L + K v²), greatest at v = √(L / K)."""
-    characteristic = math.sqrt(KNOWN.wheelbase / KNOWN.understeer)
-    gains = []
-    for vx in (0.6 * characteristic, characteristic, 1.5 * characteristic):
-        last = steady_corner(vx, 0.02).last
-        gain = last.yaw_rate / (last.steering_wheel / RATIO)
-        assert gain == pytest.approx(
-            last.vx / (KNOWN.wheelbase + KNOWN.understeer * last.vx**2), rel=0.02
-        )
-        gains.append(gain)
-    assert gains[1] > gains[0]
-    assert gains[1] > gains[2]
-
-
 def inverse_brush(force: float, load: float, peak: float) -> float:
     """Return the slip at which F = μ Fz (1 − (1 − C σ / (3 μ Fz))³) is the force."""
     limit = (CAR.friction - CAR.friction_per_load * load) * load
@@ -203,17 +182,6 @@ def test_nothing_blows_up_in_any_spin(x: State, u: Controls, adhesion: float) ->
     assert np.isfinite(run.states).all()
     assert np.isfinite(run.forces).all()
     assert kinetic_energy(run.states).max() <= 1.01 * start + SEDAN.drivetrain.power_w * 3.0 + 1
-
-
-@pytest.mark.parametrize("adhesion", [0.1, 1.0])
-@pytest.mark.parametrize("vx", [0.0, 0.3, 1.0, 5.0, 60.0])
-def test_from_standstill_to_60_mps_all_is_finite(vx: float, adhesion: float) -> None:
-    c = constants(SEDAN, adhesion)
-    for traction in (-10.0, 0.0, 6.0):
-        for steering_wheel in (0.0, 8.7):
-            run = Run(rolling(vx), Controls(steering_wheel, traction), seconds=2.0, c=c)
-            assert np.isfinite(run.states).all()
-            assert np.abs(run.forces).max() < 1.6 * GRAVITY_MPS2
 
 
 @given(x=STATES, u=CONTROLS)

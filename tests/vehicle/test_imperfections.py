@@ -120,24 +120,6 @@ def test_a_mirrored_car_on_a_mirrored_road_drives_mirrored() -> None:
     np.testing.assert_allclose(other.steer_fr_rad, -one.steer_fl_rad, atol=1e-9)
 
 
-def test_compliance_adds_its_share_to_the_understeer_gradient() -> None:
-    """On a circle the steering grows by (K + c W_f / g) ay (Gillespie 1992, chapter 6)."""
-    ratio, compliance = SEDAN.steering.ratio, 0.15
-    flaws = CarImperfections(steering_compliance_deg_per_kn=compliance)
-    added = []
-    for speed in (6.0, 15.0):
-        road = circle(100.0, speed)
-        soft, rigid = (drive(road, flaw) for flaw in (flaws, PERFECT))
-        wheel = end(soft.steering_wheel_rad) - end(rigid.steering_wheel_rad)
-        added.append(np.degrees(wheel) / ratio)
-    c = constants(SEDAN, 1.0)
-    per_ay = compliance * 2 * c.static_front / GRAVITY_MPS2 / 1000
-    expected = per_ay * (15.0**2 - 6.0**2) / 100.0
-    assert added[1] - added[0] == pytest.approx(expected, rel=0.03)
-    # What the driver feeds forward holds the line as well as without.
-    assert abs(end(soft.lateral_offset_m) - end(rigid.lateral_offset_m)) < 0.05
-
-
 def test_compliance_shows_in_the_wheels_and_not_in_what_the_sideslip_is() -> None:
     road, flaws = circle(100.0, 15.0), CarImperfections(steering_compliance_deg_per_kn=0.2)
     soft, rigid = drive(road, flaws), drive(road)
@@ -210,22 +192,6 @@ def test_toe_turns_the_wheels_against_each_other() -> None:
     assert np.degrees(end(found.steer_fl_rad)) == pytest.approx(-0.2, abs=0.01)
     assert np.degrees(end(found.steer_fr_rad)) == pytest.approx(0.2, abs=0.01)
     assert abs(end(found.sideslip_rad)) < 1e-4
-
-
-@pytest.mark.parametrize("length_m", [0.2, 0.6])
-def test_a_tyre_follows_its_slip_after_the_relaxation_length(length_m: float) -> None:
-    """A step of the wheel's lateral velocity has built up to 63 % after L metres."""
-    c = constants(SEDAN, 1.0)
-    t = traits(SEDAN, CarImperfections(relaxation_length_m=length_m), SAMPLE_S)
-    speed, step = 20.0, 1e-4
-    x = State(speed, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, *4 * (speed * c.inverse_radius,))
-    give, before, way = RIGID, GiveRates(0.0, 0.0, 0.0, 0.0, 0.0), 0.0
-    order = 0.0
-    while give.side_rl < (1 - np.exp(-1)) * 0.2:
-        _, rates = imperfect_derivative(x, Controls(0.0, 0.0), give, FINE, c, t)
-        give = advance_give(give, rates, before, 0.0, t, step, order)
-        before, order, way = rates, SECOND_ORDER, way + speed * step
-    assert way == pytest.approx(length_m, rel=0.01)
 
 
 def test_cold_tyres_stiffen_the_car_and_grow_warm() -> None:

@@ -1,11 +1,9 @@
 """Cars: what ships, what is refused, and what follows when a car is changed."""
 
-from pathlib import Path
-
 import pytest
 
 from fleet_slip.errors import ConfigError
-from fleet_slip.resources import config_names, find_config
+from fleet_slip.resources import config_names
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, constants, load_vehicle
 from tests.support.rolling import CAR, SEDAN
 
@@ -57,24 +55,3 @@ def test_impossible_masses_are_refused(mass_kg: float) -> None:
 def test_impossible_tyres_are_refused(factor: float) -> None:
     with pytest.raises(ConfigError, match="d_class_sedan"):
         SEDAN.with_tyres(stiffness_factor=factor)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "reason"),
-    [
-        ("height_m = 0.54", "height_m = -0.54", "body.height_m"),
-        ("height_m = 0.54", "heigth_m = 0.54", "unknown key"),
-        ("friction = 1.0", "friction = nan", "tyre.friction"),
-        ("peak_stiffness_n = 77500", "peak_stiffness_n = 400000", "lower peak_stiffness_n"),
-    ],
-)
-def test_a_mistake_is_reported_with_file_and_key(
-    tmp_path: Path, old: str, new: str, reason: str
-) -> None:
-    text = find_config("vehicles", "d_class_sedan").read_text(encoding="utf-8")
-    assert old in text
-    file = tmp_path / "car.toml"
-    file.write_text(text.replace(old, new), encoding="utf-8")
-    with pytest.raises(ConfigError, match=reason) as error:
-        load_vehicle(str(file))
-    assert str(file) in str(error.value)

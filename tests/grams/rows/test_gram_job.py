@@ -1,6 +1,5 @@
 """The Gram job against plain Python integers, and its reconciliation with the logs."""
 
-from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from fleet_slip.errors import StorageError
 from fleet_slip.grams import gram_files
 from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.grams.check import check_grams, grams_of
-from fleet_slip.grams.compute import aggregate, gram_statement
+from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.job import update_grams
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Unit
@@ -120,20 +119,6 @@ def test_gram_rows_of_a_file_that_is_gone_are_dropped(warehouse: Warehouse) -> N
     assert not update_grams(warehouse).changed
 
 
-def test_many_small_gram_files_are_merged_without_changing_a_row(
-    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    most = 8
-    monkeypatch.setattr(gram_files, "SMALL_FILES_MAX", most)
-    rng = np.random.default_rng(4)
-    for number in range(most + 2):
-        land(warehouse, f"f{number}", log_rows(f"d{number}", random_counts(rng, 3)))
-        update_grams(warehouse)
-    assert len(warehouse.grams.snapshot().files) < most
-    assert len(stored(warehouse)) == most + 2
-    assert check_grams(warehouse, 100).drives == most + 2
-
-
 def test_merging_and_rewriting_take_few_rows_at_a_time(
     warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -158,19 +143,6 @@ def test_merging_and_rewriting_take_few_rows_at_a_time(
     assert check_grams(warehouse, 100).drives == 9
 
 
-def test_the_statement_names_each_product_once() -> None:
-    statement = gram_statement(catalogue())
-    pairs = [(a, b) for i, a in enumerate(NAMES) for b in NAMES[: i + 1]]
-    for a, b in pairs:
-        assert statement.count(f"sum({a}::INTEGER * {b}::INTEGER)") == 1
-    assert len(pairs) == 66
-    assert not [
-        p
-        for p in permutations(NAMES, 2)
-        if p not in pairs and f"({p[0]}::INTEGER * {p[1]}:" in statement
-    ]
-
-
 def test_the_check_finds_a_gram_row_that_is_not_of_its_file(
     warehouse: Warehouse, tmp_path: Path
 ) -> None:
@@ -185,19 +157,3 @@ def test_the_check_finds_a_gram_row_that_is_not_of_its_file(
     ):
         check_grams(warehouse, 1)
     assert DAY in rows["day"].to_pylist()
-
-
-def test_a_car_can_compute_its_gram_row_tick_by_tick(warehouse: Warehouse) -> None:
-    """78 64-bit integers, and as many multiplications a tick: what an ECU would do on board."""
-    counts = random_counts(np.random.default_rng(5), 200)
-    land(warehouse, "one", log_rows("car", counts))
-    update_grams(warehouse)
-    [gram] = stored(warehouse).values()
-    on_board = np.zeros(78, dtype=np.int64)
-    row, column = np.tril_indices(12)
-    for tick in range(200):
-        values = np.array([1, *(counts[name][tick] for name in NAMES)], dtype=np.int64)
-        on_board += values[row] * values[column]
-    n, products = on_board[0], on_board[(row > 0) & (column > 0)]
-    sums = on_board[(row > 0) & (column == 0)]
-    assert [n, *sums, *products] == [gram.n, *gram.sums, *gram.products]
