@@ -30,7 +30,7 @@ from deltalake import DeltaTable
 from benchmarks.crash_commands import COMMANDS, Command, prepare_inputs
 from benchmarks.harness import call, forked, load_code
 from fleet_slip.errors import PendingError
-from fleet_slip.grams.backlog import BEING_WRITTEN_HOURS
+from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.verify import verify
 from fleet_slip.storage.local import LocalFolder

@@ -201,44 +201,27 @@ class CourseRelation:
 
     @property
     def fault(self) -> Fault | None:
-        """What no course of a car does."""
-        if self.scale < REVERSED:
-            return Fault(
-                "reversed",
-                (COURSE,),
-                f"it turns {self.scale:+.2f} times as the yaw rate does",
-                "Turn clockwise_from_north round, or swap north and east.",
-            )
-        if abs(self.scale) < STILL:
-            return Fault(
-                "stuck",
-                (COURSE,),
-                f"it turns {self.scale:+.2f} times as the yaw rate does",
-                "Map the course that moves.",
-            )
+        """What no course of a car does: the first of these."""
+        turns = f"it turns {self.scale:+.2f} times as the yaw rate does"
+        grows = f"the course turns {self.scale:.2f} times as the yaw rate does"
+        errs = f"a fix errs by {self.noise_mps:.2f} m/s across the car"
+        slips = f"beyond the yaw rate it changes by {self.slip:.2f} times what a car slips"
         most = MOST_NOISE_MPS if self.explained < LEAST_EXPLAINED else HARDLY_A_COURSE_MPS
-        if self.noise_mps > most:
-            return Fault(
-                "noisy",
-                (COURSE,),
-                f"a fix errs by {self.noise_mps:.2f} m/s across the car",
-                "Reflected signals? Leave out fixes that the receiver doubts, by where.",
-            )
-        if not SCALES[0] < self.scale < SCALES[1]:
-            return Fault(
-                "scaled",
-                (YAW_RATE, COURSE),
-                f"the course turns {self.scale:.2f} times as the yaw rate does",
-                "Check both units, and the gyroscope.",
-            )
-        if self.slip + 2 * self.slip_error < LEAST_SLIP:
-            return Fault(
-                "no slip",
-                (COURSE,),
-                f"beyond the yaw rate it changes by {self.slip:.2f} times what a car slips",
-                "It is a heading, of a compass or the car: map the course over ground.",
-            )
-        return None
+        scaled = not SCALES[0] < self.scale < SCALES[1]
+        unslipping = self.slip + 2 * self.slip_error < LEAST_SLIP
+        around = "Turn clockwise_from_north round, or swap north and east."
+        doubt = "Reflected signals? Leave out fixes that the receiver doubts, by where."
+        units = "Check both units, and the gyroscope."
+        heading = "It is a heading, of a compass or the car: map the course over ground."
+        still, course = "Map the course that moves.", (COURSE,)
+        judged = (
+            (self.scale < REVERSED, Fault("reversed", course, turns, around)),
+            (abs(self.scale) < STILL, Fault("stuck", course, turns, still)),
+            (self.noise_mps > most, Fault("noisy", course, errs, doubt)),
+            (scaled, Fault("scaled", (YAW_RATE, COURSE), grows, units)),
+            (unslipping, Fault("no slip", course, slips, heading)),
+        )
+        return next((fault for wrong, fault in judged if wrong), None)
 
     @property
     def misplaced(self) -> Fault | None:

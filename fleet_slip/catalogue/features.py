@@ -94,27 +94,27 @@ class FeatureSet(Config):
 
     @model_validator(mode="after")
     def _consistent(self) -> "FeatureSet":
-        if self.of is None and not self.signals:
-            raise ValueError("a set has signals, or is of another set")
-        if self.of is not None and not self.change_s:
-            raise ValueError("a set of another has change_s")
-        unknown = [name for name in self.signals if name not in catalogue().feature_inputs]
-        if unknown:
-            raise ValueError(f"not input signals: {', '.join(unknown)}")
-        if len(set(self.columns)) < len(self.columns):
-            raise ValueError("a column stands twice")
-        if bool(self.regimes) + bool(self.block_s) + bool(self.row_folds) > 1:
-            raise ValueError("a set has regimes, block_s or row_folds, not several of them")
-        if (self.windows or self.calibrated) and self.row_folds:
-            raise ValueError("a set with windows has no row_folds")
-        if self.change_ticks and (self.row_folds or self.regimes or self.block_s):
-            raise ValueError("a set with change_s does not divide rows")
-        if self.change_ticks and not (self.windows or self.of):
-            raise ValueError("a set with change_s has windows")
-        if self.as_logged and not self.change_ticks:
-            raise ValueError("only a set with change_s is as_logged")
-        if any(not 0 < ticks <= LONGEST_TICKS for ticks in self.change_ticks):
-            raise ValueError(f"change_s is at most {LONGEST_TICKS * float(SAMPLE_TIME_S):g}")
+        inputs = catalogue().feature_inputs
+        unknown = ", ".join(name for name in self.signals if name not in inputs)
+        ticks = self.change_ticks
+        ways = bool(self.regimes) + bool(self.block_s) + bool(self.row_folds)
+        windowed = self.windows or self.calibrated
+        out_of_range = any(not 0 < n <= LONGEST_TICKS for n in ticks)
+        longest = f"{LONGEST_TICKS * float(SAMPLE_TIME_S):g}"
+        for wrong, what in (
+            (self.of is None and not self.signals, "a set has signals, or is of another set"),
+            (self.of is not None and not self.change_s, "a set of another has change_s"),
+            (unknown, f"not input signals: {unknown}"),
+            (len(set(self.columns)) < len(self.columns), "a column stands twice"),
+            (ways > 1, "a set has regimes, block_s or row_folds, not several of them"),
+            (windowed and self.row_folds, "a set with windows has no row_folds"),
+            (ticks and ways, "a set with change_s does not divide rows"),
+            (ticks and not (self.windows or self.of), "a set with change_s has windows"),
+            (self.as_logged and not ticks, "only a set with change_s is as_logged"),
+            (out_of_range, f"change_s is at most {longest}"),
+        ):
+            if wrong:
+                raise ValueError(what)
         for name, times_s in (("block_s", (self.block_s,)), ("change_s", self.change_s)):
             if any(one and Fraction(one) % SAMPLE_TIME_S for one in times_s):
                 raise ValueError(f"{name} must be a multiple of {float(SAMPLE_TIME_S)}")
@@ -187,10 +187,9 @@ class FeatureCatalogue(Config):
         twice = sorted(name for name in names if name in taken or names.count(name) > 1)
         if twice:
             raise ValueError(f"names must differ, from those of signals too: {', '.join(twice)}")
-        if PLAIN in self.sets:
-            raise ValueError(f"{PLAIN!r} is the set of the catalogue's own signals")
-        if RECEIVED in self.sets:
-            raise ValueError(f"files of Gram rows that cars sent are called {RECEIVED!r}")
+        for name, what in ((PLAIN, "the catalogue's own signals"), (RECEIVED, "what cars sent")):
+            if name in self.sets:
+                raise ValueError(f"{name!r} is the set of {what}")
         for name, regime in self.regimes.items():
             if regime.of not in {*self.features, *signals.feature_inputs}:
                 raise ValueError(f"regimes.{name}: {regime.of} is no input signal or feature")
@@ -215,29 +214,29 @@ class FeatureCatalogue(Config):
         Raises `ValueError` for one that looks back on nothing known, or twice the same name.
         """
         found: dict[str, TimeColumn] = {}
+
+        def add(where: str, columns: Mapping[str, TimeColumn]) -> None:
+            if twice := [name for name in columns if name in found]:
+                raise ValueError(f"{where}: {twice[0]} stands twice")
+            found.update(columns)
+
         for family, window in self.windows.items():
             row, scale = self._row(window.of, f"windows.{family}")
             for name, ticks in window.members(family).items():
-                if name in found:
-                    raise ValueError(f"windows.{family}: {name} stands twice")
-                found[name] = _named(f"windows.{name}", window_column, window, ticks, row, scale)
+                where = f"windows.{name}"
+                add(where, {name: _named(where, window_column, window, ticks, row, scale)})
         for name, factor in self.factors.items():
+            where = f"factors.{name}"
             if factor.of in found:
                 base, scale = found[factor.of].definition, found[factor.of].exact_scale
             else:
-                base, scale = self._row(factor.of, f"factors.{name}")
-            if name in found:
-                raise ValueError(f"factors.{name} stands twice")
-            found[name] = _named(f"factors.{name}", factor_column, factor, base, scale)
+                base, scale = self._row(factor.of, where)
+            add(where, {name: _named(where, factor_column, factor, base, scale)})
         for name, gate in self.gates.items():
-            members = _named(f"gates.{name}", gated_columns, name, gate, dict(found))
-            if twice := [member for member in members if member in found]:
-                raise ValueError(f"gates.{name}: {twice[0]} stands twice")
-            found |= members
+            where = f"gates.{name}"
+            add(where, _named(where, gated_columns, name, gate, dict(found)))
         for name, calibrated in self.calibrated.items():
-            if name in found:
-                raise ValueError(f"calibrated.{name} stands twice")
-            found[name] = self._calibrated(name, calibrated, found)
+            add(f"calibrated.{name}", {name: self._calibrated(name, calibrated, found)})
         return found
 
     def _calibrated(

@@ -11,9 +11,8 @@ import pyarrow.compute as pc
 from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.errors import DataError, StorageError
-from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.grams.compute import by_sql, wide_grams
-from fleet_slip.grams.gram_files import is_of_received
+from fleet_slip.grams.gram_files import find_backlog, is_of_received
 from fleet_slip.grams.gram_rows import is_received
 from fleet_slip.grams.job import unit_name
 from fleet_slip.grams.receiver_delay import recorded_cars

@@ -1,14 +1,19 @@
-"""Writes Gram rows to files: of one feature set each, neither too many nor too large."""
+"""Files of Gram rows: of which log files they are, how they are written and rewritten.
 
-from collections.abc import Iterable, Iterator, Sequence
+Each is of one feature set; they are neither too many nor too large.
+"""
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import accumulate
 
 import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
-from fleet_slip.catalogue.facts import RECEIVED_FILES
 from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.errors import ConflictError
+from fleet_slip.grams.gram_rows import is_received
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot, Table, TableFile
 from fleet_slip.warehouse.database import open_database, reading_files
@@ -48,7 +53,7 @@ def _together(parts: Sequence[pa.Table]) -> pa.Table:
 
 def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
     """Write a file for each feature set, and others for received rows, not to be computed again."""
-    came = pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
+    came = is_received(rows)
     actions = []
     for prefix, some in ((RECEIVED_NAME, came), ("", pc.invert(came))):
         mine = _only(rows, some)
@@ -125,6 +130,19 @@ def read_rows(grams: Table, file: TableFile) -> pa.Table:
     return pa.table(columns, schema=grams.schema)
 
 
+def rows_of_set(grams: Snapshot, identity: str, *columns: str) -> Iterator[pa.Table]:
+    """Yield the Gram rows of a feature set, file by file; null in columns that came later."""
+    for file in grams.files:
+        mine = pc.equal(grams.table.read(file.path, ["feature_set"])["feature_set"], identity)
+        if not pc.any(mine).as_py():
+            continue
+        there = grams.table.read_metadata(file.path).schema.to_arrow_schema().names
+        rows = grams.table.read(file.path, [name for name in columns if name in there])
+        for name in sorted(set(columns).difference(there)):
+            rows = rows.append_column(name, pa.nulls(len(rows)))
+        yield rows.filter(mine)
+
+
 _COMPARED = ("drive_id", "feature_set", "vehicle_id", "day", "signals", "n", "sums", "products")
 
 
@@ -144,3 +162,63 @@ def find_superseded(grams: Snapshot, new_rows: Sequence[pa.Table]) -> tuple[set[
         with reading_files(database, "looking for drives whose logs have come"):
             found = database.execute(statement).fetchall()
     return {drive for drive, _ in found}, {paths[file] for _, file in found}
+
+
+# How the tables `logs` and `grams` differ.
+
+BEING_WRITTEN_HOURS = 1.0
+"""A file that no commit ever knew and that is younger may belong to a job that is running."""
+
+
+@dataclass(frozen=True)
+class Backlog:
+    """How `grams` and `logs` differ."""
+
+    missing: tuple[TableFile, ...]
+    stale: frozenset[str]
+    """Paths in `grams`, of any set, that are no active log file, and none that may become one."""
+
+
+def find_backlog(logs: Snapshot, grams: Snapshot, identity: str = PLAIN) -> Backlog:
+    """Compare active log files with those that Gram rows of a feature set's `identity` name."""
+    done, named = named_files(grams, identity)
+    active = {file.path for file in logs.files}
+    return Backlog(
+        missing=tuple(file for file in logs.files if file.path not in done),
+        stale=frozenset(named - active - _about_to_land(logs, named - active)),
+    )
+
+
+def named_files(grams: Snapshot, identity: str) -> tuple[set[str], set[str]]:
+    """Return the log files that Gram rows of a feature set name, and those that any name."""
+    done: set[str] = set()
+    named: set[str] = set()
+    for file in grams.files:
+        if is_of_received(file):  # of no log
+            continue
+        pairs = grams.table.read_combinations(file.path, ["feature_set", "file"])
+        named.update(pairs["file"].filter(pc.invert(is_received(pairs))).to_pylist())
+        done.update(pairs["file"].filter(pc.equal(pairs["feature_set"], identity)).to_pylist())
+    return done, named
+
+
+def _about_to_land(logs: Snapshot, paths: Collection[str]) -> set[str]:
+    """Return the log files that a job has written and not committed: their Gram rows land first."""
+    if not paths:
+        return set()
+    written = {
+        file.path
+        for file in logs.table.folder.files()
+        if file.path in paths and file.age_hours < BEING_WRITTEN_HOURS
+    }
+    return written - logs.removed() if written else set()
+
+
+def require_active(logs: Snapshot, files: Collection[TableFile]) -> None:
+    """Raise `ConflictError` if the logs have lost a file whose Gram rows are landing."""
+    lost = {file.path for file in files} - {file.path for file in logs.files}
+    if lost:
+        raise ConflictError(
+            f"{logs.table.folder}: other processes keep removing files, such as {min(lost)}. Run "
+            "the same command again."
+        )

@@ -18,18 +18,22 @@ from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.catalogue.facts import DELAY
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.errors import StorageError
-from fleet_slip.grams.backlog import Backlog, find_backlog, named_files, require_active
 from fleet_slip.grams.compute import aggregate, compute_grams
 from fleet_slip.grams.gram_files import (
+    Backlog,
     files_to_rewrite,
+    find_backlog,
     find_superseded,
     is_of_received,
+    named_files,
+    require_active,
+    rows_of_set,
     rows_to_keep,
     write_rows,
 )
 from fleet_slip.grams.gram_rows import is_received
 from fleet_slip.grams.receiver_delay import course_delays, files_of_other_delay
-from fleet_slip.storage.table import Change, Snapshot, TableFile, Unit, retry_conflicts
+from fleet_slip.storage.table import Change, Snapshot, TableFile, Unit, retrying
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -68,7 +72,7 @@ def update_grams(
     """
     if features().feature_set(feature_set).in_time and DELAY in features().sets:
         update_grams(warehouse, progress, DELAY, executor, among)
-    return retry_conflicts(lambda: _update_once(warehouse, progress, feature_set, executor, among))
+    return _update_once(warehouse, progress, feature_set, executor, among)
 
 
 def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list[GramReport]:
@@ -95,12 +99,11 @@ def _unique(
     grams: Snapshot, identity: str, column: str, drives: pa.Array | None = None
 ) -> pa.Array:
     found = [pa.array([], pa.string())]
-    for file in grams.files:
-        rows = grams.table.read(file.path, list({"feature_set", "drive_id", column}))
-        mine = pc.equal(rows["feature_set"], identity)
+    for rows in rows_of_set(grams, identity, *{"drive_id", column}):
+        values = rows[column].cast(pa.string())
         if drives is not None:
-            mine = pc.and_(mine, pc.is_in(rows["drive_id"].cast(pa.string()), drives))
-        found.append(rows.filter(mine)[column].cast(pa.string()).unique())
+            values = values.filter(pc.is_in(rows["drive_id"].cast(pa.string()), drives))
+        found.append(values.unique())
     return pa.concat_arrays(found).unique()
 
 
@@ -109,6 +112,7 @@ def unit_name(identity: str) -> str:
     return f"gram/{identity}"
 
 
+@retrying
 def _update_once(
     warehouse: Warehouse,
     progress: Progress,
@@ -139,38 +143,24 @@ def _update_once(
         others &= frozenset(among)
         chosen = tuple(file for file in backlog.missing if file.path in among)
         backlog = Backlog(chosen, backlog.stale)
-    version, gram_rows = grams.version, grams.rows
-    logs_version = logs.version
-    dropped = 0
+    after, dropped = grams, 0
     if backlog.missing or backlog.stale:
         new_rows = compute_grams(warehouse, backlog.missing, progress, feature_set, executor, late)
         merged = _Merged(grams, backlog.stale, identity, others)
-        grams.commit_or_discard(
-            Change(
-                add=write_rows(warehouse, merged.parts(new_rows)),
-                remove=merged.replaced,
-                units=[Unit(unit_name(identity), logs_version or 0)],
-                note={
-                    "job": "gram",
-                    "feature_set": identity,
-                    "logs_version": logs_version,
-                },
-            )
-        )
+        add = write_rows(warehouse, merged.parts(new_rows))
+        _land(grams, logs, identity, add, merged.replaced)
         # Who removed a file may have found no Gram row of its drives, and so have changed none; the
         # next attempt drops those that landed.
         require_active(logs.renewed(), backlog.missing)
-        after = warehouse.grams.snapshot()
-        version, gram_rows = after.version, after.rows
-        dropped = merged.superseded
+        after, dropped = warehouse.grams.snapshot(), merged.superseded
     return GramReport(
         feature_set=identity,
         files_read=len(backlog.missing),
         rows_read=sum(file.rows for file in backlog.missing),
         files_dropped=len(backlog.stale),
-        gram_rows=gram_rows,
-        logs_version=logs_version,
-        grams_version=version,
+        gram_rows=after.rows,
+        logs_version=logs.version,
+        grams_version=after.version,
         received_dropped=dropped,
     )
 
@@ -241,13 +231,19 @@ def land_ahead(
         if features().feature_set(name).in_time:
             late = course_delays(grams, frozenset(file.path for file in logs.files))
         rows = aggregate(warehouse, missing, feature_set=name, late=late)
-        grams.commit_or_discard(
-            Change(
-                add=write_rows(warehouse, [rows]),
-                units=[Unit(unit_name(identity), logs.version or 0)],
-                note={"job": "gram", "feature_set": identity, "logs_version": logs.version},
-            )
-        )
+        _land(grams, logs, identity, write_rows(warehouse, [rows]))
+
+
+def _land(
+    grams: Snapshot,
+    logs: Snapshot,
+    identity: str,
+    add: Sequence[AddAction],
+    remove: Sequence[TableFile] = (),
+) -> None:
+    units = [Unit(unit_name(identity), logs.version or 0)]
+    note = {"job": "gram", "feature_set": identity, "logs_version": logs.version}
+    grams.commit_or_discard(Change(add, remove, units, note))
 
 
 def _as_file(action: AddAction) -> TableFile:

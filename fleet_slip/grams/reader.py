@@ -18,7 +18,7 @@ from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, LONGEST_PAUSE_S,
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, NotComputedError
-from fleet_slip.grams.backlog import find_backlog
+from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.receiver_delay import RECEIVER
 from fleet_slip.regression.gram import GramTable, packed_size

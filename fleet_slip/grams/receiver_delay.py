@@ -22,6 +22,7 @@ from fleet_slip.catalogue.course import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOS
 from fleet_slip.catalogue.facts import DELAY, RECEIVED_FILES
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.grams.gram_files import rows_of_set
 from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.shrinkage import Pooled, pool
@@ -334,7 +335,7 @@ def in_parts(one: ReceiverDelay) -> int:
 
 def _of_delay(grams: Snapshot, active: frozenset[str]) -> Iterator[pa.RecordBatch]:
     identity = features().identity(DELAY)
-    for rows in _rows_of(grams, identity, *_OF_DELAY, RECEIVER):
+    for rows in rows_of_set(grams, identity, *_OF_DELAY, RECEIVER):
         files = rows["file"].cast(pa.string())
         counts = pc.is_in(files, pa.array(sorted(active), pa.string()))
         counts = pc.or_(counts, pc.starts_with(files, RECEIVED_FILES))
@@ -362,22 +363,9 @@ def recorded_cars(grams: Snapshot, identity: str, log_file: str) -> dict[str, in
 def _recorded(grams: Snapshot, identity: str) -> set[tuple[str, str, int]]:
     """Return each log file, car and delay that Gram rows of a set are of; 0 where none is known."""
     found: set[tuple[str, str, int]] = set()
-    for rows in _rows_of(grams, identity, "file", "vehicle_id", COURSE_LATE):
+    for rows in rows_of_set(grams, identity, "file", "vehicle_id", COURSE_LATE):
         files, cars, recorded = (
             rows[name].to_pylist() for name in ("file", "vehicle_id", COURSE_LATE)
         )
         found.update(zip(files, cars, (late or 0 for late in recorded), strict=True))
     return found
-
-
-def _rows_of(grams: Snapshot, identity: str, *columns: str) -> Iterator[pa.Table]:
-    """Yield the Gram rows of a feature set, file by file; null in columns that came later."""
-    for file in grams.files:
-        mine = pc.equal(grams.table.read(file.path, ["feature_set"])["feature_set"], identity)
-        if not pc.any(mine).as_py():
-            continue
-        there = grams.table.read_metadata(file.path).schema.to_arrow_schema().names
-        rows = grams.table.read(file.path, [name for name in columns if name in there])
-        for name in sorted(set(columns).difference(there)):
-            rows = rows.append_column(name, pa.nulls(len(rows)))
-        yield rows.filter(mine)

@@ -21,7 +21,7 @@ from fleet_slip.catalogue.facts import RECEIVED
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, UnexaminedError
-from fleet_slip.grams.backlog import find_backlog
+from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.ingest.drives import SOURCE

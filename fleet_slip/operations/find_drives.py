@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue, digest_drive
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.grams.backlog import BEING_WRITTEN_HOURS
+from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, StoredFile
 from fleet_slip.storage.runs import gather_runs

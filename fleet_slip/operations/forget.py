@@ -46,7 +46,7 @@ from fleet_slip.operations.rewriting import (
 )
 from fleet_slip.resources import config_file, find_config
 from fleet_slip.storage.runs import runs_under_way
-from fleet_slip.storage.table import Change, retry_conflicts, rows_in
+from fleet_slip.storage.table import Change, retrying, rows_in
 from fleet_slip.views import connect
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
@@ -113,7 +113,8 @@ def forget(
     if not landed <= drives:  # they landed before the fence
         drives |= landed
         models = _begin(warehouse, audit, subject, drives, located, source_file)
-    _forget_quarantined(warehouse, subject, drives)
+    if drives:
+        _forget_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
     if not audit.names_are_exact:
         drop_unused_names(warehouse)
@@ -165,40 +166,35 @@ def _drives_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> 
     return frozenset(found)
 
 
+@retrying
 def _rewrite_logs(
     warehouse: Warehouse, subject: Forgettable, located: Located, progress: Progress
 ) -> tuple[int, int, int]:
-    def attempt() -> tuple[int, int, int]:
-        logs = warehouse.logs.snapshot()
-        drives = drives_by_file(logs, subject, located)
-        concerned = [file for file in logs.files if file.path in drives]
-        if not concerned:
-            return 0, 0, 0
-        kept = rewrite(
-            warehouse,
-            logs,
-            [Rewriting("kept", [file], drives[file.path]) for file in concerned],
-            note={"job": "forget"},
-            data_change=True,
-            progress=progress,
-        )
-        rows = sum(file.rows for file in concerned) - sum(map(rows_in, kept))
-        return rows, len(kept), len(concerned) - len(kept)
-
-    return retry_conflicts(attempt)
+    logs = warehouse.logs.snapshot()
+    drives = drives_by_file(logs, subject, located)
+    concerned = [file for file in logs.files if file.path in drives]
+    if not concerned:
+        return 0, 0, 0
+    kept = rewrite(
+        warehouse,
+        logs,
+        [Rewriting("kept", [file], drives[file.path]) for file in concerned],
+        note={"job": "forget"},
+        data_change=True,
+        progress=progress,
+    )
+    rows = sum(file.rows for file in concerned) - sum(map(rows_in, kept))
+    return rows, len(kept), len(concerned) - len(kept)
 
 
+@retrying
 def _forget_quarantined(
     warehouse: Warehouse, subject: Forgettable, drives: Collection[str]
 ) -> None:
-    def attempt() -> None:
-        snapshot = warehouse.quarantine.snapshot()
-        add, remove = write_without(snapshot, lambda rows: quarantined_of(rows, subject, drives))
-        if remove:
-            snapshot.commit_or_discard(Change(add=add, remove=remove, note={"job": "forget"}))
-
-    if drives:
-        retry_conflicts(attempt)
+    snapshot = warehouse.quarantine.snapshot()
+    add, remove = write_without(snapshot, lambda rows: quarantined_of(rows, subject, drives))
+    if remove:
+        snapshot.commit_or_discard(Change(add=add, remove=remove, note={"job": "forget"}))
 
 
 Calling: TypeAlias = Literal["drive_name", "source_file"]

@@ -20,7 +20,7 @@ from fleet_slip.simulation.job import file_name, simulate_batch
 from fleet_slip.storage.checksums import checksum_in, checksum_of
 from fleet_slip.storage.commits import LATEST, LOG, check_commits
 from fleet_slip.storage.storage_errors import storage_errors
-from fleet_slip.storage.table import Change, TableFile, retry_conflicts
+from fleet_slip.storage.table import Change, TableFile, retrying
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -36,7 +36,8 @@ def repair(
     rebuilt += found
     rebuilt += _simulate_again(warehouse, damaged - set(found), campaigns)
     lost = {path.removeprefix("logs/") for path in damaged.difference(rebuilt)}
-    rebuilt += _aggregate_again(warehouse, damaged, wrong, lost)
+    rebuilt += _drop_wrong(warehouse, damaged, wrong)
+    reconcile(warehouse, unreadable=lost)  # also what an interrupted repair has dropped
     return rebuilt
 
 
@@ -125,30 +126,21 @@ def _candidates(
                 yield batch
 
 
-def _aggregate_again(
-    warehouse: Warehouse, damaged: Collection[str], wrong: set[str], lost: Collection[str]
-) -> list[str]:
-    """Drop wrong Gram files, and compute what logs that are not `lost` can tell again."""
-    removed: list[str] = []
-
-    def attempt() -> None:
-        removed.clear()
-        snapshot = warehouse.grams.snapshot()
-        readable = _readable_grams(warehouse).items()
-        named = {path: rows["file"].unique().to_pylist() for path, rows in readable}
-        bad = [
-            file
-            for file in snapshot.files
-            if (f"grams/{file.path}" in damaged and not is_of_received(file))
-            or not wrong.isdisjoint(named.get(file.path, ()))
-        ]
-        if bad:
-            snapshot.commit(Change(remove=bad, note={"job": "repair"}))
-            removed.extend(f"grams/{file.path}" for file in bad)
-
-    retry_conflicts(attempt)
-    reconcile(warehouse, unreadable=lost)  # also what an interrupted repair has dropped
-    return removed
+@retrying
+def _drop_wrong(warehouse: Warehouse, damaged: Collection[str], wrong: set[str]) -> list[str]:
+    """Drop the Gram files that are damaged, or have wrong rows of log files; return them."""
+    snapshot = warehouse.grams.snapshot()
+    readable = _readable_grams(warehouse).items()
+    named = {path: rows["file"].unique().to_pylist() for path, rows in readable}
+    bad = [
+        file
+        for file in snapshot.files
+        if (f"grams/{file.path}" in damaged and not is_of_received(file))
+        or not wrong.isdisjoint(named.get(file.path, ()))
+    ]
+    if bad:
+        snapshot.commit(Change(remove=bad, note={"job": "repair"}))
+    return [f"grams/{file.path}" for file in bad]
 
 
 def _readable_grams(warehouse: Warehouse) -> dict[str, pa.Table]:

@@ -18,14 +18,14 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Progress, no_progress
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import ConflictError, FleetSlipError
-from fleet_slip.grams.gram_files import read_rows, write_rows
+from fleet_slip.grams.gram_files import read_rows, rows_of_set, write_rows
 from fleet_slip.grams.gram_rows import is_received
 from fleet_slip.grams.job import land_ahead, reconcile
 from fleet_slip.ingest.recordings import MEASURED, Fingerprints, Origin, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of
-from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, Unit, retry_conflicts
+from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, Unit, retrying
 from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse, connect_tables
 
@@ -154,41 +154,35 @@ def write_without(
     return add, remove
 
 
+@retrying
 def drop_unused_names(warehouse: Warehouse) -> int:
     """Write files anew without names that none of their rows has; return how many."""
-
-    def attempt() -> int:
-        logs = warehouse.logs.snapshot()
-        files = [file for file in logs.files if warehouse.logs.has_unused_names(file.path)]
-        if files:
-            rewritings = [Rewriting("kept", [file]) for file in files]
-            rewrite(warehouse, logs, rewritings, note={"job": "names"}, data_change=False)
-        return len(files)
-
-    return retry_conflicts(attempt)
+    logs = warehouse.logs.snapshot()
+    files = [file for file in logs.files if warehouse.logs.has_unused_names(file.path)]
+    if files:
+        rewritings = [Rewriting("kept", [file]) for file in files]
+        rewrite(warehouse, logs, rewritings, note={"job": "names"}, data_change=False)
+    return len(files)
 
 
+@retrying
 def forget_received(warehouse: Warehouse, subject: Forgettable) -> int:
     """Commit the Gram rows without those that came without a log; return how many rows."""
-
-    def attempt() -> int:
-        snapshot = warehouse.grams.snapshot()
-        concerned: list[TableFile] = []
-        rows = 0
-        for file in snapshot.files:
-            every = warehouse.grams.read(file.path, ["file", "drive_id", "vehicle_id", "day", "n"])
-            mine = pc.and_(rows_of(every, subject), is_received(every))
-            if pc.any(mine).as_py():
-                concerned.append(file)
-                rows += pc.sum(every.filter(mine)["n"]).as_py()
-        if concerned:
-            read = (read_rows(warehouse.grams, file) for file in concerned)
-            kept = (r.filter(pc.invert(pc.and_(rows_of(r, subject), is_received(r)))) for r in read)
-            add = write_rows(warehouse, kept)
-            snapshot.commit_or_discard(Change(add=add, remove=concerned, note={"job": "forget"}))
-        return rows
-
-    return retry_conflicts(attempt)
+    snapshot = warehouse.grams.snapshot()
+    concerned: list[TableFile] = []
+    rows = 0
+    for file in snapshot.files:
+        every = warehouse.grams.read(file.path, ["file", "drive_id", "vehicle_id", "day", "n"])
+        mine = pc.and_(rows_of(every, subject), is_received(every))
+        if pc.any(mine).as_py():
+            concerned.append(file)
+            rows += pc.sum(every.filter(mine)["n"]).as_py()
+    if concerned:
+        read = (read_rows(warehouse.grams, file) for file in concerned)
+        kept = (r.filter(pc.invert(pc.and_(rows_of(r, subject), is_received(r)))) for r in read)
+        add = write_rows(warehouse, kept)
+        snapshot.commit_or_discard(Change(add=add, remove=concerned, note={"job": "forget"}))
+    return rows
 
 
 # Takes drives out of the logs that others replace, or that somebody withdraws.
@@ -227,11 +221,8 @@ def _without_refused(snapshot: Snapshot, origins: Collection[Origin]) -> Change:
 
 def drives_in(warehouse: Warehouse, logs: Snapshot) -> dict[str, set[str]]:
     """Return the drives of each log file, opening only files without Gram rows."""
-    grams, identity = warehouse.grams.snapshot(), features().identity(PLAIN)
     found: dict[str, set[str]] = {}
-    for file in grams.files:
-        rows = grams.table.read(file.path, ["feature_set", "file", "drive_id"])
-        rows = rows.filter(pc.equal(rows["feature_set"], identity)).drop_columns("feature_set")
+    for rows in rows_of_set(warehouse.grams.snapshot(), PLAIN, "file", "drive_id"):
         for row in rows.to_pylist():
             found.setdefault(row["file"], set()).add(row["drive_id"])
     return {
@@ -240,29 +231,26 @@ def drives_in(warehouse: Warehouse, logs: Snapshot) -> dict[str, set[str]]:
     }
 
 
+@retrying
 def take_back(warehouse: Warehouse, what: str) -> int:
     """Take out what was ingested from a file, or through a mapping; return how many drives.
 
     `what` names either, or begins the names of a file's drives. All of it goes that is there at the
     commit, whoever replaces it meanwhile.
     """
-
-    def attempt() -> int:
-        logs = warehouse.logs.snapshot()
-        drives = _drives_called(warehouse, what)
-        if warehouse.logs.snapshot().version != logs.version:
-            raise ConflictError(f"{warehouse.root}: the logs keep changing. Run it again.")
-        origins = {origin.file for drive in drives if (origin := Origin.of_drive(drive))}
-        refused = warehouse.quarantine.snapshot()
-        changes: dict[TableName, Snapshot] = {"quarantine": refused, "logs": logs}
-        for name, snapshot in changes.items() if drives else ():
-            gone = take_out(warehouse, name, snapshot, origins)
-            if gone.remove or gone.units:
-                change = Change(gone.add, gone.remove, gone.units, {"job": "undo"})
-                snapshot.commit_or_discard(change)
-        return len(drives)
-
-    return retry_conflicts(attempt)
+    logs = warehouse.logs.snapshot()
+    drives = _drives_called(warehouse, what)
+    if warehouse.logs.snapshot().version != logs.version:
+        raise ConflictError(f"{warehouse.root}: the logs keep changing. Run it again.")
+    origins = {origin.file for drive in drives if (origin := Origin.of_drive(drive))}
+    refused = warehouse.quarantine.snapshot()
+    changes: dict[TableName, Snapshot] = {"quarantine": refused, "logs": logs}
+    for name, snapshot in changes.items() if drives else ():
+        gone = take_out(warehouse, name, snapshot, origins)
+        if gone.remove or gone.units:
+            change = Change(gone.add, gone.remove, gone.units, {"job": "undo"})
+            snapshot.commit_or_discard(change)
+    return len(drives)
 
 
 def _drives_called(warehouse: Warehouse, what: str) -> list[str]:
@@ -328,22 +316,20 @@ def compact(
     )
 
 
+@retrying
 def _compact_day(warehouse: Warehouse, day: date, target_rows: int) -> int:
-    def attempt() -> int:
-        snapshot = warehouse.logs.snapshot()
-        small = [f for f in snapshot.files if f.day == day and 2 * f.rows <= target_rows]
-        packs = list(_packs(small, target_rows))
-        if packs:
-            rewrite(
-                warehouse,
-                snapshot,
-                [Rewriting("compact", pack) for pack in packs],
-                note={"job": "compact", "day": day.isoformat()},
-                data_change=False,
-            )
-        return sum(file.rows for pack in packs for file in pack)
-
-    return retry_conflicts(attempt)
+    snapshot = warehouse.logs.snapshot()
+    small = [f for f in snapshot.files if f.day == day and 2 * f.rows <= target_rows]
+    packs = list(_packs(small, target_rows))
+    if packs:
+        rewrite(
+            warehouse,
+            snapshot,
+            [Rewriting("compact", pack) for pack in packs],
+            note={"job": "compact", "day": day.isoformat()},
+            data_change=False,
+        )
+    return sum(file.rows for pack in packs for file in pack)
 
 
 def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableFile]]:

@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
-from fleet_slip.grams.backlog import find_backlog
+from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.limits import memory_bytes
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.peers import thresholds

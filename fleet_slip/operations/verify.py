@@ -20,7 +20,6 @@ from fleet_slip.base import Progress, Record, no_progress, number_of
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
-from fleet_slip.grams.backlog import named_files
 from fleet_slip.grams.check import (
     CheckReport,
     DriveGrams,
@@ -30,6 +29,7 @@ from fleet_slip.grams.check import (
     stored_grams,
 )
 from fleet_slip.grams.compute import by_sql, wide_grams
+from fleet_slip.grams.gram_files import named_files
 from fleet_slip.grams.gram_rows import is_received
 from fleet_slip.grams.on_board import counted_sets, impossible_rows
 from fleet_slip.models.registry import Registry

@@ -25,7 +25,7 @@ from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec
 from fleet_slip.simulation.receivers import ReceiverFixes, ReceiverLog
 from fleet_slip.simulation.roads import road_with
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
-from fleet_slip.storage.table import Change, Snapshot, Unit, retry_conflicts
+from fleet_slip.storage.table import Change, Snapshot, Unit, retry_conflicts, retrying
 from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
 from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse
@@ -274,7 +274,7 @@ def simulate_campaign(
     plan = (campaign.batches(day) for day in open_days)
     report = _simulate(warehouse, plan, len(open_days), executor, progress)
     report.days_present = len(every) - len(open_days)
-    retry_conflicts(lambda: _complete(warehouse, campaign, open_days))
+    _complete(warehouse, campaign, open_days)
     report.logs_version = warehouse.logs.snapshot().version
     return report
 
@@ -291,6 +291,7 @@ def _open_days(snapshot: Snapshot, campaign: Campaign, days: Iterable[date]) -> 
     return tuple(found)
 
 
+@retrying
 def _complete(warehouse: Warehouse, campaign: Campaign, days: Iterable[date]) -> None:
     snapshot = warehouse.logs.snapshot()
     units = [unit for unit, _ in day_units(campaign, _open_days(snapshot, campaign, days))]

@@ -1,6 +1,7 @@
 """A Delta table of a data root: its files, and what it takes to open and make it."""
 
 import contextlib
+import functools
 import json
 import math
 import random
@@ -12,7 +13,7 @@ from dataclasses import dataclass, field
 from datetime import date
 from decimal import Decimal
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -185,6 +186,7 @@ _CONFLICT = re.compile(
 )
 """What the Delta library says when another commit was faster; anything else is a fault."""
 
+Given = ParamSpec("Given")
 Result = TypeVar("Result")
 
 
@@ -229,6 +231,16 @@ def retry_conflicts(attempt: Callable[[], Result]) -> Result:
             longest = min(FIRST_WAIT_S * 2**number, LONGEST_WAIT_S)
             time.sleep(random.uniform(0, longest))  # noqa: S311 - not a secret
     return attempt()
+
+
+def retrying(commit: Callable[Given, Result]) -> Callable[Given, Result]:
+    """Decorate a function that commits to a table, to be called as `retry_conflicts` does."""
+
+    @functools.wraps(commit)
+    def retried(*given: Given.args, **named: Given.kwargs) -> Result:
+        return retry_conflicts(lambda: commit(*given, **named))
+
+    return retried
 
 
 # A count means nothing without its scale, so the schema in the Delta log records each.

@@ -13,9 +13,9 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.errors import StorageError
 from fleet_slip.grams import gram_files
-from fleet_slip.grams.backlog import find_backlog
 from fleet_slip.grams.check import check_grams, grams_of
 from fleet_slip.grams.compute import aggregate
+from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.grams.job import update_grams
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Unit

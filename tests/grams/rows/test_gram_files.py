@@ -7,8 +7,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.catalogue.features import FeatureCatalogue
-from fleet_slip.grams.backlog import find_backlog, named_files
-from fleet_slip.grams.gram_files import is_of_received
+from fleet_slip.grams.gram_files import find_backlog, is_of_received, named_files
 from fleet_slip.storage.table import Change
 from tests.support.counted_rows import START_S, write_counted
 from tests.support.fleet_rows import rows_of_fleet
