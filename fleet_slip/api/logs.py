@@ -30,10 +30,9 @@ if TYPE_CHECKING:
     from fleet_slip.grams.check import CheckReport
     from fleet_slip.grams.job import GramReport
     from fleet_slip.grams.on_board import CountedReport
-    from fleet_slip.ingest.load import IngestReport
+    from fleet_slip.ingest.load import IngestReport, Preview
     from fleet_slip.ingest.log_files import Log
     from fleet_slip.ingest.mapping import Mapping
-    from fleet_slip.ingest.preview import Preview
     from fleet_slip.ingest.recordings import Replace
     from fleet_slip.operations.migration import MigrationReport
     from fleet_slip.simulation.campaign import Campaign
@@ -181,13 +180,13 @@ class LogsAndGrams(Rooted):
     ) -> "list[Preview]":
         """Read measured files as `ingest` does, and store nothing; raises the same.
 
-        Tells rows, drives, rejections, each signal's range, and what looks wrong in the longest
-        drive: a sign, a unit, swapped wheels, a delay of the label.
+        Reports rows, drives, rejections, each signal's range, and what `ingest` would find wrong: a
+        sign, a unit, swapped wheels, a delay of the label.
         """
-        from fleet_slip.ingest.preview import preview_log
+        from fleet_slip.ingest.load import preview_logs
 
         plan, logs, _ = _chosen_logs(files, mapping, as_one=as_one)
-        return [preview_log(log, plan) for log in logs]
+        return preview_logs(logs, plan)
 
     @record_call
     def gram(

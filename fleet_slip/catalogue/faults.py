@@ -332,8 +332,21 @@ def steering_swapped(moments: MeanMoments) -> dict[int, Fault]:
 
 
 def _witnesses(moments: MeanMoments) -> list[str]:
-    """Return the witnesses of which all signals are there."""
-    return [name for name, parts in WITNESSES.items() if set(parts) <= set(moments.signals)]
+    """Return the witnesses of which all signals are there; of equal signals the first alone.
+
+    One angle of both front wheels stands for three signals, and is one witness.
+    """
+    signals: list[str] = []
+    for name in (*WITNESSES, *moments.signals):
+        if name in moments.signals and not any(_are_equal(moments, name, o) for o in signals):
+            signals.append(name)
+    return [name for name, parts in WITNESSES.items() if set(parts) <= set(signals)]
+
+
+def _are_equal(moments: MeanMoments, a: str, b: str) -> bool:
+    """Whether two signals have one column: no product tells them apart, in any drive."""
+    i, j, m = moments.position(a), moments.position(b), moments.matrices
+    return bool(np.array_equal(m[:, i, :], m[:, j, :]) and m[:, i, i].any())
 
 
 def _weights(moments: MeanMoments, names: Sequence[str]) -> FloatArray:

@@ -25,8 +25,7 @@ from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
     from fleet_slip.ingest.draft import Draft
-    from fleet_slip.ingest.load import IngestReport
-    from fleet_slip.ingest.preview import Preview
+    from fleet_slip.ingest.load import IngestReport, Preview
     from fleet_slip.simulation.job import SimulationReport
 
 

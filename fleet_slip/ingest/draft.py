@@ -31,8 +31,8 @@ from fleet_slip.ingest.guess import (
     headings,
     unit_choices,
 )
+from fleet_slip.ingest.load import preview_log, signals_of
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.preview import preview_log
 from fleet_slip.ingest.profile import FileProfile
 from fleet_slip.ingest.suspicion import STEERING_RATIO, Signals, find_suspicions
 from fleet_slip.ingest.vocabulary import parts_of
@@ -78,7 +78,8 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
             usable.pop(COURSE)
         if not usable:
             return {}
-        return preview_log(file, as_mapping(profile, time, usable, drive_keys)).longest
+        _, drive = preview_log(file, as_mapping(profile, time, usable, drive_keys))
+        return signals_of(drive) if drive is not None else {}
 
     failures: list[str] = []
     suspicions: list[Fault] = []

@@ -423,6 +423,10 @@ def to_ticks(
     if COURSE in mapping.signals:
         counts |= _fixes(rows, resampler, intervals_s, mapping, counts)
     counts |= place_label(mapping, counts)
+    counts |= {
+        wheel: round_chunks([physical(counts, "steer")], catalogue()[wheel])
+        for wheel in mapping.front_wheels
+    }
     for signal in counts:
         if not counts[signal].null_count:
             somewhere[:] = True

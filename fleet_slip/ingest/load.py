@@ -4,11 +4,12 @@
 `commit_batch` commits these.
 """
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain, count, pairwise
+from itertools import chain, pairwise
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -25,9 +26,8 @@ from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConflictError, InputError, RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive, drive_id
 from fleet_slip.ingest.formats.source import Spool
-from fleet_slip.ingest.log_files import Log, StoredParts, local_copies
+from fleet_slip.ingest.log_files import Log, StoredParts, local_copies, local_copy
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.preview import signals_of
 from fleet_slip.ingest.recordings import (
     FILES,
     PREFIX,
@@ -46,7 +46,7 @@ from fleet_slip.ingest.recordings import (
     unit_of,
 )
 from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
-from fleet_slip.ingest.suspicion import find_suspicions
+from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
 from fleet_slip.storage.folder import StoredFile
 from fleet_slip.storage.table import Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.warehouse.forgotten import Audit
@@ -71,30 +71,57 @@ TakeOut: TypeAlias = Callable[[TableName, Snapshot, Collection[Origin]], Change]
 
 
 @dataclass
-class IngestReport(Record):
-    """What became of one file."""
-
-    DOCUMENT = "file new *counts rows_quarantined drives_forgotten drives_replaced suspicions"
+class _Judged(Record):
+    """What a file became, and what looks wrong in it."""
 
     file: str
-    new: bool
     counts: IngestCounts
-    drives_forgotten: int = 0
-    """Drives that were left out: of cars that were forgotten, or forgotten themselves."""
     suspicions: tuple[Fault, ...] = ()
-    """What looks wrong in its longest drive; of small files that land together, in one of all."""
-    drives_replaced: int = 0
-    """Drives that gave way to it: its recording, from another file or through another mapping."""
+    """In the file as a whole; and in the longest drive of all files that are read together."""
 
     @property
     def alarms(self) -> tuple[Fault, ...]:
         """What looks wrong and does harm."""
         return tuple(one for one in self.suspicions if one.does_harm)
 
+
+@dataclass
+class IngestReport(_Judged):
+    """What became of one file."""
+
+    DOCUMENT = "file new *counts rows_quarantined drives_forgotten drives_replaced suspicions"
+
+    new: bool = True
+    drives_forgotten: int = 0
+    """Drives that were left out: of cars that were forgotten, or forgotten themselves."""
+    drives_replaced: int = 0
+    """Drives that gave way to it: its recording, from another file or through another mapping."""
+
     @property
     def rows_quarantined(self) -> int:
         """How many rows were refused."""
         return sum(self.counts.quarantined.values())
+
+
+@dataclass(frozen=True)
+class SignalRange:
+    """The values of a signal in a file, in the catalogue's unit."""
+
+    signal: str
+    unit: str
+    low: float
+    high: float
+    missing: float
+    """Part of the ticks without a value."""
+
+
+@dataclass
+class Preview(_Judged):
+    """What would become of a file."""
+
+    DOCUMENT = "file *counts ranges suspicions"
+
+    ranges: tuple[SignalRange, ...] = ()
 
 
 @dataclass
@@ -253,30 +280,6 @@ FILE_ROWS = 2**18
 """A data file is written as soon as it has so many rows; its last drive may make it larger."""
 
 
-class _Batch:
-    """Files that are written together."""
-
-    def __init__(
-        self, warehouse: Warehouse, mapping: Mapping, number: int, writers: ThreadPoolExecutor
-    ) -> None:
-        self.warehouse, self.audit, self._number = warehouse, Audit(warehouse.root), number
-        self.forgotten = self.audit.begun()
-        self.look_again()
-        tables = tables_of(warehouse).items()
-        self.data = {name: DataFiles(table, writers) for name, table in tables}
-        self.mapping = mapping
-
-    def look_again(self) -> None:
-        """Look at the tables as they are now."""
-        snapshots = {name: table.snapshot() for name, table in tables_of(self.warehouse).items()}
-        self.logs = snapshots["logs"]
-        self.landed = {name: one.landed_among(self._number) for name, one in snapshots.items()}
-
-    def lacks(self, name: TableName, digest: str) -> bool:
-        """Whether a file's rows are neither in a table nor about to be."""
-        return digest not in self.data[name].digests and not self.landed[name](FILES + digest)
-
-
 def write_batch(
     warehouse: Warehouse,
     mapping: Mapping,
@@ -286,108 +289,132 @@ def write_batch(
 ) -> WrittenBatch:
     """Read files, and write their rows together: one data file a day. Nothing is committed.
 
-    A file that cannot be used is a failure of its own. Of what is new the longest drive is looked
-    at for what looks wrong: one of a batch, since a folder of small files shall not be held up.
-    `progress` counts bytes of each file.
+    A file that cannot be used is a failure of its own. `progress` counts bytes of each file.
     """
-    longest: tuple[WrittenFile, MeasuredDrive] | None = None
-    written: list[WrittenFile] = []
     failures: list[InputError] = []
     copies = local_copies(asked.file for asked in files)
     with copies as open_copy, ThreadPoolExecutor(WRITERS) as writers:
-        batch = _Batch(warehouse, mapping, len(files), writers)
-        same = SameRecordings(warehouse, batch.logs, mapping.name, replace)
+        batch = _Batch(warehouse, mapping, files, writers, replace)
         for asked in files:
             try:
                 with (
                     open_copy(asked.file) as file,
                     open_measured(file, mapping, progress) as stream,
                 ):
-                    first = drive_id(stream.prefix, 0)
-                    if not batch.lacks("logs", stream.digest) and let_return(
-                        warehouse, stream.digest, first
-                    ):
-                        batch.look_again()
-                    one, drive, rest = _write_file(stream, asked.file, batch)
-                    if one.report.new:
-                        earlier = asked.earlier
-                        there = earlier and batch.landed["logs"](FILES + earlier)
-                        one.same, one.replaced, one.report.drives_replaced = same.find(
-                            one.log,
-                            one.digest,
-                            one.fingerprints,
-                            stream.name,
-                            earlier if there else None,
-                        )
+                    one = batch.write(stream, asked)
             except BaseException as error:
                 for data in batch.data.values():
                     data.discard_log()
                 if not isinstance(error, InputError):
                     raise
                 failures.append(error)
-                continue
-            for name, data in batch.data.items():
-                data.end_log(one.digest, rest.get(name, []))
-            written.append(one)
-            if drive and (longest is None or drive.ticks.size > longest[1].ticks.size):
-                longest = one, drive
-        for data in batch.data.values():
-            data.write_waiting()
-        if longest is not None:
-            one, drive = longest
-            one.report.suspicions += tuple(find_suspicions(signals_of(drive)))
+            else:
+                batch.end(one, stream.longest)
+        batch.longest.judge()
         new = {name: data.finish() for name, data in batch.data.items()}
-    return WrittenBatch(tuple(written), tuple(failures), batch.forgotten, new)
+    return WrittenBatch(tuple(batch.written), tuple(failures), batch.forgotten, new)
 
 
-def _write_file(
-    stream: MeasuredStream, log: Log, batch: _Batch
-) -> tuple[WrittenFile, MeasuredDrive | None, dict[TableName, list[pa.Table]]]:
-    """Read a file, write all but its last rows; return what it became, its longest drive, these."""
-    digest, audit = stream.digest, batch.audit
-    is_new = batch.lacks("logs", digest)
-    lacking = {name for name in batch.data if is_new and batch.lacks(name, digest)}
-    names = (f"measured-{digest[:24]}-{number}" for number in count(1))
-    refused, rest = _RefusedRows(stream), dict[TableName, list[pa.Table]]()
-    longest: MeasuredDrive | None = None
-    left_out, ticks = set[str](), 0
-    fingerprints = {f"{PREFIX}{stream.content[:16]}": Origin.of(digest).number}
-    for drives in _groups(_read_drives(stream, refused)):
-        longest = max([*([longest] if longest else []), *drives], key=lambda one: one.ticks.size)
-        kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), audit)
-        left_out |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in kept}
-        ticks += _rows_of(kept)
-        for drive in kept if is_new else ():
-            if origin := Origin.of_drive(drive.drive_id):
-                fingerprints[f"{PREFIX}{drive.counts_digest}"] = origin.number
-        if not kept or "logs" not in lacking:
-            continue
-        if _rows_of(drives) >= FILE_ROWS:
-            batch.data["logs"].add(next(names), [log_table(kept, batch.mapping)])
-        else:
-            rest["logs"] = [log_table(kept, batch.mapping)]
-    for table, following in pairwise(chain(refused.tables(), [None])):
-        allowed = keep_refused(table, audit, left_out)
-        if not allowed.num_rows or "quarantine" not in lacking:
-            continue
-        if following is not None:
-            batch.data["quarantine"].add(next(names), [allowed])
-        else:
-            rest["quarantine"] = [allowed]
-    report = IngestReport(str(log), is_new, stream.counts)
-    if not is_new:
-        return WrittenFile(log, digest, report), None, {}
-    report.drives_forgotten, report.suspicions = len(left_out), stream.suspicions()
-    drives_left = stream.counts.drives - len(left_out)
-    report.counts = replace(stream.counts, drives=drives_left, ticks=ticks)
-    return WrittenFile(log, digest, report, fingerprints if ticks else {}), longest, rest
+class _Longest:
+    """The longest drive of files that are read together, which is looked at for what looks wrong.
+
+    It stands for all, since to look at a drive takes longer than to load a small file.
+    """
+
+    def __init__(self) -> None:
+        self._report: _Judged | None = None
+        self._drive: MeasuredDrive | None = None
+
+    def add(self, report: _Judged, drive: MeasuredDrive | None) -> None:
+        """Keep the longest drive of a file if it is longer than all before."""
+        if drive and (self._drive is None or drive.ticks.size > self._drive.ticks.size):
+            self._report, self._drive = report, drive
+
+    def judge(self) -> None:
+        """Add what looks wrong in it to the report of its file."""
+        if self._report is not None and self._drive is not None:
+            self._report.suspicions += tuple(find_suspicions(signals_of(self._drive)))
 
 
-def _read_drives(stream: MeasuredStream, refused: "_RefusedRows") -> Iterator[MeasuredDrive]:
-    """Yield the drives of a file; keep its refused rows."""
-    for piece in stream.pieces():
-        refused.add(piece.refused)
-        yield from piece.drives
+class _Batch:
+    """Files that are written together."""
+
+    def __init__(
+        self,
+        warehouse: Warehouse,
+        mapping: Mapping,
+        files: Batch,
+        writers: ThreadPoolExecutor,
+        replace: Replace,
+    ) -> None:
+        self.warehouse, self.audit, self.mapping = warehouse, Audit(warehouse.root), mapping
+        self.forgotten, self._number = self.audit.begun(), len(files)
+        logs = self._look()
+        self.data = {name: DataFiles(t, writers) for name, t in tables_of(warehouse).items()}
+        self._same = SameRecordings(warehouse, logs, mapping.name, replace)
+        self.written: list[WrittenFile] = []
+        self.longest = _Longest()
+
+    def _look(self) -> Snapshot:
+        """Look at the tables as they are now; return a snapshot of the logs."""
+        snapshots = {name: table.snapshot() for name, table in tables_of(self.warehouse).items()}
+        self._landed = {name: one.landed_among(self._number) for name, one in snapshots.items()}
+        return snapshots["logs"]
+
+    def _lacks(self, name: TableName, digest: str) -> bool:
+        """Whether a file's rows are neither in a table nor about to be."""
+        return digest not in self.data[name].digests and not self._landed[name](FILES + digest)
+
+    def write(self, stream: MeasuredStream, asked: AskedFile) -> WrittenFile:
+        """Read a file, and write all but its last rows, which wait; return what it became.
+
+        Raises `InputError`, and `RepeatedError` for a recording that is in the logs.
+        """
+        digest, first_drive = stream.digest, drive_id(stream.prefix, 0)
+        if not self._lacks("logs", digest) and let_return(self.warehouse, digest, first_drive):
+            self._look()
+        is_new = self._lacks("logs", digest)
+        for name, data in self.data.items():
+            data.begin_log(digest, wanted=is_new and self._lacks(name, digest))
+        fingerprints = {f"{PREFIX}{stream.content[:16]}": Origin.of(digest).number}
+        refused = _RefusedRows(stream)
+        left_out, ticks = set[str](), 0
+        for drives in _groups(refused.collect()):
+            kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), self.audit)
+            left_out |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in kept}
+            ticks += _rows_of(kept)
+            if is_new and kept:
+                full = _rows_of(drives) >= FILE_ROWS
+                self.data["logs"].add(log_table(kept, self.mapping), full=full)
+                of_drives = ((drive, Origin.of_drive(drive.drive_id)) for drive in kept)
+                fingerprints |= {
+                    f"{PREFIX}{drive.counts_digest}": origin.number
+                    for drive, origin in of_drives
+                    if origin
+                }
+        for table, following in pairwise(chain(refused.tables(), [None])):
+            allowed = keep_refused(table, self.audit, left_out)
+            self.data["quarantine"].add(allowed, full=following is not None)
+        report = IngestReport(str(asked.file), stream.counts, new=is_new)
+        one = WrittenFile(asked.file, digest, report)
+        if is_new:
+            report.drives_forgotten, report.suspicions = len(left_out), stream.suspicions()
+            drives_left = stream.counts.drives - len(left_out)
+            report.counts = replace(stream.counts, drives=drives_left, ticks=ticks)
+            one.fingerprints = fingerprints if ticks else {}
+            is_there = asked.earlier and self._landed["logs"](FILES + asked.earlier)
+            earlier = asked.earlier if is_there else None
+            found = self._same.find(asked.file, digest, one.fingerprints, stream.name, earlier)
+            one.same, one.replaced, report.drives_replaced = found
+        return one
+
+    def end(self, one: WrittenFile, longest: MeasuredDrive | None) -> None:
+        """Take a file that was written."""
+        for data in self.data.values():
+            data.end_log()
+        self.written.append(one)
+        if one.report.new:
+            self.longest.add(one.report, longest)
 
 
 def _groups(drives: Iterable[MeasuredDrive]) -> Iterator[list[MeasuredDrive]]:
@@ -413,21 +440,78 @@ class _RefusedRows:
         self._stream, self._spool = stream, Spool()
         self._rows: list[pl.DataFrame] = []
 
-    def add(self, rows: pl.DataFrame) -> None:
-        if rows.height:
-            self._rows.append(rows)
-        if sum(one.height for one in self._rows) >= FILE_ROWS:
-            sink = pa.BufferOutputStream()
-            with pa.ipc.new_stream(sink, QUARANTINE_SCHEMA) as writer:
-                writer.write_table(self._stream.quarantine_table(self._rows))
-            self._spool.add("", sink.getvalue().to_pybytes())
-            self._rows = []
+    def collect(self) -> Iterator[MeasuredDrive]:
+        """Yield the drives of the file, and keep its refused rows."""
+        for piece in self._stream.pieces():
+            if piece.refused.height:
+                self._rows.append(piece.refused)
+            if sum(one.height for one in self._rows) >= FILE_ROWS:
+                sink = pa.BufferOutputStream()
+                with pa.ipc.new_stream(sink, QUARANTINE_SCHEMA) as writer:
+                    writer.write_table(self._stream.quarantine_table(self._rows))
+                self._spool.add("", sink.getvalue().to_pybytes())
+                self._rows = []
+            yield from piece.drives
 
     def tables(self) -> Iterator[pa.Table]:
+        """Yield the refused rows."""
         for piece in self._spool.read(""):
             yield pa.ipc.open_stream(piece).read_all()
         if self._rows:
             yield self._stream.quarantine_table(self._rows)
+
+
+# What would become of files: they are read as above, and nothing is written.
+
+
+def preview_logs(logs: Iterable[Log], mapping: Mapping) -> list[Preview]:
+    """Read logs as `ingest_files` does, with the same verdict; store nothing.
+
+    Raises `InputError`.
+    """
+    previews: list[Preview] = []
+    for batch in _batches(map(AskedFile, logs)):
+        longest = _Longest()
+        for asked in batch:
+            preview, drive = preview_log(asked.file, mapping)
+            longest.add(preview, drive)
+            previews.append(preview)
+        longest.judge()
+    return previews
+
+
+def preview_log(log: Log, mapping: Mapping) -> tuple[Preview, MeasuredDrive | None]:
+    """Return what would become of a log, and its longest drive. Raises `InputError`."""
+    ends: dict[str, list[int]] = {name: [] for name in mapping.signal_names}
+    values: Counter[str] = Counter()
+    with local_copy(log) as file, open_measured(file, mapping) as stream:
+        for drive in (drive for piece in stream.pieces() for drive in piece.drives):
+            for name, counts in drive.counts.items():
+                values[name] += len(counts) - counts.null_count
+                found = pc.min_max(counts).as_py()
+                ends[name] += [] if found["min"] is None else [found["min"], found["max"]]
+        of_rows = stream.suspicions()  # which may look into the file again
+    ranges = []
+    for name, some in ends.items():
+        scale = float(catalogue()[name].scale)
+        low, high = (scale * min(some), scale * max(some)) if some else (np.nan, np.nan)
+        missing = 1 - values[name] / max(stream.counts.ticks, 1)
+        ranges.append(SignalRange(name, catalogue()[name].unit, low, high, missing))
+    return Preview(str(log), stream.counts, of_rows, tuple(ranges)), stream.longest
+
+
+MOST_TICKS = 200_000
+"""Ticks of the longest drive that are looked at: half an hour."""
+
+
+def signals_of(drive: MeasuredDrive) -> Signals:
+    """Return the signals of the beginning of a drive, as `find_suspicions` takes them."""
+    kept = drive.ticks - drive.ticks[0] < MOST_TICKS
+    counts = {  # by Polars: Arrow's own would load pandas
+        name: pl.Series(values).cast(pl.Float64).fill_null(float("nan")).to_numpy()[kept]
+        for name, values in drive.counts.items()
+    }
+    return on_every_tick(drive.ticks[kept], counts)
 
 
 # Data files of bounded size. Nothing is committed yet.
@@ -435,41 +519,42 @@ class _RefusedRows:
 WRITERS = 2
 """Data files that are written at once: encoding them is the longest part of an ingest."""
 
-_POLARS_TYPES: dict[pa.DataType, type[pl.DataType] | pl.DataType] = {
-    pa.string(): pl.String,
-    pa.float64(): pl.Float64,
-    pa.int64(): pl.Int64,
-    pa.int32(): pl.Int32,
-    pa.date32(): pl.Date,
-    pa.timestamp("us", tz="UTC"): pl.Datetime("us", "UTC"),
-}
-
 
 class DataFiles:
-    """Data files of a batch in one table. Logs are read one by one, and ended or discarded."""
+    """Data files of a batch in one table. Logs are begun one by one, and ended or discarded."""
 
     def __init__(self, table: Table, threads: ThreadPoolExecutor) -> None:
         """Take the table, and threads to write with."""
         self._table, self._threads = table, threads
         self._written: list[Future[list[AddAction]]] = []
         self._of_this_log: list[Future[list[AddAction]]] = []
-        self._waiting: dict[str, list[pa.Table]] = {}
+        self._waiting: dict[str, pa.Table] = {}
         self.digests: list[str] = []
 
-    def add(self, name: str, rows: list[pa.Table]) -> None:
-        """Write rows of the log that is being read to a data file of their own."""
-        self._of_this_log.append(self._begin(name, rows))
+    def begin_log(self, digest: str, *, wanted: bool) -> None:
+        """Begin a log, whose rows are passed over unless they are wanted."""
+        self._digest, self._is_wanted = digest, wanted
+        self._rest: pa.Table | None = None
 
-    def end_log(self, digest: str, rest: list[pa.Table]) -> None:
-        """End the log that is being read: the rest of its rows wait for those of others."""
-        if self._of_this_log or rest:
-            self.digests.append(digest)
+    def add(self, rows: pa.Table, *, full: bool) -> None:
+        """Write rows of the log to a data file of their own if they are enough to fill it."""
+        if self._is_wanted and rows.num_rows:
+            if full:
+                name = f"measured-{self._digest[:24]}-{len(self._of_this_log) + 1}"
+                self._of_this_log.append(self._begin(name, [rows]))
+            else:
+                self._rest = rows
+
+    def end_log(self) -> None:
+        """End the log: the rest of its rows wait for those of others."""
+        if self._of_this_log or self._rest is not None:
+            self.digests.append(self._digest)
         self._written += self._of_this_log
         self._of_this_log = []
-        if rest:
-            self._waiting[digest] = rest
-        if sum(one.num_rows for rows in self._waiting.values() for one in rows) >= FILE_ROWS:
-            self.write_waiting()
+        if self._rest is not None:
+            self._waiting[self._digest] = self._rest
+        if sum(rows.num_rows for rows in self._waiting.values()) >= FILE_ROWS:
+            self._write_waiting()
 
     def discard_log(self) -> None:
         """Delete what was written of the log that is being read."""
@@ -477,19 +562,19 @@ class DataFiles:
         self._table.discard(file for writing in written for file in writing.result())
         self._of_this_log = []
 
-    def write_waiting(self) -> None:
+    def finish(self) -> NewFiles:
+        """Return all data files, written, and the units that they are."""
+        self._write_waiting()
+        files = tuple(file for writing in self._written for file in writing.result())
+        return NewFiles(tuple(map(unit_of, sorted(self.digests))), files)
+
+    def _write_waiting(self) -> None:
         """Write rows in the order of their logs' digests, and so of the names of drives."""
         digests = sorted(self._waiting)
         if digests:
-            rows = [one for digest in digests for one in self._waiting[digest]]
+            rows = [self._waiting[digest] for digest in digests]
             self._written.append(self._begin(f"measured-{digest_of(digests)[:24]}", rows))
             self._waiting = {}
-
-    def finish(self) -> NewFiles:
-        """Return all data files, written, and the units that they are."""
-        self.write_waiting()
-        files = tuple(file for writing in self._written for file in writing.result())
-        return NewFiles(tuple(map(unit_of, sorted(self.digests))), files)
 
     def _begin(self, name: str, rows: list[pa.Table]) -> Future[list[AddAction]]:
         """Write rows while the caller goes on; at most `WRITERS` files are under way."""
@@ -542,7 +627,7 @@ def _gather(values: Sequence[Any], at: IntArray, kind: pa.DataType) -> pa.Array:
         codes = [None if text is None else texts.index(text) for text in values]
         named = pl.Series(texts, dtype=pl.String).to_arrow().cast(kind)
         return pa.DictionaryArray.from_arrays(_gather(codes, at, pa.int32()), named, safe=False)
-    return pl.Series(values, dtype=_POLARS_TYPES[kind]).gather(at).to_arrow().cast(kind)
+    return pl.Series(values, strict=False).gather(at).to_arrow().cast(kind)
 
 
 # What was written is committed: refused rows, then drives.

@@ -47,6 +47,7 @@ from fleet_slip.ingest.formats.tables import DuckdbRows
 from fleet_slip.resources import find_config
 
 SPEEDS = ("vx", "vehicle_speed")
+FRONT_WHEELS = ("steer_fl", "steer_fr")
 
 
 class LabelSensor(Config):
@@ -260,7 +261,14 @@ class Mapping(Config):
     def signal_names(self) -> tuple[str, ...]:
         """All signals that drives have, those computed from others too."""
         derived = self.label is not None and self.label.from_velocities
-        return (*self.signals, *([catalogue().label] if derived else []))
+        label = [catalogue().label] if derived else []
+        return (*self.signals, *label, *self.front_wheels)
+
+    @property
+    def front_wheels(self) -> tuple[str, ...]:
+        """The signals that one angle of both front wheels stands for, where it is all there is."""
+        alone = "steer" in self.signals and not set(FRONT_WHEELS) & set(self.signals)
+        return tuple(name for name in FRONT_WHEELS if alone and name in catalogue().signals)
 
     @property
     def formats(self) -> FileFormats:

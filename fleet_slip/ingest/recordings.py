@@ -247,17 +247,6 @@ def _state_of(log: Log) -> tuple[int, int | str] | None:
 # What becomes of a file whose recording is in the logs already.
 
 
-class Same(NamedTuple):
-    """Which files, and drives of others, have a file's fingerprints, whether still there or not.
-
-    And which of these give way to it, and how many drives that are.
-    """
-
-    origins: frozenset[Origin]
-    replaced: frozenset[Origin]
-    drives_replaced: int
-
-
 class SameRecordings:
     """Looks for the recordings of a batch of files, in the logs and in the batch."""
 
@@ -278,8 +267,8 @@ class SameRecordings:
         fingerprints: Named[str, int],
         name: str,
         earlier: str | None,
-    ) -> Same:
-        """Return what the logs have of a file, and what gives way to it.
+    ) -> tuple[frozenset[Origin], frozenset[Origin], int]:
+        """Return what has a file's fingerprints, there or not, what gives way, and how many drives.
 
         `name` is the file's as `source_file` has it; `earlier` is the digest of what its path had
         before, if that is there. Raises `RepeatedError` for what does not give way to it.
@@ -317,7 +306,7 @@ class SameRecordings:
             )
         self._batch.update(fingerprints)
         self._files[Origin.of(digest).digest] = log
-        return Same(origins, replaced if drives else frozenset(), len(drives))
+        return origins, replaced if drives else frozenset(), len(drives)
 
 
 def let_return(warehouse: Warehouse, digest: str, first_drive: str) -> bool:

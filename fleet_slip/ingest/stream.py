@@ -104,6 +104,7 @@ class MeasuredStream:
         self.prefix = f"{mapping.name}-{digest[:12]}"
         self.checker, self._meter = RowChecker(file, mapping, meter), meter
         self.counts = IngestCounts()
+        self.longest: MeasuredDrive | None = None
         self._refused = Counter[tuple[str, str]]()
         self._first_refused: dict[str, Any] | None = None
         self._samples, self._values = Counter[str](), Counter[str]()
@@ -213,6 +214,8 @@ class MeasuredStream:
         for signal, values in drive.counts.items():
             self._samples[signal] += rows.number_of(signal)
             self._values[signal] += len(values) - values.null_count
+        if self.longest is None or drive.ticks.size > self.longest.ticks.size:
+            self.longest = drive
         self._faults.add(rows, drive)
         self._require_sane_drives()
         return drive

@@ -41,10 +41,13 @@ EACH = 5
 
 LEAST_EXPLAINED = 0.6
 """Where accelerations explain less of the change of lateral velocity, they are no witness."""
-LEAST_KINEMATIC_LAG, LEAST_KINEMATIC_GAIN = 5, 0.1
-"""Simulated drives without a delay reach 11 ticks and .04, one of these at a time."""
-LEAST_LAG, LEAST_GAIN = 3, 0.3
-"""A delay explains away this part of a label's variance: a car's own lag of 0.1 s does 0.23."""
+LEAST_LAG = 7
+"""Buses hold signals and send them late, up to so many ticks apart from one another."""
+LEAST_KINEMATIC_GAIN, LEAST_GAIN = 0.1, 0.3
+"""A delay explains away this part of a label's variance. By the accelerations, simulated drives
+without a delay reach .04; by the inputs, a car's own lag of 0.1 s does 0.23."""
+UNIQUE = 3.0
+"""At delays half a second away the inputs leave so many times as much: a slalom shows no delay."""
 
 
 def moving(speed: FloatArray | None) -> BoolArray:
@@ -107,10 +110,12 @@ def find_delay(
     moves = np.array([_mean(ay_mps2[:n]), _mean(turning), _mean(speed)])
     smooth = rows & (np.arange(n) % EACH == 0)
     left = _unexplained(_change(speed * np.tan(angle)), moves, smooth)
-    if 1 - min(left.values()) > LEAST_EXPLAINED:
-        return _judged(left, LEAST_KINEMATIC_LAG, LEAST_KINEMATIC_GAIN)
+    if 1 - min(left.values()) > LEAST_EXPLAINED and not _is_one_of_many(left):
+        return _judged(left, LEAST_KINEMATIC_GAIN)
     left = _unexplained(angle, np.array([*(one[:n] for one in inputs), speed]), rows)
-    return None if min(left.values()) > 1 / 2 else _judged(left, LEAST_LAG, LEAST_GAIN)
+    if min(left.values()) > 1 / 2 or _is_one_of_many(left):
+        return None
+    return _judged(left, LEAST_GAIN)
 
 
 def is_in_time(angle_rad: FloatArray, course_rad: FloatArray, yaw_rate_rad_s: FloatArray) -> bool:
@@ -122,7 +127,7 @@ def is_in_time(angle_rad: FloatArray, course_rad: FloatArray, yaw_rate_rad_s: Fl
     angle, slip = (changes[:2] + np.pi) % (2 * np.pi) - np.pi
     left = _unexplained(angle, np.array([slip, changes[2]]), np.ones(angle.size, dtype=np.bool_))
     best = min(left, key=lambda lag: left[lag])
-    return 1 - left[best] > LEAST_EXPLAINED and abs(best) < LEAST_KINEMATIC_LAG
+    return 1 - left[best] > LEAST_EXPLAINED and abs(best) < LEAST_LAG
 
 
 def _unexplained(label: FloatArray, inputs: FloatArray, rows: BoolArray) -> dict[int, float]:
@@ -137,14 +142,18 @@ def _unexplained(label: FloatArray, inputs: FloatArray, rows: BoolArray) -> dict
     }
 
 
-def _judged(
-    left: dict[int, float], least_lag: int, least_gain: float
-) -> tuple[float, float] | None:
+def _judged(left: dict[int, float], least_gain: float) -> tuple[float, float] | None:
     best = min(left, key=lambda lag: left[lag])
     gain = 1 - left[best] / left[0] if left[0] > 0 else 0.0
-    if not least_lag <= abs(best) < FAR_LAG or gain < least_gain:
+    if not LEAST_LAG <= abs(best) < FAR_LAG or gain < least_gain:
         return None
     return best * float(SAMPLE_TIME_S), gain
+
+
+def _is_one_of_many(left: dict[int, float]) -> bool:
+    """Return whether the inputs leave nearly as little at quite another delay, as in a slalom."""
+    best = min(left, key=lambda lag: left[lag])
+    return min(left[lag] for lag in left if abs(lag - best) > MOST_LAG) < UNIQUE * left[best]
 
 
 def _change(velocity_mps: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from asammdf import MDF, Signal
 from fleet_slip.errors import InputError, UsageError
 from fleet_slip.ingest import stream
 from fleet_slip.ingest.formats.reading import log_digest
-from fleet_slip.ingest.preview import preview_log
+from fleet_slip.ingest.load import preview_log
 from tests.ingest.test_formats import AX, BETA_DEG, START, TIME_S, mdf_mapping, require_the_drive
 from tests.support.measured import (
     a_mapping,

@@ -99,6 +99,17 @@ def test_extras_are_stored_in_their_units(tmp_path: Path) -> None:
     assert physical(log, "steer", 0.00005)[5] == pytest.approx(0.01745, abs=2.5e-5)
 
 
+def test_one_angle_of_both_front_wheels_needs_no_line_for_each(tmp_path: Path) -> None:
+    columns = {"t": ["0.00", "0.01", "0.02"], "delta": ["1", "", "-3"], "ax": ["0", "0", "0"]}
+    one = {"ax": {"column": "ax", "unit": "m/s^2"}, "steer": EXTRA["steer"]}
+    log = read_columns(tmp_path, columns, a_mapping(signals=one))
+    assert log.drives["steer"].to_pylist()[1] is None
+    for name in ("steer_fl", "steer_fr"):
+        assert log.drives[name].to_pylist() == log.drives["steer"].to_pylist()
+    left = read_columns(tmp_path, columns, a_mapping(signals={**one, "steer_fl": EXTRA["steer"]}))
+    assert left.drives["steer_fr"].null_count == 3
+
+
 def test_a_gear_is_never_between_two_gears(tmp_path: Path) -> None:
     columns = {"t": [0, 0.05, 0.1, 0.15], "gear": [2, 3, 3, 5], "ax": [0, 1, 2, 3]}
     log = read_columns(tmp_path, columns, a_mapping(signals={"ax": PLAIN["ax"], **only("gear")}))
@@ -126,7 +137,9 @@ def test_a_file_has_the_columns_of_extras_only_where_a_drive_has_them(
     found = "SELECT count(*), count(steer_rad), max(gear_number), max(throttle_position) FROM log"
     assert ask(warehouse, found) == [(2 * ROWS + 1, ROWS + 1, 5.0, 1.0)]
     update_grams(warehouse)
-    assert set(ask(warehouse, "SELECT signals FROM grams")) == {("ax,sideslip",)}
+    assert set(ask(warehouse, "SELECT signals FROM grams")) == {
+        ("ax,sideslip",), ("ax,steer_fl,steer_fr,sideslip",),
+    }  # fmt: skip
     compact(warehouse)
     assert ask(warehouse, found) == [(2 * ROWS + 1, ROWS + 1, 5.0, 1.0)]
     assert not list(verify(warehouse, full=True).damage)

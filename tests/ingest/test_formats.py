@@ -22,8 +22,8 @@ from fleet_slip.errors import ExtraError, InputError
 from fleet_slip.ingest.formats import matlab, mdf
 from fleet_slip.ingest.formats import source as budget
 from fleet_slip.ingest.formats.source import Budget, reading_with
+from fleet_slip.ingest.load import preview_logs
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.preview import preview_log
 from tests.support.measured import MeasuredLog, a_mapping, failure, read_measured, ticks
 
 START = datetime(2024, 5, 31, 12, tzinfo=UTC)
@@ -361,7 +361,8 @@ def test_a_group_without_samples_is_a_signal_without_values(tmp_path: Path) -> N
     log = read_measured(file, mdf_mapping())
     assert log.drives["ax"].to_pylist() == AX_COUNTS
     assert log.drives["sideslip"].null_count == 100
-    (suspicion,) = preview_log(file, mdf_mapping()).suspicions
+    (preview,) = preview_logs([file], mdf_mapping())
+    (suspicion,) = preview.suspicions
     assert (suspicion.kind, suspicion.signals) == ("absent", ("sideslip",))
     file = write_mdf(tmp_path, [a_x()], [beta()], [nothing_but(condition)])
     where = mdf_mapping(where=[{"column": "fix", "at_least": 1}])
