@@ -408,7 +408,7 @@ def _open_tables(warehouse: Warehouse, report: Verification) -> dict[str, Snapsh
     for table in warehouse.tables:
         name = table.folder.name
         try:
-            snapshot = table.snapshot()
+            snapshot = table.snapshot(anew=True)
             _ = snapshot.files
             found[name] = snapshot
             for file, problem in find_commit_faults(snapshot):

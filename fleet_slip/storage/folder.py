@@ -84,6 +84,9 @@ class Folder(Protocol):
     def files(self) -> list[StoredFile]:
         """Return all files below, at any depth, sorted by path."""
 
+    def stamp(self, path: str) -> object:
+        """Return what another file in its place differs in; None without one, and of a store."""
+
     def read(self, path: str, longest: int | None = None) -> bytes:
         """Return the content of a file, or only its first bytes."""
 

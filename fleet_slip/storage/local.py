@@ -73,6 +73,13 @@ class LocalFolder:
             paths = sorted(Path(folder) / name for folder, _, names in walked for name in names)
             return [file for file in map(self._judge, filter(Path.is_file, paths)) if file]
 
+    def stamp(self, path: str) -> object:
+        try:
+            found = (self.path / path).stat()
+        except OSError:
+            return None
+        return found.st_ino, found.st_mtime_ns, found.st_size
+
     def read(self, path: str, longest: int | None = None) -> bytes:
         with (
             _regular_file(self.path / path, os.O_RDONLY) as descriptor,

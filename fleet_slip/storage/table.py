@@ -382,12 +382,13 @@ class Snapshot:
 
     def renewed(self) -> "Snapshot":
         """Return the newest version: this snapshot, or another, which takes its place."""
-        if self.delta is None:
-            return self.table.snapshot()
         version = self.version
-        with storage_errors(self.table.folder):
-            self.delta.update_incremental()
-        return self if self.version == version else self.table.snapshot()
+        if self.delta is not None and not self.table.folder.is_local:
+            with storage_errors(self.table.folder):
+                self.delta.update_incremental()
+            return self if self.version == version else self.table.snapshot()
+        newest = self.table.snapshot()
+        return self if newest.version == version else newest
 
     def removed(self, before_hours: float = 0) -> set[str]:
         """Return the paths of files removed so many hours ago or earlier; of a week at least."""
@@ -499,12 +500,20 @@ class Table:
         """The schema without the optional columns."""
         return pa.schema([field for field in self.schema if field.name not in self.optional])
 
-    def snapshot(self, version: int | None = None) -> Snapshot:
-        """Return the table as it is, or at a version; empty if unwritten. Raises `StorageError`."""
-        delta = self.open_delta(version)
-        if delta is not None and version is None:
+    def snapshot(self, version: int | None = None, *, anew: bool = False) -> Snapshot:
+        """Return the table as it is, or at a version; empty if unwritten. Raises `StorageError`.
+
+        What this process opened before is the result as long as nobody commits, unless `anew`: then
+        the whole log is read, and what was damaged meanwhile is seen.
+        """
+        if version is not None:
+            return Snapshot(self, self.open_delta(version))
+        if not anew and (opened := _still_newest(self)):
+            return opened
+        delta = self.open_delta()
+        if delta is not None:
             require_readable(self.folder, self.schema, delta)
-        return Snapshot(self, delta)
+        return _remembered(Snapshot(self, delta))
 
     def open_delta(self, version: int | None = None) -> DeltaTable | None:
         """Return the Delta table as it is now, or was; None if nobody has written it yet."""
@@ -663,3 +672,41 @@ class Table:
             commit_properties=CommitProperties(custom_metadata={NOTE: checked_note({}, [], {})}),
         )
         return (self.open_delta(version=0) if delta.version() else delta) or delta
+
+
+# The newest snapshots: to open a table costs milliseconds, to see that nobody committed a look.
+
+REMEMBERED_TABLES = 16
+
+_remembered_tables: dict[str, tuple[Snapshot, object]] = {}
+"""By table the snapshot opened last, and its stamp."""
+
+
+def _remembered(snapshot: Snapshot) -> Snapshot:
+    """Return a snapshot, and remember it where the commit after it can be looked for at once."""
+    stamp = _stamp(snapshot)
+    if stamp is not None:
+        uri = snapshot.table.folder.uri
+        _remembered_tables.pop(uri, None)
+        _remembered_tables[uri] = snapshot, stamp
+        for oldest in list(_remembered_tables)[:-REMEMBERED_TABLES]:
+            _remembered_tables.pop(oldest, None)
+    return snapshot
+
+
+def _still_newest(table: Table) -> Snapshot | None:
+    """Return the snapshot of a table that was opened last, if it is the newest one."""
+    snapshot, stamp = _remembered_tables.get(table.folder.uri, (None, None))
+    if snapshot is None or snapshot.table != table or _stamp(snapshot) != stamp:
+        return None
+    same = snapshot.table.schema.equals(table.schema, check_metadata=True)  # the scales of counts
+    return snapshot if same else None
+
+
+def _stamp(snapshot: Snapshot) -> object:
+    """Return what another log in its place differs in; None if there is a newer commit."""
+    log, version = snapshot.table.folder / LOG, snapshot.version
+    if version is None or log.stamp(f"{version + 1:020}.json") is not None:
+        return None
+    commit = log.stamp(f"{version:020}.json")
+    return None if commit is None else (commit, log.stamp(LATEST))
