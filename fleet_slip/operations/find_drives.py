@@ -264,6 +264,8 @@ def drives_by_file(
     active = [file.path for file in logs.files]
     found = {path: located.drives[path] for path in active if path in located.drives}
     unknown = [path for path in active if path not in located.known]
+    if not unknown:
+        return found
     statement = read_sql("jobs", "find_drives.sql").format(condition=subject.condition)
     with (
         open_database(reading=logs.table.folder) as database,
