@@ -200,7 +200,11 @@ def check_opened_files(database: duckdb.DuckDBPyConnection) -> None:
     check_local_files(path for (path,) in opened if "://" not in path)
 
 
-_OPENED_FILES = "SELECT DISTINCT path FROM duckdb_logs_parsed('FileSystem') WHERE op = 'OPEN'"
+# Not `duckdb_logs_parsed`, which takes seven times as long and reads no quotes in paths.
+_OPENED_FILES = """
+SELECT DISTINCT regexp_extract(message, '^.*?"path":"(.*)","op":"OPEN"}$', 1, 's') AS path
+FROM duckdb_logs() WHERE type = 'FileSystem' AND suffix(message, '"op":"OPEN"}')
+"""
 
 
 def duckdb_message(error: BaseException) -> str:
