@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, is_hypothesis_test, settings
 
+from fleet_slip.resources import cache_folder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.budget import Budget
@@ -18,6 +19,9 @@ from tests.support.commands import Finished, RunCommand, done_on, run_on
 from tests.support.once import made_once, require_unchanged
 
 os.environ["FLEET_SLIP_LOG"] = "text"  # a test reads what a person would
+
+# A test that has a cache of its own does not compile anew, which takes half a minute.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder("compiled")))
 
 # A shell ignores interrupts for what it starts in the background, and so would all that is started.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -4,7 +4,9 @@ import json
 import shutil
 from datetime import date
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -41,11 +43,18 @@ def drive(car: str, number: int, day: date = date(2024, 5, 1)) -> pa.Table:
 
 def fill(root: Path, *cars: str) -> Warehouse:
     """A warehouse where some cars drove; files mix them."""
-    warehouse = Warehouse(LocalFolder(root))
+    shutil.copytree(_filled(cars).name, root, dirs_exist_ok=True)
+    return Warehouse(LocalFolder(root))
+
+
+@cache
+def _filled(cars: tuple[str, ...]) -> TemporaryDirectory[str]:
+    folder = TemporaryDirectory()
+    warehouse = Warehouse(LocalFolder(Path(folder.name)))
     for number in range(3):
         land(warehouse, f"f{number}", *(drive(car, number) for car in cars))
     update_grams(warehouse)
-    return warehouse
+    return folder
 
 
 def coefficients(warehouse: Warehouse) -> dict[str, Fraction]:

@@ -60,7 +60,7 @@ def just_before_its_commit(
 
 
 def cars_in(warehouse: Warehouse, view: str) -> set[str]:
-    with fleet_slip.connect(warehouse.root) as database:
+    with fleet_slip.connect(warehouse.root, query=view) as database:
         rows = database.execute(f"SELECT DISTINCT vehicle_id FROM {view}").fetchall()
     return {row[0] for row in rows}
 

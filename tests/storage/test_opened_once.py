@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,10 +22,13 @@ def test_a_table_is_opened_again_after_a_commit_of_anybody(
     warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     land(warehouse, "one", log_rows("one", COUNTS))
-    opened = []
-    monkeypatch.setattr(
-        tables, "DeltaTable", lambda *a, **k: opened.append(a) or DeltaTable(*a, **k)
-    )
+    opened: list[str] = []
+
+    def opening(uri: str, **options: Any) -> DeltaTable:
+        opened.append(uri)
+        return DeltaTable(uri, **options)
+
+    monkeypatch.setattr(tables, "DeltaTable", opening)
     first = warehouse.logs.snapshot()
     assert len(first.files) == 1
     opened.clear()

@@ -56,7 +56,7 @@ class Landing:
 
     def drives(self) -> list[str]:
         """Return the drives that can land, by day and number."""
-        with fleet_slip.connect(self.source) as database:
+        with fleet_slip.connect(self.source, query="log") as database:
             found = database.sql(
                 "SELECT DISTINCT drive_id FROM log WHERE source <> 'scenario' ORDER BY 1"
             ).fetchall()
@@ -67,7 +67,7 @@ class Landing:
         file = self.folder / f"{name}.parquet"
         listed = ", ".join(f"'{drive}'" for drive in drives)
         changed = ", ".join(f"{sql} AS {column}" for column, sql in changes.items())
-        with fleet_slip.connect(self.source) as database:
+        with fleet_slip.connect(self.source, query="log") as database:
             rows = database.sql(
                 f"SELECT * REPLACE (DATE '{day}' AS day{', ' if changed else ''}{changed}) "
                 f"FROM log WHERE drive_id IN ({listed}) ORDER BY drive_id, time_s"
