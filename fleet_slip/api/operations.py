@@ -1,6 +1,6 @@
 """The part of a `Fleet` that watches the warehouse and looks after it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import date
 from typing import TYPE_CHECKING, Annotated, cast
@@ -19,9 +19,10 @@ from fleet_slip.api.calls import (
     within_reach,
 )
 from fleet_slip.api.models import JudgedModels
-from fleet_slip.base import Record, date_of
+from fleet_slip.base import date_of, number_of
 from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.runs import step
 
 if TYPE_CHECKING:
@@ -37,11 +38,28 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Compacted(Record):
+class Compacted(Answer):
     """What `Fleet.compact` did, or, of a dry run, which files it would remove."""
 
     compacted: "CompactionReport | None"
     vacuumed: "VacuumReport"
+
+    def parts(self) -> Iterator[Part]:
+        """Return what was compacted, and removed."""
+        found = self.compacted
+        if found is None:
+            if self.vacuumed.files:
+                yield TextTable("", "would be removed", zip(self.vacuumed.files))
+        elif found.changed:
+            yield Remark(
+                f"{number_of(found.files_before, 'file')} became {found.files_after}; "
+                f"{found.rows_rewritten:,} rows were written again, "
+                f"{found.size_bytes_before:,} bytes became {found.size_bytes_after:,}"
+            )
+        else:
+            files = number_of(found.files_after, "file")
+            yield Remark(f"nothing to compact: {files}, large or alone in the day")
+        yield self.vacuumed.remark
 
 
 class HealthAndUpkeep(JudgedModels):

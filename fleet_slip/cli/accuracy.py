@@ -3,7 +3,7 @@
 import os
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,19 +14,13 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import needed, number_of
 from fleet_slip.catalogue.facts import ALL_DRIVES
 from fleet_slip.cli.options import command
-from fleet_slip.cli.output import (
-    Json,
-    print_json,
-    print_records,
-    print_table,
-    print_text,
-    say,
-)
+from fleet_slip.cli.output import Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
-from fleet_slip.cli.selection import say_examined, say_without_information
+from fleet_slip.cli.selection import remark_without_information
 from fleet_slip.errors import UsageError
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.score import Score
+from fleet_slip.rendering import Part, Remark, TextTable
 from fleet_slip.resources import folder
 from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.warehouse.condition import parse_condition, row_columns
@@ -48,18 +42,20 @@ FRONT_DRIVE = typer.Option(help="Share of the drive torque in front.", min=0, ma
 
 # What `evaluate` prints for people: a screen, and with --all the errors of all on every drive.
 
+BLIND_NAMES = 5
+"""Estimators of the table that is printed first: published models, then the best of the others."""
 
-def print_evaluation(content: Mapping[str, Any], everything: bool) -> None:
-    """Print the summary of an evaluation's document, with `everything` its one table besides."""
+
+def evaluation_parts(content: Mapping[str, Any], everything: bool) -> Iterator[Part]:
+    """Return the summary of an evaluation's document, with `everything` its one table besides."""
     names = list(content["estimators"])
     if "scenarios" in content:
         drives, title = content["scenarios"], "Test drives: RMSE in deg"
-        print_ranking(content["ranking"])
-        ours = content["ranking"]["estimator"]
-        print_text(f"Pictures: fleet-slip report {shlex.quote(ours)}")
+        yield ranking_table(content["ranking"])
+        yield f"Pictures: fleet-slip report {shlex.quote(content['ranking']['estimator'])}"
     elif "cohort" in content:
         drives, title = content["drives"], "RMSE in deg by drive"
-        _print_measured(content)
+        yield from _measured(content)
     else:
         drives, title = content["drives"], "Blind drives: RMSE in deg against the exact angle"
         errors = {name: one["rmse_deg"] for name, one in drives[0]["results"].items()}
@@ -67,87 +63,75 @@ def print_evaluation(content: Mapping[str, Any], everything: bool) -> None:
         if not everything:
             groups = [one for one in drives if one["drives"] > 1]
             shown = [name for name in names if "/" not in name]
-            print_errors(title, groups, shown[:BLIND_NAMES])
+            yield error_table(title, groups, shown[:BLIND_NAMES])
     if everything:
-        print_errors(f"\n{title}", drives, names)
+        yield error_table(f"\n{title}", drives, names)
     else:
-        print_text("Every drive, and all estimators: --all; for machines --json.")
+        yield "Every drive, and all estimators: --all; for machines --json."
 
 
-BLIND_NAMES = 5
-"""Estimators of the table that is printed first: published models, then the best of the others."""
+def error_table(title: str, drives: Sequence[Mapping[str, Any]], names: Sequence[str]) -> TextTable:
+    """Return RMSE by drive and estimator, and of how much of the drive unless of all."""
+    words = [name.replace("_", " ") for name in names]  # which a heading can wrap
 
+    def error(found: Mapping[str, Any]) -> str:
+        if found["rmse_deg"] is None:
+            return "none"
+        covered = found["coverage"]
+        return f"{found['rmse_deg']:.3f}" + ("" if covered == 1 else f" ({covered:.0%})")
 
-def print_errors(title: str, drives: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
-    """Print RMSE by drive and estimator."""
-    rows = [
+    rows = (
         [
             one["name"],
             f"{one.get('truth', one)['sideslip_std_deg']:.2f}",
-            *(_error_cell(one["results"][name]) for name in names),
+            *(error(one["results"][name]) for name in names),
         ]
         for one in drives
-    ]
-    words = [name.replace("_", " ") for name in names]  # which a heading can wrap
-    print_table(title, ["drive", "side-slip std", *words], rows)
+    )
+    return TextTable(title, "|".join(["drive", "side-slip std", *words]), rows)
 
 
-def _error_cell(found: Mapping[str, Any]) -> str:
-    if found["rmse_deg"] is None:
-        return "none"
-    covered = found["coverage"]
-    return f"{found['rmse_deg']:.3f}" + ("" if covered == 1 else f" ({covered:.0%})")
-
-
-def print_ranking(ranking: Mapping[str, Any]) -> None:
-    """Print who wins each test drive."""
+def ranking_table(ranking: Mapping[str, Any]) -> TextTable:
+    """Return who wins each test drive."""
     least, ours = ranking["least_coverage"], ranking["estimator"]
-    print_records(
+    return TextTable(
         f"\n{ours} wins {ranking['won']} of {ranking['drives']} test drives by RMSE, and is within "
         f"{ranking['close_ratio']:g} of the winner on {ranking['close']} others.\nAll compete that "
         f"need no GPS and estimate {least:.0%} of the rows. Drives that differ in GPS alone are "
         f"one. {ours}/3 is model 3 of Table I, trained on what {ours} was trained on.",
         f"scenario|won by|RMSE deg|{ours} deg|ratio",
-        "{scenario}|{winner}|{winner_rmse_deg:.3f}|{rmse_deg:.3f}|{ratio:.2f}",
         (one for one in ranking["standings"] if one["same_as"] is None),
+        "{scenario}|{winner}|{winner_rmse_deg:.3f}|{rmse_deg:.3f}|{ratio:.2f}",
         left=2,
     )
 
 
-def _print_measured(content: Mapping[str, Any]) -> None:
-    """Print figures on measured drives, the best estimator first."""
+def _measured(content: Mapping[str, Any]) -> Iterator[Part]:
+    """Return figures on measured drives, the best estimator first."""
     drives = number_of(len(content["drives"]), "drive")
     left_out = "quarters of their time" if content["parts_of"] == "time" else "whole"
     kinds = ", ".join(f"{one['name']} ({len(one['drives'])})" for one in content["kinds"])
-    print_records(
+    yield TextTable(
         f"{content['cohort']}: {drives}, left out {left_out} in turn, in {content['parts']} parts",
         "estimator|knows|RMSE deg|±|mean|std|correlation|rows|worst|kinds left out",
-        "{name}|{told}|{rmse_deg:.3f}|{error}|{error_mean_deg:+.3f}|{error_std_deg:.3f}|"
-        "{correlation:.3f}|{coverage:.0%}|{worst_drive_rmse_deg:.3f}|{kinds}",
         (
-            {
-                **one,
-                "name": name,
-                "error": _optional(one["rmse_standard_error_deg"]),
-                "kinds": _optional((one["kinds_left_out"] or {}).get("rmse_deg")),
-            }
+            {**one, "name": name, "kinds": (one["kinds_left_out"] or {}).get("rmse_deg")}
             for name, one in content["estimators"].items()
         ),
+        "{name}|{told}|{rmse_deg:.3f}|{rmse_standard_error_deg:.3f}|{error_mean_deg:+.3f}|"
+        "{error_std_deg:.3f}|{correlation:.3f}|{coverage:.0%}|{worst_drive_rmse_deg:.3f}|"
+        "{kinds:.3f}",
         left=2,
     )
-    print_text(
+    yield (
         "±: standard error over drives; worst: RMSE of the drive that is estimated worst.\n"
         + (f"Kinds of driving: {kinds}." if kinds else "All drives are of one kind of driving.")
     )
     if content["vehicle"] is None:
-        print_text(
+        yield (
             "No filter competes: no car is known. Say what it measures (--mass, --front-axle, "
             "--rear-axle), or name a vehicle file with --vehicle."
         )
-
-
-def _optional(value: float | None) -> str:
-    return "" if value is None else f"{value:.3f}"
 
 
 @command(Fleet.score, arguments=["model"])
@@ -172,14 +156,15 @@ def score(
         _score_against(fleet, version, fleet.model(name), cohort, unexamined=unexamined, json=json)
         return
     found: Score = fleet.score(version, cohort, unexamined=unexamined)
-    say_examined(found.examined)
+    if found.examined:
+        say(found.examined)
     if json:
         return print_json(
             {"model": version.reference, "cohort": cohort or ALL_DRIVES, **found.as_dict()}
         )
-    _print_scores({version.reference: found.as_dict()})
-    say_without_information(found.rows_without, found.rows + found.rows_without)
-    _say_trained(found, version.reference)
+    print_parts([_score_table({version.reference: found.as_dict()})])
+    print_parts(remark_without_information(found.rows_without, found.rows + found.rows_without))
+    print_parts(_trained(found, version.reference))
 
 
 def _score_against(
@@ -195,7 +180,8 @@ def _score_against(
     from fleet_slip.models.score import score as score_rows  # noqa: PLC0415 - compiled code
 
     rows, examined = fleet.scored_rows(cohort, unexamined=unexamined)
-    say_examined(str(examined))
+    if str(examined):
+        say(str(examined))
     columns = sorted({*one.manifest.columns, *other.manifest.columns})
     complete = " AND ".join(f"{name} IS NOT NULL" for name in columns)
     both = rows & parse_condition(complete, row_columns())
@@ -205,16 +191,16 @@ def _score_against(
     }
     if json:
         return print_json({"cohort": rows.text, "models": scores})
-    _print_scores(scores)
+    print_parts([_score_table(scores)])
 
 
-def _print_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print a row for each figure that all models have."""
+def _score_table(scores: Mapping[str, Mapping[str, Any]]) -> TextTable:
+    """Return a row for each figure that all models have."""
     first, *_ = scores.values()
-    print_table(
+    return TextTable(
         f"{' and '.join(scores)} on {number_of(first['rows'], 'row')}",
-        ["figure", *scores],
-        [
+        "|".join(["figure", *scores]),
+        (
             [
                 name.replace("_deg", ", deg").replace("_", " "),
                 *(f"{one[name]:.4f}" for one in scores.values()),
@@ -222,19 +208,21 @@ def _print_scores(scores: Mapping[str, Mapping[str, Any]]) -> None:
             for name in first
             if name.startswith(("error", "rmse", "correlation"))
             and None not in [one[name] for one in scores.values()]
-        ],
+        ),
     )
 
 
-def _say_trained(found: Score, reference: str) -> None:
-    """Say which drives made the model: on these its error is that of a fit."""
+def _trained(found: Score, reference: str) -> Iterator[Remark]:
+    """Yield which drives made the model: on these its error is that of a fit."""
     if found.drives_trained is None:
-        say(f"{reference} does not say which drives it was trained on: these may be among them.")
+        yield Remark(
+            f"{reference} does not say which drives it was trained on: these may be among them."
+        )
     elif found.drives_left_out:
         left = number_of(found.drives_left_out, "drive")
-        say(f"left out: {left} of {found.drives:,} that {reference} was trained on.")
+        yield Remark(f"left out: {left} of {found.drives:,} that {reference} was trained on.")
     elif found.drives_trained:
-        say(
+        yield Remark(
             f"{reference} was trained on {found.drives_trained:,} of these "
             f"{number_of(found.drives or 0, 'drive')}: there the error is that of the fit. New "
             f"drives: fleet-slip evaluate {reference}"
@@ -306,7 +294,7 @@ def evaluate(
         raise UsageError("--blind has drives of its own: leave out --scenario.")
     if blind:
         content = fleet.evaluate_blind(model, others, threads=threads)
-        return print_json(content) if json else print_evaluation(content, everything)
+        return print_json(content) if json else print_parts(evaluation_parts(content, everything))
     if cohort is not None:
         known: str | dict[str, float] | None = vehicle
         if mass and front_axle and rear_axle:
@@ -327,7 +315,7 @@ def evaluate(
             )
     if json:
         return print_json({"number": kept.number, "sha256": kept.sha256, **kept.content})
-    print_evaluation(kept.content, everything)
+    print_parts(evaluation_parts(kept.content, everything))
     say(f"kept as evaluations/{'' if cohort is None else 'measured/'}{kept.number}.json")
 
 
@@ -373,15 +361,12 @@ def identify(
     if output is not None:
         with storage_errors(output):
             output.write_text(found.as_toml(), encoding="utf-8")
-    if json:
-        print_json(found.as_dict())
-        return
     shown = found.as_dict()
-    print_table(
-        f"{name}, identified from {number_of(found.drives, 'drive')}",
-        ["what", "value"],
-        [[what.replace("_", " "), f"{value:.4g}"] for what, value in shown["found"].items()],
-    )
+    if json:
+        return print_json(shown)
+    title = f"{name}, identified from {number_of(found.drives, 'drive')}"
+    values = ((what.replace("_", " "), value) for what, value in shown["found"].items())
+    print_parts([TextTable(title, "what|value", values, "{0}|{1:.4g}")])
     held_out = shown["held_out_deg"]
     say(
         f"the extended Kalman filter in it errs by {shown['fit_deg']:.4f} deg on these drives"

@@ -83,10 +83,10 @@ GROUPS = {
         "quality": "operations",
         "calibrate": "operations",
         "monitor": "operations",
-        "verify": "upkeep",
-        "compact": "upkeep",
-        "forget": "upkeep",
-        "migrate": "upkeep",
+        "verify": "operations",
+        "compact": "operations",
+        "forget": "operations",
+        "migrate": "operations",
     },
 }
 """The commands in the groups and the order of `--help`, and the module of `fleet_slip.cli` that has

@@ -4,6 +4,7 @@ import os
 import shlex
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,13 +19,14 @@ from fleet_slip.cli.options import (
     Unexamined,
     command,
 )
-from fleet_slip.cli.output import All, Json, print_json, say
-from fleet_slip.cli.selection import print_selection, say_examined
-from fleet_slip.errors import FleetSlipError, RefusedError
+from fleet_slip.cli.output import All, Json, print_json, print_parts, say
+from fleet_slip.cli.selection import selection_parts
+from fleet_slip.errors import FleetSlipError
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import DryRun, Publication, recipe_for
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import Selection
+from fleet_slip.rendering import Part, Remark
 from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.runs import step
 
@@ -71,39 +73,21 @@ def publish(
     drives = fleet.cohort(recipe.cohort, unexamined=unexamined)
     with step("select"):
         selection = drives.select(**vars(recipe.request))
-    say_examined(selection.examined)
-    if dry_run:
-        told = fleet.would_publish(name, selection, force=force, candidate=candidate)
-        if json:
-            print_json(told)
-        else:
-            print_selection(selection, everything)
-        if told.refused:
-            raise RefusedError(told.reason)
-        if not json:
-            _print_dry_run(told)
-        return
-    publication = fleet.publish(name, selection, force=force, candidate=candidate)
-    number = fleet.log_to_mlflow(publication.version, mlflow) if mlflow else None
+    come_to = fleet.would_publish if dry_run else fleet.publish
+    answer: DryRun | Publication = come_to(name, selection, force=force, candidate=candidate)
     if json:
-        print_json(publication)
+        if selection.examined:
+            say(selection.examined)
+        print_json(answer)
     else:
-        print_selection(selection, everything)
-        print_publication(publication)
-        if number:
-            say(f"in MLflow: {publication.version.manifest.name}, version {number}")
-
-
-def _print_dry_run(told: DryRun) -> None:
-    would = "would be published" if told.publishes else "would not be published"
-    would += " as a candidate" if told.publishes and told.candidate else ""
-    say(f"{told.model} {would}. {told.reason}")
-
-
-def print_publication(publication: Publication) -> None:
-    """Say what was published."""
-    done = "published" if publication.new else "nothing to publish:"
-    say(f"{done} {publication.version.reference}. {publication.reason}")
+        print_parts(selection_parts(selection, everything))
+        print_parts(answer.parts())
+    if mlflow and isinstance(answer, Publication):
+        number = fleet.log_to_mlflow(answer.version, mlflow)
+        if not json:
+            say(f"in MLflow: {name}, version {number}")
+    if answer.problem:
+        raise answer.problem
 
 
 @command(Fleet.run, progress=("", "rows"))
@@ -118,7 +102,7 @@ def run(report: RunReport, fleet: Fleet, everything: All = False, json: Json = F
     """
     if json:
         return print_json(report)
-    _print_report(report, everything)
+    print_parts(_parts(report, everything))
     if (made := report.publication) and made.new:
         model = made.version.manifest.name
         _say_of_lost(fleet, report.campaign, model)
@@ -128,26 +112,26 @@ def run(report: RunReport, fleet: Fleet, everything: All = False, json: Json = F
                 say(f"  {line}")
 
 
-def _print_report(report: RunReport, everything: bool) -> None:
-    simulated, gram, publication = report.simulation, report.gram, report.publication
+def _parts(report: RunReport, everything: bool) -> Iterator[Part]:
+    simulated, publication = report.simulation, report.publication
+    took = f"{report.seconds:.1f} s"
     if not report.changed:
         kept = publication.version.reference if publication else report.refusal
-        say(f"{report.campaign}: nothing to do, {kept} is up to date ({report.seconds:.1f} s)")
+        yield Remark(f"{report.campaign}: nothing to do, {kept} is up to date ({took})")
         return
-    say(f"simulated {number_of(simulated.drives, 'drive')}, {number_of(simulated.rows, 'row')}")
-    say(f"gram: {number_of(gram.rows_read, 'row')} read, {number_of(gram.gram_rows, 'Gram row')}")
-    if wide := report.gram_features:
-        say(
-            f"gram {wide.feature_set}: {number_of(wide.rows_read, 'row')} read, "
-            f"{number_of(wide.gram_rows, 'Gram row')}"
-        )
+    drives, rows = number_of(simulated.drives, "drive"), number_of(simulated.rows, "row")
+    yield Remark(f"simulated {drives}, {rows}")
+    for gram in filter(None, (report.gram, report.gram_features)):
+        name = "gram" if gram is report.gram else f"gram {gram.feature_set}"
+        read, made = number_of(gram.rows_read, "row"), number_of(gram.gram_rows, "Gram row")
+        yield Remark(f"{name}: {read} read, {made}")
     if report.selection:
-        print_selection(report.selection, everything)
+        yield from selection_parts(report.selection, everything)
     if publication:
-        print_publication(publication)
+        yield from publication.parts()
     else:
-        say(report.refusal)
-    say(f"done in {report.seconds:.1f} s")
+        yield Remark(report.refusal)
+    yield Remark(f"done in {took}")
 
 
 def next_steps(fleet: Fleet, campaign: str, model: str) -> list[str]:
@@ -217,5 +201,4 @@ def select(selection: Selection, everything: All = False) -> None:
 
     Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
     """
-    say_examined(selection.examined)
-    print_selection(selection, everything)
+    print_parts(selection_parts(selection, everything))

@@ -16,9 +16,10 @@ import typer
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
 from fleet_slip.cli.options import Cluster, command
-from fleet_slip.cli.output import Json, print_json, print_records, print_text, say
+from fleet_slip.cli.output import Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.errors import AlarmError, UsageError
+from fleet_slip.rendering import TextTable
 from fleet_slip.resources import folder as shipped
 from fleet_slip.storage.runs import recording
 from fleet_slip.storage.storage_errors import storage_errors
@@ -228,21 +229,9 @@ def _show_previews(previews: "list[Preview]", json: bool) -> None:
     """Print previews. Raises `AlarmError` if anything looks wrong."""
     if json:
         print_json(previews)
-    for preview in () if json else previews:
-        counts = preview.counts
-        rejected = ", ".join(f"{n:,} {reason}" for reason, n in counts.quarantined.items())
-        print_records(
-            f"{preview.file}: {number_of(counts.rows_read, 'row')}; left out by conditions "
-            f"{counts.rows_left_out:,}; rejected {sum(counts.quarantined.values()):,}"
-            f"{f' ({rejected})' if rejected else ''}; {number_of(counts.drives, 'drive')} of "
-            f"{number_of(counts.ticks, 'tick')}",
-            "signal|unit|least|most|missing",
-            "{signal}|{unit}|{low:.4g}|{high:.4g}|{missing:.1%}",
-            preview.ranges,
-            left=2,
-        )
-        for suspicion in preview.suspicions:
-            print_text(f"looks wrong: {suspicion}")
+    else:
+        for preview in previews:
+            print_parts(preview.parts())
     if suspicions := sum(len(preview.alarms) for preview in previews):
         raise AlarmError(
             f"{number_of(suspicions, 'thing')} to look at before ingesting. Nothing was stored."
@@ -295,13 +284,14 @@ def mapping(
     else:
         header = "channel|unit|guess|Hz|least|most|missing"
         row = "{channel}|{unit}|{signal}|{rate_hz:.4g}|{least:.4g}|{most:.4g}|{missing:.1%}"
-        print_records(f"{file}: {len(channels)} channels", header, row, channels, left=3)
+        title = f"{file}: {len(channels)} channels"
+        print_parts([TextTable(title, header, channels, row, left=3)])
     if output is not None:
         with storage_errors(output):
             output.write_text(text, encoding="utf-8")
         say(f"draft written to {output}")
     elif not json:
-        print_text("\n" + text)
+        print_parts(["\n" + text])
 
 
 def _draft(
@@ -363,7 +353,7 @@ def init(
             draft = Path(temporary) / "project"
             _write(draft, whole, model, mapping)
             os.rename(draft, whole)  # noqa: PTH104 - takes the place of an empty folder
-    print_text((whole / "README.md").read_text(encoding="utf-8").rstrip())
+    print_parts([(whole / "README.md").read_text(encoding="utf-8").rstrip()])
 
 
 def _write(draft: Path, whole: Path, model: str, mapping: str) -> None:

@@ -12,11 +12,12 @@ from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.options import command
-from fleet_slip.cli.output import All, Json, print_json, print_table, say
+from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.columns.sql import column_query
 from fleet_slip.config import read_named_file
 from fleet_slip.grams.compute import gram_statement
+from fleet_slip.rendering import TextTable
 from fleet_slip.resources import config_files, folder, own_configs
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def gram(
         print_json(reports if features == ALL_SETS else reports[0])
         return
     for report in reports:
-        _say_gram(report)
+        print_parts(report.parts())
     if not (any(one.gram_rows for one in reports) or fleet.warehouse.logs.snapshot().files):
         say(f"{fleet.root}: there are no logs yet. They come with: fleet-slip run, or ingest")
 
@@ -68,22 +69,6 @@ def _run_gram(
 ) -> "GramReport":
     with progress(f"gram {feature_set}", "rows") as show:
         return fleet.gram(feature_set, cohort=cohort, workers=executor, progress=show)
-
-
-def _say_gram(report: "GramReport") -> None:
-    rows = f"{number_of(report.gram_rows, 'Gram row')} in all"
-    if not report.changed:
-        return say(f"gram {report.feature_set}: nothing to do, {rows} are up to date")
-    say(
-        f"gram {report.feature_set}: {number_of(report.files_read, 'new file')}, "
-        f"{number_of(report.rows_read, 'row')} read, "
-        f"{number_of(report.files_dropped, 'file')} dropped; {rows}"
-    )
-    if dropped := report.received_dropped:
-        say(
-            f"{number_of(dropped, 'Gram row')} that cars had sent dropped: the logs of the same "
-            "drives are here now"
-        )
 
 
 # The command that lists features, feature sets and the config files that define them: features.
@@ -138,18 +123,18 @@ def features(
             }
         )
     elif sets:
-        rows = [[name, " ".join(one.inputs), one.description] for name, one in named.items()]
-        print_table("", ["set", "columns", "description"], rows, left=3)
+        row = "{0}|{1.inputs}|{1.description}"
+        print_parts([TextTable("", "set|columns|description", named.items(), row, left=3)])
     else:
         shown: dict[str, Any] = {**known.features, **(known.time_columns if everything else {})}
-        rows = [[name, one.unit, str(one.scale), one.description] for name, one in shown.items()]
-        print_table("", ["column", "unit", "scale", "description"], rows, left=4)
+        header, row = "column|unit|scale|description", "{0}|{1.unit}|{1.scale}|{1.description}"
+        print_parts([TextTable("", header, shown.items(), row, left=4)])
         if not everything:
-            _print_families(known)
+            print_parts([_families(known)])
 
 
-def _print_families(known: FeatureCatalogue) -> None:
-    """Print columns over time by family: one by one they are hundreds."""
+def _families(known: FeatureCatalogue) -> TextTable:
+    """Return columns over time by family: one by one they are hundreds."""
     families = [
         [name, " ".join(map(str, one.members(name).values())), one.description]
         for name, one in known.windows.items()
@@ -158,8 +143,8 @@ def _print_families(known: FeatureCatalogue) -> None:
     families += [[name, "", known.time_columns[name].description] for name in single]
     families += [[f"COLUMN_{name}_…", "", gate.description] for name, gate in known.gates.items()]
     many = number_of(len(known.time_columns), "column")
-    header = ["column", "over ticks", "description"]
-    print_table(f"\n{many} over time; one by one: --all", header, families, left=3)
+    title = f"\n{many} over time; one by one: --all"
+    return TextTable(title, "column|over ticks|description", families, left=3)
 
 
 def _print_files(json: bool) -> None:
@@ -176,5 +161,4 @@ def _print_files(json: bool) -> None:
         print_json(found)
     else:
         heading = f"own configs: {own or 'none'}\nshipped ones: {folder('configs')}"
-        rows = [[name, one["from"]] for name, one in found.items()]
-        print_table(heading, ["file", "from"], rows, left=2)
+        print_parts([TextTable(heading, "file|from", found.items(), "{0}|{1[from]}", left=2)])

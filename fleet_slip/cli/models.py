@@ -1,21 +1,19 @@
 """Commands that serve models: models, show, promote, pin, diff, export."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
 from fleet_slip.cli.options import command
-from fleet_slip.cli.output import All, Json, print_json, print_records, print_table, print_text, say
+from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.errors import UsageError
 from fleet_slip.models.manifest import CrossValidated, LearnedFrom
 from fleet_slip.models.registry import ModelVersion
-
-if TYPE_CHECKING:
-    from fleet_slip.models.diff import Difference, Term
+from fleet_slip.rendering import Part, TextTable
 
 
 def models(
@@ -47,26 +45,22 @@ def models(
     if not rows:
         say("no model has been published yet. Run: fleet-slip publish NAME")
         return
-    print_records(
-        "",
-        "model|aliases|signals|published|correlation|RMSE deg|drives",
-        "{name}@{version}|{aliases}|{inputs}|{published_at:%Y-%m-%d %H:%M}|"
-        "{correlation:.4f}|{rmse_deg:.4f}|{drives:,}",
-        (
-            {**row, "aliases": row["aliases"].split(","), "inputs": row["signals"].count(",") + 1}
-            for row in rows
-        ),
-        left=4,
+    shown = (
+        {**row, "aliases": row["aliases"].split(","), "inputs": row["signals"].count(",") + 1}
+        for row in rows
     )
+    header = "model|aliases|signals|published|correlation|RMSE deg|drives"
+    form = "{name}@{version}|{aliases}|{inputs}|{published_at:%Y-%m-%d %H:%M}|"
+    form += "{correlation:.4f}|{rmse_deg:.4f}|{drives:,}"
+    print_parts([TextTable("", header, shown, form, left=4)])
     for row in rows:
         if row["trained_on_forgotten"]:
             say(f"{row['name']}@{row['version']} was trained on drives that were forgotten since")
     if name:
+        moves = fleet.registry().history(name).moves()
         header = "at|command|alias|version"
-        row = "{at:%Y-%m-%d %H:%M:%S}|{command}|{alias}|{version}"
-        print_records(
-            "\nhistory of aliases", header, row, fleet.registry().history(name).moves(), 3
-        )
+        form = "{at:%Y-%m-%d %H:%M:%S}|{command}|{alias}|{version}"
+        print_parts([TextTable("\nhistory of aliases", header, moves, form, left=3)])
 
 
 def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> None:
@@ -101,7 +95,7 @@ def show(version: ModelVersion, everything: All = False, json: Json = False) -> 
         }
         print_json({**facts, **content})
     else:
-        _print_version(version, everything)
+        print_parts(_version_parts(version, everything))
 
 
 def _teacher(learned: LearnedFrom) -> str:
@@ -119,31 +113,32 @@ def _teacher(learned: LearnedFrom) -> str:
     )
 
 
-def _print_version(version: ModelVersion, everything: bool) -> None:
+def _version_parts(version: ModelVersion, everything: bool) -> Iterator[Part]:
     manifest = version.manifest
     label, origin = manifest.label, manifest.through_origin
-    print_text(
+    yield (
         f"{version.reference}: {label.column} = {'' if origin else 'intercept + '}"
         f"sum of coefficient * signal{', through the origin' if origin else ''}"
     )
     facts = {**_facts(version), **({"sha256": version.sha256} if everything else {})}
-    print_table("", ["", ""], facts.items(), left=2)
+    yield TextTable("", "|", facts.items(), left=2)
     form = repr if everything else "{:.6g}".format
     terms = [] if origin else [["intercept", label.unit, form(manifest.intercept), ""]]
     for term in manifest.terms:
         per_count = f"{float(term.coefficient_exact * term.scale_exact):.9g}"
         terms.append([term.column, term.unit, form(term.coefficient), per_count])
-    shown = 4 if everything else 3
-    header = ["signal", "unit", "coefficient", "per count"]
-    print_table("", header[:shown], [row[:shown] for row in terms], left=2)
+    header = "signal|unit|coefficient"
     if not everything:
+        yield TextTable("", header, [row[:3] for row in terms], left=2)
         return
-    print_text("per count: coefficient times scale, for an ECU that works on raw counts")
+    yield TextTable("", f"{header}|per count", terms, left=2)
+    yield "per count: coefficient times scale, for an ECU that works on raw counts"
     if manifest.features:
-        print_table(
+        yield TextTable(
             "\nfeatures: SQL over the counts of log_counts, clipped to +-32767, times the scale",
-            ["feature", "scale", "SQL"],
-            [[t.signal, f"{t.scale} {t.unit}", t.sql] for t in manifest.terms if t.sql],
+            "feature|scale|SQL",
+            (term for term in manifest.terms if term.sql),
+            "{signal}|{scale} {unit}|{sql}",
             left=3,
         )
 
@@ -213,58 +208,12 @@ def pin(version: ModelVersion, name: str, alias: str, off: bool) -> None:
     say(f"{name}@{alias} {done.format(version.version)}")
 
 
-# Two model versions beside each other: the command diff.
-
-
 @command(Fleet.diff, arguments=["one", "other"])
-def diff(found: "Difference") -> None:
+def diff() -> None:
     """Tell two model versions apart: their data, signals, coefficients and figures.
 
     Example: **fleet-slip diff waterford@1 waterford@2**
     """
-    one, other = found.one.reference, found.other.reference
-    if not found.facts and all(term.same for term in found.terms):
-        say(f"{one} and {other} are the same estimator from the same data")
-        return
-    terms = []
-    for term in found.terms:
-        here, there = _coefficients(term)
-        terms.append([term.signal, term.unit, here, "the same" if term.same else there])
-    print_table("", ["signal", "unit", one, other], terms, left=2)
-    if found.drives is not None:
-        shared = found.drives
-        say(
-            f"drives: {shared.both:,} made both, {shared.only_one:,} only {one}, "
-            f"{shared.only_other:,} only {other}"
-        )
-    rows = [
-        [name.rpartition(".")[2].replace("_", " "), _shown(a), _shown(b)]
-        for name, (a, b) in found.facts.items()
-        if not name.endswith("sha256")  # for machines: --json
-    ]
-    print_table("", ["what differs", one, other], rows, left=3)
-
-
-def _coefficients(term: "Term") -> list[str]:
-    """Return the two coefficients of a term, with more digits where few would hide a difference."""
-    values = (term.one, term.other)
-    short = ["" if value is None else f"{value:.6g}" for value in values]
-    return short if term.same or short[0] != short[1] else [repr(value) for value in values]
-
-
-def _shown(value: Any) -> str:
-    match value:
-        case None:
-            return ""
-        case dict():
-            return ", ".join(f"{name} {inner}" for name, inner in value.items())
-        case float():
-            return f"{value:.6g}"
-        case _:
-            return str(value)
-
-
-# The command that brings a published version into other programs: export.
 
 
 @command(Fleet.export, arguments=["model"])

@@ -14,7 +14,7 @@ import typer
 
 from fleet_slip.api.calls import doc_of, open_workers, type_of
 from fleet_slip.base import date_of, document_of, last_day
-from fleet_slip.cli.output import Json, print_json
+from fleet_slip.cli.output import Json, print_json, print_parts
 from fleet_slip.errors import FleetSlipError, UsageError
 from fleet_slip.resources import CONFIG_VARIABLE, config_names
 from fleet_slip.storage.runs import recording
@@ -139,8 +139,10 @@ def command(
     instead of calling the function, unless that has a parameter `json`. Its other parameters are
     options of its own, values of options, or `fleet`. While calls work their `progress` is shown:
     what is done, with options in braces, and its unit. What changes the warehouse leaves a record.
+    The `problem` of an answer is raised when all is printed.
 
-    A function whose first parameter is `fleet` makes the calls by itself, and prints JSON, too.
+    A function whose first parameter is `fleet` makes the calls by itself, and prints JSON, too. One
+    without a parameter that is no option has nothing to add to the parts of an `Answer`.
     """
     names = NAMES | names
     asked = {
@@ -160,7 +162,9 @@ def command(
         given["cluster"] = _plain("cluster", Cluster)
 
     def expand(show: Callable[..., None]) -> Callable[..., None]:
-        first, *others = inspect.signature(show).parameters.values()
+        others = [*inspect.signature(show).parameters.values()]
+        renders = not others or others[0].default is not inspect.Parameter.empty
+        first = None if renders else others.pop(0).name
         rest = {one.name for one in others if one.kind is inspect.Parameter.VAR_KEYWORD}
         own = {one.name for one in others} - rest
         beside = {
@@ -186,7 +190,7 @@ def command(
             known = {**values, "fleet": fleet, "json": json}
             known = {name: one for name, one in known.items() if name in own or rest}
             with record or nullcontext():
-                if first.name == "fleet":
+                if first == "fleet":
                     return show(**known | {"fleet": fleet})
                 with _doing(fleet, asked, typed, *progress) as working:
                     answer = fleet
@@ -197,14 +201,14 @@ def command(
                             **{name: one for name, one in options.items() if name in taken}
                         )
                 if json and "json" not in own:
-                    print_json(
-                        {names.get(one, one).strip("-"): values[one] for one in echo}
-                        | document_of(answer)
-                        if echo
-                        else answer
-                    )
-                    return
-                show(answer, **known)
+                    echoed = {names.get(one, one).strip("-"): values[one] for one in echo}
+                    print_json(echoed | document_of(answer) if echo else answer)
+                elif renders:
+                    print_parts(answer.parts(**known))
+                else:
+                    show(answer, **known)
+                if problem := getattr(answer, "problem", None):
+                    raise problem
 
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {one.name: one.annotation for one in parameters}

@@ -1,120 +1,96 @@
-"""What is printed of a selection, and the commands that examine a fit: diagnose, what-if."""
+"""What is shown of a selection, and the commands that examine a fit: diagnose, what-if."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.options import command
-from fleet_slip.cli.output import (
-    cell,
-    figures_cells,
-    print_line,
-    print_records,
-    print_table,
-    print_text,
-    say,
-)
+from fleet_slip.grams.cohort import remark_left_out
 from fleet_slip.grams.folding import BANDS, PARTS, ROW_FOLDS
-from fleet_slip.models.diagnose import CohortComparison, Diagnosis, WhatIf
+from fleet_slip.models.diagnose import influence_remarks
 from fleet_slip.models.search import SearchChoice
-from fleet_slip.models.select import Selection, Uncertainty, WithoutLabel
+from fleet_slip.models.select import Selection, WithoutLabel
 from fleet_slip.regression.choice import CROSS_VALIDATION, NestedDistances
-from fleet_slip.regression.drives import Influential
-from fleet_slip.regression.folds import CrossValidation
-from fleet_slip.regression.inference import INTERCEPT, Evidence
-
-# Says which drives of a cohort what was computed leaves out.
+from fleet_slip.regression.inference import Evidence
+from fleet_slip.rendering import Part, Remark, TextTable
 
 TELLING = 0.01
 """Part of a cohort's rows without the label or a signal that is worth a remark."""
 
 
-def say_without_log(drives: int, feature_set: str) -> None:
-    """Say how many drives have no Gram rows of a feature set, since their cars sent no log."""
-    if drives:
-        say(
-            f"{number_of(drives, 'drive')} without a log left out: cars send Gram rows of the "
-            f"logged signals, not of the feature set {feature_set}."
-        )
-
-
-def say_influential(cars: Mapping[str, Influential], what: str) -> None:
-    """Say which cars have an influence that no honest car has, and what becomes of them."""
-    for car, one in cars.items():
-        say(
-            f"{car} {what}: its influence on the model is {one.times:.0f} times the median one, "
-            f"by what its rows give it ({one.rows:.1%} of all)."
-        )
-
-
-def say_without_information(rows: int, of: int) -> None:
-    """Say how many rows of a cohort told nothing, if they are more than windows begin with."""
+def remark_without_information(rows: int, of: int) -> Iterator[Remark]:
+    """Yield how many rows of a cohort told nothing, if they are more than windows begin with."""
     if rows > TELLING * of:
-        say(
+        yield Remark(
             f"{rows:,} of {number_of(of, 'row')} tell nothing: the label or a signal of the model "
             "is missing there."
         )
 
 
-def say_examined(told: str) -> None:
-    """Say which drives were left out since they are not in order, if there are any."""
-    if told:
-        say(told)
-
-
 MANY_SIGNALS = 30
 """Of more, a table names families."""
 
-DISTANCES = ("contribution A", "D to full", "expected D")
-
-ERROR = ("correlation", "RMSE deg", "error mean deg", "error std deg")
+DISTANCES = "contribution A|D to full|expected D"
 
 BEST = 10
 """So many models are shown unless all are asked for."""
 CONDITION_WIDTH = 120
 
 
-def print_selection(selection: Selection, everything: bool = False) -> None:
-    """Print the winner and why, the best models or all, and how sure that is."""
+def selection_parts(selection: Selection, everything: bool = False) -> Iterator[Part]:
+    """Return the winner and why, the best models or all, and how sure that is."""
+    if selection.examined:
+        yield Remark(selection.examined)
     winner = selection.winner
-    print_text(f"winner: {winner.model.name}. {winner.reason}")
+    yield f"winner: {winner.model.name}. {winner.reason}"
     if selection.searched is not None and winner.model in selection.searched.models:
-        print_text(f"its columns: {in_families(winner.model.signals)}")
+        yield f"its columns: {in_families(winner.model.signals)}"
     if selection.choice is not None:
-        _print_choice(selection.choice)
+        yield from _choice(selection.choice)
     if isinstance(selection.distances, NestedDistances):
-        _print_distances(selection.distances)
-    _print_models(selection, everything)
-    _say_left_out(selection)
+        yield from _distances(selection.distances)
+    yield _models(selection, everything)
+    yield from _left_out(selection)
     if selection.cohort.unlabelled:
-        say(
+        yield Remark(
             f"a change of the course has {selection.cohort.weight} times the weight of a row with "
             "the label; the figures are of the angle about its mean in each drive with the label."
         )
     if selection.folds.by in (PARTS, BANDS):
-        _print_folds(selection.winner.model)
+        model = winner.model
+        yield TextTable(
+            f"\nmodel {model.name}, each fold left out in turn",
+            "fold|rows|correlation|RMSE deg|error mean deg|error std deg",
+            zip(model.fold_names, model.folds, strict=True),
+            "{0}|{1.rows:,}|{1.correlation:.4f}|{1.rmse_deg:.4f}|{1.error_mean_deg:+.4f}|"
+            "{1.error_std_deg:.4f}",
+        )
     if selection.folds.by == ROW_FOLDS:
-        say(
+        yield Remark(
             "folds of rows leak: each test row's neighbours at 100 Hz are training rows, so that "
             "these figures are those of the fit, not of prediction. Compare with --by drive."
         )
     if isinstance(selection.distances, str):
-        say(f"the distances of the nested models cannot be told: {selection.distances}")
+        yield Remark(f"the distances of the nested models cannot be told: {selection.distances}")
     for name, reason in selection.skipped.items():
         one, *others = reason.split("; ")
         more = f"; and {number_of(len(others), 'relation')} more, see --json." if others else ""
-        say(f"model {name} was left out: {one}{more}")
+        yield Remark(f"model {name} was left out: {one}{more}")
     if selection.choice is not None and (honest := selection.choice.honest) is not None:
-        print_line(
+        yield (
             "made again inside every training fold, the whole choice has a correlation of "
             f"{honest.correlation:.4f} and an RMSE of {honest.pooled.rmse_deg:.4f} deg."
         )
-    if selection.uncertainty is not None:
-        _print_uncertainty(selection.uncertainty)
+    if (found := selection.uncertainty) is not None:
+        interval = found.interval
+        yield (
+            f"{interval.level:.0%} interval of the winner's correlation, drawing its "
+            f"{found.drawn}s {interval.replicates:,} times: {interval.low:.4f} to "
+            f"{interval.high:.4f}."
+        )
 
 
 def _shortened(condition: str, everything: bool) -> str:
@@ -123,8 +99,8 @@ def _shortened(condition: str, everything: bool) -> str:
     return f"{condition[:CONDITION_WIDTH].rstrip()} … (--all)" if long else condition
 
 
-def _print_models(selection: Selection, everything: bool) -> None:
-    """Print a table of the models, of many the best; without signals where a table above has them.
+def _models(selection: Selection, everything: bool) -> TextTable:
+    """Return a table of the models, of many the best; without signals where a table above has them.
 
     A search changes some columns from size to size: how many there are stands here.
     """
@@ -158,23 +134,22 @@ def _print_models(selection: Selection, everything: bool) -> None:
         }
         for one in shown
     )
-    print_records(title, header, row, rows, left=1 + listed)
+    return TextTable(title, header, rows, row, left=1 + listed)
 
 
-def _say_label_noise(selection: Selection) -> None:
-    """Say how much of the errors is noise of the label they are measured against."""
+def _label_noise(selection: Selection) -> Remark:
+    """Return how much of the errors is noise of the label they are measured against."""
     noise = selection.label_noise_deg
     if noise is None:
-        say("how noisy the label is, is not known: all errors have its noise in them.")
-    else:
-        say(
-            f"all errors have the label's own noise in them, {noise:.4f} deg; without it the "
-            f"winner has {selection.beyond_label_noise_deg:.4f} deg."
-        )
+        return Remark("how noisy the label is, is not known: all errors have its noise in them.")
+    return Remark(
+        f"all errors have the label's own noise in them, {noise:.4f} deg; without it the "
+        f"winner has {selection.beyond_label_noise_deg:.4f} deg."
+    )
 
 
-def _say_without_label(told: WithoutLabel) -> None:
-    """Say what changes of the course tell of the angle, and what they do not."""
+def _without_label(told: WithoutLabel) -> Iterator[Remark]:
+    """Yield what changes of the course tell of the angle, and what they do not."""
     over = ", ".join(f"{one:g}" for one in told.change_s)
     figures = f"learned from changes of the course over {over} s: the figures are of these changes"
     if told.noise_deg is not None:
@@ -182,44 +157,34 @@ def _say_without_label(told: WithoutLabel) -> None:
             f", which have {told.noise_deg:.4f} deg of noise where cars go straight on; the "
             f"angle's own error over so long is at most {told.angle_at_most_deg:.3f} deg"
         )
-    say(f"{figures}.")
+    yield Remark(f"{figures}.")
     if (side := told.one_way) is not None:
-        say(
+        yield Remark(
             f"cars turn to the {side} nearly always: columns that differ between left and right "
             "alone, such as ay and its square, cannot be told apart, nor can offsets. Add drives "
             "that turn to the other side."
         )
-    say(
+    yield Remark(
         "changes do not show the constant (see show of a published version), nor what a course "
         "that is late or an antenna in another place would add."
     )
 
 
-def _say_left_out(selection: Selection) -> None:
-    """Say which drives of the cohort the models were not made of, and what the label is worth."""
+def _left_out(selection: Selection) -> Iterator[Remark]:
+    """Yield which drives of the cohort the models were not made of, and what the label is worth."""
     if not selection.cohort.unlabelled:
-        say_without_information(selection.rows_without, selection.cohort.rows)
+        yield from remark_without_information(selection.rows_without, selection.cohort.rows)
     if without_log := selection.cohort.count_received_with():
-        say(f"{number_of(without_log, 'drive')} of these without a log: their cars sent Gram rows.")
-    say_without_log(selection.cohort.left_out, selection.cohort.feature_set)
-    say_influential(selection.left_out, "left out")
+        without = number_of(without_log, "drive")
+        yield Remark(f"{without} of these without a log: their cars sent Gram rows.")
+    yield from remark_left_out(selection.cohort.left_out, selection.cohort.feature_set)
+    yield from influence_remarks(selection.left_out, "left out")
     if selection.remark:
-        say(selection.remark)
+        yield Remark(selection.remark)
     if selection.without_label is not None:
-        _say_without_label(selection.without_label)
+        yield from _without_label(selection.without_label)
     elif not selection.cohort.unlabelled:
-        _say_label_noise(selection)
-
-
-def _print_folds(model: CrossValidation) -> None:
-    print_table(
-        f"\nmodel {model.name}, each fold left out in turn",
-        ["fold", "rows", *ERROR],
-        [
-            [name, f"{found.rows:,}", *figures_cells(found)]
-            for name, found in zip(model.fold_names, model.folds, strict=True)
-        ],
-    )
+        yield _label_noise(selection)
 
 
 def in_families(signals: Sequence[str]) -> str:
@@ -235,46 +200,45 @@ def _worth(evidence: Evidence) -> str:
     return f"taking {evidence.kind} for independent, the cohort is worth {evidence.rows:,.0f} rows"
 
 
-def _print_distances(found: NestedDistances) -> None:
-    print_table(
+def _distances(found: NestedDistances) -> Iterator[Part]:
+    yield TextTable(
         f"distance D of equation (2) by the number of signals; {_worth(found.evidence)}",
-        ["", "added", *DISTANCES],
+        f"|added|{DISTANCES}",
         _distance_rows(found.order, found.evidence),
         left=2,
     )
-    print_line(f"without any signal: RMSE {found.null.pooled.rmse_deg:.4f} deg.\n")
+    yield f"without any signal: RMSE {found.null.pooled.rmse_deg:.4f} deg.\n"
 
 
-def _print_choice(choice: SearchChoice) -> None:
+def _choice(choice: SearchChoice) -> Iterator[Part]:
     worth = _worth(choice.evidence)
-    if choice.nested is not None:
-        nested, by_folds = choice.nested, choice.rule.criterion == CROSS_VALIDATION
+    if (nested := choice.nested) is not None:
+        by_folds = choice.rule.criterion == CROSS_VALIDATION
         criterion = "minus correlation" if by_folds else choice.rule.criterion
-        print_table(
+        rows = zip(_distance_rows(nested.order, nested.evidence), nested.values, strict=True)
+        yield TextTable(
             f"order by {choice.rule.ranking}; {worth}",
-            ["", "added", *DISTANCES, criterion],
+            f"|added|{DISTANCES}|{criterion}",
             (
                 [*line, f"{value:,.4f}{' <' if j == nested.size else '  '}"]
-                for j, (line, value) in enumerate(
-                    zip(_distance_rows(nested.order, nested.evidence), nested.values, strict=True)
-                )
+                for j, (line, value) in enumerate(rows)
             ),
             left=2,
         )
-    if choice.subsets is not None and choice.picks is not None:
-        print_table(
+    if choice.subsets is not None and (picks := choice.picks) is not None:
+        rows_of_sizes = (
+            {
+                "best": one.best,
+                "picked_by": [name for name, size in picks.items() if size == one.best.size],
+                "gap": one.gap,
+            }
+            for one in choice.subsets
+        )
+        yield TextTable(
             f"best subset of every size; {worth}",
-            ["size", "signals", "picked by", "R squared", "gap to second"],
-            [
-                [
-                    str(result.best.size),
-                    " ".join(result.best.model.signals),
-                    " ".join(c for c, size in choice.picks.items() if size == result.best.size),
-                    f"{result.best.r_squared:.6f}",
-                    cell(result.gap, ".2g"),
-                ]
-                for result in choice.subsets
-            ],
+            "size|signals|picked by|R squared|gap to second",
+            rows_of_sizes,
+            "{best.size}|{best.model.signals}|{picked_by}|{best.r_squared:.6f}|{gap:.2g}",
             left=3,
         )
 
@@ -292,22 +256,12 @@ def _distance_rows(order: Sequence[str], evidence: Evidence) -> Iterator[list[st
         yield [str(j), added, contribution, f"{to_full:,.1f}", f"{expected:,.1f}"]
 
 
-def _print_uncertainty(found: Uncertainty) -> None:
-    print_line(
-        f"{found.interval.level:.0%} interval of the winner's correlation, drawing its "
-        f"{found.drawn}s {found.interval.replicates:,} times: {found.interval.low:.4f} to "
-        f"{found.interval.high:.4f}."
-    )
-
-
-# The commands that examine a fit on a cohort: diagnose and what-if.
-
 SOUND = ("unexamined",)
 """Not an option of what trains no model."""
 
 
 @command(Fleet.cohort, FleetCohort.diagnose, arguments=["model"], without=SOUND, echo=["condition"])
-def diagnose(result: Diagnosis) -> None:
+def diagnose() -> None:
     """Fit a model's signals to a cohort and examine the fit, from Gram rows.
 
     Standard errors by drives, or by cars where there are several, are the ones to believe: at
@@ -315,61 +269,6 @@ def diagnose(result: Diagnosis) -> None:
 
     Example: **fleet-slip diagnose waterford**
     """
-    both = zip(result.robust.estimates, result.naive.estimates, strict=True)
-    units = {INTERCEPT: catalogue()[catalogue().label].unit}
-    rows = (
-        {
-            "robust": robust,
-            "naive": naive,
-            "unit": units.get(robust.name) or features().of(robust.name).unit,
-            "vif": result.inflation.get(robust.name),
-        }
-        for robust, naive in both
-    )
-    print_records(
-        f"{number_of(result.drives, 'drive')}, {number_of(result.fitted.gram.n, 'row')}, worth "
-        f"{result.evidence.rows:,.0f} independent ones; R squared {result.fitted.r_squared:.4f}, "
-        f"condition number {result.condition_number:.3g} (1: no signal tells what another tells)",
-        f"signal|unit|coefficient|s.e. by {result.cluster}s|t|s.e. by rows|VIF",
-        "{robust.name}|{unit}|{robust.value:.6g}|{robust.standard_error:.2g}|{robust.t:.1f}|"
-        "{naive.standard_error:.2g}|{vif:.3g}",
-        rows,
-        left=2,
-    )
-    if result.cluster == "row":
-        say(
-            "there is one drive only: its rows are taken for independent evidence, which they are "
-            "not at 100 Hz, so that the standard errors are far too small."
-        )
-    say_influential(result.influential, "would be left out by select --robust")
-    if result.comparison is not None:
-        _print_comparison(result, result.comparison)
-
-
-def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
-    both = zip(result.robust.estimates, found.other.estimates, strict=True)
-    print_records(
-        f"\nthe same signals where {found.condition}",
-        "signal|coefficient here|there|s.e. there",
-        "{here.name}|{here.value:.6g}|{there.value:.6g}|{there.standard_error:.2g}",
-        ({"here": here, "there": there} for here, there in both),
-    )
-    test = found.test
-    if test is None:
-        unit = "drive" if result.cluster == "row" else result.cluster
-        say(
-            f"there are too few {unit}s to compare so many coefficients by them. Choose "
-            "fewer signals, or more drives."
-        )
-        return
-    degrees = f"{test.numerator}, {test.denominator:.4g}"
-    print_line(
-        f"the same coefficients? Wald, by {result.cluster}s: F({degrees}) = {test.f:,.2f}, "
-        f"p = {test.p:.2g}."
-    )
-
-
-# The command that predicts a model's error with worse sensors: what-if.
 
 
 @command(
@@ -379,25 +278,10 @@ def _print_comparison(result: Diagnosis, found: CohortComparison) -> None:
     without=SOUND,
     echo=["condition", "noise", "bias"],
 )
-def what_if(result: WhatIf) -> None:
+def what_if() -> None:
     """Predict a model's error with worse sensors, in closed form; nothing is simulated.
 
     Bias and noise come on top of what the logs have. Shown too: the best model for such sensors.
 
     Example: **fleet-slip what-if waterford --noise ay=0.2 --bias yaw_rate=0.02**
     """
-    print_table(
-        f"{number_of(result.drives, 'drive')}, {number_of(result.before.rows, 'row')}",
-        ["", "correlation", "RMSE deg", "mean deg", "std deg"],
-        [
-            ["as logged", *figures_cells(result.before)],
-            ["with these sensors", *figures_cells(result.after)],
-            ["best model for these sensors", *figures_cells(result.refitted_after)],
-        ],
-    )
-    print_table(
-        "\nbest model for these sensors",
-        ["signal", "coefficient"],
-        [[INTERCEPT, f"{result.refitted.offset:.6g}"]]
-        + [[name, f"{weight:.6g}"] for name, weight in result.refitted.weights.items()],
-    )

@@ -8,7 +8,6 @@ import json
 import logging
 import os
 import sys
-import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from fleet_slip.cli.early_exit import for_machines
 from fleet_slip.errors import hide_passwords, printable
+from fleet_slip.rendering import wrap_lines
 from fleet_slip.storage.runs import LOGGER, current_run_id
 
 if TYPE_CHECKING:
@@ -114,16 +114,6 @@ def drawing_on(console: "Console") -> Iterator[None]:
         _drawn_on.remove(console)
 
 
-def wrapped(text: str, width: int) -> str:
-    """Return text whose lines break between words; a line that is indented is kept to be copied."""
-    return "\n".join(
-        line
-        if len(line) <= width or line.startswith("  ")
-        else textwrap.fill(line, width, break_long_words=False, break_on_hyphens=False)
-        for line in text.split("\n")
-    )
-
-
 class PeopleHandler(logging.Handler):
     """Prints remarks, on a terminal in lines that it can show.
 
@@ -138,7 +128,7 @@ class PeopleHandler(logging.Handler):
                 print(text, file=sys.stderr, flush=True)  # noqa: T201 - a remark
                 return
             console = stderr()
-            shown = wrapped(text, console.width) if console.is_terminal else text
+            shown = wrap_lines(text, console.width) if console.is_terminal else text
             console.print(shown, markup=False)
 
 

@@ -6,17 +6,18 @@ came, and a drive that is forgotten is gone from them. `car_evidence` says how s
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from math import sqrt
+from statistics import median, pstdev
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import date_of
+from fleet_slip.base import date_of, number_of
 from fleet_slip.catalogue.course import COLUMNS, turned_scale
 from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, CAR_NUMBERS, NumberName
 from fleet_slip.catalogue.features import features, input_scales
@@ -24,6 +25,7 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.car_estimates import KINDS, kinds_by_set
 from fleet_slip.grams.car_evidence import (
+    FEWEST_CARS,
     CalibratedNumber,
     CarEvidence,
     Piece,
@@ -39,6 +41,7 @@ from fleet_slip.grams.receiver_delay import (
     ReceiverDelays,
     receiver_delays,
 )
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -99,8 +102,23 @@ def _halves(evidence: CarEvidence, car: str, since: date) -> tuple[Piece, Piece]
     return (evidence.estimate(before), before), (evidence.estimate(after), after)
 
 
+def parts_of_changed(changed: Sequence[ChangedNumber], since: date) -> Iterator[Part]:
+    """Return a table of the numbers of cars that are others from a day on."""
+    if not changed:
+        yield Remark(f"no number of a car is another since {since}, as far as its drives tell")
+        return
+    rows = ({**vars(one), "unit": CAR_NUMBERS[one.number].unit} for one in changed)
+    yield TextTable(
+        f"changed since {since}, by more than {SURE_ERRORS:g} standard errors",
+        "car|number|unit|before|after|+-",
+        rows,
+        "{car}|{number}|{unit}|{before:.5g}|{after:.5g}|{uncertainty:.2g}",
+        left=3,
+    )
+
+
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(Answer):
     """The numbers of every car of a cohort.
 
     Attributes:
@@ -139,6 +157,57 @@ class Calibration:
     def changed(self, since: date | str) -> list[ChangedNumber]:
         """Return the numbers of cars that are others from a day on."""
         return changed_numbers(self.evidence, date_of(since, "since"))
+
+    def parts(self) -> Iterator[Part]:
+        """Return a table of the numbers over all cars."""
+        rows = []
+        for name, about in CAR_NUMBERS.items():
+            cars = [numbers[name] for numbers in self.cars.values() if name in numbers]
+            known = [one.uncertainty for one in cars if one.uncertainty is not None]
+            if cars:
+                values = [one.value for one in cars]
+                row = {"name": name, "unit": about.unit, "cars": len(cars)}
+                row |= {"median": median(values), "spread": pstdev(values)}
+                rows.append(row | {"known": median(known) if known else None})
+        yield TextTable(
+            f"{number_of(len(self.cars), 'car')}, by their own drives",
+            "number|unit|cars|median|differs by|known to +-",
+            rows,
+            "{name}|{unit}|{cars:,}|{median:.3g}|{spread:.2g}|{known:.2g}",
+            left=2,
+        )
+        if not any(one.uncertainty for cars in self.cars.values() for one in cars.values()):
+            yield Remark("no car has two drives: how sure the numbers are cannot be told")
+        yield from self._remarks_on_roads()
+
+    def parts_of_car(self, car: str) -> Iterator[Part]:
+        """Return a table of a car's numbers, and why others are missing."""
+        yield TextTable(
+            f"{car}, by its own drives",
+            "number|unit|value|+-|drives|count on board|of",
+            ({"name": k, "of": CAR_NUMBERS[k], "one": one} for k, one in self.car(car).items()),
+            "{name}|{of.unit}|{one.value:.6g}|{one.uncertainty:.2g}|{one.drives}|{one.count}|"
+            "{of.grain}",
+            left=2,
+        )
+        refusals = self.evidence.refusals(car)
+        for reason in dict.fromkeys(refusals.values()):
+            names = [name for name, why in refusals.items() if why == reason]
+            are = "is" if len(names) == 1 else "are"
+            yield Remark(f"{', '.join(names)} {are} missing: {reason}")
+        yield from self._remarks_on_roads()
+
+    def _remarks_on_roads(self) -> Iterator[Remark]:
+        if self.roads.hide_offsets:
+            yield Remark(
+                "bends look banked, and roads may always lean to one side, which fewer than "
+                f"{FEWEST_CARS} cars with offsets cannot tell from their own: no car has ay_offset"
+            )
+        elif not self.roads.banked:
+            yield Remark(
+                "bends are seen not to be banked: a road that always leans to one side counts as "
+                f"ay_offset. {FEWEST_CARS} cars or more tell the one from the other"
+            )
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `calibrate --json` prints."""

@@ -34,6 +34,16 @@ class CheckReport:
     wide_sets: tuple[str, ...] = ()
     wide_drives: int = 0
 
+    @property
+    def ways(self) -> list[tuple[str, int, str]]:
+        """What was compared, in how many drives, and that it was equal."""
+        ways = dict.fromkeys(
+            ("SQL against stored Gram rows", "SQL against the kernel"), self.drives
+        )
+        if self.wide_sets:
+            ways[f"SQL against the kernel: {', '.join(self.wide_sets)}"] = self.wide_drives
+        return [(way, drives, "yes") for way, drives in ways.items()]
+
 
 def check_grams(
     warehouse: Warehouse,

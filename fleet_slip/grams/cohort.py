@@ -4,7 +4,7 @@ What looks at single drives has all Gram rows in memory; what compares given mod
 sum of each fold alone, of any number of rows.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from fractions import Fraction
@@ -44,8 +44,18 @@ from fleet_slip.regression.drives import (
 )
 from fleet_slip.regression.folds import CohortFolds, Folds
 from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.rendering import Remark
 from fleet_slip.warehouse.condition import Condition, parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
+
+
+def remark_left_out(drives: int, feature_set: str) -> Iterator[Remark]:
+    """Yield how many drives have no Gram rows of a feature set, since their cars sent no log."""
+    if drives:
+        yield Remark(
+            f"{number_of(drives, 'drive')} without a log left out: cars send Gram rows of the "
+            f"logged signals, not of the feature set {feature_set}."
+        )
 
 
 @dataclass(frozen=True)

@@ -33,12 +33,13 @@ from fleet_slip.grams.gram_files import (
 )
 from fleet_slip.grams.gram_rows import is_received
 from fleet_slip.grams.receiver_delay import course_delays, files_of_other_delay
+from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.table import Change, Snapshot, TableFile, Unit, retrying
 from fleet_slip.warehouse.tables import Warehouse
 
 
 @dataclass(frozen=True)
-class GramReport:
+class GramReport(Answer):
     """What a run of the job did for one feature set."""
 
     feature_set: str
@@ -55,6 +56,23 @@ class GramReport:
     def changed(self) -> bool:
         """Whether there was anything to do."""
         return bool(self.files_read or self.files_dropped)
+
+    def parts(self) -> Iterator[Part]:
+        """Return remarks: what was read, and what there is."""
+        rows = f"{number_of(self.gram_rows, 'Gram row')} in all"
+        if not self.changed:
+            yield Remark(f"gram {self.feature_set}: nothing to do, {rows} are up to date")
+            return
+        yield Remark(
+            f"gram {self.feature_set}: {number_of(self.files_read, 'new file')}, "
+            f"{number_of(self.rows_read, 'row')} read, "
+            f"{number_of(self.files_dropped, 'file')} dropped; {rows}"
+        )
+        if dropped := self.received_dropped:
+            yield Remark(
+                f"{number_of(dropped, 'Gram row')} that cars had sent dropped: the logs of the "
+                "same drives are here now"
+            )
 
 
 def update_grams(

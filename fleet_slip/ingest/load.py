@@ -47,6 +47,7 @@ from fleet_slip.ingest.recordings import (
 )
 from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
 from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
+from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.storage.folder import StoredFile
 from fleet_slip.storage.table import Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.warehouse.forgotten import Audit
@@ -116,12 +117,28 @@ class SignalRange:
 
 
 @dataclass
-class Preview(_Judged):
+class Preview(_Judged, Answer):
     """What would become of a file."""
 
     DOCUMENT = "file *counts ranges suspicions"
 
     ranges: tuple[SignalRange, ...] = ()
+
+    def parts(self) -> Iterator[Part]:
+        """Return how many rows are taken, a table of the signals, and what looks wrong."""
+        counts = self.counts
+        rejected = ", ".join(f"{n:,} {reason}" for reason, n in counts.quarantined.items())
+        yield TextTable(
+            f"{self.file}: {number_of(counts.rows_read, 'row')}; left out by conditions "
+            f"{counts.rows_left_out:,}; rejected {sum(counts.quarantined.values()):,}"
+            f"{f' ({rejected})' if rejected else ''}; {number_of(counts.drives, 'drive')} of "
+            f"{number_of(counts.ticks, 'tick')}",
+            "signal|unit|least|most|missing",
+            self.ranges,
+            "{signal}|{unit}|{low:.4g}|{high:.4g}|{missing:.1%}",
+            left=2,
+        )
+        yield from (f"looks wrong: {one}" for one in self.suspicions)
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """What there is to know about a model's fit to a cohort: errors, collinearity, stability."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -19,6 +19,7 @@ from fleet_slip.regression.drives import (
 )
 from fleet_slip.regression.figures import Figures, error_sums
 from fleet_slip.regression.inference import (
+    INTERCEPT,
     Evidence,
     FTest,
     Inference,
@@ -29,6 +30,7 @@ from fleet_slip.regression.inference import (
 )
 from fleet_slip.regression.least_squares import Fit, LinearModel, condition_number, fit
 from fleet_slip.regression.shrinkage import disturb, fit_noise_matched
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
 
 
 @dataclass(frozen=True)
@@ -41,9 +43,37 @@ class CohortComparison(Record):
     other: Inference
     test: FTest | None
 
+    def parts(self, here: Inference, unit: str) -> Iterator[Part]:
+        """Return the coefficients beside those of `here`, and the test by a unit of drives."""
+        both = zip(here.estimates, self.other.estimates, strict=True)
+        yield TextTable(
+            f"\nthe same signals where {self.condition}",
+            "signal|coefficient here|there|s.e. there",
+            ({"here": one, "there": other} for one, other in both),
+            "{here.name}|{here.value:.6g}|{there.value:.6g}|{there.standard_error:.2g}",
+        )
+        if (test := self.test) is None:
+            yield Remark(
+                f"there are too few {'drive' if unit == 'row' else unit}s to compare so many "
+                "coefficients by them. Choose fewer signals, or more drives."
+            )
+        else:
+            degrees = f"{test.numerator}, {test.denominator:.4g}"
+            f, p = f"F({degrees}) = {test.f:,.2f}", f"p = {test.p:.2g}"
+            yield f"the same coefficients? Wald, by {unit}s: {f}, {p}."
+
+
+def influence_remarks(cars: Mapping[str, Influential], what: str) -> Iterator[Remark]:
+    """Yield which cars have an influence that no honest car has, and what becomes of them."""
+    for car, one in cars.items():
+        yield Remark(
+            f"{car} {what}: its influence on the model is {one.times:.0f} times the median one, "
+            f"by what its rows give it ({one.rows:.1%} of all)."
+        )
+
 
 @dataclass(frozen=True)
-class Diagnosis(Record):
+class Diagnosis(Answer):
     """One model on one cohort; coefficients are in SI units, and None is what was not asked for.
 
     Attributes:
@@ -78,6 +108,38 @@ class Diagnosis(Record):
     def clusters(self) -> int:
         """How many pieces of independent evidence there are."""
         return self.robust.degrees_of_freedom + 1 if self.cluster != "row" else 1
+
+    def parts(self) -> Iterator[Part]:
+        """Return the coefficients, and how they compare with those of another cohort."""
+        both = zip(self.robust.estimates, self.naive.estimates, strict=True)
+        units = {INTERCEPT: catalogue()[catalogue().label].unit}
+        rows = (
+            {
+                "robust": robust,
+                "naive": naive,
+                "unit": units.get(robust.name) or features().of(robust.name).unit,
+                "vif": self.inflation.get(robust.name),
+            }
+            for robust, naive in both
+        )
+        yield TextTable(
+            f"{number_of(self.drives, 'drive')}, {number_of(self.fitted.gram.n, 'row')}, worth "
+            f"{self.evidence.rows:,.0f} independent ones; R squared {self.fitted.r_squared:.4f}, "
+            f"condition number {self.condition_number:.3g} (1: no signal tells what another tells)",
+            f"signal|unit|coefficient|s.e. by {self.cluster}s|t|s.e. by rows|VIF",
+            rows,
+            "{robust.name}|{unit}|{robust.value:.6g}|{robust.standard_error:.2g}|{robust.t:.1f}|"
+            "{naive.standard_error:.2g}|{vif:.3g}",
+            left=2,
+        )
+        if self.cluster == "row":
+            yield Remark(
+                "there is one drive only: its rows are taken for independent evidence, which they "
+                "are not at 100 Hz, so that the standard errors are far too small."
+            )
+        yield from influence_remarks(self.influential, "would be left out by select --robust")
+        if self.comparison is not None:
+            yield from self.comparison.parts(self.robust, self.cluster)
 
 
 def diagnose(
@@ -160,7 +222,7 @@ def _compare(
 
 
 @dataclass(frozen=True)
-class WhatIf(Record):
+class WhatIf(Answer):
     """Figures of a model before and after bias and noise come, and of the best model after it."""
 
     DOCUMENT = "drives before after refitted_after refitted"
@@ -170,6 +232,24 @@ class WhatIf(Record):
     after: Figures
     refitted: LinearModel
     refitted_after: Figures
+
+    def parts(self) -> Iterator[Part]:
+        """Return figures and the best model for such sensors."""
+        figures = {
+            "as logged": self.before,
+            "with these sensors": self.after,
+            "best model for these sensors": self.refitted_after,
+        }
+        yield TextTable(
+            f"{number_of(self.drives, 'drive')}, {number_of(self.before.rows, 'row')}",
+            "|correlation|RMSE deg|mean deg|std deg",
+            ({"name": name, "of": one} for name, one in figures.items()),
+            "{name}|{of.correlation:.4f}|{of.rmse_deg:.4f}|{of.error_mean_deg:+.4f}|"
+            "{of.error_std_deg:.4f}",
+        )
+        weights = {INTERCEPT: self.refitted.offset, **self.refitted.weights}
+        title = "\nbest model for these sensors"
+        yield TextTable(title, "signal|coefficient", weights.items(), "{0}|{1:.6g}")
 
 
 def what_if(

@@ -1,5 +1,6 @@
 """Tells two model versions apart: what each was made of, and what it came to."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
@@ -11,6 +12,7 @@ from fleet_slip.grams.gram_rows import hash_numbers
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.score import cohort_of_rows
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.warehouse.condition import Condition, asking, drive_columns
 from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.tables import Warehouse, connect_tables
@@ -35,9 +37,20 @@ class Term:
     other: float | None
     same: bool
 
+    @property
+    def cells(self) -> list[str]:
+        """Signal, unit and coefficients, with more digits where few would hide a difference."""
+        values = (self.one, self.other)
+        short = ["" if value is None else f"{value:.6g}" for value in values]
+        if self.same:
+            short[1] = "the same"
+        elif short[0] == short[1]:
+            short = [repr(value) for value in values]
+        return [self.signal, self.unit, *short]
+
 
 @dataclass(frozen=True)
-class Difference:
+class Difference(Answer):
     """Two versions: facts and terms of either, and shared drives, None where these are not kept."""
 
     one: ModelVersion
@@ -45,6 +58,26 @@ class Difference:
     drives: CommonDrives | None
     facts: dict[str, tuple[Any, Any]]
     terms: tuple[Term, ...] = field(repr=False)
+
+    def parts(self) -> Iterator[Part]:
+        """Return tables of coefficients and facts, and how many drives both were made of."""
+        one, other = self.one.reference, self.other.reference
+        if not self.facts and all(term.same for term in self.terms):
+            yield Remark(f"{one} and {other} are the same estimator from the same data")
+            return
+        terms = [term.cells for term in self.terms]
+        yield TextTable("", f"signal|unit|{one}|{other}", terms, left=2)
+        if (shared := self.drives) is not None:
+            yield Remark(
+                f"drives: {shared.both:,} made both, {shared.only_one:,} only {one}, "
+                f"{shared.only_other:,} only {other}"
+            )
+        rows = [
+            [name.rpartition(".")[2].replace("_", " "), _shown(a), _shown(b)]
+            for name, (a, b) in self.facts.items()
+            if not name.endswith("sha256")  # for machines: --json
+        ]
+        yield TextTable("", f"what differs|{one}|{other}", rows, left=3)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `diff --json` prints."""
@@ -56,6 +89,18 @@ class Difference:
             "facts": {name: {"one": a, "other": b} for name, (a, b) in self.facts.items()},
             "terms": [vars(term) for term in self.terms],
         }
+
+
+def _shown(value: Any) -> str:
+    match value:
+        case None:
+            return ""
+        case dict():
+            return ", ".join(f"{name} {inner}" for name, inner in value.items())
+        case float():
+            return f"{value:.6g}"
+        case _:
+            return str(value)
 
 
 def compare_versions(registry: Registry, one: ModelVersion, other: ModelVersion) -> Difference:

@@ -2,16 +2,16 @@
 
 import functools
 import math
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from fractions import Fraction
 from importlib.metadata import version as package_version
 from typing import Any
 
-from fleet_slip.base import Record
 from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import ConfigError, QuestionError
+from fleet_slip.errors import ConfigError, QuestionError, RefusedError
 from fleet_slip.models.acceptance import judge
 from fleet_slip.models.manifest import (
     CrossValidated,
@@ -29,6 +29,7 @@ from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import GIVEN, Selection, checksum_of_list
 from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.regression.folds import CrossValidation
+from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.warehouse.condition import parse_cohort, with_all_drives
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -269,7 +270,7 @@ def _cross_validated(winner: CrossValidation, selection: Selection) -> CrossVali
 
 
 @dataclass(frozen=True)
-class Publication(Record):
+class Publication(Answer):
     """What publishing came to."""
 
     DOCUMENT = (
@@ -282,6 +283,11 @@ class Publication(Record):
     reason: str
     candidate: bool = False
     """Whether it waits for somebody to promote it."""
+
+    def parts(self) -> Iterator[Part]:
+        """Return what was published, and why."""
+        done = "published" if self.new else "nothing to publish:"
+        yield Remark(f"{done} {self.version.reference}. {self.reason}")
 
 
 def publish(
@@ -320,7 +326,7 @@ def publish(
 
 
 @dataclass(frozen=True)
-class DryRun:
+class DryRun(Answer):
     """What publishing would come to.
 
     Attributes:
@@ -336,6 +342,18 @@ class DryRun:
     reason: str
     candidate: bool = False
     refused: bool = False
+
+    def parts(self) -> Iterator[Part]:
+        """Return what would be published, unless it is refused."""
+        if not self.refused:
+            would = "would be published" if self.publishes else "would not be published"
+            would += " as a candidate" if self.publishes and self.candidate else ""
+            yield Remark(f"{self.model} {would}. {self.reason}")
+
+    @property
+    def problem(self) -> RefusedError | None:
+        """That it would be refused."""
+        return RefusedError(self.reason) if self.refused else None
 
 
 def would_publish(

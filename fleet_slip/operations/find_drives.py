@@ -9,10 +9,12 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from fleet_slip.base import number_of
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue, digest_drive
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS
+from fleet_slip.rendering import Remark
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, StoredFile
 from fleet_slip.storage.runs import gather_runs
@@ -37,6 +39,12 @@ class VacuumReport:
     files: tuple[str, ...]
     size_bytes: int
     dry_run: bool
+
+    @property
+    def remark(self) -> Remark:
+        """How much was removed."""
+        done = "would be removed" if self.dry_run else "removed"
+        return Remark(f"{number_of(len(self.files), 'file')} with {self.size_bytes:,} bytes {done}")
 
 
 def vacuum(

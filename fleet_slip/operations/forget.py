@@ -17,9 +17,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pydantic import Field
 
-from fleet_slip.base import Progress, no_progress
+from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.config import Config, load_config
-from fleet_slip.errors import ConfigError, QuestionError, RefusedError
+from fleet_slip.errors import ConfigError, PendingError, QuestionError, RefusedError
 from fleet_slip.grams.gram_files import is_of_received
 from fleet_slip.grams.job import reconcile
 from fleet_slip.models.registry import Registry
@@ -44,6 +44,7 @@ from fleet_slip.operations.rewriting import (
     rewrite,
     write_without,
 )
+from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import config_file, find_config
 from fleet_slip.storage.runs import runs_under_way
 from fleet_slip.storage.table import Change, retrying, rows_in
@@ -51,9 +52,12 @@ from fleet_slip.views import connect
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 
+PENDING_SHOWN = 5
+"""So many are named on a line; --json names all."""
+
 
 @dataclass(frozen=True)
-class ForgetReport:
+class ForgetReport(Answer):
     """What was done."""
 
     drives: int
@@ -73,6 +77,37 @@ class ForgetReport:
     def changed(self) -> bool:
         """Whether there was anything to do."""
         return bool(self.drives or self.old_files_deleted)
+
+    def parts(self) -> Iterator[Part]:
+        """Return remarks: what was forgotten, what is left, and which models to train again."""
+        if not self.changed:
+            yield Remark("nothing to do, it was forgotten before")
+            return
+        yield Remark(
+            f"{number_of(self.drives, 'drive')} forgotten, {number_of(self.rows, 'row')}: "
+            f"{number_of(self.files_rewritten, 'file')} "
+            f"written again without them, {self.files_removed} removed"
+        )
+        if self.old_files_deleted:
+            yield Remark(f"{self.old_files_deleted} old files with them deleted")
+        if self.old_files_left:
+            yield Remark(
+                f"{self.old_files_left} old files still have them until fleet-slip compact removes "
+                "them; repeat with --now to delete them at once"
+            )
+        if self.models:
+            names = dict.fromkeys(one.partition("@")[0] for one in self.models)
+            again = ", ".join(f"fleet-slip publish {name}" for name in names)
+            yield Remark(f"trained on them: {', '.join(self.models)}. Train again with: {again}")
+
+    def require_all(self) -> None:
+        """Raise `PendingError` while anything may have the drives."""
+        if self.pending:
+            raise PendingError(
+                f"{len(self.pending)} may still have its rows, in files that no reader sees: "
+                f"{', '.join(self.pending[:PENDING_SHOWN])}. Repeat this command when they have "
+                "ended, or for files of killed jobs after an hour."
+            )
 
 
 def forget(
@@ -274,12 +309,24 @@ class Retention(Config):
 
 
 @dataclass(frozen=True)
-class RetentionReport:
+class RetentionReport(Answer):
     """What was forgotten, and which files were removed."""
 
     before: date
     forgotten: ForgetReport
     vacuumed: VacuumReport
+
+    def parts(self) -> Iterator[Part]:
+        """Return remarks: what was forgotten and removed."""
+        if self.forgotten.changed:
+            yield from self.forgotten.parts()
+            yield Remark(
+                "their files are not read again; drives as old that come in other files do, until "
+                "the next forget --expired"
+            )
+        else:
+            yield Remark(f"no drive is older than {self.before}")
+        yield self.vacuumed.remark
 
 
 def load_retention(path: str | None) -> Retention:

@@ -5,14 +5,16 @@
 3. Files whose dictionaries have names that none of their rows has are written again.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 
 from deltalake import DeltaTable, Field
 from deltalake.schema import Schema
 
+from fleet_slip.base import number_of
 from fleet_slip.operations.rewriting import drop_unused_names
+from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.table import (
     ALL_STATISTICS,
     SCALE,
@@ -26,7 +28,7 @@ from fleet_slip.warehouse.tables import Warehouse
 
 
 @dataclass(frozen=True)
-class MigrationReport:
+class MigrationReport(Answer):
     """What a migration did, and the columns of the logs that the catalogue has no longer."""
 
     added: tuple[str, ...]
@@ -39,6 +41,16 @@ class MigrationReport:
     def changed(self) -> bool:
         """Whether there was anything to do but to record scales."""
         return bool(self.added or self.files_without_names)
+
+    def parts(self) -> Iterator[Part]:
+        """Return remarks: what was added and written anew."""
+        if not self.changed:
+            yield Remark("migrate: nothing to do, the logs agree with the signal catalogue")
+        if self.added:
+            yield Remark(f"added: {', '.join(self.added)}; null in the files that are there")
+        if self.files_without_names:
+            files = number_of(self.files_without_names, "file")
+            yield Remark(f"{files} written anew, without names that none of their rows has")
 
 
 def migrate(warehouse: Warehouse) -> MigrationReport:

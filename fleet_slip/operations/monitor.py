@@ -10,7 +10,7 @@ with Student's t for m - 1 degrees of freedom: with few days the limits are as w
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.features import PLAIN, features, input_scales
-from fleet_slip.errors import ConfigError, DataError, StorageError
-from fleet_slip.grams.cohort import sum_days
+from fleet_slip.errors import AlarmError, ConfigError, DataError, StorageError
+from fleet_slip.grams.cohort import remark_left_out, sum_days
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import counts_model
 from fleet_slip.models.registry import ModelVersion
@@ -34,6 +34,7 @@ from fleet_slip.regression.figures import error_sums, student_t_quantile
 from fleet_slip.regression.folds import least_squares
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import LinearModel
+from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.warehouse.condition import Condition, parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
@@ -86,7 +87,7 @@ class Day:
 
 
 @dataclass(frozen=True)
-class Chart:
+class Chart(Answer):
     """A control chart of a model version.
 
     Attributes:
@@ -106,6 +107,31 @@ class Chart:
     def alarms(self) -> tuple[Day, ...]:
         """The days that are beyond a limit."""
         return tuple(day for day in self.days if day.alarms)
+
+    def parts(self) -> Iterator[Part]:
+        """Return a table of the days."""
+        mean, std = self.mean_limits, self.std_limits
+        yield TextTable(
+            f"{self.model}, drives where {self.cohort}; limits from the training days: "
+            f"mean {mean.lower:+.4f} to {mean.upper:+.4f}, std up to {std.upper:.4f} deg",
+            "day||drives|rows|RMSE deg|mean deg|std deg|beyond",
+            ({**vars(one), "kind": "training" if one.training else "new"} for one in self.days),
+            "{day}|{kind}|{drives:,}|{rows:,}|{rmse_deg:.4f}|{error_mean_deg:+.4f}|"
+            "{error_std_deg:.4f}|{alarms}",
+            left=2,
+        )
+        yield from remark_left_out(self.drives_left_out, self.feature_set)
+
+    @property
+    def alarm(self) -> str:
+        """The new days that are beyond a limit, and by what."""
+        return ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in self.alarms)
+
+    @property
+    def problem(self) -> AlarmError | None:
+        """That a new day is beyond a limit."""
+        text = f"the error of {self.model} is beyond its limits on {self.alarm}"
+        return AlarmError(text) if self.alarms else None
 
 
 def monitor(

@@ -14,6 +14,7 @@ from fleet_slip.errors import AlarmError, FleetSlipError, printable
 from fleet_slip.operations.monitor import Chart, control_chart
 from fleet_slip.pages.drawing import Picture, draw
 from fleet_slip.pages.page import Cell, Mark, ReportTable, Tile, count, fill_in, table
+from fleet_slip.rendering import Answer, Part
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
@@ -123,7 +124,7 @@ class NightStep(Record):
 
 
 @dataclass(frozen=True)
-class NightReport:
+class NightReport(Answer):
     """The summary of a night. All but `seconds` is the same if the night was killed on its way.
 
     Attributes:
@@ -162,11 +163,17 @@ class NightReport:
     def problem(self) -> FleetSlipError | None:
         """The first failure, else what calls for attention; None after a good night."""
         night = f"the night of {self.night}"
+        found: FleetSlipError | None = None
         for step in self.steps:
             if step.error is not None:
-                return type(step.error)(f"{night}: {step.name} failed: {step.error}")
+                found = type(step.error)(f"{night}: {step.name} failed: {step.error}")
+                break
         calling = [f"{one.name}: {one.told}" for one in self.steps if one.state == "attention"]
-        return AlarmError(f"{night}: {' '.join(calling)}") if calling else None
+        if calling and found is None:
+            found = AlarmError(f"{night}: {' '.join(calling)}")
+        if found is not None:
+            found.headline = f"{night}: {self.verdict}"
+        return found
 
     @property
     def exit_code(self) -> int:
@@ -204,7 +211,7 @@ class NightReport:
             frozenset(hash_drive(self.model, one.drive_id) for one in self.faults),
         )
 
-    def as_text(self) -> str:
+    def parts(self) -> Iterator[Part]:
         """Return the summary for people, lines of text."""
         wide = max(len(step.name) for step in self.steps)
         mark = {"done": "ok", "attention": "LOOK", "failed": "FAILED", "left out": "-"}
@@ -218,7 +225,7 @@ class NightReport:
                 for one in self.new_faults
             ),
         ]
-        return "\n".join(printable(line).rstrip() for line in lines)
+        yield "\n".join(printable(line).rstrip() for line in lines)
 
     @property
     def moved(self) -> bool:
@@ -256,7 +263,7 @@ MARKS: dict[str, Mark] = {"done": "good", "attention": "miss", "failed": "miss",
 def write_summary(report: NightReport, folder: Path) -> list[Path]:
     """Write NIGHT.txt, .json and .html, each as a whole; return them. Raises `StorageError`."""
     files = {
-        f"{report.night}.txt": report.as_text() + "\n",
+        f"{report.night}.txt": f"{report}\n",
         f"{report.night}.json": json.dumps(report.as_dict(), indent=2, default=str) + "\n",
         f"{report.night}.html": render_night(report),
     }

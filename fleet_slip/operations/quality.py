@@ -10,13 +10,13 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.base import Record
+from fleet_slip.base import Record, number_of
 from fleet_slip.catalogue.course import relate
 from fleet_slip.catalogue.facts import DELAY, TRAINING_DRIVES
 from fleet_slip.catalogue.faults import DriveBatches, Fault, find_implausible
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import DataError
+from fleet_slip.errors import AlarmError, DataError
 from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
 from fleet_slip.grams.reader import GramReader
@@ -25,6 +25,7 @@ from fleet_slip.ingest.recordings import Origin
 from fleet_slip.operations.labels import find_odd_days, find_repeated, find_reversed_labels
 from fleet_slip.operations.peers import QualityThresholds, settle, thresholds
 from fleet_slip.regression.gram import GramTable
+from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.warehouse.condition import Condition, parse_cohort, parse_condition
 from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.tables import Warehouse
@@ -46,7 +47,7 @@ BY_DAY = attrgetter("day", "drive_id")
 
 
 @dataclass(frozen=True)
-class QualityReport(Record):
+class QualityReport(Answer):
     """What was examined and found.
 
     Attributes:
@@ -58,6 +59,27 @@ class QualityReport(Record):
     drives: int
     compared: int
     findings: tuple[SensorFault, ...]
+
+    def parts(self) -> Iterator[Part]:
+        """Return a table of the findings."""
+        peers = "other" if self.compared else "too few"
+        examined = (
+            f"{number_of(self.drives, 'drive')} examined, {self.compared:,} of them beside their "
+            f"peers ({peers} drives of a car or vehicle model)"
+        )
+        if self.findings:
+            header = "drive|car|fault|signals|what shows it"
+            row = "{drive_id}|{vehicle_id}|{fault.kind}|{fault.signals}|{fault.figure}"
+            yield TextTable(examined, header, self.findings, row, left=5)
+        else:
+            yield f"{examined}: {'all are in order' if self.drives else 'none is long enough'}"
+
+    @property
+    def problem(self) -> AlarmError | None:
+        """That some drives are not in order."""
+        of = number_of(self.drives, "drive")
+        found = len(self.findings)
+        return AlarmError(f"{found} of {of} are not in order") if found else None
 
 
 def examine_drives(

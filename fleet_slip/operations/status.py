@@ -9,11 +9,20 @@ from typing import Any
 
 import pyarrow as pa
 
-from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
+from fleet_slip.base import number_of
+from fleet_slip.errors import (
+    AlarmError,
+    DataError,
+    FleetSlipError,
+    QuestionError,
+    RefusedError,
+    StorageError,
+)
 from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.limits import memory_bytes
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.peers import thresholds
+from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, Folder
 from fleet_slip.storage.runs import add_runs, find_changed_lines, find_missing_documents, state_of
@@ -58,7 +67,7 @@ class ChampionStatus:
 
 
 @dataclass(frozen=True)
-class WarehouseStatus:
+class WarehouseStatus(Answer):
     """What there is to know; `problems` says what calls for attention."""
 
     root: str
@@ -78,6 +87,42 @@ class WarehouseStatus:
     def __repr__(self) -> str:
         found = "; ".join(self.problems) or "nothing calls for attention"
         return f"<{type(self).__name__}: {self.root}, newest day {self.newest_day}; {found}>"
+
+    def parts(self) -> Iterator[Part]:
+        """Return tables, facts, last runs and champions."""
+        yield TextTable(
+            f"{self.root} at {self.checked_at:%Y-%m-%d %H:%M} UTC",
+            "table|last commit|version|files|rows|size MB",
+            (
+                {"name": name, "size_mb": one.size_bytes / 1e6, **vars(one)}
+                for name, one in self.tables.items()
+            ),
+            "{name}|{committed_at:%Y-%m-%d %H:%M}|{version}|{files:,}|{rows:,}|{size_mb:,.1f}",
+            left=2,
+        )
+        backlog = f"{number_of(self.backlog_files, 'file')}, {number_of(self.backlog_rows, 'row')}"
+        facts = {"newest day": str(self.newest_day or "none"), "waiting for the Gram job": backlog}
+        if self.disk_free_bytes is not None and self.disk_free_fraction is not None:
+            free = f"{self.disk_free_bytes / 1e9:,.1f} GB free, {self.disk_free_fraction:.0%}"
+            facts["disk"] = free
+        yield TextTable("", "|", facts.items(), left=2)
+        if self.last_runs:
+            header = "command|started|state|seconds|rows"
+            row = "{command}|{started_at:%Y-%m-%d %H:%M:%S}|{state}|{seconds:.1f}|{rows:,}"
+            yield TextTable("\nlast runs", header, self.last_runs, row, left=3)
+        if self.champions:
+            header = "model|published|age h|logs behind|grams behind"
+            row = (
+                "{model}@{version}|{published_at:%Y-%m-%d %H:%M}|{age_hours:,.1f}|"
+                "{logs_behind}|{grams_behind}"
+            )
+            yield TextTable("\nchampions", header, self.champions, row, left=2)
+
+    @property
+    def problem(self) -> AlarmError | None:
+        """That something calls for attention."""
+        found = number_of(len(self.problems), "matter")
+        return AlarmError(f"{found}, above, to be looked after.") if self.problems else None
 
 
 def status_of(

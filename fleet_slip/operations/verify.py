@@ -16,7 +16,7 @@ from typing import Literal, TypeAlias
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_slip.base import Progress, Record, no_progress, number_of
+from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
@@ -34,6 +34,7 @@ from fleet_slip.grams.gram_rows import is_received
 from fleet_slip.grams.on_board import counted_sets, impossible_rows
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import find_temporary_files, find_unreferenced
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.checksums import checksum_in, checksum_of
 from fleet_slip.storage.commits import LOG
@@ -80,7 +81,7 @@ class Damage:
 
 
 @dataclass
-class Verification(Record):
+class Verification(Answer):
     """What was looked at, what was found, and what was rebuilt and compared besides."""
 
     DOCUMENT = (
@@ -110,6 +111,22 @@ class Verification(Record):
     def remarks(self) -> list[Damage]:
         """The others, which are worth knowing."""
         return [finding for finding in self.findings if not finding.damage]
+
+    def parts(self) -> Iterator[Part]:
+        """Return what was rebuilt, damage and remarks in tables, and what was read."""
+        for path in self.rebuilt:
+            yield Remark(f"rebuilt {path}")
+        for title in ("damage", "remarks"):
+            if findings := getattr(self, title):
+                yield TextTable(title, "where|problem", findings, "{path}|{problem}", left=2)
+        yield Remark(
+            f"{number_of(self.files, 'file')} with {self.size_bytes:,} bytes and "
+            f"{number_of(self.documents, 'document')} were read, the Gram rows of "
+            f"{number_of(self.log_files_recomputed, 'log file')} computed again: "
+            + (f"{len(self.damage)} damaged" if self.damage else "all is as it must be")
+        )
+        if self.compared:
+            yield TextTable("", "way|drives|equal", self.compared.ways)
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ def test_a_night_brings_in_what_is_new_and_writes_its_summary(
     assert f"Night of {day_of(2)}: all went well" in (tmp_path / f"out/{day_of(2)}.html").read_text(
         encoding="utf-8"
     )
-    again = give(place, 3).as_text()
+    again = str(give(place, 3))
     assert "0 new rows" in again
     assert "smoke@3 is up to date" in again
 
@@ -158,8 +158,8 @@ def test_a_fleet_that_counts_on_board_alone_has_nights(place: Path, tmp_path: Pa
             0,
             12 + 12 * night,
             f"smoke@{night + 1}",
-        ), report.as_text()
-    assert "smoke@2 is up to date" in give(place, 2).as_text()
+        ), str(report)
+    assert "smoke@2 is up to date" in str(give(place, 2))
     assert fleet.verify(full=True).findings == []
 
 
@@ -238,14 +238,14 @@ def test_a_broken_sensor_is_told_once_and_trains_no_model(place: Path, landing: 
     assert first.exit_code == 10
     assert len(first.new_faults) == 2
     assert {fault.fault.signals for fault in first.new_faults} == {("yaw_rate",)}
-    assert all(fault.drive_id in first.as_text() for fault in first.new_faults)
+    assert all(fault.drive_id in str(first) for fault in first.new_faults)
     assert first.champion == "smoke@2"
     second = give(place, 3)
     assert second.exit_code == 0
     assert (len(second.faults), second.new_faults) == (2, ())
     hostile = replace(first.faults[0], drive_id="\x1b[2J<b>")
     shown = replace(first, faults=(hostile,))
-    assert "\x1b" not in shown.as_text()
+    assert "\x1b" not in str(shown)
     assert "<b>" not in render_night(shown)
     record = "".join(file.read_text() for file in (place / "data/nights").iterdir())
     assert first.new_faults[0].drive_id not in record
@@ -289,7 +289,7 @@ def test_before_anything_has_landed_it_says_so(tmp_path: Path, smoke_root: Path)
     landing.prepare()
     report = give(tmp_path, 0)
     assert report.exit_code == 10
-    assert "No log is in the folder" in report.as_text()
+    assert "No log is in the folder" in str(report)
     shutil.rmtree(landing.folder)
     assert refused(tmp_path, 0)[0] == 4
 

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 import fleet_slip
-from tests.support.commands import finish, start
+from tests.support.commands import finish, run_on, start
 
 
 def test_answers_are_shown_on_a_line_or_two(smoke_root: Path) -> None:
@@ -44,3 +44,10 @@ print(open_database().sql("SELECT 42").fetchall())
 
 def test_a_notebook_needs_no_widgets() -> None:
     assert finish(start([sys.executable, "-c", KERNEL]))[0].stdout == "[(42,)]\n"
+
+
+def test_an_answer_is_the_text_that_its_command_prints(smoke_root: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    answers = {"quality": fleet.quality(), "diagnose smoke": fleet.cohort().diagnose("smoke")}
+    for words, answer in answers.items():
+        assert str(answer) == run_on(smoke_root, *words.split()).stdout.rstrip()

@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 from rich.text import Text
 
-from fleet_slip.cli.accuracy import print_evaluation
+from fleet_slip.cli.accuracy import evaluation_parts
 from fleet_slip.cli.app import app
-from fleet_slip.cli.output import print_table, print_text
+from fleet_slip.cli.output import print_parts
 from fleet_slip.errors import AlarmError
+from fleet_slip.rendering import TextTable
 
 Shown = Callable[..., list[str]]
 
@@ -60,14 +61,14 @@ def test_every_word_is_whole(smoke_root: Path, shown: Shown, command: str) -> No
     assert words <= {word for line in shown(give, 2000) for word in line.split()}
 
 
-HEADER = ["model", "signals", "drives", "RMSE deg"]
+HEADER = "model|signals|drives|RMSE deg"
 ROWS = [["2", "ax ay yaw_rate steering_wheel", "96", "0.0735"], ["ours", "", "", "0.0302"]]
 
 
 def table(width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     monkeypatch.setenv("COLUMNS", str(width))
-    print_table("", HEADER, ROWS, left=2)
+    print_parts([TextTable("", HEADER, ROWS, left=2)])
     return Text.from_ansi(capsys.readouterr().out).plain
 
 
@@ -103,7 +104,7 @@ ours                              0.0302
 
 
 def test_prose_breaks_between_words_and_commands_do_not(shown: Shown) -> None:
-    lines = shown(lambda: print_text("a model of the fleet " * 20))
+    lines = shown(lambda: print_parts(["a model of the fleet " * 20]))
     assert " ".join(lines).split() == ("a model of the fleet " * 20).split()
 
 
@@ -125,10 +126,10 @@ def test_an_evaluation_is_a_screen(shown: Shown) -> None:
         "results": {"ours@1": result},
     }
     content = {"estimators": {"ours@1": {}}, "ranking": ranking, "scenarios": [scenario]}
-    text = " ".join(" ".join(shown(lambda: print_evaluation(content, False))).split())
+    text = " ".join(" ".join(shown(lambda: print_parts(evaluation_parts(content, False)))).split())
     assert "nominal ekf 0.100 0.200 2.00" in text
     assert "Every drive, and all estimators: --all" in text
-    whole = " ".join(" ".join(shown(lambda: print_evaluation(content, True))).split())
+    whole = " ".join(" ".join(shown(lambda: print_parts(evaluation_parts(content, True)))).split())
     assert "nominal 0.70 0.200 (35%)" in whole
 
 

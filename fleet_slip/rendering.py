@@ -1,0 +1,174 @@
+"""Results as people are shown them: texts and tables, and remarks beside these."""
+
+import string
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import Any
+
+from fleet_slip.base import Record
+from fleet_slip.errors import FleetSlipError, printable
+
+GAPS = (2, 1)
+"""Spaces between two columns: usually, and where a terminal is narrow."""
+FILE_WIDTH = 200
+"""Characters of a line that goes to a file or into a pipe."""
+
+
+class Remark(str):
+    """What is said beside a result: a command says it on stderr."""
+
+    __slots__ = ()
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Records, mappings or tuples, of whose fields `row` has formats: `{name}|{rmse_deg:.4f}`.
+
+    Without a `row` they are sequences of cells. The first `left` columns are text, the others are
+    numbers. None is an empty cell, and a list is its texts in a row.
+    """
+
+    title: str
+    header: str
+    records: Iterable[Any]
+    row: str = ""
+    left: int = 1
+
+    def text(self, width: int = FILE_WIDTH, *, bold: bool = False) -> str:
+        """Return the table, no wider than a terminal; words and numbers are never broken.
+
+        Where there is too little room, columns move closer; where that is not enough, every row
+        becomes a paragraph with a line for each column.
+        """
+        header = self.header.split("|")
+        rows = [[printable(text) for text in self._cells(one)] for one in self.records]
+        for gap in GAPS:
+            if widths := _fit_columns(header, rows, width, gap):
+                break
+        else:
+            return _paragraphs(header, rows, width)
+        sides = [str.ljust if i < self.left else str.rjust for i in range(len(header))]
+
+        def lines(cells: Sequence[str], *, below: bool = False) -> Iterator[str]:
+            wrapped = [_wrap(text, wide) for text, wide in zip(cells, widths, strict=True)]
+            high = max(map(len, wrapped))
+            if below:
+                wrapped = [[""] * (high - len(one)) + one for one in wrapped]
+            for texts in zip_longest(*wrapped, fillvalue=""):
+                padded = (
+                    side(text, wide - _cells_of(text) + len(text))
+                    for side, text, wide in zip(sides, texts, widths, strict=True)
+                )
+                yield (" " * gap).join(padded).rstrip()
+
+        head = [*lines(header, below=True)] if any(header) else []
+        if bold:
+            head = [f"\x1b[1m{line}\x1b[0m" for line in head]
+        return "\n".join([*head, *(line for one in rows for line in lines(one))])
+
+    def _cells(self, record: Any) -> list[str]:
+        if not self.row:
+            return [*map(_FORMATTER.text, record)]
+        return [_FORMATTER.vformat(form, (record,), {}) for form in self.row.split("|")]
+
+
+class _Formatter(string.Formatter):
+    """Formats by the fields of the one argument."""
+
+    def get_value(self, key: int | str, args: Sequence[Any], kwargs: Any) -> Any:  # noqa: ARG002
+        """Return a field of the record."""
+        (record,) = args
+        if isinstance(key, int) or isinstance(record, Mapping):
+            return record[key]
+        return getattr(record, key)
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        """Return a field as a table shows it."""
+        return self.text(value, format_spec)
+
+    @staticmethod
+    def text(value: Any, form: str = "") -> str:
+        """Return a value as a table shows it."""
+        if isinstance(value, tuple | list):
+            return " ".join(map(str, value))
+        return "" if value is None else format(value, form)
+
+
+_FORMATTER = _Formatter()
+
+Part = str | TextTable
+"""A text, a `Remark` or a table."""
+
+
+class Answer(Record):
+    """A result that people are shown, by commands and by `str`."""
+
+    def parts(self) -> Iterable[Part]:
+        """Return what is shown; some take `everything` where a screen is usual."""
+        raise NotImplementedError
+
+    @property
+    def problem(self) -> FleetSlipError | None:
+        """What a command fails with that has shown it."""
+        return None
+
+    def __str__(self) -> str:
+        texts = (
+            [part.title, part.text()] if isinstance(part, TextTable) else [part]
+            for part in self.parts()
+        )
+        return "\n".join(text for some in texts for text in some if text)
+
+
+def wrap_lines(text: str, width: int) -> str:
+    """Return text whose lines break between words; a line that is indented is kept to be copied."""
+    return "\n".join(
+        line if len(line) <= width or line.startswith("  ") else "\n".join(_wrap(line, width))
+        for line in text.split("\n")
+    )
+
+
+def _wrap(text: str, width: int) -> list[str]:
+    if len(text) <= width:
+        return [text]
+    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
+
+
+def _cells_of(text: str) -> int:
+    """Return how many columns of a terminal a text takes: letters of East Asia take two."""
+    if text.isascii():
+        return len(text)
+    from rich.cells import cell_len  # noqa: PLC0415 - names of most fleets need none
+
+    return cell_len(text)
+
+
+def _fit_columns(
+    header: Sequence[str], rows: Sequence[Sequence[str]], width: int, gap: int
+) -> list[int] | None:
+    """Return how wide each column is, none less than its longest word; None if they do not fit."""
+    columns = [[name, *(row[i] for row in rows)] for i, name in enumerate(header)]
+    wished = [max(map(_cells_of, cells)) for cells in columns]
+    widths = [max((_cells_of(w) for c in cells for w in c.split()), default=0) for cells in columns]
+    left = width - sum(widths) - gap * (len(widths) - 1)
+    if left < 0:
+        return None
+    while left and widths != wished:
+        wanting = [i for i in range(len(widths)) if widths[i] < wished[i]]
+        widths[min(wanting, key=widths.__getitem__)] += 1  # many narrow columns before a wide one
+        left -= 1
+    return widths
+
+
+def _paragraphs(header: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> str:
+    """Return rows as paragraphs, whose lines have what a figure is called, and the figure."""
+    wide = max(map(len, header))
+    lines = []
+    for row in rows:
+        for name, text in zip(header, row, strict=True):
+            first, *more = _wrap(text, max(width - wide - 2, 1)) or [""]
+            lines += [f"{name:<{wide}}  {first}", *(" " * (wide + 2) + one for one in more)]
+        lines.append("")
+    return "\n".join(line.rstrip() for line in lines)
