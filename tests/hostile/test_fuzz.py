@@ -11,10 +11,10 @@ from fleet_slip.errors import FleetSlipError
 from tests.support.fuzz.mutate import ByteRandom
 from tests.support.fuzz.targets import TARGETS
 
-pytestmark = pytest.mark.long
-
 EXAMPLES = {"csv": 60, "parquet": 60, "config": 100, "sql": 60, "manifest": 40}
 FEW = 6
+AT_ONCE = ("csv", "parquet")
+"""What `make test` attacks, too."""
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,10 @@ def sandbox(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fuzz")
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n in AT_ONCE else pytest.mark.long) for n in TARGETS],
+)
 def test_whatever_comes_is_answered_or_refused(name: str, sandbox: Path) -> None:
     target, _ = TARGETS[name]
 

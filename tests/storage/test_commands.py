@@ -11,7 +11,7 @@ from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import finish, start_on
 from tests.support.dask_processes import dask_processes
-from tests.support.s3_server import ACCESS_KEY, SECRET_KEY, Server, command_on
+from tests.support.s3_server import SECRET_KEY, Server, command_on
 
 pytestmark = pytest.mark.long
 
@@ -136,20 +136,6 @@ def test_workers_of_a_cluster_write_to_it(
         done = command_on(root, "run", "--campaign", "smoke", "--cluster", dask.address)
         assert done.exit_code == 0, done.stderr
     assert stored(root) == stored(local)
-
-
-@pytest.mark.parametrize(
-    ("url", "told"),
-    [
-        ("s3://no-such-bucket/data", "there is no such bucket"),
-        (f"s3://{ACCESS_KEY}:x@bucket/data", "is written as s3://BUCKET/PATH"),
-    ],
-)
-def test_a_mistake_is_one_line(url: str, told: str) -> None:
-    done = command_on(url, "run", "--campaign", "smoke")
-    assert done.exit_code == STORAGE
-    assert told in done.stderr
-    assert len(done.stderr.splitlines()) == 1
 
 
 def test_a_store_that_refuses_writes_is_left_as_it_was(server: Server, filled: Folder) -> None:
