@@ -22,7 +22,7 @@ from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.base import shown
 from fleet_slip.config import Config, Name, read_named_file
 from fleet_slip.errors import ConfigError, InputError
-from fleet_slip.ingest.formats.source import Spool, reading_with
+from fleet_slip.ingest.formats.source import Spool, load_library
 
 Bytes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
@@ -205,12 +205,12 @@ def read_can_database(bus: CanBus, folder: Path) -> CanBus:
 def parse_database(bus: CanBus) -> Any:
     """Return the messages of a database. Raises `InputError`, which quotes no line of it."""
     database = Path(bus.database)
-    with reading_with(database, "cantools") as cantools:
-        try:
-            return cantools.database.load_string(bus.text, bus.format, strict=False)
-        except Exception as error:
-            place = re.search(r"line \d+", str(error))
-            raise InputError(
-                f"{shown(database)}: cantools cannot read it as {bus.format.upper()}"
-                f"{f', from {place[0]} on' if place else ''}. Is it the right file, and complete?"
-            ) from None
+    cantools = load_library(database, "cantools")
+    try:
+        return cantools.database.load_string(bus.text, bus.format, strict=False)
+    except Exception as error:
+        place = re.search(r"line \d+", str(error))
+        raise InputError(
+            f"{shown(database)}: cantools cannot read it as {bus.format.upper()}"
+            f"{f', from {place[0]} on' if place else ''}. Is it the right file, and complete?"
+        ) from None

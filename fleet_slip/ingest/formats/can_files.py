@@ -44,8 +44,8 @@ from fleet_slip.ingest.formats.source import (
     Channel,
     FormatSource,
     Spool,
+    load_library,
     missing_column,
-    reading_with,
 )
 
 # BLF, of which nobody published the format, is read as python-can does, as arrays: a hundred times
@@ -241,7 +241,8 @@ def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
             f"{shown(budget.file)}: the suffix names the format of a CAN trace: "
             f"{', '.join(sorted(SUFFIXES))}. Name it as what it is."
         )
-    with reading_with(budget.file, "can") as can, can.LogReader(budget.file) as trace:
+    can = load_library(budget.file, "can")
+    with can.LogReader(budget.file) as trace:
         # A BLF file says how long it is; python-can reads what is there of one that was cut.
         stated = getattr(trace, "file_size", 0)
         if stated > budget.size:

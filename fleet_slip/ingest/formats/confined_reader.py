@@ -33,10 +33,9 @@ from typing import Any, BinaryIO, NamedTuple
 
 import polars as pl
 
-from fleet_slip.base import shown
 from fleet_slip.errors import FleetSlipError, is_lack_of_memory
 from fleet_slip.ingest.formats.can import CanBus
-from fleet_slip.ingest.formats.source import Base, Budget, Source
+from fleet_slip.ingest.formats.source import Base, Budget, Source, unreadable
 
 
 class Format(NamedTuple):
@@ -160,8 +159,7 @@ class _Reader:
             if is_lack_of_memory(error) or getattr(error, "errno", 0) == errno.EFBIG:
                 kind = "MemoryError"
             elif not isinstance(error, FleetSlipError):
-                reason = shown(text.strip().split("\n")[0][:200]) or kind
-                text = f"{shown(file)}: cannot be read: {reason}. Is it complete? Copy it again."
+                text = str(unreadable(file, error))
             self._send({"error": kind, "text": text})
             return False
         return True

@@ -18,8 +18,8 @@ from fleet_slip.ingest.formats.source import (
     Channel,
     FormatSource,
     as_column,
+    load_library,
     missing_column,
-    reading_with,
 )
 
 _COLUMN = re.compile(r"(.+)\(:,(\d+)\)")
@@ -139,8 +139,8 @@ def _rows_columns(matrix: Matrix) -> tuple[int, int]:
 @contextmanager
 def open_mat(budget: Budget) -> Iterator[Vectors]:
     """Open a MATLAB file of version 5 to 7, which is then in memory. Raises `InputError`."""
-    with reading_with(budget.file, "scipy.io") as scipy, budget.file.open("rb") as stream:
-        content = scipy.loadmat(stream, simplify_cells=True)
+    with budget.file.open("rb") as stream:
+        content = load_library(budget.file, "scipy.io").loadmat(stream, simplify_cells=True)
     own = {name: value for name, value in content.items() if not name.startswith("__")}
     yield Vectors(dict(_arrays_in(own)), budget, {})
 
@@ -163,7 +163,8 @@ def open_mat73(budget: Budget) -> Iterator[Vectors]:
     not followed.
     """
     file = budget.file
-    with reading_with(file, "h5py") as h5py, h5py.File(file, "r") as root:
+    h5py = load_library(file, "h5py")
+    with h5py.File(file, "r") as root:
         matrices: dict[str, _Stored] = {}
         refused: dict[str, str] = {}
 

@@ -29,8 +29,8 @@ from fleet_slip.ingest.formats.source import (
     Channel,
     FormatSource,
     Spool,
+    load_library,
     missing_column,
-    reading_with,
 )
 
 Decode = Callable[[bytes], Any]
@@ -246,7 +246,8 @@ def read_records(budget: Budget) -> Iterator[Any]:
     Raises `InputError`.
     """
     path = budget.file
-    with reading_with(path, "mcap.stream_reader") as mcap, path.open("rb") as file:
+    mcap = load_library(path, "mcap.stream_reader")
+    with path.open("rb") as file:
 
         class Reader(mcap.StreamReader):  # type: ignore[misc, name-defined]
             """Passes over indices: unpacking one takes as long as its messages."""
@@ -387,14 +388,13 @@ class McapSource(FormatSource):
         """The fields of the first message of each topic that can be decoded."""
         found: dict[str, list[str]] = {}
         encodings: dict[int, str] = {}
-        with reading_with(self._file, "mcap"):
-            for channels, block in self._blocks():
-                for number in set(block.heads[:, 0].tolist()) - encodings.keys():
-                    channel = channels[number]
-                    encodings[number] = channel.encoding
-                    _, data, _ = next(block.of([number]).one_by_one())
-                    if channel.decode is not None and channel.topic not in found:
-                        found[channel.topic] = list(dict(leaves_of(channel.decode(data))))
+        for channels, block in self._blocks():
+            for number in set(block.heads[:, 0].tolist()) - encodings.keys():
+                channel = channels[number]
+                encodings[number] = channel.encoding
+                _, data, _ = next(block.of([number]).one_by_one())
+                if channel.decode is not None and channel.topic not in found:
+                    found[channel.topic] = list(dict(leaves_of(channel.decode(data))))
         if not found:
             raise InputError(
                 f"{shown(self._file)}: no message in it can be decoded "
@@ -421,15 +421,14 @@ class McapSource(FormatSource):
         self._spool.clear()
         self._kept, self._numbers, self._texts = {}, set(), set()
         self._rows = dict.fromkeys(wanted, 0)
-        with reading_with(self._file, "mcap"):
-            for channels, block in self._blocks():
-                for topic, fields in wanted.items():
-                    mine = block.of([n for n, one in channels.items() if one.topic == topic])
-                    if len(mine):
-                        self._put_aside(topic, self._columns(fields, mine, channels))
+        for channels, block in self._blocks():
             for topic, fields in wanted.items():
-                if not self._rows[topic]:
-                    self._put_aside(topic, dict.fromkeys([OWN_TIME, *fields], np.zeros(0)))
+                mine = block.of([n for n, one in channels.items() if one.topic == topic])
+                if len(mine):
+                    self._put_aside(topic, self._columns(fields, mine, channels))
+        for topic, fields in wanted.items():
+            if not self._rows[topic]:
+                self._put_aside(topic, dict.fromkeys([OWN_TIME, *fields], np.zeros(0)))
         self._kept = wanted
 
     def _columns(

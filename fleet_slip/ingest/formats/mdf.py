@@ -26,8 +26,8 @@ from fleet_slip.ingest.formats.source import (
     FormatSource,
     Spool,
     as_column,
+    load_library,
     missing_column,
-    reading_with,
 )
 
 # Applies the conversions of an MDF file, of counts to physical values.
@@ -274,18 +274,17 @@ class MdfSource(FormatSource):
                 yield number, {c.name: i for i, c in enumerate(group.channels)}
 
     def _signals(self, number: int, indices: dict[str, int], start: int, records: int) -> list[Any]:
-        with reading_with(self._file, "asammdf"):
-            # Of 200 MiB and more `select` reads all records, however few it is asked for.
-            select = getattr(self._mdf, "_select_fallback", self._mdf.select)
-            signals = select(
-                [(None, number, index) for index in indices.values()],
-                record_offset=start,
-                record_count=records,
-                raw=True,
-            )
-            for signal, index in zip(signals, indices.values(), strict=True):
-                signal.samples = self._physical(number, index, signal.samples)
-            self._release()
+        # Of 200 MiB and more `select` reads all records, however few it is asked for.
+        select = getattr(self._mdf, "_select_fallback", self._mdf.select)
+        signals = select(
+            [(None, number, index) for index in indices.values()],
+            record_offset=start,
+            record_count=records,
+            raw=True,
+        )
+        for signal, index in zip(signals, indices.values(), strict=True):
+            signal.samples = self._physical(number, index, signal.samples)
+        self._release()
         if len(signals[0]) < records:
             raise InputError(
                 f"{shown(self._file)}: group {number} has {start + len(signals[0]):,} samples and "
@@ -373,10 +372,9 @@ def open_mdf(budget: Budget) -> Iterator[MdfSource]:
     An attachment may be any other file, and so may the database by which asammdf would decode bus
     logging at once: nothing is read of either.
     """
-    with reading_with(budget.file, "asammdf") as asammdf:
-        mdf = asammdf.MDF(
-            budget.file, temporary_folder=tempfile.gettempdir(), process_bus_logging=False
-        )
+    mdf = load_library(budget.file, "asammdf").MDF(
+        budget.file, temporary_folder=tempfile.gettempdir(), process_bus_logging=False
+    )
     if getattr(mdf._mdf, "_delete_on_close", False):
         mdf._mdf.name.unlink()  # it stays open, and goes with the process however that ends
     mdf._mdf.extract_attachment = lambda *_, **__: (b"", Path(), b"")

@@ -33,7 +33,7 @@ from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.confined_reader import FORMATS, SIZES, Job
 from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
-from fleet_slip.ingest.formats.source import Base, Budget, Channel, Source
+from fleet_slip.ingest.formats.source import Base, Budget, Channel, Source, unreadable
 from fleet_slip.ingest.formats.tables import MAGIC as DUCKDB_MAGIC
 from fleet_slip.ingest.formats.tables import MAGIC_AT as DUCKDB_AT
 from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, DuckdbRows, open_duckdb, open_parquet
@@ -185,10 +185,7 @@ def file_errors(file: Path) -> Iterator[None]:
         pl.exceptions.PolarsError,
         pl.exceptions.PanicException,
     ) as error:
-        reason = shown(str(error).strip().split("\n")[0][:200]) or type(error).__name__
-        raise InputError(
-            f"{shown(file)}: cannot be read: {reason}. Is it complete? Copy or export it again."
-        ) from None
+        raise unreadable(file, error) from None
 
 
 # A file that another process reads.

@@ -13,7 +13,6 @@ import time
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -24,7 +23,7 @@ import numpy as np
 import polars as pl
 
 from fleet_slip.base import Progress, needed, no_progress, shown
-from fleet_slip.errors import FleetSlipError, InputError
+from fleet_slip.errors import InputError
 
 OWN_TIME = "\0time"
 """Column of times in s, where the file has clocks of its own."""
@@ -127,24 +126,21 @@ class FormatSource(Source):
         ]
 
 
-@contextmanager
-def reading_with(file: Path, package: str) -> Iterator[Any]:
-    """Give a package of the extra `logs`; whatever it raises at a file is an `InputError`."""
+def load_library(file: Path, package: str) -> Any:
+    """Return a package of the extra `logs`, which then logs nothing; what it raises is its own."""
     with needed("logs", f"{shown(file)}: its format"):
         module = import_module(package)
     logging.getLogger(package.partition(".")[0]).setLevel(logging.CRITICAL)
-    try:
-        yield module
-    except (FleetSlipError, MemoryError):
-        raise
-    except Exception as error:
-        if getattr(error, "errno", 0) == errno.EFBIG:  # who set the limit reports it
-            raise
-        reason = shown(str(error).strip().split("\n")[0][:200]) or type(error).__name__
-        raise InputError(
-            f"{shown(file)}: {package} cannot read it: {reason}. Is it complete? Copy it again, or "
-            "export it in another format."
-        ) from None
+    return module
+
+
+def unreadable(file: object, error: BaseException) -> InputError:
+    """Return the error of a file at which a library raised another one."""
+    reason = shown(str(error).strip().split("\n")[0][:200]) or type(error).__name__
+    return InputError(
+        f"{shown(file)}: cannot be read: {reason}. Is it complete? Copy it again, or export it in "
+        "another format."
+    )
 
 
 def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:

@@ -17,7 +17,7 @@ import polars as pl
 from fleet_slip.base import shown
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.matlab import Matrix, Vectors
-from fleet_slip.ingest.formats.source import OWN_TIME, Budget, Channel, reading_with
+from fleet_slip.ingest.formats.source import OWN_TIME, Budget, Channel, load_library
 
 READ_AHEAD = 2**17
 """Values that are read at once: for each time npTDMS reads all that a segment has of a channel."""
@@ -82,7 +82,8 @@ def open_tdms(budget: Budget) -> Iterator[Vectors]:
     Raises `InputError`, also for a file that ends too early, or has counts of a converter.
     """
     file = budget.file
-    with reading_with(file, "nptdms") as nptdms, file.open("rb") as stream:
+    nptdms = load_library(file, "nptdms")
+    with file.open("rb") as stream:
         nptdms.log.log_manager.set_level(CRITICAL)  # each of its modules has a level of its own
         tdms = nptdms.TdmsFile.open(stream)
         last = tdms._reader._segments[-1:]
