@@ -24,6 +24,7 @@ from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Any, TypeVar
 
+import duckdb
 import polars as pl
 import pyarrow as pa
 
@@ -174,13 +175,14 @@ def _wanted(said: Said | None, file: Path, table: str, key: str, formats: FileFo
 
 @contextmanager
 def file_errors(file: Path) -> Iterator[None]:
-    """Turn what the operating system, Polars and pyarrow raise into an `InputError`."""
+    """Turn what the operating system, Polars, pyarrow and DuckDB raise into an `InputError`."""
     try:
         yield
     except (
         OSError,
         ValueError,
         MemoryError,
+        duckdb.Error,
         pa.ArrowException,
         pl.exceptions.PolarsError,
         pl.exceptions.PanicException,

@@ -45,7 +45,7 @@ class ParquetSource(FormatSource):
 
     def __init__(self, stream: pa.NativeFile, budget: Budget) -> None:
         """Take the bytes of a file, and what it may become."""
-        _require_sane_footer(stream, budget.file)
+        _require_small_footer(stream, budget.file)
         self._file, self._stream = budget.file, stream
         parquet = pq.ParquetFile(stream)
         _require_within(budget, parquet.metadata)
@@ -102,15 +102,9 @@ def partition_keys(file: Path) -> dict[str, str]:
     return {key: unquote(text) for key, equals, text in named if key and equals}
 
 
-def _require_sane_footer(stream: pa.NativeFile, file: Path) -> None:
-    size = stream.size()
-    tail = stream.read_at(8, max(0, size - 8))
-    if tail[4:] != PARQUET_MAGIC or size < 12:
-        raise InputError(
-            f"{shown(file)}: begins as a Parquet file but has no footer: it is truncated. "
-            "Copy it again."
-        )
-    if int.from_bytes(tail[:4], "little") > MAX_FOOTER_BYTES:
+def _require_small_footer(stream: pa.NativeFile, file: Path) -> None:
+    tail = stream.read_at(8, max(0, stream.size() - 8))
+    if tail[4:] == PARQUET_MAGIC and int.from_bytes(tail[:4], "little") > MAX_FOOTER_BYTES:
         raise InputError(
             f"{shown(file)}: its footer is too large. Write fewer columns or row groups."
         )
@@ -232,8 +226,7 @@ class DuckdbSource(FormatSource):
 
     def channels(self) -> list[Channel]:
         """Return the columns."""
-        with _duckdb_errors(self._file):
-            return [Channel(name) for name in self._connection.sql(self._query).columns]
+        return [Channel(name) for name in self._connection.sql(self._query).columns]
 
     def find(self, column: str) -> tuple[str, int]:
         """Return where a column is. Raises `InputError`."""
@@ -245,10 +238,9 @@ class DuckdbSource(FormatSource):
 
     def read(self, _base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield rows. Raises `InputError`."""
-        with _duckdb_errors(self._file):
-            for batch in self._connection.sql(self._query).to_arrow_reader(BATCH_ROWS):
-                plain = {n: plain_column(batch.column(n), n, self._file) for n in found}
-                yield pl.DataFrame(pa.table(plain))
+        for batch in self._connection.sql(self._query).to_arrow_reader(BATCH_ROWS):
+            plain = {n: plain_column(batch.column(n), n, self._file) for n in found}
+            yield pl.DataFrame(pa.table(plain))
 
 
 @contextmanager
@@ -263,7 +255,7 @@ def open_duckdb(rows: DuckdbRows, budget: Budget) -> Iterator[DuckdbSource]:
             f"{shown(file)}: beside it is a .wal file with rows that are not in it yet. Open and "
             "close it with DuckDB."
         )
-    with TemporaryDirectory(prefix="fleet-slip-") as folder, _duckdb_errors(file):
+    with TemporaryDirectory(prefix="fleet-slip-") as folder:
         # One thread: the order of rows, and so the ticks, may depend on nothing but the file.
         settings: dict[str, Any] = {
             "threads": 1,
@@ -287,14 +279,3 @@ def open_duckdb(rows: DuckdbRows, budget: Budget) -> Iterator[DuckdbSource]:
                 )
             budget.require_rows(stored[0][1])
             yield DuckdbSource(connection, rows.table, stored[0][1], file)
-
-
-@contextmanager
-def _duckdb_errors(file: Path) -> Iterator[None]:
-    try:
-        yield
-    except duckdb.Error as error:
-        reason = " ".join(str(error).split())[:300]
-        raise InputError(
-            f"{shown(file)}: DuckDB says: {reason} See [duckdb] in the mapping."
-        ) from None
