@@ -19,12 +19,10 @@ from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
-from fleet_slip.ingest.formats.csv import CsvFormat
 from fleet_slip.ingest.guess import (
     Guess,
     TimeGuess,
     choose_units,
-    find_relations,
     guess_cars,
     guess_signals,
     guess_time,
@@ -34,8 +32,7 @@ from fleet_slip.ingest.guess import (
 from fleet_slip.ingest.load import preview_log, signals_of
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.profile import FileProfile
-from fleet_slip.ingest.suspicion import STEERING_RATIO, Signals, find_suspicions
-from fleet_slip.ingest.vocabulary import parts_of
+from fleet_slip.ingest.suspicion import Signals, find_suspicions
 
 _MOST_REFUSED = 20
 _STAND_IN: dict[str, Any] = {"vehicle_id": "car", "vehicle_model": "car", "day": date(2000, 1, 1)}
@@ -86,7 +83,7 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     try:
         guesses = choose_units(guesses, drive_of(guesses))
         drive = drive_of(guesses)
-        guesses = _correct(_road_wheels(guesses, drive), find_suspicions(drive))
+        guesses = _correct(guesses, find_suspicions(drive))
         suspicions = find_suspicions(drive_of(guesses))
     except FleetSlipError as error:
         failures = [str(error)]
@@ -98,21 +95,6 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     left = {name: guess for name, guess in guesses.items() if name in asked_for}
     notes = (*failures, *map(str, suspicions), *_notes(profile, guesses), *_refused(profile))
     return Draft(file, profile, time, sure, left, drive_keys, notes)
-
-
-def _road_wheels(guesses: dict[str, Guess], drive: Signals) -> dict[str, Guess]:
-    """Return an angle called that of steering as the road wheels', where the car turns so."""
-    guess = guesses.get("steering_wheel")
-    in_bends = (one for one in find_relations(drive) if not one.expected)
-    ratios = [STEERING_RATIO * abs(one.ratio) for one in in_bends if "steering_wheel" in one.powers]
-    if guess is None or not ratios or not 0.3 < ratios[0] < 4:
-        return guesses
-    figure = f"it is {ratios[0]:.1f} times the angle of the road wheels in bends, not 12 to 20"
-    named = {"wheel", "whl", "rad", "lenkrad"} & set(parts_of(guess.column))
-    if "steer" in guesses or named:
-        return {**guesses, "steering_wheel": guess.doubted(figure)}
-    others = {name: one for name, one in guesses.items() if name != "steering_wheel"}
-    return {**others, "steer": replace(guess.because(figure), signal="steer")}
 
 
 def _doubted(guesses: dict[str, Guess], suspicions: list[Fault]) -> dict[str, Guess]:
@@ -147,11 +129,6 @@ def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
             f"derives it from motion: course = {{ column = {_value(name)}, "
             'unit = "deg", clockwise_from_north = true, antenna_x_m = ..., antenna_y_m = ... }, '
             "with satellite_speed beside it. A heading says nothing of side-slip."
-        )
-    for name, number in profile.absent.doubtful:
-        yield (
-            f"{shown(name)}: {number:g} looks like no value, but is one in another column: leave "
-            f"such rows out with where = '\"{name}\" != {number:g}'."
         )
     if {"vx", "vy"} <= set(guesses) and "sideslip" not in guesses:
         yield (
@@ -190,7 +167,7 @@ def as_mapping(
         **_STAND_IN,
         **{key: source.get("drive", source) for key, source in drive_keys.items()},
     }
-    given |= {"missing": profile.absent.texts, "drive": drive}
+    given |= {"missing": profile.missing, "drive": drive}
     return Mapping.model_validate({"name": "draft", "time": time.keys, "signals": signals, **given})
 
 
@@ -209,13 +186,9 @@ def _correct(guesses: dict[str, Guess], suspicions: list[Fault]) -> dict[str, Gu
     for one in suspicions:
         if one.kind == "reversed":
             (name,) = one.signals
-            if name not in corrected:
-                continue
-            if name == COURSE:
-                corrected |= _turned_round(corrected, one.figure)
-                continue
-            turned = None if corrected[name].keys.get("negate") else True
-            corrected[name] = corrected[name].because(one.figure, negate=turned)
+            if name in corrected and name != COURSE:  # which a person turns
+                turned = None if corrected[name].keys.get("negate") else True
+                corrected[name] = corrected[name].because(one.figure, negate=turned)
         elif one.kind == "swapped" and len(one.signals) == 2 and {*one.signals} <= {*corrected}:
             left, right = one.signals
             corrected[left], corrected[right] = (
@@ -223,17 +196,6 @@ def _correct(guesses: dict[str, Guess], suspicions: list[Fault]) -> dict[str, Gu
                 replace(corrected[left].because(one.figure), signal=right),
             )
     return corrected
-
-
-def _turned_round(guesses: dict[str, Guess], figure: str) -> dict[str, Guess]:
-    """Return the course counterclockwise, or with north and east swapped."""
-    course, speed = guesses[COURSE], guesses[SPEED]
-    if not course.component:
-        return {COURSE: course.because(figure, clockwise_from_north=False)}
-    return {
-        COURSE: replace(speed.because(figure, component="north"), signal=COURSE),
-        SPEED: replace(course.because(figure, component="east"), signal=SPEED),
-    }
 
 
 # Writes a draft of a mapping as TOML, each guess with its reasons as a comment.
@@ -262,10 +224,11 @@ def write_draft(draft: Draft, name: str, place: Path | str | None = None) -> str
     called = shlex.quote(shown(str(place or draft.file)))
     parts = [_HEAD.format(file=called), f"name = {_value(name)}\n"]
     formats = draft.profile.formats
-    if draft.profile.absent.texts:
-        parts.append(f"missing = {_value(draft.profile.absent.texts)}\n")
-    if keys := _csv_keys(formats.csv):
-        parts.append(_table("csv", keys))
+    if draft.profile.missing:
+        parts.append(f"missing = {_value(draft.profile.missing)}\n")
+    if keys := formats.csv.model_dump(exclude_defaults=True):
+        decimal_comma = {"decimal_comma": formats.csv.decimal_comma} if "separator" in keys else {}
+        parts.append(_table("csv", keys | decimal_comma))
     if formats.can is not None:
         parts.append(_table("can", {"database": formats.can.database}))
     if formats.duckdb is not None:
@@ -287,15 +250,9 @@ def _wrapped(line: str) -> str:
     )
 
 
-def _csv_keys(csv: CsvFormat) -> dict[str, Any]:
-    """Return what is not usual of a text file."""
-    keys = csv.model_dump(exclude_defaults=True)
-    return keys | ({"decimal_comma": csv.decimal_comma} if "separator" in keys else {})
-
-
 def _drive(draft: Draft) -> str:
     lines = ["[drive]"]
-    if not draft.profile.has_clock and not _is_dated(draft):
+    if not draft.profile.has_clock and not TimeBase.model_validate(draft.time.keys).is_dated:
         lines.append("# day = 2024-05-31  # to be filled in")
     trip = draft.drive.get("column", {}).get("drive")
     if trip is not None:
@@ -309,10 +266,6 @@ def _drive(draft: Draft) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _is_dated(draft: Draft) -> bool:
-    return TimeBase.model_validate(draft.time.keys).is_dated
-
-
 def _signals(draft: Draft) -> str:
     lines = ["[signals]"]
     for name, guess in draft.guesses.items():
@@ -324,7 +277,9 @@ def _signals(draft: Draft) -> str:
         doubts = "; ".join(guess.doubts) or "its name and unit fit several columns"
         lines.append(f"# Which one, if any? {name}: {doubts}")
         if guess.component != "east":
-            alternatives = (guess, *guess.rivals, *_in_other_units(guess))
+            alternatives = [guess, *guess.rivals]
+            if guess.is_without_unit and not guess.rivals:
+                alternatives += (guess.because("", **keys) for keys in unit_choices(guess)[1:])
             lines += ["# " + _line(name, one, draft.questions) for one in alternatives]
     known = {*draft.guesses, *draft.questions}
     absent = [name for name in catalogue().signals if name not in known]
@@ -340,12 +295,6 @@ def _line(name: str, guess: Guess, guesses: dict[str, Guess]) -> str:
         keys = {"north": keys["column"], "east": east, "unit": keys["unit"]}
     text = ", ".join(f"{key} = {_value(value)}" for key, value in keys.items())
     return f"{name} = {{ {text} }}"
-
-
-def _in_other_units(guess: Guess) -> Iterator[Guess]:
-    """Yield a guess in the other units that its values may be in."""
-    if guess.is_without_unit and not guess.rivals:
-        yield from (guess.because("", **keys) for keys in unit_choices(guess)[1:])
 
 
 def _table(name: str, keys: dict[str, Any]) -> str:

@@ -279,8 +279,6 @@ class TimeGuess:
     keys: dict[str, Any]
     reason: str
     rate_hz: float | None
-    day: date | None = None
-    """The date that times have; None without one, or if each drive has its own."""
 
 
 def guess_cars(profiles: Iterable[Profile]) -> tuple[dict[str, dict[str, str]], NDArray[np.int64]]:

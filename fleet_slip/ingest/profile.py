@@ -140,52 +140,33 @@ _FAR = 2.0
 _FEWEST = 20
 
 
-@dataclass(frozen=True)
-class Absent:
-    """What means that there is no value.
+def find_absent(
+    channels: Sequence[tuple[FloatArray, tuple[str, ...]]],
+) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """Return what means no value in channels, of their numbers and of texts among these.
 
-    Attributes:
-        texts: as a mapping has them under `missing`, numbers too.
-        numbers: those of them that are numbers.
-        doubtful: a channel and a number that means none in it, though another has it as a value.
+    All as text, as a mapping has it under `missing`; and the numbers among them. A number that is a
+    value in some channel is none of them.
     """
-
-    texts: tuple[str, ...] = ()
-    numbers: tuple[float, ...] = ()
-    doubtful: tuple[tuple[str, float], ...] = ()
-
-
-def find_absent(channels: Sequence[tuple[str, FloatArray, tuple[str, ...]]]) -> Absent:
-    """Return what means no value in channels: their names, numbers, and texts among numbers."""
     known = vocabulary()["missing"]
-    texts = [t for _, _, odd in channels for t in odd if t.lower() in known["texts"]]
-    sentinels: dict[float, list[str]] = {}
-    real: set[float] = set()
-    for name, values, _ in channels:
+    texts = [text for _, odd in channels for text in odd if text.lower() in known["texts"]]
+    means_none: dict[float, bool] = {}
+    for values, _ in channels:
         present = values[np.isfinite(values)]
-        others = present[~np.isin(present, known["numbers"])]
-        for number in np.unique(present[np.isin(present, known["numbers"])]):
-            if others.size >= _FEWEST and _is_far(float(number), others):
-                sentinels.setdefault(float(number), []).append(name)
-            else:
-                real.add(float(number))
-    sure = tuple(number for number in sentinels if number not in real)
-    doubtful = tuple((n, one) for one, names in sentinels.items() if one in real for n in names)
-    written = [f"{number:.0f}" for number in sure]
-    return Absent(tuple(dict.fromkeys([*written, *texts])), sure, doubtful)
+        is_known = np.isin(present, known["numbers"])
+        others = present[~is_known]
+        for number in map(float, np.unique(present[is_known])):
+            is_none = others.size >= _FEWEST and _is_far(number, others)
+            means_none[number] = is_none and means_none.get(number, True)
+    numbers = tuple(number for number, is_none in means_none.items() if is_none)
+    written = [f"{number:.0f}" for number in numbers]
+    return tuple(dict.fromkeys([*written, *texts])), numbers
 
 
 def _is_far(number: float, others: FloatArray) -> bool:
     low, high = float(others.min()), float(others.max())
     margin = _FAR * max(high - low, 1e-6)
     return number > high + margin or number < low - margin
-
-
-def without_absent(values: FloatArray, absent: Absent) -> FloatArray:
-    """Return values with NaN for the numbers that mean none."""
-    if not absent.numbers or not values.size:
-        return values
-    return np.where(np.isin(values, absent.numbers), np.nan, values)
 
 
 MOST_ROWS = 200_000
@@ -237,8 +218,8 @@ class FileProfile:
     has_clock: bool
     formats: FileFormats
     profiles: tuple[Profile, ...]
-    absent: Absent = field(default_factory=Absent)
-    """What means that there is no value."""
+    missing: tuple[str, ...] = ()
+    """What means that there is no value, as a mapping has it."""
     refused: tuple[str, ...] = ()
     """What is wrong with channels that cannot be read."""
 
@@ -263,10 +244,11 @@ def profile_file(file: Path, formats: FileFormats) -> FileProfile:
         found = tuple(
             p for of in bases.values() for p in _profile_base(source, of, formats.csv, refused)
         )
-        absent = find_absent([(p.channel.name, p.values, p.texts) for p in found if p.is_number])
-        cleaned = (replace(p, values=without_absent(p.values, absent)) for p in found)
+        missing, numbers = find_absent([(p.values, p.texts) for p in found if p.is_number])
+        without = (np.where(np.isin(p.values, numbers), np.nan, p.values) for p in found)
+        cleaned = tuple(replace(p, values=v) for p, v in zip(found, without, strict=True))
         reasons = tuple(dict.fromkeys(refused))
-        return FileProfile(source.has_clock, formats, tuple(cleaned), absent, reasons)
+        return FileProfile(source.has_clock, formats, cleaned, missing, reasons)
 
 
 def _profile_base(
