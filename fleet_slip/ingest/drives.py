@@ -16,13 +16,7 @@ from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
 from fleet_slip.catalogue.signals import catalogue, digest_drive, round_chunks
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
-from fleet_slip.ingest.log_rows import (
-    describe_refused,
-    join_refused,
-    no_rows,
-    physical,
-    place_label,
-)
+from fleet_slip.ingest.log_rows import describe_refused, join_refused, no_rows
 from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.resampling import (
     SNAP_TOLERANCE_S,
@@ -35,6 +29,8 @@ from fleet_slip.ingest.resampling import (
     choose_method,
     course_and_speed,
     fixes_on_ticks,
+    physical,
+    place_label,
 )
 
 LONGEST_DRIVE_S = 2**19 * STEP_S

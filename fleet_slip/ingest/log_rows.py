@@ -1,253 +1,355 @@
-"""Reads the rows of a log, which is a file or several, in bounded batches.
+"""Checks each row by itself: values in SI units of good ones, the reason why bad ones are refused.
 
-A batch is a Polars frame with the columns that a mapping uses: text (CSV, text in Parquet), 64-bit
-floats, dates or timestamps. CSV fields stay text, so that what is not a number can be quarantined
-as it was written. A time base goes on from file to file, each open only while it is read.
+A batch's columns carry the prefix `RAW`, so that no name in a file can meet one of ours, be taken
+for a pattern, or be anything but a name.
 """
 
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from collections.abc import Mapping as Named
-from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache, partial
+from datetime import date, datetime
+from decimal import Decimal
+from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import polars as pl
-import pyarrow as pa
 
-from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.arrays import BoolArray, is_finite
 from fleet_slip.base import shown
-from fleet_slip.catalogue.signals import catalogue, round_chunks
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.columns import describe
-from fleet_slip.ingest.formats.reading import file_errors, open_source
-from fleet_slip.ingest.formats.source import BASE, Base, Budget, Meter, Source
-from fleet_slip.ingest.formats.tables import BATCH_ROWS
-from fleet_slip.ingest.log_files import parts_of
-from fleet_slip.ingest.mapping import SPEEDS, LabelSensor, Mapping
-from fleet_slip.ingest.raw_columns import (
-    LONGEST_TEXT,
-    RAW,
-    REASONS,
-    ROW,
-    Field,
-    fields_of,
-    meets_conditions,
-    merge_bases,
+from fleet_slip.ingest.columns import (
+    DateColumn,
+    SignalColumn,
+    as_moments,
+    conversion_factor,
+    count_range,
+    describe,
 )
+from fleet_slip.ingest.formats.csv import CUT, EXTRA_FIELDS
+from fleet_slip.ingest.formats.source import BASE, Meter
+from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
+from fleet_slip.ingest.time_bases import DISORDER, HELD, ROW, read_batches
 
-_OpenIt = Callable[[Path], AbstractContextManager[tuple[list[Base], set[str]]]]
-
-_CLOCK = "this file says when each sample was taken: write own_clock = true under [time]"
-_NO_CLOCK = "this file has no clock of its own: write column or rate_hz under [time]"
-
-
-@dataclass
-class _Opened:
-    """An open file, its time bases, their columns, and how many of them are being read."""
-
-    file: ExitStack
-    bases: list[Base]
-    columns: set[str]
-    readers: int = 0
-
-
-class PartBases:
-    """Opens the files of a log, each once for all who read a time base of it at a time."""
-
-    def __init__(self, open_it: _OpenIt) -> None:
-        """Take what opens a file: it gives its time bases, and which columns they have."""
-        self._open_it = open_it
-        self._opened: dict[Path, _Opened] = {}
-
-    def __enter__(self) -> "PartBases":
-        """Begin without open files."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close what readers have left open."""
-        for part in [*self._opened]:
-            self._opened.pop(part).file.close()
-
-    @contextmanager
-    def using(self, part: Path) -> Iterator[_Opened]:
-        """Give a file, open as long as somebody uses it."""
-        if part not in self._opened:
-            with ExitStack() as file:
-                bases, columns = file.enter_context(self._open_it(part))
-                self._opened[part] = _Opened(file.pop_all(), bases, columns)
-        opened = self._opened[part]
-        opened.readers += 1
-        try:
-            with file_errors(part):
-                yield opened
-        finally:
-            opened.readers -= 1
-            if not opened.readers and self._opened.get(part) is opened:
-                del self._opened[part]
-                opened.file.close()
+RAW = "raw "
+REASONS = (
+    "missing",
+    "not_a_number",
+    "not_a_time",
+    "not_finite",
+    "out_of_range",
+    "extra_fields",
+    "cut_line",
+    "no_value",
+    "time_backwards",
+    "time_duplicate",
+    "isolated",
+)
+"""What can be wrong with a row by itself; a problem is an index into this."""
 
 
-class _Stretch(NamedTuple):
-    """The rows of a time base in one file: which of its bases it is, and how many there are."""
+@dataclass(frozen=True)
+class Field:
+    """One thing to take from a row, or a condition on it.
 
-    part: Path
-    place: int
-    first_s: float
-    rows: int
-
-
-def join_parts(log: Path, parts: list[Path], mapping: Mapping, opened: PartBases) -> list[Base]:
-    """Return the time bases of a log: what has the same columns goes on from file to file.
-
-    Files follow each other in the order of their first times. Raises `InputError` for a column that
-    no file has.
+    `value` is made of raw columns; `problem`, null where all is well, may also use the value under
+    the field's name, so that a text is parsed once. `is_sound` looks at a whole batch that has the
+    values: where it holds no row has the problem, and looking at each is saved.
     """
-    time = str(mapping.time.key)
-    missing = {name for names in mapping.time_bases().values() for name in names}
-    found: dict[str, list[_Stretch]] = defaultdict(list)
-    for part in parts:
-        with opened.using(part) as there:
-            missing -= there.columns
-            for place, base in enumerate(there.bases):
-                first = next(base.read())
-                name = " ".join(sorted({*first.columns, time}))
-                least = first[time].min()
-                first_s = least if isinstance(least, float) else 0.0
-                found[name].append(_Stretch(part, place, first_s, base.count_rows()))
-    if missing:
-        raise InputError(f"{shown(log)}: no file in it has the column {min(missing)!r}.")
-    for stretches in found.values():
-        stretches.sort(key=lambda stretch: stretch.first_s)
-    names = sorted(found, key=lambda name: found[name][0].first_s)
-    return [
-        Base(
-            name,
-            partial(sum, [stretch.rows for stretch in found[name]]),
-            partial(_read, opened, found[name]),
-        )
-        for name in names
-    ]
+
+    name: str
+    kind: Literal["key", "time", "signal", "condition"]
+    raw: pl.Expr
+    value: pl.Expr
+    problem: pl.Expr
+    is_sound: Callable[[pl.DataFrame], bool] = lambda _: False
 
 
-def _read(opened: PartBases, stretches: list[_Stretch]) -> Iterator[pl.DataFrame]:
-    for stretch in stretches:
-        with opened.using(stretch.part) as there:
-            yield from there.bases[stretch.place].read()
+def find_held(column: str, schema: pl.Schema) -> str:
+    """Return where a column's last value stands, in rows of several time bases."""
+    return HELD + column if RAW + HELD + column in schema else column
 
 
-def read_batches(log: Path, mapping: Mapping, meter: Meter | None = None) -> Iterator[pl.DataFrame]:
-    """Yield the columns of a log that a mapping uses, in its order, in bounded batches.
-
-    Rows of several time bases come as `merge_bases` says. The meter gets how many rows come.
-    Raises `InputError` if a file cannot be read, or a column is missing or ambiguous.
-    """
-    meter = meter or Meter()
-    wanted, parts, time = mapping.time_bases(), parts_of(log), mapping.time.key
-    if time is None or (len(wanted) == 1 and not mapping.time.own_clock):
-        for part in parts:
-            with _open_part(part, mapping) as source:
-                columns = next(iter(wanted.values()))
-                if meter.is_watched and part == parts[0]:
-                    meter.expect(source.expected_rows(columns), of=part.stat().st_size)
-                yield from Budget.of(part).metered(source.batches(columns))
-    elif len(parts) == 1:
-        with _open_part(log, mapping) as source:
-            bases = _bases_of(source, log, mapping, wanted)
-            if meter.is_watched:
-                meter.expect(sum(map(source.expected_rows, wanted.values())))
-            yield from _merged(bases, mapping)
-    else:
-        with PartBases(partial(_open_bases, mapping)) as opened:
-            bases = join_parts(log, parts, mapping, opened)
-            meter.expect(sum(base.count_rows() for base in bases))
-            yield from _merged(bases, mapping)
-
-
-def _merged(bases: list[Base], mapping: Mapping) -> Iterator[pl.DataFrame]:
-    """Yield the rows of time bases as those of one table."""
-    time, held = str(mapping.time.key), mapping.common_columns()
-    for rows in merge_bases(bases, time, held, mapping.time.split_gap_s):
-        yield from rows.iter_slices(BATCH_ROWS)
-
-
-@contextmanager
-def _open_part(part: Path, mapping: Mapping) -> Iterator[Source]:
-    """Open a file that says times as the mapping does. Raises `InputError`."""
-    with file_errors(part), open_source(part, mapping.formats) as source:
-        if source.has_clock != mapping.time.own_clock:
-            raise InputError(
-                f"{shown(part)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
-                f"{mapping.name!r}."
-            )
-        yield source
-
-
-@contextmanager
-def _open_bases(mapping: Mapping, part: Path) -> Iterator[tuple[list[Base], set[str]]]:
-    """Open a file, which may lack wanted columns; yield its time bases, and the columns it has."""
-    wanted = mapping.time_bases()
-    with _open_part(part, mapping) as source:
-        names = {channel.name for channel in source.channels()}
-        # What several groups of one file have is called NAME@GROUP, there only.
-        all_names = {name for columns in wanted.values() for name in columns}
-        there = names | {name for name in all_names if name.rpartition("@")[0] in names}
-        found = {
-            own: [name for name in columns if name in there]
-            for own, columns in wanted.items()
-            if own is None or own in there
-        }
-        found = {own: columns for own, columns in found.items() if columns}
-        columns = {name for columns in found.values() for name in columns}
-        yield _bases_of(source, part, mapping, found), columns
-
-
-def _bases_of(
-    source: Source, part: Path, mapping: Mapping, wanted: dict[str | None, list[str]]
-) -> list[Base]:
-    """Return the time bases of a file that have one of the wanted columns."""
-    if source.has_clock:
-        bases = [base for columns in wanted.values() for base in source.bases(columns)]
-    else:
-        time = str(mapping.time.key)
-        bases = [
-            Base(
-                str(own),
-                partial(_count_rows, source, str(own), own == time),
-                partial(_read_with_times, source, part, columns, str(own), time),
-            )
-            for own, columns in wanted.items()
+def find_problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
+    """Return the index of the first reason whose condition holds, else null."""
+    return pl.coalesce(
+        [
+            pl.when(condition).then(pl.lit(REASONS.index(reason), pl.Int16))
+            for condition, reason in cases
         ]
-
-    def metered(read: Callable[[], Iterator[pl.DataFrame]]) -> Iterator[pl.DataFrame]:
-        return Budget.of(part).metered(read())
-
-    return [replace(base, read=partial(metered, base.read)) for base in bases]
+    )
 
 
-def _count_rows(source: Source, own: str, is_main: bool) -> int:
-    """Return how many rows a base has: those with a time, where it has times of its own."""
-    batches = source.batches([own])
-    return sum(batch.height - (0 if is_main else batch[own].null_count()) for batch in batches)
+def as_text(column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
+    """Return a column as text, whole numbers without a point, null for missing."""
+    raw = pl.col(RAW + column)
+    text = raw.cast(pl.String)
+    if schema[RAW + column] == pl.Float64:
+        whole = raw.cast(pl.Int64, strict=False)
+        text = pl.when(whole == raw).then(whole.cast(pl.String)).otherwise(text)
+    return without_missing(text, mapping)
 
 
-def _read_with_times(
-    source: Source, part: Path, columns: list[str], own: str, time: str
-) -> Iterator[pl.DataFrame]:
-    """Yield the rows of a base, its times under the name that all times have."""
-    for batch in source.batches(columns):
-        if not batch[own].dtype.is_numeric():
-            raise InputError(
-                f"{shown(part)}: the time {own!r} is not of numbers; signals with times of their "
-                "own need them."
-            )
-        if own == time:
-            yield batch
+def as_number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr, pl.Expr, pl.Expr]:
+    """Return a column as it is, as float64 with null for missing, and whether there is a text."""
+    raw = pl.col(RAW + column)
+    absent = [float(text) for text in mapping.missing if is_number(text)]
+    match schema[RAW + column]:
+        case pl.String:
+            text = without_missing(raw, mapping)
+            if mapping.csv.decimal_comma:
+                text = text.str.replace(",", ".", literal=True)
+            number = text.cast(pl.Float64, strict=False)
+            if not absent:
+                return raw, number, text.is_not_null()
+            is_present = text.is_not_null() & ~number.is_in(absent).fill_null(value=False)
+            return raw, pl.when(is_present).then(number), is_present
+        case pl.Float64:
+            number = pl.when(~raw.is_in(absent)).then(raw) if absent else raw
+            return raw, number, pl.lit(value=False)
+        case other:
+            raise unfit_column(column, other, "numbers")
+
+
+def without_missing(text: pl.Expr, mapping: Mapping) -> pl.Expr:
+    """Return a text without spaces around it, null where it means that there is no value."""
+    text = text.str.strip_chars()
+    return pl.when(~text.is_in(["", *mapping.missing])).then(text)
+
+
+def unfit_column(column: str, kind: pl.DataType, needed: str) -> InputError:
+    """Return the error of a column whose type cannot be what the mapping says it is."""
+    return InputError(f"column {column!r} has the type {kind}; the mapping needs {needed}.")
+
+
+_FIRST_DAY, _END_DAY = date(1970, 1, 1), date(2200, 1, 1)
+
+
+def day_field(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    """Return the field of a day. Raises `InputError` for a column that is none."""
+    raw, value = pl.col(RAW + column), pl.col(name)
+    text = raw
+    match schema[RAW + column]:
+        case pl.String:
+            text = without_missing(raw, mapping)
+            days = [text.str.to_date(f, strict=False) for f in ("%Y-%m-%d", "%d.%m.%Y")]
+            day = pl.coalesce(days)
+        case pl.Date | pl.Datetime:
+            day = raw.cast(pl.Date)
+        case other:
+            raise unfit_column(column, other, "a date such as 2024-05-31")
+    outside = (value < pl.lit(_FIRST_DAY)) | (value >= pl.lit(_END_DAY))
+    problem = find_problems(
+        (text.is_null(), "missing"), (value.is_null(), "not_a_time"), (outside, "out_of_range")
+    )
+    return Field(name, "key", raw, day, problem)
+
+
+def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    """Return the field of the time in s, since 1970 for timestamps. Raises `InputError`."""
+    unit = "s" if mapping.time.own_clock else mapping.time.unit
+    if unit is None:
+        return _timestamp(column, schema, mapping)
+    raw, number, present = as_number(column, schema, mapping)
+    value = pl.col("time")
+    problem = find_problems(
+        (value.is_null() & present, "not_a_number"),
+        (value.is_null(), "missing"),
+        (~value.is_finite(), "not_finite"),
+    )
+    time_s = number * conversion_factor(unit, "s")
+
+    def is_sound(rows: pl.DataFrame) -> bool:
+        found = rows["time"]
+        return not found.null_count() and is_finite(found.to_numpy())
+
+    return Field("time", "time", raw, time_s, problem, is_sound)
+
+
+def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    raw, value = pl.col(RAW + column), pl.col("time")
+    kind = schema[RAW + column]
+    if kind == pl.String and mapping.time.format is not None:
+        text = without_missing(raw, mapping)
+        if mapping.time.date is not None:
+            text = _dates(mapping.time.date, schema, mapping) + " " + text
+        if not mapping.time.is_dated:  # the time of day
+            clock_s = text.str.to_time(mapping.time.format, strict=False).cast(pl.Int64) / 1e9
+            cases = ((text.is_null(), "missing"), (value.is_null(), "not_a_time"))
+            return Field("time", "time", raw, clock_s, find_problems(*cases))
+        moment = as_moments(text, str(mapping.time.moment_format))
+    elif isinstance(kind, pl.Datetime):
+        text = moment = raw
+    else:
+        needed = "a time: add 'unit' for numbers, 'format' for timestamps as text"
+        raise unfit_column(column, kind, needed)
+    if mapping.time.zone is not None and getattr(kind, "time_zone", None) is None:
+        moment = moment.dt.replace_time_zone(
+            mapping.time.zone, ambiguous="earliest", non_existent="null"
+        )
+    first, end = (datetime.combine(day, datetime.min.time()) for day in (_FIRST_DAY, _END_DAY))
+    outside = (value < 0) | (value >= (end - first).total_seconds())
+    problem = find_problems(
+        (text.is_null(), "missing"), (value.is_null(), "not_a_time"), (outside, "out_of_range")
+    )
+    return Field("time", "time", raw, moment.dt.epoch("us") / 1e6, problem)
+
+
+def _dates(date: DateColumn, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
+    """Return dates as text; of digits alone with the noughts that a number lacks."""
+    text = as_text(find_held(date.column, schema), schema, mapping)
+    digits = _FIRST_DAY.strftime(date.format)
+    return text.str.zfill(len(digits)) if digits.isdigit() else text
+
+
+# What a mapping takes from each row: values in SI units and their faults.
+
+LONGEST_TEXT = 200
+"""Characters of metadata that are accepted, and of offending values that are kept."""
+
+
+def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
+    """Return the fields of a batch with this schema: drive metadata, time, signals, conditions.
+
+    Raises `InputError` if a column's type cannot be what the mapping says it is.
+    """
+    fields: list[Field] = []
+    if mapping.drive.column is not None:
+        fields.append(_text("drive", find_held(mapping.drive.column, schema), schema, mapping))
+    for name, make in _METADATA.items():
+        source = getattr(mapping.drive, name)
+        if isinstance(source, FromColumn):
+            fields.append(make(name, find_held(source.column, schema), schema, mapping))
+    if mapping.time.key is not None:
+        fields.append(time_field(mapping.time.key, schema, mapping))
+        if RAW + DISORDER in schema:
+            fields.append(_disorder(pl.col(RAW + mapping.time.key)))
+    names = [name for name in catalogue().signals if name in mapping.signals]
+    signals = [_signal(name, schema, mapping) for name in names]
+    nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
+    no_value = _condition(nothing, "no_value", pl.lit(None, pl.String))
+    somewhere = replace(
+        no_value, is_sound=lambda rows: any(not rows[name].null_count() for name in names)
+    )
+    fields += [*signals, somewhere]
+    if RAW + EXTRA_FIELDS in schema:
+        name = RAW + EXTRA_FIELDS
+        extra = pl.col(name)
+        problem = find_problems((extra == CUT, "cut_line"), (extra.is_not_null(), "extra_fields"))
+        field = Field("", "condition", extra, extra, problem)
+        fields.append(replace(field, is_sound=lambda rows: rows[name].null_count() == rows.height))
+    return fields
+
+
+def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
+    """Return whether a row meets all of the mapping's conditions. Raises `InputError`."""
+    met = pl.lit(value=True)
+    for condition in mapping.where:
+        of = condition.signal
+        source = None if of is None else mapping.signals[of]
+        name = find_held(str(source.column if source else condition.column), schema)
+        column = pl.col(RAW + name)
+        if of is not None and source is not None:
+            number = _signed(source, name, schema, mapping)[1]
+            met &= condition.is_met(_si_value(of, source, number), column)
+        elif condition.one_of:
+            met &= condition.is_met(column, as_text(name, schema, mapping))
         else:
-            yield batch.filter(pl.col(own).is_not_null()).rename({own: time})
+            met &= condition.is_met(as_number(name, schema, mapping)[1], column)
+    return met
+
+
+def _condition(condition: pl.Expr, reason: str, raw: pl.Expr) -> Field:
+    return Field("", "condition", raw, raw, find_problems((condition, reason)))
+
+
+def _disorder(time: pl.Expr) -> Field:
+    """What a file of several time bases says of each row's time among those of its base."""
+    reasons = ("time_backwards", "time_duplicate", "isolated")
+    problem = find_problems(*((pl.col(RAW + DISORDER) == reason, reason) for reason in reasons))
+    return Field("time", "condition", time, time, problem)
+
+
+def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    """A signal in SI units. Its range is checked on the count that it will become."""
+    source = mapping.signals[name]
+    raw, number, present = _signed(source, source.column, schema, mapping)
+    (signal, least, most), value = count_range(name, source), pl.col(name)
+    count = value / float(signal.scale)
+    outside = (count <= least - 0.5) | (count >= most + 0.5)
+    problem = find_problems(
+        (value.is_null() & present, "not_a_number"),
+        (source.is_outside_table(number), "out_of_range"),
+        (~value.is_finite(), "not_finite"),
+        (outside, "out_of_range"),
+    )
+
+    def is_sound(rows: pl.DataFrame) -> bool:
+        found = rows[name]
+        if source.table or (found.null_count() and schema[RAW + source.column] == pl.String):
+            return False
+        return _lies_within(found, least - 0.5, most + 0.5, signal.scale)
+
+    return Field(name, "signal", raw, _si_value(name, source, number), problem, is_sound)
+
+
+def _signed(
+    source: SignalColumn, column: str, schema: pl.Schema, mapping: Mapping
+) -> tuple[pl.Expr, pl.Expr, pl.Expr]:
+    """Return a column as `as_number` does, with the sign that stands in another one."""
+    raw, number, present = as_number(column, schema, mapping)
+    if source.sign is None:
+        return raw, number, present
+    sign = as_text(find_held(source.sign.column, schema), schema, mapping)
+    negative = sign == str(source.sign.negative)
+    signed = pl.when(negative).then(-number).when(sign.is_not_null()).then(number)
+    return raw, signed, present & sign.is_not_null()
+
+
+def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
+    gain, bias = source.linear(catalogue()[name].unit)
+    value = source.looked_up(number)
+    # Otherwise it would change nothing but the sign of zero.
+    return value if (gain, bias) == (1.0, 0.0) else value * gain + bias
+
+
+def _lies_within(values: pl.Series, low: float, high: float, scale: Decimal) -> bool:
+    """Whether all values are finite, and their counts between two limits, which are outside."""
+    present = (values.drop_nulls() if values.null_count() else values).to_numpy()
+    if not present.size:
+        return True
+    # Dividing keeps the order of what it rounds; a NaN is the least and the most, and in no range.
+    least, most = float(present.min()) / float(scale), float(present.max()) / float(scale)
+    return low < least and most < high
+
+
+def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    raw, number, present = as_number(column, schema, mapping)
+    value = pl.col(name)
+    problem = find_problems(
+        (value.is_null() & present, "not_a_number"),
+        (~value.is_finite(), "not_finite"),
+        (value <= 0, "out_of_range"),
+    )
+    return Field(name, "key", raw, number, problem)
+
+
+def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+    too_long = pl.col(name).str.len_chars() > LONGEST_TEXT
+    problem = find_problems((pl.col(name).is_null(), "missing"), (too_long, "out_of_range"))
+    return Field(name, "key", pl.col(RAW + column), as_text(column, schema, mapping), problem)
+
+
+_METADATA: dict[str, Callable[[str, str, pl.Schema, Mapping], Field]] = {
+    "vehicle_id": _text,
+    "vehicle_model": _text,
+    "track": _text,
+    "mass_kg": _positive,
+    "tyres": _text,
+    "receiver": _text,
+    "adhesion": _positive,
+    "day": day_field,
+}
 
 
 # Each row is checked by itself: values in SI units of good ones, the reason of bad ones.
@@ -421,57 +523,3 @@ def _explain(bad: pl.DataFrame, fields: list[Field]) -> pl.DataFrame:
         pl.lit(field.name or None, pl.String).alias("signal"),
         field.raw.cast(pl.String).str.slice(0, LONGEST_TEXT).alias("value"),
     )
-
-
-# The label is brought to the centre of gravity: with the yaw rate r, a sensor x before it and y to
-# its left has the velocities (vx - r y, vy + r x). Of an angle alone the speed is needed beside it.
-
-RADIUS_M = 0.31
-"""Of a wheel whose mapping names none; a tenth more moves the correction by a tenth."""
-LEAST_SPEED_MPS = 2.0
-"""Below it two velocities give no angle, and an angle is not moved."""
-
-
-def physical(counts: Named[str, pa.Array], name: str) -> FloatArray:
-    """Return a signal in SI units, NaN where there is none."""
-    values = pl.Series(counts[name]).cast(pl.Float64).fill_null(float("nan")).to_numpy()
-    return np.asarray(values * float(catalogue()[name].scale))
-
-
-def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.Array]:
-    """Return the counts of the label at the centre of gravity, and of velocities it is made of."""
-    sensor = mapping.label
-    if sensor is None:
-        return {}
-    found = _velocities(sensor, counts) if sensor.from_velocities else _angle(mapping, counts)
-    return {name: round_chunks([values], catalogue()[name]) for name, values in found.items()}
-
-
-def _velocities(sensor: LabelSensor, counts: Named[str, pa.Array]) -> dict[str, FloatArray]:
-    vx, vy = physical(counts, "vx"), physical(counts, "vy")
-    if sensor.is_elsewhere:
-        yaw_rate = physical(counts, "yaw_rate")
-        vx, vy = vx + yaw_rate * sensor.sensor_y_m, vy - yaw_rate * sensor.sensor_x_m
-    fast = np.hypot(vx, vy) >= LEAST_SPEED_MPS
-    return {"vx": vx, "vy": vy, catalogue().label: np.where(fast, np.arctan2(vy, vx), np.nan)}
-
-
-def _angle(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, FloatArray]:
-    sensor, label = mapping.label, catalogue().label
-    if sensor is None or not sensor.is_elsewhere:
-        return {}
-    angle, yaw_rate = physical(counts, label), physical(counts, "yaw_rate")
-    speed = _speed(mapping, counts)
-    vx = speed * np.cos(angle) + yaw_rate * sensor.sensor_y_m
-    vy = speed * np.sin(angle) - yaw_rate * sensor.sensor_x_m
-    return {label: np.where(speed >= LEAST_SPEED_MPS, np.arctan2(vy, vx), np.nan)}
-
-
-def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray:
-    """Return the car's speed: as it is logged, or that of its wheels."""
-    for name in SPEEDS:
-        if name in counts:
-            return np.abs(physical(counts, name))
-    wheels = [name for name in counts if name.startswith("wheel_")]
-    speeds = [physical(counts, n) * (mapping.signals[n].radius_m or RADIUS_M) for n in wheels]
-    return np.asarray(np.median(speeds, axis=0), dtype=np.float64)

@@ -10,7 +10,7 @@ from nptdms import ChannelObject
 
 import fleet_slip
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import raw_columns, stream
+from fleet_slip.ingest import stream, time_bases
 from fleet_slip.ingest.formats import can as can_frames
 from fleet_slip.ingest.formats import can_files, mdf
 from fleet_slip.ingest.formats import csv as csv_batches
@@ -95,7 +95,7 @@ def test_a_file_with_a_clock_tells_bytes_too(
     monkeypatch.setattr(can_files, "AT_ONCE", 8)
     monkeypatch.setattr(can_frames, "PIECE_FRAMES", 8)
     monkeypatch.setattr(mdf, "WINDOW_RECORDS", 10)
-    monkeypatch.setattr(raw_columns, "WINDOW_ROWS", 20)
+    monkeypatch.setattr(time_bases, "WINDOW_ROWS", 20)
     monkeypatch.setattr(stream, "RATE_ROWS", 20)
     monkeypatch.setattr(stream, "FEWEST_STEPS", 2)
     file, mapping = own_clock(tmp_path, name)

@@ -10,8 +10,8 @@ import pytest
 
 from fleet_slip.catalogue.signals import as_arrow
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import log_rows
 from fleet_slip.ingest import log_rows as checking
+from fleet_slip.ingest import time_bases
 from fleet_slip.ingest.formats import csv as csv_batches
 from fleet_slip.ingest.formats import tables
 from fleet_slip.ingest.formats.source import Budget
@@ -166,7 +166,7 @@ def test_a_file_that_grows_while_it_is_read_is_refused(
 ) -> None:
     file = write(tmp_path, GOOD.encode())
 
-    read = log_rows.read_batches
+    read = time_bases.read_batches
 
     def grow(*arguments: Any) -> Any:
         yield from read(*arguments)

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import log_rows, raw_columns, stream
+from fleet_slip.ingest import stream, time_bases
 from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, Source
-from fleet_slip.ingest.raw_columns import DISORDER, HELD, ROW, merge_bases
+from fleet_slip.ingest.time_bases import DISORDER, HELD, ROW, merge_bases
 from tests.support.measured import MeasuredLog, a_mapping, read_measured
 
 GAP_S = 1.0
@@ -107,7 +107,7 @@ def test_windows_say_what_the_whole_says(
     ]
     source = FakeSource(frames, batch)
     columns = [f"v{i}" for i in range(len(frames))]
-    with mock.patch.object(raw_columns, "WINDOW_ROWS", window):
+    with mock.patch.object(time_bases, "WINDOW_ROWS", window):
         windows = list(merge_bases(source.bases(columns), OWN_TIME, ["v0"], GAP_S))
     some = [rows for rows in bases if rows]
     if len(some) < 2:
@@ -144,9 +144,9 @@ def read_in(
     file = folder / "log.mf4"
     file.write_bytes(b"in memory")
     with ExitStack() as patched:
-        patched.enter_context(mock.patch.object(log_rows, "_open_part", opened))
-        patched.enter_context(mock.patch.object(log_rows, "BATCH_ROWS", max(batch // 2, 1)))
-        patched.enter_context(mock.patch.object(raw_columns, "WINDOW_ROWS", window))
+        patched.enter_context(mock.patch.object(time_bases, "_open_part", opened))
+        patched.enter_context(mock.patch.object(time_bases, "BATCH_ROWS", max(batch // 2, 1)))
+        patched.enter_context(mock.patch.object(time_bases, "WINDOW_ROWS", window))
         patched.enter_context(mock.patch.object(stream, "RATE_ROWS", 60))
         patched.enter_context(mock.patch.object(stream, "FEWEST_STEPS", 20))
         patched.enter_context(mock.patch.object(stream, "LONGEST_DRIVE_S", 0.8))

@@ -1,0 +1,395 @@
+"""Reads the rows of a log, which is a file or several, in bounded batches.
+
+A batch is a Polars frame with the columns that a mapping uses: text (CSV, text in Parquet), 64-bit
+floats, dates or timestamps. CSV fields stay text, so that what is not a number can be quarantined
+as it was written. A time base goes on from file to file, each open only while it is read.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import polars as pl
+
+from fleet_slip.base import shown
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.reading import file_errors, open_source
+from fleet_slip.ingest.formats.source import BASE, Base, Budget, Meter, Source
+from fleet_slip.ingest.formats.tables import BATCH_ROWS
+from fleet_slip.ingest.log_files import parts_of
+from fleet_slip.ingest.mapping import Mapping
+
+_OpenIt = Callable[[Path], AbstractContextManager[tuple[list[Base], set[str]]]]
+
+_CLOCK = "this file says when each sample was taken: write own_clock = true under [time]"
+_NO_CLOCK = "this file has no clock of its own: write column or rate_hz under [time]"
+
+
+@dataclass
+class _Opened:
+    """An open file, its time bases, their columns, and how many of them are being read."""
+
+    file: ExitStack
+    bases: list[Base]
+    columns: set[str]
+    readers: int = 0
+
+
+class PartBases:
+    """Opens the files of a log, each once for all who read a time base of it at a time."""
+
+    def __init__(self, open_it: _OpenIt) -> None:
+        """Take what opens a file: it gives its time bases, and which columns they have."""
+        self._open_it = open_it
+        self._opened: dict[Path, _Opened] = {}
+
+    def __enter__(self) -> "PartBases":
+        """Begin without open files."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close what readers have left open."""
+        for part in [*self._opened]:
+            self._opened.pop(part).file.close()
+
+    @contextmanager
+    def using(self, part: Path) -> Iterator[_Opened]:
+        """Give a file, open as long as somebody uses it."""
+        if part not in self._opened:
+            with ExitStack() as file:
+                bases, columns = file.enter_context(self._open_it(part))
+                self._opened[part] = _Opened(file.pop_all(), bases, columns)
+        opened = self._opened[part]
+        opened.readers += 1
+        try:
+            with file_errors(part):
+                yield opened
+        finally:
+            opened.readers -= 1
+            if not opened.readers and self._opened.get(part) is opened:
+                del self._opened[part]
+                opened.file.close()
+
+
+class _Stretch(NamedTuple):
+    """The rows of a time base in one file: which of its bases it is, and how many there are."""
+
+    part: Path
+    place: int
+    first_s: float
+    rows: int
+
+
+def join_parts(log: Path, parts: list[Path], mapping: Mapping, opened: PartBases) -> list[Base]:
+    """Return the time bases of a log: what has the same columns goes on from file to file.
+
+    Files follow each other in the order of their first times. Raises `InputError` for a column that
+    no file has.
+    """
+    time = str(mapping.time.key)
+    missing = {name for names in mapping.time_bases().values() for name in names}
+    found: dict[str, list[_Stretch]] = defaultdict(list)
+    for part in parts:
+        with opened.using(part) as there:
+            missing -= there.columns
+            for place, base in enumerate(there.bases):
+                first = next(base.read())
+                name = " ".join(sorted({*first.columns, time}))
+                least = first[time].min()
+                first_s = least if isinstance(least, float) else 0.0
+                found[name].append(_Stretch(part, place, first_s, base.count_rows()))
+    if missing:
+        raise InputError(f"{shown(log)}: no file in it has the column {min(missing)!r}.")
+    for stretches in found.values():
+        stretches.sort(key=lambda stretch: stretch.first_s)
+    names = sorted(found, key=lambda name: found[name][0].first_s)
+    return [
+        Base(
+            name,
+            partial(sum, [stretch.rows for stretch in found[name]]),
+            partial(_read, opened, found[name]),
+        )
+        for name in names
+    ]
+
+
+def _read(opened: PartBases, stretches: list[_Stretch]) -> Iterator[pl.DataFrame]:
+    for stretch in stretches:
+        with opened.using(stretch.part) as there:
+            yield from there.bases[stretch.place].read()
+
+
+def read_batches(log: Path, mapping: Mapping, meter: Meter | None = None) -> Iterator[pl.DataFrame]:
+    """Yield the columns of a log that a mapping uses, in its order, in bounded batches.
+
+    Rows of several time bases come as `merge_bases` says. The meter gets how many rows come.
+    Raises `InputError` if a file cannot be read, or a column is missing or ambiguous.
+    """
+    meter = meter or Meter()
+    wanted, parts, time = mapping.time_bases(), parts_of(log), mapping.time.key
+    if time is None or (len(wanted) == 1 and not mapping.time.own_clock):
+        for part in parts:
+            with _open_part(part, mapping) as source:
+                columns = next(iter(wanted.values()))
+                if meter.is_watched and part == parts[0]:
+                    meter.expect(source.expected_rows(columns), of=part.stat().st_size)
+                yield from Budget.of(part).metered(source.batches(columns))
+    elif len(parts) == 1:
+        with _open_part(log, mapping) as source:
+            bases = _bases_of(source, log, mapping, wanted)
+            if meter.is_watched:
+                meter.expect(sum(map(source.expected_rows, wanted.values())))
+            yield from _merged(bases, mapping)
+    else:
+        with PartBases(partial(_open_bases, mapping)) as opened:
+            bases = join_parts(log, parts, mapping, opened)
+            meter.expect(sum(base.count_rows() for base in bases))
+            yield from _merged(bases, mapping)
+
+
+def _merged(bases: list[Base], mapping: Mapping) -> Iterator[pl.DataFrame]:
+    """Yield the rows of time bases as those of one table."""
+    time, held = str(mapping.time.key), mapping.common_columns()
+    for rows in merge_bases(bases, time, held, mapping.time.split_gap_s):
+        yield from rows.iter_slices(BATCH_ROWS)
+
+
+@contextmanager
+def _open_part(part: Path, mapping: Mapping) -> Iterator[Source]:
+    """Open a file that says times as the mapping does. Raises `InputError`."""
+    with file_errors(part), open_source(part, mapping.formats) as source:
+        if source.has_clock != mapping.time.own_clock:
+            raise InputError(
+                f"{shown(part)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
+                f"{mapping.name!r}."
+            )
+        yield source
+
+
+@contextmanager
+def _open_bases(mapping: Mapping, part: Path) -> Iterator[tuple[list[Base], set[str]]]:
+    """Open a file, which may lack wanted columns; yield its time bases, and the columns it has."""
+    wanted = mapping.time_bases()
+    with _open_part(part, mapping) as source:
+        names = {channel.name for channel in source.channels()}
+        # What several groups of one file have is called NAME@GROUP, there only.
+        all_names = {name for columns in wanted.values() for name in columns}
+        there = names | {name for name in all_names if name.rpartition("@")[0] in names}
+        found = {
+            own: [name for name in columns if name in there]
+            for own, columns in wanted.items()
+            if own is None or own in there
+        }
+        found = {own: columns for own, columns in found.items() if columns}
+        columns = {name for columns in found.values() for name in columns}
+        yield _bases_of(source, part, mapping, found), columns
+
+
+def _bases_of(
+    source: Source, part: Path, mapping: Mapping, wanted: dict[str | None, list[str]]
+) -> list[Base]:
+    """Return the time bases of a file that have one of the wanted columns."""
+    if source.has_clock:
+        bases = [base for columns in wanted.values() for base in source.bases(columns)]
+    else:
+        time = str(mapping.time.key)
+        bases = [
+            Base(
+                str(own),
+                partial(_count_rows, source, str(own), own == time),
+                partial(_read_with_times, source, part, columns, str(own), time),
+            )
+            for own, columns in wanted.items()
+        ]
+
+    def metered(read: Callable[[], Iterator[pl.DataFrame]]) -> Iterator[pl.DataFrame]:
+        return Budget.of(part).metered(read())
+
+    return [replace(base, read=partial(metered, base.read)) for base in bases]
+
+
+def _count_rows(source: Source, own: str, is_main: bool) -> int:
+    """Return how many rows a base has: those with a time, where it has times of its own."""
+    batches = source.batches([own])
+    return sum(batch.height - (0 if is_main else batch[own].null_count()) for batch in batches)
+
+
+def _read_with_times(
+    source: Source, part: Path, columns: list[str], own: str, time: str
+) -> Iterator[pl.DataFrame]:
+    """Yield the rows of a base, its times under the name that all times have."""
+    for batch in source.batches(columns):
+        if not batch[own].dtype.is_numeric():
+            raise InputError(
+                f"{shown(part)}: the time {own!r} is not of numbers; signals with times of their "
+                "own need them."
+            )
+        if own == time:
+            yield batch
+        else:
+            yield batch.filter(pl.col(own).is_not_null()).rename({own: time})
+
+
+# Time bases become one table: a row is a sample of one of them, and null in the columns of others.
+# It comes in windows of time, so that only some rows of each base are in memory.
+
+DISORDER = "\0disorder"
+"""Column that says what is wrong with a row's time among those of its base, null if nothing."""
+HELD = "\0held "
+"""Before the name of a column: its last value at the time, whatever base the row is of."""
+ROW = "\0row"
+"""Column with the row's number, from 1: those of the first base come first, then the next."""
+_RIGHT = "\0right"
+"""Column with the last right time of the base up to each row: where the row stands among others."""
+WINDOW_ROWS = 2**16
+"""A window has about this many rows of all bases together."""
+
+
+def merge_bases(
+    bases: Sequence[Base], time: str, held: Sequence[str], split_gap_s: float
+) -> Iterator[pl.DataFrame]:
+    """Yield the rows of all bases, window by window in the order of time, with `BASE` as a number.
+
+    Times are in s. A row whose time does not increase within its base has the reason in
+    `DISORDER`, and stands where the base's last right time was. The `held` columns, conditions and
+    names of drives, say of every row what was last known there, for `split_gap_s` at most. Where
+    only one base has rows, they come as they are.
+    """
+    opened = [_Coming(base, time, split_gap_s) for base in bases]
+    columns = {name: kind for one in opened for name, kind in one.columns.items()}
+    some = [one for one in opened if one.has_rows]
+    if len(some) == 1:
+        yield from (_completed(batch, columns) for batch in some[0].batches)
+        return
+    coming, offset = some, 0
+    for number, one in enumerate(some):
+        one.begin(number, offset, max(WINDOW_ROWS // len(some), 1))
+        if number + 1 < len(some):
+            offset += one.base.count_rows()
+    columns |= {BASE: pl.Int32(), DISORDER: pl.String(), ROW: pl.Int64(), _RIGHT: pl.Float64()}
+    of = {name: number for number, one in reversed([*enumerate(some)]) for name in one.columns}
+    lasting = [_Lasting(name, of.get(name, -1), time, split_gap_s) for name in held]
+    while coming := [one for one in coming if one.fill()]:
+        until = min(one.reached for one in coming)
+        rows = pl.concat([_completed(one.take(until), columns) for one in coming])
+        rows = rows.sort(_RIGHT, maintain_order=True)
+        yield rows.with_columns(one.hold(rows) for one in lasting).drop(_RIGHT)
+
+
+def _completed(rows: pl.DataFrame, columns: dict[str, pl.DataType]) -> pl.DataFrame:
+    """Return rows with all columns, null where they have none."""
+    absent = [pl.lit(None, kind).alias(name) for name, kind in columns.items() if name not in rows]
+    return rows.with_columns(absent).select(*columns)
+
+
+class _Coming:
+    """The rows of a base that are in no window yet; of the first ones its columns are known."""
+
+    def __init__(self, base: Base, time: str, split_gap_s: float) -> None:
+        self.base, self._time, self._gap_s = base, time, split_gap_s
+        batches = base.read()
+        first = next(batches)
+        while not first.height and (following := next(batches, None)) is not None:
+            first = following
+        self.columns, self.has_rows = dict(first.schema), first.height > 0
+        self.batches = chain([first], batches)
+        self._before_s, self._right_s = np.nan, -np.inf
+        self._rows = pl.DataFrame()
+
+    def begin(self, number: int, offset: int, most: int) -> None:
+        """Take the base's number, that of its first row, and how many rows to read at once."""
+        self._number, self._offset = pl.lit(number, pl.Int32).alias(BASE), offset
+        self._slices = _resized(self._judged(), most)
+
+    def _judged(self) -> Iterator[pl.DataFrame]:
+        """Yield the rows with `DISORDER`, `ROW` and `_RIGHT`; the last one waits for the next."""
+        waiting: pl.DataFrame | None = None
+        for batch in self.batches:
+            rows = batch if waiting is None else pl.concat([waiting, batch])
+            if rows.height > 1:
+                yield self._judge(rows.head(rows.height - 1), rows[self._time][-1])
+            waiting = rows.tail(1)
+        if waiting is not None and waiting.height:
+            yield self._judge(waiting, None)
+
+    def _judge(self, rows: pl.DataFrame, after_s: float | None) -> pl.DataFrame:
+        """Judge rows before a time. One far ahead is `isolated`, or all after it would be late."""
+        time_s = rows[self._time].to_numpy()
+        before_s = np.concatenate([[self._before_s], time_s[:-1]])
+        next_s = np.append(time_s[1:], np.nan if after_s is None else after_s)
+        with np.errstate(invalid="ignore"):
+            ahead = (time_s - before_s > self._gap_s) & (next_s < time_s)
+        usable = np.where(ahead | ~np.isfinite(time_s), -np.inf, time_s)
+        right_s = np.maximum.accumulate(np.concatenate([[self._right_s], usable]))
+        late, twice = time_s < right_s[:-1], time_s == right_s[:-1]
+        reasons: pl.Series | pl.Expr = pl.lit(None, pl.String)
+        if (late | twice | ahead).any():
+            names = np.select(
+                [ahead, late, twice], ["isolated", "time_backwards", "time_duplicate"], ""
+            )
+            reasons = pl.Series(names.tolist()).replace("", None)
+        self._before_s, self._right_s = time_s[-1], right_s[-1]
+        self._offset += rows.height
+        first = self._offset - rows.height + 1
+        return rows.with_columns(
+            reasons.alias(DISORDER),
+            pl.int_range(first, self._offset + 1, dtype=pl.Int64).alias(ROW),
+            pl.Series(_RIGHT, right_s[1:]),
+        )
+
+    def fill(self) -> bool:
+        """Read on if no rows wait; return whether some do now."""
+        if not self._rows.height:
+            self._rows = next(self._slices, self._rows)
+        return self._rows.height > 0
+
+    @property
+    def reached(self) -> float:
+        """Place of the last row."""
+        return float(self._rows[_RIGHT][-1])
+
+    def take(self, until: float) -> pl.DataFrame:
+        """Return what waits up to a time."""
+        number = int(self._rows[_RIGHT].search_sorted(until, side="right"))
+        taken, self._rows = self._rows.head(number), self._rows.slice(number)
+        return taken.with_columns(self._number)
+
+
+def _resized(batches: Iterator[pl.DataFrame], most: int) -> Iterator[pl.DataFrame]:
+    """Yield the rows of batches with `most` at once: of large ones less, of small ones together."""
+    small: list[pl.DataFrame] = []
+    for batch in batches:
+        small.append(batch)
+        if sum(one.height for one in small) >= most:
+            yield from pl.concat(small).iter_slices(most)
+            small = []
+    if small:
+        yield from pl.concat(small).iter_slices(most)
+
+
+class _Lasting:
+    """A column of one base that says something of the rows of all."""
+
+    def __init__(self, name: str, base: int, time: str, longest_s: float) -> None:
+        self._name, self._longest_s = name, longest_s
+        self._says = (
+            pl.col(name).is_not_null()
+            & (pl.col(BASE) == base)
+            & pl.col(DISORDER).is_null()
+            & pl.col(time).is_finite()
+        )
+        self._last: list[pl.DataFrame] = []
+
+    def hold(self, rows: pl.DataFrame) -> pl.Series:
+        """Return the last value at the place of each row of a window, null if it is too old."""
+        said = rows.filter(self._says).select(_RIGHT, pl.col(self._name).alias(HELD + self._name))
+        known = pl.concat([*self._last, said]).set_sorted(_RIGHT)
+        self._last = [known.tail(1)]
+        held = rows.select(_RIGHT).join_asof(known, on=_RIGHT, tolerance=self._longest_s)
+        return held[HELD + self._name]
