@@ -45,12 +45,22 @@ SIUnit = Annotated[str, StringConstraints(pattern=rf"^(?:1|{_SYMBOL}(?:[*/]{_SYM
 pattern, because a units library takes half a second to start and every command needs it."""
 
 
-class Signal(Config):
-    """One signal. `physical = scale * count`."""
+class Scaled(Config):
+    """What is logged, or computed, in counts. `physical = scale * count`."""
+
+    scale: Decimal = Field(gt=0)
+
+    @property
+    def exact_scale(self) -> Fraction:
+        """Physical value of one count, exactly."""
+        return Fraction(self.scale)
+
+
+class Signal(Scaled):
+    """One signal."""
 
     unit: SIUnit
     column: Identifier
-    scale: Decimal = Field(gt=0)
     min: Decimal
     max: Decimal
     role: Literal["input", "extra", "label", "truth"]
@@ -70,11 +80,6 @@ class Signal(Config):
         if largest > COUNT_MAX and not self.cyclic:
             raise ValueError(f"the range needs counts up to {largest:f}, int16 ends at {COUNT_MAX}")
         return self
-
-    @property
-    def exact_scale(self) -> Fraction:
-        """Physical value of one count, exactly."""
-        return Fraction(self.scale)
 
     @property
     def min_count(self) -> int:

@@ -21,10 +21,9 @@ from fleet_slip.catalogue.definitions import (
     Number,
     Over,
     integer_arithmetic,
-    limit_of,
 )
 from fleet_slip.catalogue.facts import CAR_NUMBERS, NumberName, Unit
-from fleet_slip.catalogue.signals import Identifier, SIUnit, catalogue
+from fleet_slip.catalogue.signals import Identifier, Scaled, SIUnit, catalogue
 from fleet_slip.config import Config
 
 TICKS = "{ticks}"
@@ -88,19 +87,13 @@ class Calibrated(Config):
     description: str = Field(min_length=1)
 
 
-class TimeColumn(Config):
+class TimeColumn(Scaled):
     """One column over time: how it is defined, and what a count of it is worth."""
 
     definition: Definition
-    scale: Decimal
     unit: Unit
     column: Identifier
     description: str
-
-    @property
-    def exact_scale(self) -> Fraction:
-        """Physical value of one count, exactly."""
-        return Fraction(self.scale)
 
 
 def window_column(window: Window, ticks: int, row: Definition, scale: Fraction) -> TimeColumn:
@@ -228,13 +221,12 @@ def gated_columns(
             peak=counts[knot],
             high=counts[knot + 1] if knot + 1 < len(counts) else None,
         )
-        found[member] = TimeColumn(
-            definition=base.definition.model_copy(update={"gate": gate}),
-            scale=base.scale,
-            unit=base.unit,
-            column=f"{base.column}_{name}_{knot}",
-            description=f"{base.description}, where {family.of} is near {family.knots[knot]:f}",
-        )
+        changed = {
+            "definition": base.definition.model_copy(update={"gate": gate}),
+            "column": f"{base.column}_{name}_{knot}",
+            "description": f"{base.description}, where {family.of} is near {family.knots[knot]:f}",
+        }
+        found[member] = base.model_copy(update=changed)
     return found
 
 
@@ -246,13 +238,12 @@ _DECLARED = re.compile(r"(?:[a-z0-9_+\-*() ]|// [1-9][0-9]*(?![0-9]))+")
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
-class Feature(Config):
-    """One feature. `physical = scale * count`, the count clipped to its bits: 16 are +-32767."""
+class Feature(Scaled):
+    """One feature. Its count is clipped to its bits: 16 are +-32767."""
 
     counts: str = Field(min_length=1)
     divided_by: str | None = None
     at_least: int | None = Field(default=None, gt=0)
-    scale: Decimal = Field(gt=0)
     bits: Bits = COUNT_BITS
     unit: SIUnit
     column: Identifier
@@ -291,16 +282,6 @@ class Feature(Config):
         """The signals that it is computed from, in catalogue order."""
         used = parse(self.sql).inputs
         return tuple(name for name in catalogue().feature_inputs if name in used)
-
-    @property
-    def exact_scale(self) -> Fraction:
-        """Physical value of one count, exactly."""
-        return Fraction(self.scale)
-
-    @property
-    def limit(self) -> int:
-        """Largest count."""
-        return limit_of(self.bits)
 
 
 def _widened(text: str) -> str:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from datetime import date
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fleet_slip.base import canonical_json, number_of, sha256_of
 from fleet_slip.catalogue.facts import RECEIVED
@@ -138,20 +138,21 @@ class Examined:
         return tuple(SensorFault(*row, self.found[one]) for one, row in named if one in self.found)
 
 
-@dataclass(frozen=True)
-class _Piece:
+class _Piece(NamedTuple):
     """Days whose drives are examined together; `rows` are hashes of their Gram rows."""
 
-    days: tuple[date, ...]
+    first: date
+    last: date
     drives: int
-    rows: tuple[int, ...]
+    rows: list[int]
 
-    def __add__(self, other: "_Piece") -> "_Piece":
-        return _Piece(self.days + other.days, self.drives + other.drives, self.rows + other.rows)
+    def and_then(self, other: "_Piece") -> "_Piece":
+        drives, rows = self.drives + other.drives, self.rows + other.rows
+        return _Piece(self.first, other.last, drives, rows)
 
     @property
     def condition(self) -> Condition:
-        return parse_condition(f"day BETWEEN DATE '{self.days[0]}' AND DATE '{self.days[-1]}'")
+        return parse_condition(f"day BETWEEN DATE '{self.first}' AND DATE '{self.last}'")
 
 
 def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
@@ -168,9 +169,9 @@ def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
     missing, missing_rows = _lacking(warehouse, grams, logs, condition)
     parts: list[Mapping[str, Any]] = []
     for piece in _pieces(warehouse, condition) if grams.rows else []:
-        about = {"cohort": condition.text, "from": piece.days[0], "root": warehouse.root.uri}
+        about = {"cohort": condition.text, "from": piece.first, "root": warehouse.root.uri}
         limits = thresholds().quality.model_dump(mode="json")
-        state = [list(piece.rows), sha256(canonical_json(limits).encode()).hexdigest()]
+        state = [piece.rows, sha256(canonical_json(limits).encode()).hexdigest()]
         name = sha256(canonical_json({k: str(v) for k, v in about.items()}).encode()).hexdigest()
         kept = cache_folder("examined") / f"{name[:32]}.json"
         parts.append(_known(kept, state) or _examine(warehouse, condition & piece.condition))
@@ -229,13 +230,13 @@ def _pieces(warehouse: Warehouse, condition: Condition) -> list[_Piece]:
         with asking(opened.database, condition):
             found = opened.database.execute(statement).fetchall()
     pieces: list[_Piece] = []
-    for day in (_Piece((day,), drives, (rows,)) for day, drives, rows in found if drives):
+    for day in (_Piece(day, day, drives, [rows]) for day, drives, rows in found if drives):
         if pieces and pieces[-1].drives < PIECE:
-            pieces[-1] += day
+            pieces[-1] = pieces[-1].and_then(day)
         else:
             pieces.append(day)
     if len(pieces) > 1 and 4 * pieces[-1].drives < PIECE:
-        pieces[-2:] = [pieces[-2] + pieces[-1]]
+        pieces[-2:] = [pieces[-2].and_then(pieces[-1])]
     return pieces
 
 

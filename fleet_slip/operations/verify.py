@@ -349,19 +349,16 @@ def verify_models(
             try:
                 manifest = registry.load(name, number).manifest
                 registry.trained_drives(manifest)
-            except RefusedError as error:  # its signature
-                report.note("model", f"{name}@{number}", str(error))
-                continue
-            except (StorageError, DataError, QuestionError) as error:
-                if "drives" in str(error):  # anything else is reported as a document
+            except (RefusedError, StorageError, DataError, QuestionError) as error:
+                # What is no fault of its format or its drives is reported as a document.
+                if isinstance(error, RefusedError) or "drives" in str(error):
                     report.note("model", f"{name}@{number}", str(error))
                 continue
-            trained = manifest.trained_on
-            if manifest.imported_from is not None:  # the tables that made it are elsewhere
-                continue
-            made_of = {"grams": trained.grams_version}
-            if trained.drives_without_log != trained.drives:
-                made_of["logs"] = trained.logs_version
+            trained, made_of = manifest.trained_on, {}
+            if manifest.imported_from is None:  # else the tables that made it are elsewhere
+                made_of["grams"] = trained.grams_version
+                if trained.drives_without_log != trained.drives:
+                    made_of["logs"] = trained.logs_version
             for table, version in made_of.items():
                 latest = snapshots[table].version if table in snapshots else None
                 if latest is None or version > latest:

@@ -3,9 +3,10 @@
 A drive depends on the campaign's seed and its own name, never on days, other drives or order.
 """
 
+import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, timedelta
 from functools import cached_property
 from itertools import groupby
@@ -17,11 +18,12 @@ from pydantic import Field, TypeAdapter, model_validator
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import canonical_ascii, sha256_of
+from fleet_slip.catalogue.facts import SCENARIO
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import find_config
-from fleet_slip.simulation.imperfections import NONE, Imperfections
+from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative, Positive
 from fleet_slip.simulation.plan import DriveDraw, FleetPlan, GridPlan, TrialPlan
 from fleet_slip.simulation.receivers import Receiver, Receivers
 from fleet_slip.simulation.roads import (
@@ -39,6 +41,13 @@ from fleet_slip.vehicle.parameters import VehicleParameters
 
 ROAD_SPACING_M = 1.0
 """Spacing of the points at which curvature and target speed are tabulated, in m."""
+
+
+class PacePoint(Config):
+    """Speed over that of the planned profile at one station; linear in between."""
+
+    station_m: NotNegative
+    factor: Positive
 
 
 @dataclass(frozen=True)
@@ -65,11 +74,20 @@ class DriveSpec:
     receiver: Annotated[Receiver | None, Field(exclude_if=lambda one: one is None)] = None
     drawn_as: Annotated[str, Field(exclude_if=lambda name: not name)] = ""
     """The campaign whose car, road and noise this drive has, if it is not its own."""
+    pace: Annotated[tuple[PacePoint, ...], Field(exclude=True)] = ()
+    """Of a scenario: how its speed varies beside what the track asks for."""
 
     @property
     def profile(self) -> SpeedProfile:
-        """The speed profile of the track within the limits, before the speed factor."""
-        return speed_profile(self.track, self.limits, ROAD_SPACING_M)
+        """The speed profile of the track within the limits, with the pace, before the factor."""
+        planned = speed_profile(self.track, self.limits, ROAD_SPACING_M)
+        if not self.pace:
+            return planned
+        stations = [point.station_m for point in self.pace]
+        factors = [point.factor for point in self.pace]
+        period = self.track.length_m if self.track.closed else None
+        factor = np.interp(planned.station_m, stations, factors, period=period)
+        return replace(planned, speed_mps=planned.speed_mps * factor)
 
     @cached_property
     def expected_rows(self) -> int:
@@ -116,8 +134,10 @@ class Batch:
     @cached_property
     def digest(self) -> str:
         """SHA-256 over all that determines the batch's bytes, as canonical JSON."""
-        content = _BATCH.dump_python(self, mode="json")
-        return sha256_of(canonical_ascii(content))
+        digest = sha256_of(canonical_ascii(_BATCH.dump_python(self, mode="json")))
+        scenarios = [drive for drive in self.drives if drive.source == SCENARIO]
+        paces = [[point.model_dump() for point in drive.pace] for drive in scenarios]
+        return sha256_of(f"{digest} {json.dumps(paces)}") if scenarios else digest
 
 
 _BATCH = TypeAdapter(Batch)

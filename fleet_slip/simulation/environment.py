@@ -20,6 +20,7 @@ from fleet_slip.errors import UsageError
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.vehicle.dynamics import (
     Derivative,
+    Loads,
     braked_spins,
     driven_body,
     driver_brakes,
@@ -30,14 +31,8 @@ from fleet_slip.vehicle.dynamics import (
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
 from fleet_slip.vehicle.parameters import Constants, Controls, State, constants, load_vehicle
 
-
-class Brakes(NamedTuple):
-    """Brake force at the rim of each wheel in N, beside the driver's, before anti-lock control."""
-
-    fl: float
-    fr: float
-    rl: float
-    rr: float
+Brakes = Loads
+"""Brake force at the rim of each wheel in N, beside the driver's, before anti-lock control."""
 
 
 class Moved(NamedTuple):

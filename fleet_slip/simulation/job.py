@@ -22,7 +22,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import RefusedError
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec
-from fleet_slip.simulation.receivers import ReceiverFixes, ReceiverLog
+from fleet_slip.simulation.receivers import ReceiverLog
 from fleet_slip.simulation.roads import road_with
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
 from fleet_slip.storage.table import Change, Snapshot, Unit, retry_conflicts, retrying
@@ -46,7 +46,7 @@ class DriveLog:
     spec: DriveSpec
     measurement: Measurement
     lost_control_s: float | None
-    fixes: ReceiverFixes | None = None
+    fixes: Measurement | None = None
     """What its satellite receiver logged, if the campaign has receivers."""
     motion: Mapping[str, FloatArray] = field(default_factory=dict)
     """The channels of `MOTION` at 100 Hz, not rounded to counts, if they were asked for."""
@@ -139,7 +139,7 @@ def simulate_logs(specs: Sequence[DriveSpec], channels: Sequence[str] = ()) -> l
                 specs[block.drive],
                 recorder.measurement(),
                 None if lost is None else lost / SAMPLE_RATE_HZ,
-                receiver.fixes() if receiver else None,
+                receiver.measurement() if receiver else None,
                 {name: np.concatenate(parts) for name, parts in motions[block.drive].items()},
             )
     return [logs[drive] for drive in range(len(specs))]
@@ -163,12 +163,11 @@ def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
 
 
 def _counts(log: DriveLog, name: str) -> pa.Array:
-    if log.fixes and name in log.fixes.counts:
-        return pa.array(log.fixes.counts[name], mask=~log.fixes.fix)
-    if name not in log.measurement.counts:
+    one = log.fixes if log.fixes and name in log.fixes.counts else log.measurement
+    if name not in one.counts:
         return pa.nulls(log.rows, pa.int16())
-    no_fix = ~log.measurement.gps_fix if name in GPS_SIGNALS else None
-    return pa.array(log.measurement.counts[name], mask=no_fix)
+    by_fixes = one is log.fixes or name in GPS_SIGNALS
+    return pa.array(one.counts[name], mask=~one.gps_fix if by_fixes else None)
 
 
 def _repeated(values: pa.Array, times: Sequence[int]) -> pa.ChunkedArray:

@@ -1,6 +1,5 @@
 """Satellite receivers as cars have them: course and speed over ground, now and then, and late."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -12,7 +11,7 @@ from fleet_slip.catalogue.signals import HALF_TURN, catalogue
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.config import Config, Name
 from fleet_slip.simulation.imperfections import Latency, NotNegative, Range
-from fleet_slip.simulation.sensors import Delay, Gps, Outages, Wander
+from fleet_slip.simulation.sensors import Delay, Gps, Measurement, Outages, Wander
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.tyre import arctan2
 
@@ -58,14 +57,6 @@ class Receivers(Config):
         return one.model_copy(update=drawn)
 
 
-@dataclass(frozen=True)
-class ReceiverFixes:
-    """What a receiver logs of one drive: counts of `SATELLITE_SIGNALS`, valid where `fix` is."""
-
-    counts: dict[str, NDArray[np.int16]]
-    fix: BoolArray
-
-
 class ReceiverLog:
     """What the receiver of one car logs of one drive, recorded block by block.
 
@@ -100,10 +91,10 @@ class ReceiverLog:
         self._blocks.append((course, speed, fix))
         self._ticks += ticks
 
-    def fixes(self) -> ReceiverFixes:
-        """Return what was recorded."""
+    def measurement(self) -> Measurement:
+        """Return what was recorded: counts of `SATELLITE_SIGNALS`, valid where there is a fix."""
         course, speed, fix = (np.concatenate(parts) for parts in zip(*self._blocks, strict=True))
-        return ReceiverFixes(dict(zip(SATELLITE_SIGNALS, (course, speed), strict=True)), fix)
+        return Measurement(dict(zip(SATELLITE_SIGNALS, (course, speed), strict=True)), fix, 0)
 
 
 @equation

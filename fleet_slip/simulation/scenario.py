@@ -3,25 +3,21 @@
 Each says in what it differs from its base; its drive has a source of its own, and trains none.
 """
 
-import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from datetime import date
 from typing import Any, Literal, Self
 
-import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from fleet_slip.base import sha256_of
 from fleet_slip.catalogue.facts import SCENARIO
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.resources import config_names, find_config
-from fleet_slip.simulation.campaign import Batch, DriveSpec, load_base, merged
+from fleet_slip.simulation.campaign import Batch, DriveSpec, PacePoint, load_base, merged
 from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative, Positive
 from fleet_slip.simulation.plan import NamedTrack, NamedVehicle
-from fleet_slip.simulation.roads import SpeedLimits, SpeedProfile
+from fleet_slip.simulation.roads import SpeedLimits
 from fleet_slip.simulation.sensors import GPS_SIGNALS, Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
 
@@ -30,13 +26,6 @@ DAY = date(2024, 4, 1)
 
 NOT_INHERITED = frozenset({"name", "description", "paper", "base", "drive", "failures"})
 """What a scenario says of itself alone."""
-
-
-class PacePoint(Config):
-    """Speed over that of the planned profile at one station; linear in between."""
-
-    station_m: NotNegative
-    factor: Positive
 
 
 class Failure(Config):
@@ -57,40 +46,6 @@ class Failure(Config):
         if self.until_s is not None and self.until_s <= self.from_s:
             raise ValueError(f"until_s {self.until_s} is not after from_s {self.from_s}")
         return self
-
-
-@dataclass(frozen=True)
-class ScenarioDrive(DriveSpec):
-    """A drive whose speed varies along the track beside what the track asks for."""
-
-    pace: tuple[PacePoint, ...] = ()
-
-    @property
-    def profile(self) -> SpeedProfile:
-        """The speed profile of the track within the limits, times the pace."""
-        planned = super().profile
-        if not self.pace:
-            return planned
-        stations = [point.station_m for point in self.pace]
-        factors = [point.factor for point in self.pace]
-        period = self.track.length_m if self.track.closed else None
-        factor = np.interp(planned.station_m, stations, factors, period=period)
-        return replace(planned, speed_mps=planned.speed_mps * factor)
-
-
-@dataclass(frozen=True)
-class ScenarioBatch(Batch):
-    """The one drive of a scenario, as one Parquet file."""
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 over all that determines the batch's bytes, the pace included."""
-        paces = [
-            [point.model_dump() for point in drive.pace]
-            for drive in self.drives
-            if isinstance(drive, ScenarioDrive)
-        ]
-        return sha256_of(f"{super().digest} {json.dumps(paces)}")
 
 
 class Scenario(Config):
@@ -161,9 +116,9 @@ class Scenario(Config):
             return tyred
         return tyred.with_sprung_mass(self.sprung_mass_kg, self.load_position_m)
 
-    def batch(self) -> ScenarioBatch:
+    def batch(self) -> Batch:
         """Return the drive as the simulation job takes it."""
-        drive = ScenarioDrive(
+        drive = DriveSpec(
             drive_id=self.drive_id,
             vehicle_id=self.drive_id,
             campaign=self.drive_id,
@@ -180,7 +135,7 @@ class Scenario(Config):
             flaws=self.imperfections,
             pace=self.pace,
         )
-        return ScenarioBatch(self.drive_id, DAY, 0, (drive,))
+        return Batch(self.drive_id, DAY, 0, (drive,))
 
 
 def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue import features as features_module
+from fleet_slip.catalogue.definitions import limit_of
 from fleet_slip.catalogue.features import features, load_features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
@@ -164,7 +165,7 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
                 assert row[name] is None
                 continue
             count = nearest(value / features().features[name].exact_scale)
-            limit = features().features[name].limit
+            limit = limit_of(features().features[name].bits)
             out_of_range += abs(count) > limit
             assert row[name] == max(-limit, min(limit, count)), (name, i)
         assert row["clipped"] == out_of_range

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.job import simulate_logs
-from fleet_slip.simulation.receivers import Receiver, ReceiverFixes, ReceiverLog
+from fleet_slip.simulation.receivers import Receiver, ReceiverLog
+from fleet_slip.simulation.sensors import Measurement
 
 TICK_S = 0.01
 RAD = 2 * np.pi / 65536
@@ -36,22 +37,22 @@ def truth(ticks: int = 3000, speed: float = 15.0) -> dict[str, NDArray[np.float6
     }
 
 
-def logged(receiver: Receiver, drive: dict[str, NDArray[np.float64]], *cuts: int) -> ReceiverFixes:
+def logged(receiver: Receiver, drive: dict[str, NDArray[np.float64]], *cuts: int) -> Measurement:
     """Return what is logged of a drive that comes in blocks."""
     log = ReceiverLog(receiver, np.random.default_rng(5))
     for begin, end in zip((0, *cuts), (*cuts, len(drive["vx_mps"])), strict=True):
         log.record({name: values[begin:end] for name, values in drive.items()})
-    return log.fixes()
+    return log.measurement()
 
 
 def changes(
-    fixes: ReceiverFixes, drive: dict[str, NDArray[np.float64]], ticks: int
+    fixes: Measurement, drive: dict[str, NDArray[np.float64]], ticks: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the course's change less the yaw rate's integral, in rad, and the ticks it is of."""
     r = drive["yaw_rate_rad_s"]
     turned = np.append(0.0, np.cumsum((r[1:] + r[:-1]) * TICK_S / 2))
-    at = np.flatnonzero(fixes.fix)
-    at = at[(at >= ticks) & fixes.fix[at - ticks]]
+    at = np.flatnonzero(fixes.gps_fix)
+    at = at[(at >= ticks) & fixes.gps_fix[at - ticks]]
     counts = fixes.counts["course"]
     change = (counts[at] - counts[at - ticks]) * RAD  # int16 wraps
     less = change - (turned[at] - turned[at - ticks])
@@ -65,9 +66,9 @@ def test_the_course_changes_as_heading_and_side_slip_angle_do() -> None:
     found, at = changes(fixes, drive, 400)
     assert len(at) == 260
     assert np.abs(found - (slip[at] - slip[at - 400])).max() < 1.01 * RAD
-    assert np.ptp(fixes.counts["course"][fixes.fix].astype(int)) > 64_000, "it goes round"
-    speed = fixes.counts["satellite_speed"][fixes.fix] * 0.005
-    assert np.abs(speed - np.hypot(drive["vx_mps"], drive["vy_mps"])[fixes.fix]).max() <= 0.0026
+    assert np.ptp(fixes.counts["course"][fixes.gps_fix].astype(int)) > 64_000, "it goes round"
+    speed = fixes.counts["satellite_speed"][fixes.gps_fix] * 0.005
+    assert np.abs(speed - np.hypot(drive["vx_mps"], drive["vy_mps"])[fixes.gps_fix]).max() <= 0.0026
 
 
 def test_a_delay_is_of_course_and_speed() -> None:
@@ -75,14 +76,14 @@ def test_a_delay_is_of_course_and_speed() -> None:
     now, late = logged(EXACT, drive), logged(EXACT.model_copy(update={"delay_s": 0.1}), drive)
     for name, counts in late.counts.items():
         assert np.abs(counts[10::10] - now.counts[name][:-10:10]).max() <= 1
-    assert not late.fix[0] and late.fix[10], "before the first fix came there is none"
+    assert not late.gps_fix[0] and late.gps_fix[10], "before the first fix came there is none"
 
 
 def test_an_antenna_before_the_place_it_is_taken_for_adds_yaw_rate_over_speed() -> None:
     drive = truth()
     now, there = logged(EXACT, drive), logged(EXACT.model_copy(update={"antenna_x_m": 1.0}), drive)
-    more = (there.counts["course"] - now.counts["course"])[now.fix] * RAD
-    assert np.abs(more - drive["yaw_rate_rad_s"][now.fix] / 15.0).max() < 2e-4
+    more = (there.counts["course"] - now.counts["course"])[now.gps_fix] * RAD
+    assert np.abs(more - drive["yaw_rate_rad_s"][now.gps_fix] / 15.0).max() < 2e-4
 
 
 def test_noise_is_of_each_fix_or_lasts() -> None:
@@ -92,7 +93,7 @@ def test_noise_is_of_each_fix_or_lasts() -> None:
     }
     for key, correlated in (("velocity_std_mps", 0.0), ("wander_std_mps", 0.9)):
         fixes = logged(EXACT.model_copy(update={key: 0.1}), drive)
-        error = fixes.counts["course"][fixes.fix] * RAD * 20.0
+        error = fixes.counts["course"][fixes.gps_fix] * RAD * 20.0
         error = error - error.mean() if key == "velocity_std_mps" else error - error[0]
         following = np.corrcoef(error[1:], error[:-1])[0, 1]
         assert following == pytest.approx(1.0 if correlated else 0.0, abs=0.1)
@@ -102,7 +103,7 @@ def test_noise_is_of_each_fix_or_lasts() -> None:
 def test_blocks_change_neither_heading_nor_fixes() -> None:
     drive = truth()
     whole, parts = logged(EXACT, drive), logged(EXACT, drive, 7, 1234, 2001)
-    assert (whole.fix == parts.fix).all()
+    assert (whole.gps_fix == parts.gps_fix).all()
     for name, counts in whole.counts.items():
         assert (counts == parts.counts[name]).all()
 
@@ -122,7 +123,7 @@ def test_a_campaign_with_receivers_has_the_drives_of_its_base(received: Campaign
     assert before.fixes is None and after.fixes is not None
     for name, counts in before.measurement.counts.items():
         assert (counts == after.measurement.counts[name]).all(), name
-    assert 0.5 < after.fixes.fix.sum() * 10 / after.rows < 1.0
+    assert 0.5 < after.fixes.gps_fix.sum() * 10 / after.rows < 1.0
     true = before.measurement.counts["vx"] * 0.005
     speed = after.fixes.counts["satellite_speed"] * 0.005
-    assert np.abs(speed - true)[after.fixes.fix].max() < 0.5
+    assert np.abs(speed - true)[after.fixes.gps_fix].max() < 0.5
