@@ -231,8 +231,9 @@ def test_vibration_is_of_the_body_and_of_the_wheels_and_cut_in_blocks_the_same()
 
 
 def test_biases_drift_within_a_drive_and_forget_with_their_time_constant() -> None:
-    figures = {"acceleration_drift_mps2": 0.05, "yaw_rate_drift_rad_s": 0.001, "drift_s": 20.0}
-    drifting = seen(truth(LONG), **figures)
+    drifting = seen(
+        truth(LONG), acceleration_drift_mps2=0.05, yaw_rate_drift_rad_s=0.001, drift_s=20.0
+    )
     rate, ay = drifting["yaw_rate_rad_s"], drifting["ay_mps2"]
     assert rate.std() == pytest.approx(0.001, rel=0.3)
     assert ay.std() == pytest.approx(0.05, rel=0.3)
@@ -252,8 +253,8 @@ def test_the_label_is_noisier_the_slower_and_turned_by_its_lever() -> None:
 
 
 def test_jitter_is_age_within_its_bound_and_of_a_message() -> None:
-    second = np.arange(LONG) * 0.01  # for each second
-    ramp = truth(LONG) | dict.fromkeys(INERTIAL, second)
+    second: FloatArray = 0.01 * np.arange(LONG, dtype=np.float64)  # for each second
+    ramp = truth(LONG, **dict.fromkeys(INERTIAL, second))
     late = seen(ramp, clock_jitter_s=0.004)
     age_s = ramp["ax_mps2"] - late["ax_mps2"]
     assert 0.0 <= age_s[1:].min() < 1e-4
