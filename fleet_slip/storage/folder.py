@@ -6,7 +6,7 @@ system, `fleet_slip.storage.objects` one of an object store.
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, Self, TypeAlias
@@ -55,22 +55,24 @@ class Folder(Protocol):
     @property
     def name(self) -> str:
         """The last part of the folder's path."""
+        return str(self).rpartition("/")[2]
 
     @property
     def uri(self) -> str:
         """The folder as DuckDB and the Delta library know it."""
+        return str(self)
 
     @property
     def delta_options(self) -> dict[str, str] | None:
         """Options of the Delta library for tables below this folder."""
+        return None
 
     @property
     def spill(self) -> Path:
         """A folder of this machine for what a query cannot hold in memory."""
 
-    @property
-    def is_local(self) -> bool:
-        """Whether its files are in a file system of this machine: read twice, they are the same."""
+    is_local: bool = False
+    """Whether its files are in a file system of this machine: read twice, they are the same."""
 
     def __truediv__(self, name: str) -> Self:
         """Return a folder below this one."""
@@ -86,6 +88,7 @@ class Folder(Protocol):
 
     def stamp(self, path: str) -> object:
         """Return what another file in its place differs in; None without one, and of a store."""
+        return None  # where to look costs what opening costs
 
     def read(self, path: str, longest: int | None = None) -> bytes:
         """Return the content of a file, or only its first bytes."""
@@ -95,6 +98,7 @@ class Folder(Protocol):
 
     def check(self, path: str) -> None:
         """Raise `StorageError` for a changed data file, if `open` would not."""
+        return
 
     def open(self, path: str) -> "pa.NativeFile":
         """Open a file for reading anywhere in it."""
@@ -116,12 +120,16 @@ class Folder(Protocol):
 
     def settle_commits(self, before: int | None) -> None:
         """Make the commits after a version durable, if the folder is a Delta table."""
+        return
 
     def free_bytes(self) -> tuple[int, int] | None:
         """Return how much is free and how much there is in all; None where that has no meaning."""
+        return None
 
     def exclusive(self, name: str, waiting: Callable[[], None]) -> AbstractContextManager[None]:
-        """Hold a lock among the processes of this machine, where the folder can have one."""
+        """Hold a lock among the processes of this machine, where a killed one releases it."""
+        return nullcontext()
 
     def let_read(self, database: "duckdb.DuckDBPyConnection") -> None:
         """Enable a connection to read files below this folder."""
+        return

@@ -14,47 +14,29 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import pyarrow as pa
 
 from fleet_slip.errors import StorageError
 from fleet_slip.storage.checksums import check_local_files
-from fleet_slip.storage.folder import TEMPORARY_PREFIX, Content, StoredFile
+from fleet_slip.storage.folder import TEMPORARY_PREFIX, Content, Folder, StoredFile
 from fleet_slip.storage.storage_errors import storage_errors
-
-if TYPE_CHECKING:
-    import duckdb
 
 
 @dataclass(frozen=True)
-class LocalFolder:
+class LocalFolder(Folder):
     """A folder of a file system; see `fleet_slip.storage.folder.Folder`."""
 
     path: Path
+    is_local = True
 
     def __str__(self) -> str:
         return str(self.path)
 
     @property
-    def name(self) -> str:
-        return self.path.name
-
-    @property
-    def uri(self) -> str:
-        return str(self.path)
-
-    @property
-    def delta_options(self) -> dict[str, str] | None:
-        return None
-
-    @property
     def spill(self) -> Path:
         return self.path
-
-    @property
-    def is_local(self) -> bool:
-        return True
 
     def __truediv__(self, name: str) -> Self:
         return type(self)(self.path / name)
@@ -183,9 +165,6 @@ class LocalFolder:
                         waiting()
                         fcntl.flock(file, fcntl.LOCK_EX)
             yield
-
-    def let_read(self, database: "duckdb.DuckDBPyConnection") -> None:
-        """Enable a connection to read files below this folder, as every one is."""
 
     def _read_or_none(self, path: str) -> bytes | None:
         file = self.path / path

@@ -30,7 +30,7 @@ from obstore.store import from_url
 from fleet_slip.base import needed
 from fleet_slip.errors import StorageError
 from fleet_slip.storage.checksums import require_content
-from fleet_slip.storage.folder import Content, StoredFile
+from fleet_slip.storage.folder import Content, Folder, StoredFile
 from fleet_slip.storage.storage_errors import object_errors
 
 if TYPE_CHECKING:
@@ -262,7 +262,7 @@ READS_AT_ONCE = 32
 
 
 @dataclass(frozen=True)
-class ObjectFolder:
+class ObjectFolder(Folder):
     """A folder `s3://BUCKET`, `gs://`, `az://` + `prefix`; see `storage.folder.Folder`."""
 
     bucket: str
@@ -274,14 +274,6 @@ class ObjectFolder:
     @property
     def name(self) -> str:
         return self.prefix.rpartition("/")[2]
-
-    @property
-    def uri(self) -> str:
-        return str(self)
-
-    @property
-    def is_local(self) -> bool:
-        return False
 
     @property
     def delta_options(self) -> dict[str, str] | None:
@@ -311,9 +303,6 @@ class ObjectFolder:
         found = [self.found(meta) for page in pages for meta in page]
         return sorted(found, key=lambda file: file.path)
 
-    def stamp(self, path: str) -> object:  # noqa: ARG002 - to look costs what opening costs
-        return None
-
     def read(self, path: str, longest: int | None = None) -> bytes:
         where = f"{self}/{path}"
         if longest is None:
@@ -330,9 +319,6 @@ class ObjectFolder:
         """Return the content of files, None for one that is gone. Many are asked for at once."""
         with ThreadPoolExecutor(READS_AT_ONCE) as executor:
             return list(executor.map(self._read_or_none, paths))
-
-    def check(self, path: str) -> None:
-        """Do nothing: what is opened is looked at."""
 
     def open(self, path: str) -> pa.NativeFile:
         """Open a file; raises `StorageError` if the answer is not what the name says."""
@@ -367,17 +353,6 @@ class ObjectFolder:
     def delete(self, path: str) -> None:
         with object_errors(f"{self}/{path}"), contextlib.suppress(FileNotFoundError):
             obstore.delete(self._store, self._key(path))
-
-    def settle_commits(self, before: int | None) -> None:
-        """Make commits durable, as they are."""
-
-    def free_bytes(self) -> tuple[int, int] | None:
-        return None
-
-    @contextlib.contextmanager
-    def exclusive(self, name: str, waiting: Callable[[], None]) -> Iterator[None]:  # noqa: ARG002
-        """Hold no lock, for a killed process may keep it: what is done twice at once lands once."""
-        yield
 
     def let_read(self, database: duckdb.DuckDBPyConnection) -> None:
         database.register_filesystem(ObjectFilesystem(self.bucket, lambda: self._store))
