@@ -25,7 +25,7 @@ from fleet_slip.api.calls import (
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.logs import LogsAndGrams
 from fleet_slip.api.operations import HealthAndUpkeep
-from fleet_slip.catalogue.facts import CALIBRATION, DELAY, TRAINING_DRIVES
+from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.request import DEFAULT_MODELS, WORTH
@@ -141,10 +141,8 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
                         workers=executor,
                         progress=of_step(progress, f"gram {feature_set}"),
                     )
-                if features().feature_set(feature_set).change_ticks:
-                    # What the intercept follows from, and whether the course came in time.
-                    for name_of_set in (CALIBRATION, DELAY):
-                        self.gram(name_of_set, cohort=condition, workers=executor)
+                for name_of_set in features().beside(feature_set):
+                    self.gram(name_of_set, cohort=condition, workers=executor)
             refusal, selection = "", None
             training = Training(model_name, condition, models, worth)
             publication = training.made_already(self)

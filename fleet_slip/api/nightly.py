@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from fleet_slip.api.calls import NightRequest, of_step
 from fleet_slip.api.session import Training
 from fleet_slip.base import date_of, number_of
-from fleet_slip.catalogue.facts import CALIBRATION, DELAY
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError
 from fleet_slip.ingest.log_files import find_logs, is_url
@@ -197,9 +196,7 @@ class Night:
 
     def _gram(self) -> Told:
         wanted = load_model_list(self.training.models).features
-        changes = features().feature_set(wanted).change_ticks
-        beside = (CALIBRATION, DELAY) if changes else ()  # for the intercept, and the course's time
-        for name in dict.fromkeys((PLAIN, wanted, *beside)):
+        for name in dict.fromkeys((PLAIN, wanted, *features().beside(wanted))):
             self.fleet.gram(
                 name,
                 cohort=None if name == PLAIN else self.training.cohort,

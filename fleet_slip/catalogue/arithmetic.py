@@ -5,8 +5,9 @@ of one row, perhaps inside CASE WHEN divisor >= number THEN ... END.
 """
 
 import ast
+import operator
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -37,6 +38,18 @@ def nearest(a: int, b: int) -> int:
 def nearest_sql(number: str, divisor: str) -> str:
     """Return `nearest` as DuckDB has it, whose `//` truncates: half a divisor is added before."""
     return f"(2 * ({number}) + sign({number}) * ({divisor})) // (2 * ({divisor}))"
+
+
+COMPUTED: Mapping[str, Callable[..., int | None]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "//": lambda a, b: truncated(a, b) if b > 0 else None,
+    "negative": operator.neg,
+    "abs": abs,
+    "sign": lambda a: (a > 0) - (a < 0),
+}
+"""What each function of a step is."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +99,21 @@ def parse(sql: str) -> Arithmetic:
     if max(builder.bounds) + at_least >= _OVERFLOW:
         raise QuestionError(f"{sql[:200]!r} can need more than 64 bits: divide earlier.")
     return Arithmetic(tuple(builder.steps), guard, at_least, names)
+
+
+def evaluate(sql: str, counts: Mapping[str, int]) -> int | None:
+    """Return what the SQL of a feature comes to in one row; None where it has no value."""
+    one, found = parse(sql), list[int]()
+    for step in one.steps:
+        if step.function:
+            value = COMPUTED[step.function](*(found[operand] for operand in step.operands))
+        else:
+            value = counts[step.name] if step.name else step.value
+        if value is None:
+            return None
+        found.append(value)
+    missing = one.guard is not None and found[one.guard] < one.at_least
+    return None if missing else found[-1]
 
 
 def _tree(text: str) -> ast.expr:

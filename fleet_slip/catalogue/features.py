@@ -13,7 +13,8 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalogue.course import BESIDE, LONGEST_TICKS, YAW_RATE, course_units
 from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, plain_column
-from fleet_slip.catalogue.facts import RECEIVED
+from fleet_slip.catalogue.facts import CALIBRATION, DELAY, RECEIVED
+from fleet_slip.catalogue.mirror import parity
 from fleet_slip.catalogue.signals import (
     SAMPLE_TIME_S,
     Identifier,
@@ -313,6 +314,12 @@ class FeatureCatalogue(Config):
             columns[kind] = tuple(name for name in both if self._changes(name))
         return one.model_copy(update=columns)
 
+    def beside(self, name: str) -> tuple[str, ...]:
+        """Return the sets that a model of changes needs: for its intercept, and when fixes came."""
+        one = self.feature_set(name)
+        of = (one.of,) if one.of else ()
+        return (*of, CALIBRATION, DELAY) if one.change_ticks else ()
+
     def _changes(self, name: str) -> bool:
         if name not in self.time_columns:
             return True
@@ -320,6 +327,30 @@ class FeatureCatalogue(Config):
         alone = one.number is not None and one.number.alone
         summed = one.over == "sum" and YAW_RATE in one.signals
         return not (alone or summed or one.over == "running_mean")
+
+    def is_odd(self, name: str) -> bool:
+        """Return whether a column changes sign where left and right are exchanged."""
+        one = self.definition(name) or self.rows([name]).get(name) or plain_column(name)
+        return parity(one) == -1
+
+    def searched(self, name: str) -> tuple[str, ...]:
+        """Return what a search among a set's inputs may choose: of changes what tells of slip.
+
+        Changes tell no intercept, which an even column would stand in for, and which follows from
+        the set whose changes they are. And a window longer than half of their time hardly changes
+        with the angle, but with what is wrong about the course.
+        """
+        one = self.feature_set(name)
+        if not one.change_ticks:
+            return one.inputs
+        longest = max(one.change_ticks) // 2
+        if one.of:
+            one = one.model_copy(update={"features": self.feature_set(one.of).features})
+        columns = self.time_columns
+        short = [
+            n for n in one.inputs if n not in columns or columns[n].definition.ticks <= longest
+        ]
+        return tuple(n for n in short if self.is_odd(n))
 
     def members(self, name: str) -> tuple[str, ...]:
         """Return the columns of a family of windows or gates; any other name stays."""

@@ -61,13 +61,14 @@ from fleet_slip.grams.on_board import (
 )
 from fleet_slip.grams.receiver_delay import delay_columns
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.straight_on import levels_of
 from fleet_slip.regression.gram import packed_size
 
 # Which Gram rows a car counts beside a model, and what their columns are computed by.
 #
 # Those of the logged signals; and, if changes of the course taught the model, what teaches it
-# again: the changes of its columns, how late the receiver is, and what tells the offsets of the
-# sensors.
+# again: the changes of its columns, how late the receiver is, what tells the offsets of the
+# sensors, and the columns themselves, which the intercept follows from.
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,13 @@ def sets_on_board(manifest: Manifest) -> tuple[OnBoard, ...]:
     delay = _on_board_counted(DELAY)
     telling = tuple(column for column in delay.columns if column in delay_columns())
     told = OnBoard(delay, telling, complete=True)
-    return (plain, OnBoard(counted, columns), told, _whole(CALIBRATION))
+    sets = (plain, OnBoard(counted, columns), told, _whole(CALIBRATION))
+    if manifest.through_origin:
+        return sets
+    base, levels = levels_of(manifest)
+    of = _on_board_counted(base)
+    there = {*levels, catalogue().label}
+    return (*sets, OnBoard(of, tuple(name for name in of.columns if name in there)))
 
 
 def _whole(name: str) -> OnBoard:

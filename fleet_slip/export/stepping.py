@@ -1,11 +1,10 @@
 """A published version tick by tick, for test benches: `Fleet.estimator`."""
 
-import operator
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from typing import Any
 
-from fleet_slip.catalogue.arithmetic import nearest, truncated
+from fleet_slip.catalogue.arithmetic import COMPUTED, nearest
 from fleet_slip.catalogue.facts import round_number
 from fleet_slip.columns.operations import operation_of, plain_of
 from fleet_slip.errors import InputError
@@ -14,16 +13,10 @@ from fleet_slip.export.program import Car, Program
 from fleet_slip.models.manifest import Manifest
 
 _COMPUTED: Mapping[str, Callable[..., int | None]] = {
-    "+": operator.add,
-    "-": operator.sub,
-    "*": operator.mul,
-    "//": lambda a, b: truncated(a, b) if b > 0 else None,
+    **COMPUTED,
     "nearest": lambda a, b: nearest(a, b) if b > 0 else None,
     "min": min,
     "max": max,
-    "negative": operator.neg,
-    "abs": abs,
-    "sign": lambda a: (a > 0) - (a < 0),
     "clip": lambda a, most: max(-most, min(a, most)),
     "at_least": lambda a, least: a if a >= least else None,
     "where": lambda a, _: a,

@@ -22,12 +22,18 @@ from fleet_slip.grams.car_estimates import (
     CarEstimates,
     add_satellite_estimates,
     bank_of_bends,
+    course_terms,
     estimate_numbers,
 )
 from fleet_slip.grams.reader import DriveSums
 from fleet_slip.regression.exact import sqrt as sqrt_exact
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import DriveTermSums, Influence, influence
+from fleet_slip.regression.least_squares import (
+    DriveTermSums,
+    ExactSums,
+    Influence,
+    influence,
+)
 
 # What the roads of a fleet have in common: they lean to one side, and are banked in bends.
 #
@@ -199,6 +205,14 @@ class CarEvidence:
                 every = range(*one.cars[car].indices(len(one.drives)))[first:last]
                 found[kind] = slice(every.start, every.stop)
         return found
+
+    def means(self, car: str, terms: Sequence[str]) -> list[Fraction]:
+        """Return means of terms of the relations of course over a car's drives; 0 of no drive."""
+        totals = self._totals(self.slices(car))
+        if not (course := totals.get("course")):
+            return [Fraction(0) for _ in terms]
+        sums = ExactSums(course, course_terms())
+        return [sums.mean(term) for term in terms]
 
     def _totals(self, slices: Mapping[str, slice]) -> dict[str, Gram]:
         return {

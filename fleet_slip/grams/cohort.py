@@ -115,14 +115,14 @@ class Cohort:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Signals and features that any drive has, in the order of the feature set.
+        """What a search may choose of the columns that any drive has, in the set's order.
 
         Beside drives without the label those that some of these have as well.
         """
         known = {name for kind in _kinds(self.drives) for name in kind.split(",")}
         if self.unlabelled is not None:
             known &= set(self.unlabelled.inputs)
-        return tuple(n for n in features().feature_set(self.feature_set).inputs if n in known)
+        return tuple(n for n in features().searched(self.feature_set) if n in known)
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
         """Return the SQL condition on the view `grams` of the rows that a model is made of."""

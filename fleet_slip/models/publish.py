@@ -12,6 +12,7 @@ from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
+from fleet_slip.grams.car_evidence import three_digits
 from fleet_slip.models.acceptance import judge
 from fleet_slip.models.manifest import (
     CrossValidated,
@@ -199,8 +200,7 @@ def with_straight_intercept(
 ) -> Manifest:
     """Return a manifest with the intercept that changes do not tell, if changes taught its model.
 
-    One through the origin keeps 0, of no cars. Raises `DataError` if the cars do not tell their
-    sensors' offsets.
+    One through the origin keeps 0, of no cars. Raises `DataError` if no drive tells the intercept.
     """
     name = features().name_of(manifest.trained_on.feature_set)
     change_s = features().feature_set(name).change_s
@@ -216,7 +216,7 @@ def with_straight_intercept(
         change_s=float(change_s[0]) if len(change_s) == 1 else tuple(map(float, change_s)),
         cars=found.cars,
         intercept_uncertainty_deg=(
-            None if found.uncertainty is None else math.degrees(found.uncertainty)
+            None if found.uncertainty is None else three_digits(math.degrees(found.uncertainty))
         ),
         intercept_spread_deg=math.degrees(found.spread),
     )

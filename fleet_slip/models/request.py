@@ -328,7 +328,8 @@ def inputs_of(cohort: "Cohort", order: str) -> tuple[str, ...]:
 def require_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
     """Return the inputs, of a family of windows or gates its members.
 
-    Raises `QuestionError` for an unknown one, `UsageError` for a repeated one.
+    Raises `QuestionError` for an unknown one, or one that is not odd of changes, `UsageError` for a
+    repeated one.
     """
     known = features().feature_set(feature_set).inputs
     order = tuple(one for name in names for one in features().members(name.strip()))
@@ -339,7 +340,20 @@ def require_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
         )
     if len(set(order)) < len(order):
         raise UsageError(f"{','.join(order)}: an input stands twice.")
+    require_odd(order, feature_set)
     return order
+
+
+def require_odd(names: Sequence[str], feature_set: str) -> None:
+    """Raise `QuestionError` for columns of changes that are not odd in left and right."""
+    if not features().feature_set(feature_set).change_ticks:
+        return
+    if other := [name for name in names if not features().is_odd(name)]:
+        raise QuestionError(
+            f"{', '.join(other)}: does not change sign where left and right are exchanged, as the "
+            "side-slip angle does. Changes of the course would teach it a wrong constant: leave it "
+            "out."
+        )
 
 
 def _told(inputs: Iterable[str]) -> str:

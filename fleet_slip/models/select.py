@@ -42,6 +42,7 @@ from fleet_slip.models.request import (
     nested_candidates,
     parse_worth,
     require_inputs,
+    require_odd,
 )
 from fleet_slip.models.search import (
     ALL_SUBSETS,
@@ -386,6 +387,7 @@ def select(
     skipped: dict[str, str] = {}
     for candidate in candidates:
         try:
+            require_odd(candidate.signals, cohort.feature_set)
             models.append(validate(candidate, divided, intercept=intercept))
         except (DataError, QuestionError) as error:
             skipped[candidate.name] = str(error)

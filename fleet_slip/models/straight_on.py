@@ -1,38 +1,34 @@
 """The intercept of a model learned from changes, which have none: no car slips straight on.
 
-A car's signals when it goes straight follow from the offsets of its gyroscope and accelerometer,
-which `calibrate` tells without a label: each signal is fitted as a plane in both over all rows of
-the car, and read there. From there the car is led into even bends as hard as usual, left and right
-alike: on average the model must give no angle, also where an offset is squared. Cars differ mostly
-by their offsets: of several cars, these become columns of the model.
+Over all rows of a car each column of the model is fitted as a plane in curvature (r/v) and in
+r·v, which are free of the accelerometer's noise and roll. Where the car does not turn, the
+gyroscope tells its bias, and the plane what the column is there: mostly the steering's offset. The
+intercept makes the model zero there. Roads that lean to one side give every car of a fleet the same
+intercept, which is none: of many cars only what they differ by is taken, and becomes columns of the
+model, by what `calibrate` tells of each car.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from statistics import NormalDist
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.facts import NumberName
-from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.drive_columns import DriveCounts
+from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.errors import DataError
-from fleet_slip.grams.calibration import calibrate
-from fleet_slip.grams.car_evidence import CalibratedNumber
-from fleet_slip.grams.cohort import Cohort, load_cohort
+from fleet_slip.grams.calibration import Calibration, calibrate
+from fleet_slip.grams.reader import DriveSums, collect_sums, open_grams
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.predict import Predictor
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import LinearModel, fit
+from fleet_slip.regression.least_squares import ONE, ExactSums, LinearModel, fit, solve
 from fleet_slip.warehouse.condition import Condition
 from fleet_slip.warehouse.tables import Warehouse
 
-OFFSETS: Mapping[str, NumberName] = {"ay": "ay_offset", "yaw_rate": "yaw_rate_offset"}
-"""The signals that are off, and the numbers that tell by how much."""
+PLANE = ("curvature_mean_16", "yaw_rate_speed_mean_16")
+"""What the columns of a model are planes in, beside a constant."""
 COLUMNS: Mapping[str, NumberName] = {
     "ay_offset_alone": "ay_offset",
     "yaw_rate_offset_alone": "yaw_rate_offset",
@@ -40,12 +36,14 @@ COLUMNS: Mapping[str, NumberName] = {
 """The calibrated columns that are a car's offsets."""
 FEWEST_CARS, WORTH_RAD = 8, math.radians(0.005)
 """Fewer cars, and cars that differ by less, have one intercept."""
+OWN_PART = Fraction(4, 5)
+"""Of what a car's intercept differs by from the fleet's: the rest is chance."""
+SHARED_RAD = math.radians(0.15)
+"""Standard error that no drive and no car takes away. On three real cars, of 2 to 9 runs, the
+intercept differs by 0.08, 0.15 and 0.3 degrees from that of a reference sensor, which is turned in
+its car by as much."""
 GRAIN_RAD = Fraction(1, 10**9)
 """Of the intercepts that the offsets' coefficients are fitted to, in whole numbers."""
-ROWS = 2048
-"""Ticks of an even bend: more than most shipped windows look back on."""
-BENDS = tuple(NormalDist().inv_cdf((i + 0.5) / 7) for i in range(7))
-"""Lateral acceleration in bends, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +51,10 @@ class StraightOn:
     """What cars that go straight say of an intercept.
 
     Attributes:
-        intercept: rad, the mean of cars by rows; with slopes, that of a car without offsets.
+        intercept: rad, the mean of cars by rows; of a fleet that of its middle, or with slopes of a
+            car without offsets.
         slopes: rad for a count of the offset, by its column; none of few cars, or of like ones.
-        uncertainty: rad, of the mean, from the offsets or from how cars differ; None of one.
+        uncertainty: rad, from how drives or cars differ and what all share; None of one drive.
         spread: rad, standard deviation between cars of what the slopes do not tell.
         cars: how many.
     """
@@ -67,42 +66,163 @@ class StraightOn:
     cars: int
 
 
+@dataclass(frozen=True)
+class _Car:
+    """The intercept that a car asks for in rad, its variance as drives differ, and its rows."""
+
+    intercept: float
+    variance: float
+    rows: int
+    offsets: tuple[int, ...] | None
+
+
 def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) -> StraightOn:
-    """Return the intercept of a model without one. Raises `DataError` if no car tells offsets."""
-    evidence = calibrate(warehouse, condition).evidence
-    cohort = load_cohort(warehouse, condition)
-    signals = tuple(dict.fromkeys(name for term in manifest.terms for name in term.inputs))
-    predictor = Predictor.of(manifest)
-    found = []
-    for car, gram, facts in _by_car(cohort, tuple(dict.fromkeys((*OFFSETS, *signals)))):
-        # Whatever part of ay is the road's: these are the roads that the model was taught on.
-        known = evidence.calibrated(car, leaning=True) if car in evidence.estimates else {}
-        if set(OFFSETS.values()) <= set(known):
-            told = _of_car(predictor, gram, signals, known, facts)
-            found.append((gram.n, *told, *(known[one].count for one in COLUMNS.values())))
-    if not found:
+    """Return the intercept of a model without one. Raises `DataError` if no drive tells it."""
+    calibration = calibrate(warehouse, condition)
+    coefficients = {
+        term.signal: term.coefficient_exact * Fraction(term.scale_exact) for term in manifest.terms
+    }
+    sums = _levels(warehouse, condition, manifest)
+    every = [_of_car(sums, car, coefficients, calibration) for car in sums.cars]
+    cars = [one for one in every if one is not None]
+    if not cars:
         raise DataError(
-            f"no car of {condition.text!r} tells the offsets of its sensors, which the intercept "
-            f"follows from, and logs {', '.join(signals)}. Choose more drives (see fleet-slip "
-            "calibrate), or a model that knows none: --no-intercept."
+            f"every car of {condition.text!r} drove alike all the time: nothing tells how its "
+            "sensors are off. Choose more drives, or a model that knows no intercept: "
+            "--no-intercept."
         )
-    rows, means, variances, *offsets = np.array(found, dtype=np.float64).T
+    rows, means, variances = np.array([(c.rows, c.intercept, c.variance) for c in cars]).T
     share = rows / rows.sum()
     mean = float(share @ means)
     spread = math.sqrt(float(share @ (means - mean) ** 2))
-    variance = float(share**2 @ variances)
-    if math.isnan(variance):
-        variance = spread**2 / len(found) if len(found) > 1 else math.nan
-    uncertainty = None if math.isnan(variance) else math.sqrt(variance)
-    own = None
-    if len(found) >= FEWEST_CARS and spread >= WORTH_RAD:
-        own = _by_offsets(rows, np.array(offsets), means)
-    if own is None:
-        return StraightOn(Fraction(mean), {}, uncertainty, spread, len(found))
-    rest = means - float(own.offset) - np.array(own.coefficients, dtype=np.float64) @ offsets
-    spread = math.sqrt(float(share @ (rest - share @ rest) ** 2))
-    slopes = dict(zip(own.signals, own.coefficients, strict=True))
-    return StraightOn(own.intercept, slopes, uncertainty, spread, len(found))
+    variance = spread**2 / len(cars) if len(cars) > 1 else float(variances[0])
+    unsure = None if math.isnan(variance) else math.hypot(math.sqrt(variance), SHARED_RAD)
+    if len(cars) < FEWEST_CARS:
+        return StraightOn(Fraction(mean), {}, unsure, spread, len(cars))
+    own = (means - float(np.median(means))) * float(OWN_PART)
+    known = np.array([one.offsets is not None for one in cars])
+    offsets = np.array([one.offsets for one in cars if one.offsets is not None]).T
+    told = None
+    if spread >= WORTH_RAD and known.sum() >= FEWEST_CARS:
+        told = _by_offsets(rows[known], offsets, own[known])
+    if told is None:
+        return StraightOn(Fraction(0), {}, unsure, spread, len(cars))
+    rest = own[known] - float(told.offset) - np.array(told.coefficients, float) @ offsets
+    spread = math.sqrt(float(np.average((rest - rest.mean()) ** 2, weights=rows[known])))
+    slopes = dict(zip(told.signals, told.coefficients, strict=True))
+    return StraightOn(told.intercept, slopes, unsure, spread, len(cars))
+
+
+def levels_of(manifest: Manifest) -> tuple[str, tuple[str, ...]]:
+    """Return the set whose changes taught a model, and its columns that the intercept follows from.
+
+    Raises `DataError` if there is no such set, or it lacks one of them.
+    """
+    name = features().name_of(manifest.trained_on.feature_set)
+    base, known = features().feature_set(name).of, features().calibrated
+    wanted = (known[one].of if one in known else one for one in manifest.signals)
+    columns = tuple(dict.fromkeys((*PLANE, *wanted)))
+    there = features().feature_set(base).columns if base else ()
+    if absent := [column for column in columns if column not in there]:
+        raise DataError(
+            f"the intercept follows from Gram rows of {', '.join(absent)} themselves, not their "
+            f"changes: let the feature set {name} be of one that has them (of in "
+            "configs/features.toml), or choose a model that knows no intercept: --no-intercept."
+        )
+    return str(base), columns
+
+
+def _levels(warehouse: Warehouse, condition: Condition, manifest: Manifest) -> DriveSums:
+    base, columns = levels_of(manifest)
+    with open_grams(warehouse, base, condition) as opened:
+        found = collect_sums(opened.batches(condition), {base: columns}, unnamed=True)
+    if not found:
+        raise DataError(
+            f"no drive of {condition.text!r} has {', '.join(columns)}, which the intercept follows "
+            "from. Choose more drives, or a model that knows no intercept: --no-intercept."
+        )
+    return found[base]
+
+
+def _of_car(
+    sums: DriveSums, car: str, coefficients: Mapping[str, Fraction], calibration: Calibration
+) -> _Car | None:
+    """Return what a car asks for; None if it drove alike all the time."""
+    numbers = calibration.cars.get(car, {})
+    weights = _of_columns(coefficients, {name: one.count for name, one in numbers.items()})
+    rows = np.arange(*sums.cars[car].indices(len(sums.drives)))
+    gram = sums.table.take(rows).total()
+    bias = numbers.get("yaw_rate_offset")
+    value, unsure = (Fraction(bias.value), bias.uncertainty or 0.0) if bias else (Fraction(0), 0.0)
+    means = calibration.evidence.means(car, ("slowness", "speed"))
+    scales = (input_scales()[name] for name in PLANE)
+    # Where the car does not turn, and how that moves with the gyroscope's bias.
+    moved = [Fraction(0), *(mean / scale for mean, scale in zip(means, scales, strict=True))]
+    point = [Fraction(1), *(value * one for one in moved[1:])]
+    exact = ExactSums(gram, {name: {name: Fraction(1)} for name in gram.signals})
+    plane = (ONE, *PLANE)
+
+    def read(at: Sequence[Fraction]) -> float | None:
+        """Return minus the model where the plane is read: both sides solved at once."""
+        rows = [[*(exact(a, b) for b in plane), one] for a, one in zip(plane, at, strict=True)]
+        if (shares := solve(rows)) is None:
+            return None
+        parts = (
+            weight * share * exact(of, name)
+            for name, weight in weights.items()
+            for share, of in zip(shares, plane, strict=True)
+        )
+        return float(-sum(parts, Fraction(0)))
+
+    intercept, by_bias = read(point), read(moved)
+    if intercept is None or by_bias is None:
+        return None
+    each = sums.table.take(rows).moments()
+    label = np.array([float(weights.get(name, 0)) for name in sums.table.signals])
+    scatter = _scatter(
+        each[:, : len(plane), : len(plane)],
+        each[:, : len(plane), 1:] @ label,
+        np.array(point, dtype=np.float64),
+    )
+    offsets = tuple(numbers[name].count for name in COLUMNS.values() if name in numbers)
+    return _Car(
+        intercept,
+        scatter + (by_bias * unsure) ** 2,
+        gram.n,
+        offsets if len(offsets) == len(COLUMNS) else None,
+    )
+
+
+def _of_columns(
+    coefficients: Mapping[str, Fraction], numbers: Mapping[str, int]
+) -> dict[str, Fraction]:
+    """Return what a model of a car multiplies each stored column by; calibrated ones have none."""
+    found: dict[str, Fraction] = {}
+    for name, coefficient in coefficients.items():
+        of, factor = name, 1
+        if calibrated := features().calibrated.get(name):
+            number = features().time_columns[name].definition.number
+            of = calibrated.of
+            factor = numbers.get(number.name, number.less) - number.less if number else 1
+        found[of] = found.get(of, Fraction(0)) + coefficient * factor
+    return found
+
+
+def _scatter(inputs: FloatArray, products: FloatArray, point: FloatArray) -> float:
+    """Return the variance of a plane's value at a point as drives differ, by leaving out each.
+
+    `inputs` are the moments of the plane's columns of each drive, shape (drives, k, k), `products`
+    those with what is fitted, (drives, k). NaN of a single drive.
+    """
+    drives = len(inputs)
+    if drives < 2:
+        return math.nan
+    unit = np.sqrt(np.einsum("dii->i", inputs))
+    left = (inputs.sum(axis=0) - inputs) / np.outer(unit, unit)
+    right = (products.sum(axis=0) - products) / unit
+    planes = np.einsum("dij,dj->di", np.linalg.pinv(left, hermitian=True), right)
+    values = planes @ (point / unit)
+    return float((drives - 1) / drives * ((values - values.mean()) ** 2).sum())
 
 
 def _by_offsets(rows: FloatArray, offsets: FloatArray, means: FloatArray) -> LinearModel | None:
@@ -129,68 +249,3 @@ def _by_offsets(rows: FloatArray, offsets: FloatArray, means: FloatArray) -> Lin
         coefficients=tuple(one * GRAIN_RAD for one in found.coefficients),
         intercept=found.intercept * GRAIN_RAD,
     )
-
-
-def _by_car(cohort: Cohort, signals: Sequence[str]) -> list[tuple[str, Gram, Mapping[str, object]]]:
-    found: dict[str, tuple[Gram, Mapping[str, object]]] = {}
-    first = 0
-    for table in cohort.tables:
-        drives = cohort.drives.slice(first, len(table))
-        first += len(table)
-        if not set(signals) <= set(table.signals):
-            continue
-        names = np.array(drives["vehicle_id"].to_pylist())
-        for car in sorted(set(names.tolist())):
-            gram = table.restrict(signals).total(names == car)
-            row = drives.slice(int(np.argmax(names == car)), 1).to_pylist()[0]
-            found[car] = (found[car][0] + gram if car in found else gram, row)
-    return [(car, *found[car]) for car in sorted(found)]
-
-
-def _of_car(
-    predictor: Predictor,
-    gram: Gram,
-    signals: Sequence[str],
-    known: Mapping[NumberName, CalibratedNumber],
-    facts: Mapping[str, object],
-) -> tuple[float, float]:
-    """Return the intercept that a car asks for in rad, and its variance; NaN if not known."""
-    planes = {
-        name: fit(gram, tuple(OFFSETS), name).model for name in signals if name not in OFFSETS
-    }
-    numbers: dict[str, int] = {name: one.count for name, one in known.items()}
-    bends = {
-        name: fit(gram, ("ay",), name).model.coefficients[0] for name in signals if name != "ay"
-    }
-    variance = gram.n * gram.products[0] - gram.sums[0] ** 2
-    usual = math.sqrt(variance) / gram.n
-
-    def estimate(bend: Sequence[float], more: Mapping[str, float]) -> float:
-        at = {
-            name: Fraction(known[of].value + more.get(name, 0.0)) / catalogue()[name].exact_scale
-            for name, of in OFFSETS.items()
-        }
-        for name, plane in planes.items():
-            slopes = zip(OFFSETS, plane.coefficients, strict=True)
-            at[name] = plane.intercept + sum((c * at[of] for of, c in slopes), Fraction(0))
-        further = usual * np.repeat(bend, ROWS)
-        counts = {
-            name: np.clip(
-                np.rint(float(at[name]) + float(bends.get(name, 1)) * further), -(2**15), 2**15 - 1
-            ).astype(np.int16)
-            for name in signals
-        }
-        drive = DriveCounts(np.arange(len(further), dtype=np.int32), counts, {}, facts, numbers)
-        return math.fsum(predictor(drive)[ROWS - 1 :: ROWS].tolist()) / len(bend)
-
-    straight, found = estimate((0.0,), {}), estimate(BENDS, {})
-    if math.isnan(found):
-        raise DataError("a column of the model has no value where the car goes straight on.")
-    told = [known[of].uncertainty for of in OFFSETS.values()]
-    steps = [one for one in told if one is not None]
-    if len(steps) < len(told):
-        return -found, math.nan
-    shifts = [
-        estimate((0.0,), {name: step}) - straight for name, step in zip(OFFSETS, steps, strict=True)
-    ]
-    return -found, math.fsum(shift * shift for shift in shifts)

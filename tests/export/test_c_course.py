@@ -20,6 +20,7 @@ from fleet_slip.export.files import export_files
 from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.on_board import counted_sets
 from fleet_slip.models.registry import ModelVersion
+from fleet_slip.models.straight_on import PLANE
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
@@ -107,7 +108,7 @@ def test_received_rows_are_those_of_the_log(
 @pytest.fixture
 def three(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A set of changes over several times, with a gate."""
-    windows = ("ay_mean_16", features().members("cornering")[0])
+    windows = ("ay_mean_16", *PLANE, features().members("cornering")[0])
     few = FeatureSet(description="few", signals=("ax", "ay", "yaw_rate"), windows=windows)
     times = (Decimal("3.5"), Decimal(4), Decimal(5))
     three = FeatureSet(description="three", of="few", features=("curvature",), change_s=times)
@@ -150,6 +151,7 @@ def test_an_export_counts_what_teaches_the_model_again() -> None:
     header = files["sideslip_any_gram.h"].decode()
     assert "int32_t course_count;" in header and "_gram_pass(" in header
     sizes = [one.columns for one in sets_on_board(version.manifest)[1:]]
+    assert set(sizes[-1]) == {*COLUMNS, *PLANE, catalogue().label}, "the columns themselves"
     assert sizes[0] == (
         *(
             "ay",
