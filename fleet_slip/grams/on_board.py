@@ -227,9 +227,10 @@ def impossible_rows(
                 names = signals.split(",") if signals else []
                 if not set(names) <= set(one.columns):
                     found = {"has signals that there are not": np.arange(len(alike))}
+                elif names:
+                    found = find_impossible(gram_table(signals, alike), one.ranges_of(names))
                 else:
-                    table, ranges = gram_table(signals, alike), one.ranges_of(names)
-                    found = find_impossible(table, ranges) if names else {}
+                    found = {}
                 for reason, at in found.items():
                     yield from ((alike.slice(i, 1).to_pylist()[0], reason) for i in at.tolist())
 
