@@ -11,8 +11,16 @@ from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.errors import UsageError
 from fleet_slip.models.registry import ModelVersion, Registry
-from fleet_slip.models.request import CLUSTER, WHOLE_SET, SelectionRequest, inputs_of
+from fleet_slip.models.request import (
+    CLUSTER,
+    DEFAULT_MODELS,
+    WHOLE_SET,
+    SelectionRequest,
+    inputs_of,
+    load_model_list,
+)
 from fleet_slip.regression.drives import ClusterUnit
+from fleet_slip.storage.runs import LOGGER
 from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
@@ -30,6 +38,10 @@ SIGNALS = Doc(
     "Instead of a published model: signals to fit, separated by commas; 'catalogue' is all inputs."
 )
 OF_SIGNALS = Doc("Feature set that `signals` are of. Default: the logged signals.")
+
+
+ROWS_ON_THE_WAY = 4_000_000
+"""Rows of logs whose columns over time are computed before models are compared: seconds."""
 
 
 class FleetCohort(Rooted):
@@ -65,7 +77,8 @@ class FleetCohort(Rooted):
     def select(self, request: SelectionRequest) -> "Selection":
         """Compare models by cross-validation and choose one; `Fleet.publish` takes the answer.
 
-        Drives that are not in order are left out: see `examine`, and `examined` of the answer.
+        Drives that are not in order are left out: see `examine`, and `examined` of the answer. Gram
+        rows that the usual list needs are made, if they are not there and that takes seconds.
         Raises what `examine` raises, `UsageError` for options that do not go together or an invalid
         list, and `DataError` if no model can be fitted.
         """
@@ -74,6 +87,8 @@ class FleetCohort(Rooted):
         examined = self.examine()
         with examined.explaining():
             answer = answer_request(self.warehouse, request, examined.cohort)
+            if answer.remark and self._make_usual(examined.cohort):
+                answer = answer_request(self.warehouse, request, examined.cohort)
         return replace(answer, examined=str(examined))
 
     def diagnose(
@@ -162,6 +177,27 @@ class FleetCohort(Rooted):
         chosen = TuningDrives.of(self.warehouse, self._load("signals"), weighed=False)
         with open_workers(self.root, threads) as executor:
             return identify_held_out(car, chosen.read(), executor)
+
+    def _make_usual(self, cohort: str) -> bool:
+        """Make the Gram rows of the usual list, if that takes seconds; return whether it did."""
+        from importlib.util import find_spec
+
+        from fleet_slip.grams.gram_files import find_backlog
+        from fleet_slip.grams.job import update_grams
+        from fleet_slip.grams.reader import cohort_files
+        from fleet_slip.warehouse.condition import parse_cohort
+        from fleet_slip.warehouse.tables import gram_snapshots
+
+        name = load_model_list(DEFAULT_MODELS).features
+        grams, logs = gram_snapshots(self.warehouse)
+        files = cohort_files(self.warehouse, parse_cohort(cohort))
+        missing = find_backlog(logs, grams, known_features().identity(name)).missing
+        rows = sum(file.rows for file in missing if file.path in files)
+        if not rows or rows > ROWS_ON_THE_WAY or find_spec("numba") is None:
+            return False
+        LOGGER.info("making the Gram rows of %s, which the list %s needs", name, DEFAULT_MODELS)
+        update_grams(self.warehouse, feature_set=name, among=files)
+        return True
 
     def _load(self, feature_set: str, condition: str | None = None) -> "Cohort":
         from fleet_slip.grams.cohort import load_cohort

@@ -79,7 +79,7 @@ class LogsAndGrams(Rooted):
         files: Iterable[Path | str] | Path | str,
         mapping: "str | Mapping",
         *,
-        as_one: bool = False,
+        as_one: Annotated[bool, Doc("The files of each folder are parts of one log.")] = False,
         replace: "Replace" = "no",
         workers: Workers = None,
         each: "Callable[[IngestReport], None] | None" = None,
@@ -89,7 +89,7 @@ class LogsAndGrams(Rooted):
 
         `mapping` is a name, the path of a TOML file, or a `Mapping`. Rows that cannot be used go to
         the view `quarantine`. Of folders, at any depth, and patterns, the logs are taken that have
-        not landed unchanged; with `as_one` they are parts of one log. Objects are given as URLs.
+        not landed unchanged. Objects are given as URLs.
         Returns a report of each file read, in order; `each` gets it once the file is committed.
         Progress is in files for folders and patterns, else in bytes.
         Without a cluster, threads read a folder's small files; large ones are read one by one, by

@@ -94,7 +94,7 @@ class Night:
             rows=now.rows,
             quarantined=now.quarantined,
             champion=now.champion,
-            candidate=self._candidate(),
+            candidate=now.candidate,
             faults=self.faults,
             chart=self.chart,
             past=tuple(islice(nights.ended(self.night), SHOWN_NIGHTS)),
@@ -138,6 +138,7 @@ class Night:
             drives=self._count_drives(),
             rows=warehouse.logs.snapshot().rows,
             quarantined=warehouse.quarantine.snapshot().rows,
+            candidate=self._candidate() if self.fleet.root.exists() else None,
         )
 
     def _count_drives(self) -> int:
@@ -248,7 +249,8 @@ class Night:
         if publication is None:
             publication = self.fleet.publish(name, selection, candidate=True)
         told = f"{publication.version.reference}: {publication.reason}"
-        return "attention" if refusal else "done", told
+        said = publication.version.reference == self.before.candidate  # by an earlier night
+        return "attention" if refusal and not said else "done", told
 
     def _verify(self) -> Told:
         told = of_step(self.asked.progress, "verify")

@@ -1,15 +1,16 @@
 """SQL on the views of one moment, for any number of queries."""
 
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import duckdb
 import pyarrow as pa
 
-from fleet_slip.base import Record
+from fleet_slip.base import number_of
 from fleet_slip.errors import QueryGoesOnError, QuestionError, RefusedError
+from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.views import add_calibration
 from fleet_slip.warehouse.database import database_errors, interruptible, one_query, reading_files
 
@@ -86,7 +87,7 @@ def any_statement(_database: duckdb.DuckDBPyConnection, text: str) -> str:
 
 
 @dataclass(frozen=True)
-class RunReport(Record):
+class RunReport(Answer):
     """The report of each step; `gram_features` is that of the list's feature set.
 
     There is no selection where the champion is up to date, and no publication after a `refusal`.
@@ -104,6 +105,28 @@ class RunReport(Record):
     publication: "Publication | None"
     refusal: str
     seconds: float
+
+    def parts(self, everything: bool = False) -> Iterator[Part]:
+        """Return what each step did."""
+        simulated, publication = self.simulation, self.publication
+        took = f"{self.seconds:.1f} s"
+        if not self.changed:
+            kept = publication.version.reference if publication else self.refusal
+            yield Remark(f"{self.campaign}: nothing to do, {kept} is up to date ({took})")
+            return
+        drives, rows = number_of(simulated.drives, "drive"), number_of(simulated.rows, "row")
+        yield Remark(f"simulated {drives}, {rows}")
+        for gram in filter(None, (self.gram, self.gram_features)):
+            name = "gram" if gram is self.gram else f"gram {gram.feature_set}"
+            read, made = number_of(gram.rows_read, "row"), number_of(gram.gram_rows, "Gram row")
+            yield Remark(f"{name}: {read} read, {made}")
+        if self.selection:
+            yield from self.selection.parts(everything)
+        if publication:
+            yield from publication.parts()
+        else:
+            yield Remark(self.refusal)
+        yield Remark(f"done in {took}")
 
     @property
     def changed(self) -> bool:

@@ -16,10 +16,10 @@ from fleet_slip.catalogue.facts import ALL_DRIVES
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
-from fleet_slip.cli.selection import remark_without_information
 from fleet_slip.errors import UsageError
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.score import Score
+from fleet_slip.models.summary import remark_without_information
 from fleet_slip.rendering import Part, Remark, TextTable
 from fleet_slip.resources import folder
 from fleet_slip.storage.storage_errors import storage_errors
@@ -412,8 +412,9 @@ def watch(file: Path) -> None:
     say(f"{file}: {size(file.stat().st_size)}")
 
 
+@command(without=["json"])
 def explore(
-    context: typer.Context,
+    fleet: Fleet,
     edit: Annotated[
         bool, typer.Option("--edit", help="Show the code, and let it be changed.")
     ] = False,
@@ -434,8 +435,39 @@ def explore(
         import altair  # noqa: F401, PLC0415 - an extra
         import marimo  # noqa: F401, PLC0415
         import numba  # noqa: F401, PLC0415
-    context.obj.warehouse.require()
+    fleet.warehouse.require()
     words = ["edit" if edit else "run", str(folder("jobs") / "explore.py")]
     words += [*(["--port", str(port)] if port else []), *(["--headless"] if headless else [])]
-    command = [sys.executable, "-m", "marimo", *words, "--", "--root", str(context.obj.root)]
+    command = [sys.executable, "-m", "marimo", *words, "--", "--root", str(fleet.root)]
     os.execv(command[0], command)  # noqa: S606 - the notebook takes the place of this process
+
+
+SOUND = ("unexamined",)
+"""Not an option of what trains no model."""
+
+
+@command(Fleet.cohort, FleetCohort.diagnose, arguments=["model"], without=SOUND, echo=["condition"])
+def diagnose() -> None:
+    """Fit a model's signals to a cohort and examine the fit, from Gram rows.
+
+    Standard errors by drives, or by cars where there are several, are the ones to believe: at
+    100 Hz a row says little that the one before did not say, and a car's drives share its biases.
+
+    Example: **fleet-slip diagnose waterford**
+    """
+
+
+@command(
+    Fleet.cohort,
+    FleetCohort.what_if,
+    arguments=["model"],
+    without=SOUND,
+    echo=["condition", "noise", "bias"],
+)
+def what_if() -> None:
+    """Predict a model's error with worse sensors, in closed form; nothing is simulated.
+
+    Bias and noise come on top of what the logs have. Shown too: the best model for such sensors.
+
+    Example: **fleet-slip what-if waterford --noise ay=0.2 --bias yaw_rate=0.02**
+    """

@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 from collections.abc import Mapping
-from functools import cache, cached_property
+from functools import cache, partial
 from importlib import import_module
 from importlib.abc import InspectLoader
 from importlib.util import find_spec
@@ -74,8 +74,8 @@ GROUPS = {
         "report": "accuracy",
         "watch": "accuracy",
         "explore": "accuracy",
-        "diagnose": "selection",
-        "what-if": "selection",
+        "diagnose": "accuracy",
+        "what-if": "accuracy",
     },
     "Operations": {
         "nightly": "operations",
@@ -175,22 +175,11 @@ app = typer.Typer(
 )
 
 
-class LaterOpened:
-    """The fleet of a command, opened when it is first asked for: help waits for no table."""
-
-    def __init__(self, root: str | None) -> None:
-        """Take the root that was named."""
-        self._root = root
-
-    @cached_property
-    def _fleet(self) -> "Fleet":
-        fleet = fleet_slip.open(self._root)
-        _leave_pandas()
-        return fleet
-
-    def __getattr__(self, name: str) -> Any:
-        """Return an attribute of the fleet."""
-        return getattr(self._fleet, name)
+def _open(root: str | None) -> "Fleet":
+    """Return the fleet of a command, when it runs: its help waits for no table."""
+    fleet = fleet_slip.open(root)
+    _leave_pandas()
+    return fleet
 
 
 def _leave_pandas() -> None:
@@ -262,7 +251,7 @@ def options(
     if config is not None:
         os.environ[CONFIG_VARIABLE] = str(Path(config).absolute())
     own_configs()
-    context.obj = LaterOpened(root)
+    context.obj = partial(_open, root)
 
 
 def run_app() -> int:

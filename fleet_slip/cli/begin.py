@@ -4,7 +4,6 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,19 +13,12 @@ from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.session import RunReport
 from fleet_slip.base import number_of
-from fleet_slip.cli.options import (
-    RESAMPLING,
-    Unexamined,
-    command,
-)
+from fleet_slip.cli.options import RESAMPLING, Unexamined, command
 from fleet_slip.cli.output import All, Json, print_json, print_parts, say
-from fleet_slip.cli.selection import selection_parts
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.publish import DryRun, Publication, recipe_for
 from fleet_slip.models.request import SelectionRequest
-from fleet_slip.models.select import Selection
-from fleet_slip.rendering import Part, Remark
 from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.runs import step
 
@@ -80,7 +72,7 @@ def publish(
             say(selection.examined)
         print_json(answer)
     else:
-        print_parts(selection_parts(selection, everything))
+        print_parts(selection.parts(everything))
         print_parts(answer.parts())
     if mlflow and isinstance(answer, Publication):
         number = fleet.log_to_mlflow(answer.version, mlflow)
@@ -102,7 +94,7 @@ def run(report: RunReport, fleet: Fleet, everything: All = False, json: Json = F
     """
     if json:
         return print_json(report)
-    print_parts(_parts(report, everything))
+    print_parts(report.parts(everything))
     if (made := report.publication) and made.new:
         model = made.version.manifest.name
         _say_of_lost(fleet, report.campaign, model)
@@ -110,28 +102,6 @@ def run(report: RunReport, fleet: Fleet, everything: All = False, json: Json = F
             say("next:")
             for line in next_steps(fleet, report.campaign, model):
                 say(f"  {line}")
-
-
-def _parts(report: RunReport, everything: bool) -> Iterator[Part]:
-    simulated, publication = report.simulation, report.publication
-    took = f"{report.seconds:.1f} s"
-    if not report.changed:
-        kept = publication.version.reference if publication else report.refusal
-        yield Remark(f"{report.campaign}: nothing to do, {kept} is up to date ({took})")
-        return
-    drives, rows = number_of(simulated.drives, "drive"), number_of(simulated.rows, "row")
-    yield Remark(f"simulated {drives}, {rows}")
-    for gram in filter(None, (report.gram, report.gram_features)):
-        name = "gram" if gram is report.gram else f"gram {gram.feature_set}"
-        read, made = number_of(gram.rows_read, "row"), number_of(gram.gram_rows, "Gram row")
-        yield Remark(f"{name}: {read} read, {made}")
-    if report.selection:
-        yield from selection_parts(report.selection, everything)
-    if publication:
-        yield from publication.parts()
-    else:
-        yield Remark(report.refusal)
-    yield Remark(f"done in {took}")
 
 
 def next_steps(fleet: Fleet, campaign: str, model: str) -> list[str]:
@@ -186,11 +156,8 @@ def _faster_half(fleet: Fleet, campaign: str) -> str | None:
     return None if speed is None else f"speed_factor > {speed:.2f}"
 
 
-# The command that compares models on a cohort.
-
-
 @command(Fleet.cohort, FleetCohort.select)
-def select(selection: Selection, everything: All = False) -> None:
+def select(everything: All = False) -> None:
     """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only.
 
     Compare a list of models: **fleet-slip select --models table1**
@@ -201,4 +168,3 @@ def select(selection: Selection, everything: All = False) -> None:
 
     Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
     """
-    print_parts(selection_parts(selection, everything))

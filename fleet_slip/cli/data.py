@@ -21,7 +21,6 @@ from fleet_slip.cli.progress import progress
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.rendering import TextTable
 from fleet_slip.resources import folder as shipped
-from fleet_slip.storage.runs import recording
 from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
@@ -57,8 +56,10 @@ def _joined(*parts: str, replaced: int = 0, forgotten: int = 0) -> str:
     return "; ".join(filter(None, parts))
 
 
+@command(Fleet.ingest, without=["workers"])
 def ingest(
-    context: typer.Context,
+    fleet: Fleet,
+    as_one: bool,
     files: Annotated[
         list[str] | None,
         typer.Argument(
@@ -79,9 +80,6 @@ def ingest(
         typer.Option(
             "--dry-run", help="Store nothing; show what would be, and what looks wrong (exit 10)."
         ),
-    ] = False,
-    as_one: Annotated[
-        bool, typer.Option("--as-one", help="The files of each folder are parts of one log.")
     ] = False,
     replace: Annotated[
         bool,
@@ -111,67 +109,53 @@ def ingest(
     """
     from fleet_slip.ingest.log_files import names_several  # noqa: PLC0415 - takes a while
 
-    fleet: Fleet = context.obj
+    others = dry_run or as_one or replace
     if undo is not None:
-        _take_back(fleet, undo, json, alone=not (files or mapping or replace or dry_run or as_one))
-        return
-    if not files:
+        if files or mapping or others:
+            raise UsageError("--undo takes out and brings nothing in: give it alone.")
+        _take_back(fleet, undo, json)
+    elif not files:
         raise UsageError("give files; or --undo alone, to take drives out again.")
-    if mapping is None:
-        _ingest_counted(fleet, files, json, alone=not (dry_run or as_one or replace))
-        return
-    if dry_run:
-        _show_previews(fleet.preview(files, mapping, as_one=as_one), json)
-        return
-    folders = any(map(names_several, files)) and not as_one
-    seen: set[tuple[str, tuple[str, ...]]] = set()
-
-    def tell(report: "IngestReport") -> None:
-        if not (json or folders):
-            say(_ingested(report.file, [report]))
-        for one in report.suspicions:
-            if (one.kind, one.signals) not in seen:
-                seen.add((one.kind, one.signals))
-                say(f"{report.file}: looks wrong: {one}", logging.WARNING)
-
-    with (
-        recording(fleet.root, "ingest", sys.argv[1:]),
-        progress(*(("ingest", "files") if folders else ("read", "bytes"))) as show,
-    ):
-        reports = fleet.ingest(
-            files,
-            mapping,
-            as_one=as_one,
-            replace="all" if replace else "no",
-            workers=cluster,
-            each=tell,
-            progress=show,
-        )
-    if json:
-        print_json(reports)
-    elif folders:
-        new = sum(report.new for report in reports)
-        say(_ingested(number_of(new, "new file"), reports) if new else "nothing new")
-    _require_sound(reports)
-
-
-def _ingest_counted(fleet: Fleet, files: list[str], json: bool, *, alone: bool) -> None:
-    """Bring in tables of Gram rows that cars counted."""
-    if not alone:
-        raise UsageError(
-            "give --mapping: without it files are tables of Gram rows (docs/export.md)."
-        )
-    with recording(fleet.root, "ingest", sys.argv[1:]):
-        reports = [fleet.ingest_counted(file) for file in files]
-    if json:
-        print_json([vars(report) for report in reports])
-        return
-    for one in reports:
-        if one.new:
-            what = f"{number_of(one.gram_rows, 'Gram row')} of {number_of(one.drives, 'drive')}"
-            say(f"{one.file}: {what}, {number_of(one.rows, 'row')}")
+    elif mapping is None:
+        if others:
+            raise UsageError(
+                "give --mapping: without it files are tables of Gram rows (docs/export.md)."
+            )
+        counted = [fleet.ingest_counted(file) for file in files]
+        if json:
+            print_json(counted)
         else:
-            say(f"{one.file}: nothing to do, it was ingested before")
+            print_parts(part for one in counted for part in one.parts())
+    elif dry_run:
+        _show_previews(fleet.preview(files, mapping, as_one=as_one), json)
+    else:
+        folders = any(map(names_several, files)) and not as_one
+        seen: set[tuple[str, tuple[str, ...]]] = set()
+
+        def tell(report: "IngestReport") -> None:
+            if not (json or folders):
+                say(_ingested(report.file, [report]))
+            for one in report.suspicions:
+                if (one.kind, one.signals) not in seen:
+                    seen.add((one.kind, one.signals))
+                    say(f"{report.file}: looks wrong: {one}", logging.WARNING)
+
+        with progress(*(("ingest", "files") if folders else ("read", "bytes"))) as show:
+            reports = fleet.ingest(
+                files,
+                mapping,
+                as_one=as_one,
+                replace="all" if replace else "no",
+                workers=cluster,
+                each=tell,
+                progress=show,
+            )
+        if json:
+            print_json(reports)
+        elif folders:
+            new = sum(report.new for report in reports)
+            say(_ingested(number_of(new, "new file"), reports) if new else "nothing new")
+        _require_sound(reports)
 
 
 def _require_sound(reports: "list[IngestReport]") -> None:
@@ -184,25 +168,21 @@ def _require_sound(reports: "list[IngestReport]") -> None:
             )
 
 
-def _take_back(fleet: Fleet, what: str, json: bool, *, alone: bool) -> None:
+def _take_back(fleet: Fleet, what: str, json: bool) -> None:
     """Take out what came from a file or through a mapping, and say how many drives."""
-    if not alone:
-        raise UsageError("--undo takes out and brings nothing in: give it alone.")
-    with recording(fleet.root, "ingest", sys.argv[1:]):
-        drives = fleet.take_back(what)
+    drives = fleet.take_back(what)
     if json:
         print_json({"drives_taken_out": drives})
-        return
-    if not drives:
+    elif not drives:
         say(
             f"nothing to undo: no drive of the logs came from a file {what!r}, or through a "
             'mapping of this name. See: fleet-slip sql "SELECT drive_id, source_file FROM drives"'
         )
-        return
-    say(
-        f"{number_of(drives, 'drive')} taken out, Gram rows and all; to land again, their files "
-        "must be given again"
-    )
+    else:
+        say(
+            f"{number_of(drives, 'drive')} taken out, Gram rows and all; to land again, their "
+            "files must be given again"
+        )
 
 
 def _ingested(what: str, reports: "Sequence[IngestReport]") -> str:

@@ -16,8 +16,9 @@ from fleet_slip.models.registry import ModelVersion
 from fleet_slip.rendering import Part, TextTable
 
 
+@command()
 def models(
-    context: typer.Context,
+    fleet: Fleet,
     name: Annotated[
         str | None,
         typer.Argument(
@@ -32,7 +33,6 @@ def models(
 
     Example: **fleet-slip models**
     """
-    fleet: Fleet = context.obj
     if file is not None:
         _import_model(fleet, name, file, json)
         return

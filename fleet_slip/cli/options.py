@@ -141,8 +141,8 @@ def command(
     what is done, with options in braces, and its unit. What changes the warehouse leaves a record.
     The `problem` of an answer is raised when all is printed.
 
-    A function whose first parameter is `fleet` makes the calls by itself, and prints JSON, too. One
-    without a parameter that is no option has nothing to add to the parts of an `Answer`.
+    A function whose first parameter is `fleet` makes the calls, or others, and prints JSON, too.
+    One without a parameter that is no option has nothing to add to the parts of an `Answer`.
     """
     names = NAMES | names
     asked = {
@@ -179,7 +179,7 @@ def command(
 
         @functools.wraps(show)
         def run(context: typer.Context, *, json: bool = False, **typed: Any) -> None:
-            fleet = context.obj
+            fleet = context.obj()
             values = {
                 name: READ[name][1](one) if name in READ and name in asked else one
                 for name, one in typed.items()

@@ -17,6 +17,7 @@ import typer
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.session import Session
 from fleet_slip.base import number_of
+from fleet_slip.cli.options import command
 from fleet_slip.cli.output import Json, json_text, print_json, say
 from fleet_slip.errors import QuestionError, StorageError, UsageError
 from fleet_slip.warehouse.database import limit_memory, split_statements
@@ -29,8 +30,9 @@ FORMULA = "^[=+@\\t\\r\\n＝＋－＠-]"
 """What a text begins with that a spreadsheet executes."""
 
 
+@command()
 def sql(
-    context: typer.Context,
+    fleet: Fleet,
     query: Annotated[
         str,
         typer.Argument(
@@ -79,7 +81,6 @@ def sql(
 
     Example: **fleet-slip sql "SELECT vehicle_id, count(*) AS drives FROM drives GROUP BY ALL"**
     """
-    fleet: Fleet = context.obj
     if query == "-" and sys.stdin is not None and sys.stdin.isatty():
         raise UsageError('give a query: fleet-slip sql "FROM drives"; or pipe statements to it.')
     try:

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.base import canonical_json, sha256_of, shown
+from fleet_slip.base import canonical_json, number_of, sha256_of, shown
 from fleet_slip.catalogue.course import (
     BESIDE,
     COARSER,
@@ -44,6 +44,7 @@ from fleet_slip.grams.gram_files import files_to_rewrite, rows_to_keep, write_ro
 from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.reader import BATCH_ROWS
 from fleet_slip.regression.gram import GramTable
+from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Change, Snapshot, Unit, retry_conflicts
 from fleet_slip.warehouse.database import database_errors, open_database, reading_files
@@ -277,7 +278,7 @@ ONE_AT_A_TIME = "receive"
 
 
 @dataclass(frozen=True)
-class CountedReport:
+class CountedReport(Answer):
     """What became of a file of Gram rows: whether it is new, its drives, and rows behind them."""
 
     file: str
@@ -285,6 +286,16 @@ class CountedReport:
     gram_rows: int
     drives: int
     rows: int
+
+    def parts(self) -> Iterator[Part]:
+        """Return what was loaded, as a remark."""
+        if self.new:
+            drives, rows = number_of(self.drives, "drive"), number_of(self.rows, "row")
+            yield Remark(
+                f"{self.file}: {number_of(self.gram_rows, 'Gram row')} of {drives}, {rows}"
+            )
+        else:
+            yield Remark(f"{self.file}: nothing to do, it was ingested before")
 
 
 def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:

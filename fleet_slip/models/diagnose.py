@@ -10,6 +10,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohort import Cohort, Served, clustered_moments
 from fleet_slip.models.select import influential_cars
+from fleet_slip.models.summary import influence_remarks
 from fleet_slip.regression.choice import nested_fits
 from fleet_slip.regression.drives import (
     LEAST_CARS,
@@ -61,15 +62,6 @@ class CohortComparison(Record):
             degrees = f"{test.numerator}, {test.denominator:.4g}"
             f, p = f"F({degrees}) = {test.f:,.2f}", f"p = {test.p:.2g}"
             yield f"the same coefficients? Wald, by {unit}s: {f}, {p}."
-
-
-def influence_remarks(cars: Mapping[str, Influential], what: str) -> Iterator[Remark]:
-    """Yield which cars have an influence that no honest car has, and what becomes of them."""
-    for car, one in cars.items():
-        yield Remark(
-            f"{car} {what}: its influence on the model is {one.times:.0f} times the median one, "
-            f"by what its rows give it ({one.rows:.1%} of all)."
-        )
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from fleet_slip.models.manifest import (
     checksum_of_drives,
 )
 from fleet_slip.models.registry import CANDIDATE, CHAMPION, AliasMove, ModelVersion, Registry
-from fleet_slip.models.request import SelectionRequest, load_model_list
+from fleet_slip.models.request import LOGGED_MODELS, SelectionRequest, load_model_list
 from fleet_slip.models.select import GIVEN, Selection, checksum_of_list
 from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.regression.folds import CrossValidation
@@ -56,7 +56,8 @@ class Recipe:
 def asked_of(selection: Selection) -> dict[str, Any] | None:
     """Return what a manifest keeps of what was asked for; None if its list says it all."""
     asked = _asked(selection.request)
-    if asked.keys() <= {"models"}:
+    fell_back = not asked and selection.model_list == LOGGED_MODELS
+    if asked.keys() <= {"models"} and not fell_back:  # which is no choice: usual again next time
         return None
     whole = selection.asked == selection.cohort.condition.text
     return asked if whole else {**asked, COHORT: selection.asked}

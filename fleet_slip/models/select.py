@@ -1,7 +1,7 @@
 """Compares candidate models on a cohort by cross-validation and chooses one; no log row is read."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
@@ -54,6 +54,7 @@ from fleet_slip.models.search import (
     select_inputs,
     try_distances,
 )
+from fleet_slip.models.summary import summarize
 from fleet_slip.pages.notebook import notebook_table
 from fleet_slip.regression.choice import NestedDistances, Rule, Winner, Worth, fall_short
 from fleet_slip.regression.drives import (
@@ -75,6 +76,7 @@ from fleet_slip.regression.folds import (
 )
 from fleet_slip.regression.gram import GramTable, packed_position
 from fleet_slip.regression.orders import METHODS
+from fleet_slip.rendering import Answer, Part
 from fleet_slip.resources import find_config
 from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.database import sql_text
@@ -244,7 +246,7 @@ def _noise(changes: FloatArray, scale: float) -> tuple[float | None, float | Non
 
 
 @dataclass(frozen=True)
-class Selection:
+class Selection(Answer):
     """All candidates with their figures, in the order of the list, and the winner.
 
     Attributes:
@@ -305,6 +307,10 @@ class Selection:
         header = ["model", "signals", "correlation", "RMSE deg"]
         title = f"winner: {self.winner.model.name}. {self.winner.reason}"
         return notebook_table(title, header, rows, [one.pooled.rmse_deg for one in best])
+
+    def parts(self, everything: bool = False) -> Iterator[Part]:
+        """Return the winner and why, the best models or all, and how sure that is."""
+        return summarize(self, everything)
 
     @property
     def rows_without(self) -> int:

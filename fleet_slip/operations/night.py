@@ -31,13 +31,14 @@ Hashes: TypeAlias = Annotated[frozenset[str], PlainSerializer(sorted)]
 
 @dataclass(frozen=True)
 class Beginning:
-    """What a root had when a night began: its champion, and hashes of drives `known` as faulty."""
+    """What a root had when a night began; `known` are hashes of its faulty drives."""
 
     champion: str | None
     drives: int
     rows: int
     quarantined: int
     known: Hashes = frozenset()
+    candidate: str | None = None
 
 
 @dataclass(frozen=True)

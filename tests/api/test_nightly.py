@@ -256,11 +256,12 @@ def test_a_worse_winner_becomes_a_candidate_and_calls_for_attention(
 ) -> None:
     land(landing, 2)
     with champions_by(place / "configs", "min_correlation = 0.5", "min_correlation = 0.999999"):
-        report, again = give(place, 2), give(place, 2)
+        report, again, next_night = (give(place, night) for night in (2, 2, 3))
     assert report.exit_code == 10
     assert (report.champion, report.candidate) == ("smoke@2", "smoke@3")
     assert "publish: smoke@3" in str(report.problem)
     assert (again.exit_code, again.candidate) == (10, "smoke@3")
+    assert (next_night.exit_code, next_night.candidate) == (0, "smoke@3"), str(next_night)
 
 
 def refused(place: Path, night: int, **options: Any) -> tuple[int, str]:

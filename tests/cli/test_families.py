@@ -1,8 +1,8 @@
 """How a table names the columns of a large model."""
 
 from fleet_slip.catalogue.features import features
-from fleet_slip.cli.selection import MANY_SIGNALS, in_families
 from fleet_slip.models.request import load_model_list, require_inputs
+from fleet_slip.models.summary import MANY_SIGNALS, in_families
 
 
 def test_a_large_model_is_named_by_families_and_what_belongs_to_none() -> None:

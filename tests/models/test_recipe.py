@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import fleet_slip
 from fleet_slip.cli.app import app
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.manifest import SelectedBy
-from fleet_slip.models.publish import recipe_for
+from fleet_slip.models.publish import asked_of, recipe_for
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
@@ -99,6 +100,22 @@ def test_without_the_columns_of_the_usual_list_logged_signals_are_compared(tmp_p
     answer = answer_request(warehouse, SelectionRequest(), "true")
     assert answer.model_list == "table1"
     assert "fleet-slip gram --features windows" in answer.remark
+    assert asked_of(answer) == {}  # so that the usual list is asked for again
+    assert asked_of(answer_request(warehouse, SelectionRequest(models="table1"), "true")) is None
+
+
+def test_publishing_computes_the_columns_of_the_usual_list(
+    tmp_path: Path, smoke_root: Path
+) -> None:
+    fleet = fleet_slip.open(shutil.copytree(smoke_root, tmp_path / "data"))
+    shutil.rmtree(tmp_path / "data/grams")
+    shutil.rmtree(tmp_path / "data/models")
+    fleet.gram()
+    made = call(tmp_path / "data", "publish", "m", "--cohort", "day = '2024-05-01'")
+    chosen = fleet.model("m").manifest
+    assert (made["new"], chosen.selected_by.model_list) == (True, "estimator")
+    by_hand = fleet.cohort("day = '2024-05-01'").select()
+    assert fleet.publish("m", by_hand).reason == "The champion is this very model."
 
 
 def test_a_score_leaves_out_what_the_model_was_trained_on(root: Path) -> None:

@@ -1,21 +1,21 @@
-"""What is shown of a selection, and the commands that examine a fit: diagnose, what-if."""
+"""What people are shown of a selection: the winner and why, the best models, what was left out."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import features
-from fleet_slip.cli.options import command
 from fleet_slip.grams.cohort import remark_left_out
 from fleet_slip.grams.folding import BANDS, PARTS, ROW_FOLDS
-from fleet_slip.models.diagnose import influence_remarks
-from fleet_slip.models.search import SearchChoice
-from fleet_slip.models.select import Selection, WithoutLabel
 from fleet_slip.regression.choice import CROSS_VALIDATION, NestedDistances
 from fleet_slip.regression.inference import Evidence
 from fleet_slip.rendering import Part, Remark, TextTable
+
+if TYPE_CHECKING:
+    from fleet_slip.models.search import SearchChoice
+    from fleet_slip.models.select import Selection, WithoutLabel
+    from fleet_slip.regression.drives import Influential
 
 TELLING = 0.01
 """Part of a cohort's rows without the label or a signal that is worth a remark."""
@@ -30,6 +30,15 @@ def remark_without_information(rows: int, of: int) -> Iterator[Remark]:
         )
 
 
+def influence_remarks(cars: Mapping[str, "Influential"], what: str) -> Iterator[Remark]:
+    """Yield which cars have an influence that no honest car has, and what becomes of them."""
+    for car, one in cars.items():
+        yield Remark(
+            f"{car} {what}: its influence on the model is {one.times:.0f} times the median one, "
+            f"by what its rows give it ({one.rows:.1%} of all)."
+        )
+
+
 MANY_SIGNALS = 30
 """Of more, a table names families."""
 
@@ -40,7 +49,7 @@ BEST = 10
 CONDITION_WIDTH = 120
 
 
-def selection_parts(selection: Selection, everything: bool = False) -> Iterator[Part]:
+def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part]:
     """Return the winner and why, the best models or all, and how sure that is."""
     if selection.examined:
         yield Remark(selection.examined)
@@ -99,7 +108,7 @@ def _shortened(condition: str, everything: bool) -> str:
     return f"{condition[:CONDITION_WIDTH].rstrip()} … (--all)" if long else condition
 
 
-def _models(selection: Selection, everything: bool) -> TextTable:
+def _models(selection: "Selection", everything: bool) -> TextTable:
     """Return a table of the models, of many the best; without signals where a table above has them.
 
     A search changes some columns from size to size: how many there are stands here.
@@ -137,7 +146,7 @@ def _models(selection: Selection, everything: bool) -> TextTable:
     return TextTable(title, header, rows, row, left=1 + listed)
 
 
-def _label_noise(selection: Selection) -> Remark:
+def _label_noise(selection: "Selection") -> Remark:
     """Return how much of the errors is noise of the label they are measured against."""
     noise = selection.label_noise_deg
     if noise is None:
@@ -148,7 +157,7 @@ def _label_noise(selection: Selection) -> Remark:
     )
 
 
-def _without_label(told: WithoutLabel) -> Iterator[Remark]:
+def _without_label(told: "WithoutLabel") -> Iterator[Remark]:
     """Yield what changes of the course tell of the angle, and what they do not."""
     over = ", ".join(f"{one:g}" for one in told.change_s)
     figures = f"learned from changes of the course over {over} s: the figures are of these changes"
@@ -170,7 +179,7 @@ def _without_label(told: WithoutLabel) -> Iterator[Remark]:
     )
 
 
-def _left_out(selection: Selection) -> Iterator[Remark]:
+def _left_out(selection: "Selection") -> Iterator[Remark]:
     """Yield which drives of the cohort the models were not made of, and what the label is worth."""
     if not selection.cohort.unlabelled:
         yield from remark_without_information(selection.rows_without, selection.cohort.rows)
@@ -210,7 +219,7 @@ def _distances(found: NestedDistances) -> Iterator[Part]:
     yield f"without any signal: RMSE {found.null.pooled.rmse_deg:.4f} deg.\n"
 
 
-def _choice(choice: SearchChoice) -> Iterator[Part]:
+def _choice(choice: "SearchChoice") -> Iterator[Part]:
     worth = _worth(choice.evidence)
     if (nested := choice.nested) is not None:
         by_folds = choice.rule.criterion == CROSS_VALIDATION
@@ -254,34 +263,3 @@ def _distance_rows(order: Sequence[str], evidence: Evidence) -> Iterator[list[st
         added = order[j - 1] if j else "(none)"
         contribution = f"{evidence.contributions[j - 1]:,.1f}" if j else ""
         yield [str(j), added, contribution, f"{to_full:,.1f}", f"{expected:,.1f}"]
-
-
-SOUND = ("unexamined",)
-"""Not an option of what trains no model."""
-
-
-@command(Fleet.cohort, FleetCohort.diagnose, arguments=["model"], without=SOUND, echo=["condition"])
-def diagnose() -> None:
-    """Fit a model's signals to a cohort and examine the fit, from Gram rows.
-
-    Standard errors by drives, or by cars where there are several, are the ones to believe: at
-    100 Hz a row says little that the one before did not say, and a car's drives share its biases.
-
-    Example: **fleet-slip diagnose waterford**
-    """
-
-
-@command(
-    Fleet.cohort,
-    FleetCohort.what_if,
-    arguments=["model"],
-    without=SOUND,
-    echo=["condition", "noise", "bias"],
-)
-def what_if() -> None:
-    """Predict a model's error with worse sensors, in closed form; nothing is simulated.
-
-    Bias and noise come on top of what the logs have. Shown too: the best model for such sensors.
-
-    Example: **fleet-slip what-if waterford --noise ay=0.2 --bias yaw_rate=0.02**
-    """
