@@ -31,7 +31,7 @@ from benchmarks.flips_root import (
     flipped,
     write_configs,
 )
-from benchmarks.harness import quick_folder
+from benchmarks.harness import load_code, quick_folder
 
 READING: tuple[tuple[str, ...], ...] = (
     ("models", "--json"),
@@ -183,6 +183,7 @@ def main() -> None:
     with quick_folder() as folder:
         root = folder / "data"
         write_configs(root)
+        load_code("smoke")
         fill(root)
         kinds = options.kind or list(KINDS)
         found: dict[str, Counts] = collections.defaultdict(Counts)

@@ -6,7 +6,9 @@ import json
 import os
 import re
 import shutil
+import signal
 import tempfile
+import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +22,7 @@ from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
-from tests.support.commands import COMMAND, run_prepared
+from tests.support.commands import COMMAND, PATIENCE_S, run_here
 
 KINDS = {
     "logs": "logs/day=*/*.parquet",
@@ -78,12 +80,18 @@ class Ended:
 
 
 def command(root: Path, *arguments: str) -> Ended:
-    """Run a command on a root."""
-    try:
-        done = run_prepared([COMMAND, "--root", str(root), *arguments])
-    except TimeoutError:
-        return Ended(-1, "", "it hung")
-    return Ended(done.exit_code, done.stdout, done.stderr)
+    """Run a command on a root, in a forked process that dies if it hangs."""
+
+    def work() -> tuple[int, str, str]:
+        signal.alarm(int(PATIENCE_S))
+        try:
+            done = run_here([COMMAND, "--root", str(root), *arguments])
+        except Exception:
+            return 1, "", traceback.format_exc()
+        return done.exit_code, done.stdout, done.stderr
+
+    ended = forked(work)
+    return Ended(-1, "", "it was killed, or hung") if ended.killed else Ended(*ended.result)
 
 
 @dataclass(frozen=True)

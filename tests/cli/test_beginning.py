@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.commands import COMMAND, Finished, RunCommand, run_prepared
+from tests.support.commands import COMMAND, Finished, RunCommand, run_here
 
 SIGNALS = ["ax_mps2", "ay_mps2", "yaw_rate_deg_s", "steering_wheel_deg"]
 WHEELS = [f"wheel_{corner}_rad_s" for corner in ("fl", "fr", "rl", "rr")]
@@ -35,7 +35,7 @@ def drive_in(folder: Path, car: str, rows: int = 400) -> Path:
 
 
 def make(folder: Path, *options: str) -> Finished:
-    return run_prepared([COMMAND, "--log", "text", "init", str(folder), *options])
+    return run_here([COMMAND, "--log", "text", "init", str(folder), *options])
 
 
 def files_in(folder: Path) -> list[str]:
@@ -120,7 +120,7 @@ def test_what_the_readme_says_works(project: Path, run_command: RunCommand) -> N
     assert [words[1] for words in commands] == ["ingest", "nightly"]
     for _, *words in commands:
         given = ["landing/car-0.csv" if word == "landing/LOG" else word for word in words]
-        done = run_prepared([COMMAND, *given], project, environment)
+        done = run_here([COMMAND, *given], project, environment)
         assert done.exit_code == 0, (given, done.stdout, done.stderr)
-    done = run_prepared([COMMAND, "show", "fleet"], project, environment)
+    done = run_here([COMMAND, "show", "fleet"], project, environment)
     assert "fleet@1: sideslip_rad" in done.stdout

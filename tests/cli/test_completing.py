@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.commands import COMMAND, run_prepared
+from tests.support.commands import COMMAND, run_here
 
 
 def complete(root: Path, *words: str) -> list[str]:
@@ -15,7 +15,7 @@ def complete(root: Path, *words: str) -> list[str]:
         "COMP_WORDS": " ".join(typed),
         "COMP_CWORD": str(len(typed) - 1),
     }
-    done = run_prepared([COMMAND], env={**os.environ, **asked})
+    done = run_here([COMMAND], env={**os.environ, **asked})
     assert done.stderr == ""
     return done.stdout.split()
 

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.commands import COMMAND, RunCommand, run_prepared
+from tests.support.commands import COMMAND, RunCommand, run_here
 
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     """A folder in which the program has run for the first time, and the lines after `next:`."""
     folder = tmp_path_factory.mktemp("first")
-    done = run_prepared([COMMAND, "run", "--campaign", "smoke"], folder)
+    done = run_here([COMMAND, "run", "--campaign", "smoke"], folder)
     assert done.exit_code == 0, done.stderr
     _, _, lines = done.stderr.partition("next:\n")
     return folder, lines.splitlines()
@@ -23,7 +23,7 @@ def test_each_command_can_be_typed(told: tuple[Path, list[str]]) -> None:
     assert [shlex.split(line)[1] for line in lines] == ["sql", "show", "select", "evaluate"]
     for line in lines[:-1]:
         program, *arguments = shlex.split(line)
-        done = run_prepared([str(folder / program), *arguments], folder)
+        done = run_here([str(folder / program), *arguments], folder)
         assert done.exit_code == 0, (line, done.stderr)
         assert done.stdout
 
@@ -42,7 +42,7 @@ def test_another_root_stands_in_them(run_command: RunCommand, tmp_path: Path) ->
 
 def test_they_are_said_once(told: tuple[Path, list[str]]) -> None:
     folder, _ = told
-    again = run_prepared([COMMAND, "run", "--campaign", "smoke"], folder)
+    again = run_here([COMMAND, "run", "--campaign", "smoke"], folder)
     assert "next:" not in again.stderr
 
 

@@ -17,7 +17,6 @@ from tests.ingest.test_as_one import write_parts
 from tests.ingest.test_folders import MAPPING, write_log
 from tests.support.commands import Finished, run_on
 from tests.support.dask_processes import dask_processes
-from tests.support.prepared import server as prepared_server
 from tests.support.s3_server import Server, command_on
 from tests.support.state import state
 
@@ -30,7 +29,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
     (tmp_path / "temporary").mkdir()
-    prepared_server()  # its address is in the temporary folder of all tests, whose name is short
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     (tmp_path / "car.toml").write_text(MAPPING.format(day="2024-05-31"))
     for number in range(4):

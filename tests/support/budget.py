@@ -1,6 +1,5 @@
 """What tests take on processors: the dearest, and the folders beyond `tests/budget.toml`."""
 
-import os
 import resource
 import tomllib
 from collections import Counter
@@ -10,21 +9,14 @@ from typing import Any
 
 import pytest
 
-from tests.support.prepared import server
-
 BUDGET = Path(__file__).parents[1] / "budget.toml"
 DEAREST = 20
-TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 def processor_s() -> float:
     """Return what this process has taken, and those that it started and that have ended."""
     own, ended = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    taken = own.ru_utime + own.ru_stime + ended.ru_utime + ended.ru_stime
-    if server.cache_info().currsize:  # it has not ended, but the commands that it forked
-        fields = Path(f"/proc/{server().process}/stat").read_text().rpartition(")")[2].split()
-        taken += sum(map(int, fields[11:15])) / TICKS_PER_S
-    return taken
+    return own.ru_utime + own.ru_stime + ended.ru_utime + ended.ru_stime
 
 
 class Budget:

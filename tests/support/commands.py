@@ -1,6 +1,8 @@
 """The command line, in this process or in one of its own, none of which lasts for ever."""
 
 import contextlib
+import functools
+import inspect
 import json
 import os
 import resource
@@ -15,10 +17,8 @@ from typing import IO, Any
 from unittest.mock import patch
 
 from fleet_slip.cli.main import main as fleet_slip_main
-from fleet_slip.resources import CONFIG_VARIABLE
 from fleet_slip.storage.runs import LOGGER
 from tests.support.once import require_no_failed_run
-from tests.support.prepared import server, without_test
 
 COMMAND = str(Path(sys.executable).with_name("fleet-slip"))
 PATIENCE_S = 400.0
@@ -51,27 +51,23 @@ def run(words: Words, *, patience_s: float = PATIENCE_S, **options: Any) -> Fini
     return Finished(done.returncode, done.stdout, done.stderr)
 
 
-def run_prepared(
+def run_here(
     words: Sequence[str], cwd: str | Path | None = None, env: Mapping[str, str] | None = None
 ) -> Finished:
-    """Run `fleet-slip` as `run` does, in a process that has imported it already if that can be."""
-    environment = without_test(os.environ if env is None else env)
-    prepared = server()
-    if not prepared.can_run_in(environment):
-        return run(words, cwd=cwd, env=env)
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        streams = (out.fileno(), err.fileno())
-        code = prepared.run(list(words), Path(cwd or "."), environment, streams, PATIENCE_S)
-        return Finished(code, _text(out), _text(err))
-
-
-def run_here(words: Sequence[str], cwd: str | Path | None = None) -> Finished:
     """Run `fleet-slip` in this process, which is left as it was: a third of what another costs.
 
     What is no error of ours is raised, and ends no process.
     """
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        with _left_as_it_was(), contextlib.chdir(cwd or "."), Path(os.devnull).open() as nothing:
+        with (
+            _left_as_it_was(),
+            _configs_read_anew(env is not None or "--config" in words),
+            contextlib.chdir(cwd or "."),
+            Path(os.devnull).open() as nothing,
+        ):
+            if env is not None:
+                os.environ.clear()
+                os.environ.update(env)
             for descriptor, stream in enumerate((nothing, out, err)):
                 os.dup2(stream.fileno(), descriptor)
             sys.argv = list(words)
@@ -113,11 +109,29 @@ def _left_as_it_was() -> Iterator[None]:
             resource.setrlimit(resource.RLIMIT_DATA, limits)
 
 
-def _can_run_here(words: Sequence[str]) -> bool:
-    """Whether nothing of the process would be another's: configs are read once, streams shared."""
-    own_configs = "--config" in words or CONFIG_VARIABLE in os.environ
-    main_thread = threading.current_thread() is threading.main_thread()
-    return main_thread and not own_configs and not _running_here.locked()
+@contextlib.contextmanager
+def _configs_read_anew(anew: bool) -> Iterator[None]:
+    """Forget, before and after, what a process reads of its configs once and makes of it."""
+    if anew:
+        _forget_configs()
+    try:
+        yield
+    finally:
+        if anew:
+            _forget_configs()
+
+
+def _forget_configs() -> None:
+    for name, module in list(sys.modules.items()):
+        for one in vars(module).values() if name.startswith("fleet_slip.") else ():
+            cached = isinstance(one, functools._lru_cache_wrapper) and one.__module__ == name
+            if cached and not inspect.signature(one).parameters:
+                one.cache_clear()
+
+
+def _can_run_here() -> bool:
+    """Whether no other thread has the streams of this process, or may take them."""
+    return threading.current_thread() is threading.main_thread() and not _running_here.locked()
 
 
 def _text(file: IO[bytes]) -> str:
@@ -129,15 +143,11 @@ def _text(file: IO[bytes]) -> str:
 def run_on(root: object, *arguments: str | Path, **options: Any) -> Finished:
     """Run `fleet-slip --root ROOT ...`, which never shows a traceback.
 
-    In this process, unless an environment or other options of a process are given.
+    In this process, unless options are given that only another can have.
     """
     words = [COMMAND, "--root", str(root), *map(str, arguments)]
-    if options.keys() <= {"cwd"} and _can_run_here(words):
-        done = run_here(words, **options)
-    elif options.keys() <= {"cwd", "env"}:
-        done = run_prepared(words, **options)
-    else:
-        done = run(words, **options)
+    here = options.keys() <= {"cwd", "env"} and _can_run_here()
+    done = (run_here if here else run)(words, **options)
     assert "Traceback" not in done.stderr, done.stderr
     require_no_failed_run(root)
     return done

@@ -5,7 +5,6 @@ key, since moto takes any.
 """
 
 import io
-import os
 import random
 import re
 import threading
@@ -20,7 +19,7 @@ from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_ba
 from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
 
 from fleet_slip.storage.objects import aws_profile, client
-from tests.support.commands import PATIENCE_S, Finished, run_on
+from tests.support.commands import COMMAND, PATIENCE_S, Finished, run
 
 ACCESS_KEY = "AKIDFORTESTS"
 SECRET_KEY = "s3cr3t/of+tests"  # noqa: S105 - for a server of our own
@@ -148,7 +147,8 @@ def command_on(root: object, *arguments: str) -> Finished:
 
     In a process of its own: deltalake keeps Python's lock while it waits, which the server needs.
     """
-    done = run_on(root, *arguments, env=dict(os.environ))
+    done = run([COMMAND, "--root", str(root), *arguments])
+    assert "Traceback" not in done.stderr, done.stderr
     for text in (done.stdout, done.stderr):
         assert not [secret for secret in (ACCESS_KEY, SECRET_KEY) if secret in text]
     return done
