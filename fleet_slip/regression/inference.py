@@ -104,6 +104,25 @@ def hotelling(
     return square * denominator / (eta * size), denominator
 
 
+def variances_of_few(one: ClusteredFit) -> tuple[FloatArray, FloatArray]:
+    """Return the CR2 variance of each coefficient, and Satterthwaite's degrees of freedom.
+
+    The variance is a sum of squares, one a cluster. With P the covariance of what is squared, were
+    rows independent, they are (tr P)^2 / tr P^2.
+    """
+    clusters = len(one.moments)
+    part = _adjust(one, np.arange(clusters), clusters)
+    contrasts = part.scale
+    single = np.einsum("ja,gab,jb->jg", contrasts, part.single, contrasts, optimize=True)
+    double = np.einsum("ja,gab->jgb", contrasts, part.double)
+    shared = (double**2).sum(axis=2)
+    trace = (single - shared).sum(axis=1)
+    square = (single**2 - 2 * single * shared).sum(axis=1)
+    square += ((double.swapaxes(1, 2) @ double) ** 2).sum(axis=(1, 2))
+    degrees = np.divide(trace**2, square, out=np.full(len(trace), clusters - 1.0), where=square > 0)
+    return (part.moved**2).sum(axis=1), degrees
+
+
 def _adjust(one: ClusteredFit, at: IntArray, clusters: int) -> _Adjusted:
     """Return the parts of a fit, for the clusters of both; those that it has not have zeros."""
     lower = np.linalg.cholesky(one.moments.sum(axis=0))
@@ -149,13 +168,17 @@ INTERCEPT = "intercept"
 
 @dataclass(frozen=True)
 class Estimate:
-    """A coefficient or the "intercept" in physical units; p is two-sided, by t = value / error."""
+    """A coefficient or the "intercept" in physical units.
+
+    p is two-sided, by t = value / error with so many degrees of freedom.
+    """
 
     name: str
     value: float
     standard_error: float
     t: float
     p: float
+    degrees_of_freedom: float
 
 
 @dataclass(frozen=True)
@@ -165,7 +188,7 @@ class Inference:
     estimates: tuple[Estimate, ...]
     residual_std: float
     degrees_of_freedom: int
-    """Of t."""
+    """Pieces of independent evidence less one, or of rows what the fit leaves."""
 
 
 def noise_variance(fitted: Fit) -> Fraction:
@@ -210,35 +233,15 @@ def infer_classically(fitted: Fit, scales: Scales) -> Inference:
 def infer_by_clusters(fitted: Fit, drives: DriveMoments, scales: Scales) -> Inference:
     """Return cluster-robust standard errors, a cluster being a drive or a car.
 
-    V = c B (sum_p s_p s_p') B with B = (X'X)^-1, s_p the cluster's sum of x times residual, and
-    CR1's c = P/(P-1) (n-1)/(n-k-1); t has P - 1 degrees of freedom (Cameron and Miller 2015).
-    Raises `DataError` for one cluster.
+    CR2 with Satterthwaite's degrees of freedom: the intervals of few clusters, or of such that
+    differ in size, hold. Raises `DataError` for one cluster, or too few rows.
     """
-    covariance = cluster_covariance(fitted, drives)
+    clusters = _require_clusters(len(drives.clusters), drives.unit)
+    variances, degrees = variances_of_few(clustered_fit(fitted, drives))
     units = [float(unit) for unit in _units(fitted, scales)]
-    variances = np.diag(covariance)[int(not fitted.has_intercept) :]
     errors = [math.sqrt(v) * u for v, u in zip(variances, units, strict=True)]
     sigma2 = noise_variance(fitted)
-    return _inference(fitted, scales, sigma2, errors, len(drives.clusters) - 1)
-
-
-def cluster_covariance(fitted: Fit, drives: DriveMoments) -> FloatArray:
-    """Return the cluster-robust covariance of (intercept, coefficients) in counts."""
-    half = cluster_influences(fitted, drives)
-    return np.asarray(half @ half.T, dtype=np.float64)
-
-
-def cluster_influences(fitted: Fit, drives: DriveMoments) -> FloatArray:
-    """Return how each cluster moves (intercept, coefficients) in counts, shape (k+1, clusters).
-
-    The sum of squares is the robust covariance. Raises `DataError` for one cluster.
-    """
-    at = _columns(fitted, drives)
-    scores = cluster_scores(fitted, drives)
-    total = drives.matrix(drives.packed.sum(axis=0))[np.ix_(at, at)]
-    factor = small_sample_factor(fitted, len(scores), drives.unit)
-    half = math.sqrt(factor) * np.linalg.solve(total, scores.T)
-    return np.asarray(_to_counts(drives, at) @ half, dtype=np.float64)
+    return _inference(fitted, scales, sigma2, errors, clusters - 1, degrees.tolist())
 
 
 def _to_counts(drives: DriveMoments, at: Sequence[int]) -> FloatArray:
@@ -273,11 +276,16 @@ def cluster_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
 
 def small_sample_factor(fitted: Fit, clusters: int, unit: str) -> float:
     """Return P/(P-1) (n-1)/(n-k-1). Raises `DataError` for a single cluster."""
+    _require_clusters(clusters, unit)
+    _require_noise(fitted)
+    return clusters / (clusters - 1) * (fitted.gram.n - 1) / fitted.degrees_of_freedom
+
+
+def _require_clusters(clusters: int, unit: str) -> int:
     if clusters < 2:
         otherwise = ": take drives for independent, cluster drive" if unit == "vehicle" else ""
         raise DataError(f"cluster-robust errors need at least two {unit}s{otherwise}.")
-    _require_noise(fitted)
-    return clusters / (clusters - 1) * (fitted.gram.n - 1) / fitted.degrees_of_freedom
+    return clusters
 
 
 def variance_inflation(gram: Gram, inputs: Sequence[str]) -> dict[str, float]:
@@ -306,17 +314,22 @@ def _inference(
     sigma2: Fraction,
     errors: Sequence[float],
     degrees: int,
+    each: Sequence[float] = (),
 ) -> Inference:
     model = fitted.model.physical(scales)
     names = [INTERCEPT] if fitted.has_intercept else []
     values = [model.offset] if fitted.has_intercept else []
     estimates = []
-    for name, value, error in zip(
-        [*names, *model.signals], [*values, *model.weights.values()], errors, strict=True
+    for name, value, error, of_t in zip(
+        [*names, *model.signals],
+        [*values, *model.weights.values()],
+        errors,
+        each or [float(degrees)] * len(errors),
+        strict=True,
     ):
         t = value / error if error else math.copysign(math.inf, value)
-        p = student_t_two_sided(t, degrees)
-        estimates.append(Estimate(name, value, error, t, p))
+        p = student_t_two_sided(t, of_t)
+        estimates.append(Estimate(name, value, error, t, p, of_t))
     residual_std = exact.sqrt(sigma2 * scales[fitted.model.label] ** 2)
     return Inference(tuple(estimates), residual_std, degrees)
 

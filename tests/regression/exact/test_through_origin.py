@@ -18,6 +18,7 @@ from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import rank
 from fleet_slip.regression.subsets import best_subsets
 from tests.support.counts import Matrix, gram_of, names, random_drives, table_of, unit_scales
+from tests.support.few_cars import by_rows
 
 INPUTS = names(4)[:-1]
 
@@ -39,19 +40,19 @@ def test_coefficients_and_both_kinds_of_errors_are_those_of_statsmodels(seed: in
     counts = np.concatenate(parts)
     fitted = fit(gram_of(counts), INPUTS, "y", intercept=False)
     model = sm.OLS(counts[:, -1].astype(float), counts[:, :-1].astype(float))
-    groups = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     moments = DriveMoments.of(table_of([gram_of(part) for part in parts]).about_origin())
-    ours = [
+    classical, clustered = (
         infer_classically(fitted, unit_scales(4)),
         infer_by_clusters(fitted, moments, unit_scales(4)),
-    ]
-    theirs = [model.fit(), model.fit(cov_type="cluster", cov_kwds={"groups": groups})]
-    for mine, other in zip(ours, theirs, strict=True):
+    )
+    expected = model.fit()
+    both = (classical, expected.bse), (clustered, by_rows(parts, intercept=False)[0])
+    for mine, errors_of_rows in both:
         assert [estimate.name for estimate in mine.estimates] == list(INPUTS)
         values = [estimate.value for estimate in mine.estimates]
-        np.testing.assert_allclose(values, other.params, rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(values, expected.params, rtol=1e-8, atol=1e-9)
         errors = [estimate.standard_error for estimate in mine.estimates]
-        np.testing.assert_allclose(errors, other.bse, rtol=1e-8)
+        np.testing.assert_allclose(errors, errors_of_rows, rtol=1e-7)
 
 
 def test_the_evidence_of_the_last_signal_is_its_squared_t_value() -> None:
@@ -59,9 +60,12 @@ def test_the_evidence_of_the_last_signal_is_its_squared_t_value() -> None:
     gram = gram_of(np.concatenate(parts))
     moments = DriveMoments.of(table_of([gram_of(part) for part in parts]).about_origin())
     fits = nested_fits(gram, INPUTS, "y", intercept=False)
-    robust = infer_by_clusters(fits[-1], moments, unit_scales(4))
+    counts = np.concatenate(parts)
+    model = sm.OLS(counts[:, -1].astype(float), counts[:, :-1].astype(float))
+    groups = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    theirs = model.fit(cov_type="cluster", cov_kwds={"groups": groups})
     last = Evidence.clustered(fits, moments).contributions[-1]
-    assert last == pytest.approx(robust.estimates[-1].t ** 2, rel=1e-9)
+    assert last == pytest.approx(theirs.tvalues[-1] ** 2, rel=1e-9)
 
 
 def test_the_best_subsets_and_orders_are_those_of_the_rows() -> None:

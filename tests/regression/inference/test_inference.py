@@ -12,33 +12,17 @@ from fleet_slip.regression.drives import DriveMoments, serving_drives
 from fleet_slip.regression.figures import incomplete_beta, normal_cdf, normal_density
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import (
-    cluster_covariance,
     infer_by_clusters,
     infer_classically,
     variance_inflation,
 )
 from fleet_slip.regression.least_squares import fit
 from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of, unit_scales
+from tests.support.few_cars import by_rows, drives_of
 
 
 def moments_of(drives: list[np.ndarray]) -> DriveMoments:
     return DriveMoments.of(table_of([gram_of(counts) for counts in drives]))
-
-
-def dense_cluster_covariance(drives: list[np.ndarray]) -> np.ndarray:
-    """Cameron and Miller (2015), equations (11) and (12), from the rows."""
-    counts = np.concatenate(drives).astype(float)
-    x = np.column_stack([np.ones(len(counts)), counts[:, :-1]])
-    b, _ = dense_fit(counts)
-    bread = np.linalg.inv(x.T @ x)
-    scores = []
-    for drive in drives:
-        design = np.column_stack([np.ones(len(drive)), drive[:, :-1]])
-        scores.append(design.T @ (drive[:, -1] - design @ b))
-    n, k, p = len(counts), x.shape[1], len(drives)
-    factor = p / (p - 1) * (n - 1) / (n - k)
-    meat = np.array(scores).T @ np.array(scores)
-    return np.asarray(factor * bread @ meat @ bread)
 
 
 @settings(max_examples=25)
@@ -59,22 +43,38 @@ def test_classical_errors_equal_dense(seed: int, inputs: int) -> None:
 
 @settings(max_examples=25)
 @given(st.integers(0, 10**6), st.integers(1, 5))
-def test_cluster_errors_equal_dense(seed: int, inputs: int) -> None:
+def test_cluster_errors_are_those_of_the_rows(seed: int, inputs: int) -> None:
     drives = random_drives(seed, drives=9, inputs=inputs)
     fitted = fit(gram_of(np.concatenate(drives)), names(inputs)[:-1], "y")
-    covariance = cluster_covariance(fitted, moments_of(drives))
-    np.testing.assert_allclose(covariance, dense_cluster_covariance(drives), rtol=1e-8, atol=1e-12)
     result = infer_by_clusters(fitted, moments_of(drives), unit_scales(inputs))
-    errors = [estimate.standard_error for estimate in result.estimates]
-    np.testing.assert_allclose(errors, np.sqrt(np.diag(covariance)), rtol=1e-12)
+    errors, degrees = by_rows(drives)
+    np.testing.assert_allclose([e.standard_error for e in result.estimates], errors, rtol=1e-7)
+    np.testing.assert_allclose([e.degrees_of_freedom for e in result.estimates], degrees, rtol=1e-6)
+    p = 2 * scipy.stats.t.sf(np.abs([e.t for e in result.estimates]), degrees)
+    np.testing.assert_allclose([e.p for e in result.estimates], p, rtol=1e-5, atol=1e-14)
     assert result.degrees_of_freedom == 8
 
 
 def test_cluster_errors_of_a_smaller_model() -> None:
     drives = random_drives(4, inputs=4)
     fitted = fit(gram_of(np.concatenate(drives)), ["x4", "x2"], "y")
-    expected = dense_cluster_covariance([drive[:, [3, 1, 4]] for drive in drives])
-    np.testing.assert_allclose(cluster_covariance(fitted, moments_of(drives)), expected, rtol=1e-8)
+    found = infer_by_clusters(fitted, moments_of(drives), unit_scales(4))
+    errors, _ = by_rows([drive[:, [3, 1, 4]] for drive in drives])
+    np.testing.assert_allclose([e.standard_error for e in found.estimates], errors, rtol=1e-7)
+
+
+@pytest.mark.parametrize(("cars", "rows"), [(6, 30), (25, 30)])
+def test_intervals_of_few_unequal_cars_hold(cars: int, rows: int) -> None:
+    """At nominal 95 %: of 300 coefficients of cars that differ, 92 % and more."""
+    random = np.random.default_rng(5)
+    inside = []
+    for _ in range(100):
+        drives = drives_of(random, cars, 3, rows=rows)
+        fitted = fit(gram_of(np.concatenate(drives)), names(3)[:-1], "y")
+        for one in infer_by_clusters(fitted, moments_of(drives), unit_scales(3)).estimates[1:]:
+            reach = scipy.stats.t.ppf(0.975, one.degrees_of_freedom) * one.standard_error
+            inside.append(abs(one.value - 1) <= reach)
+    assert np.mean(inside) >= 0.92
 
 
 def test_drive_effects_make_the_classical_error_too_small() -> None:

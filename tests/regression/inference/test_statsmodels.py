@@ -1,12 +1,14 @@
 """Agreement with statsmodels: OLS, cluster-robust errors and AR(1) generalised least squares."""
 
 import numpy as np
+import pytest
 import statsmodels.api as sm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet_slip.regression.choice import nested_fits
 from fleet_slip.regression.drives import DriveMoments
-from fleet_slip.regression.inference import infer_by_clusters, infer_classically
+from fleet_slip.regression.inference import Evidence, infer_classically
 from fleet_slip.regression.least_squares import fit
 from tests.support.counts import (
     gram_of,
@@ -49,15 +51,14 @@ def test_coefficients_and_both_kinds_of_errors_agree(
     model = sm.OLS(counts[:, -1].astype(float), sm.add_constant(counts[:, :-1].astype(float)))
     groups = np.repeat(np.arange(drives), [len(part) for part in parts])
     moments = DriveMoments.of(table_of([gram_of(part) for part in parts]))
-    ours = [
-        infer_classically(fitted, unit_scales(inputs)),
-        infer_by_clusters(fitted, moments, unit_scales(inputs)),
-    ]
-    theirs = [model.fit(), model.fit(cov_type="cluster", cov_kwds={"groups": groups})]
-    for mine, other in zip(ours, theirs, strict=True):
-        largest = np.abs(other.params).max()
-        values = [estimate.value for estimate in mine.estimates]
-        np.testing.assert_allclose(values, other.params, rtol=AGREEMENT, atol=AGREEMENT * largest)
-        errors = [estimate.standard_error for estimate in mine.estimates]
-        np.testing.assert_allclose(errors, other.bse, rtol=AGREEMENT)
-    assert abs(ours[0].residual_std / np.sqrt(theirs[0].scale) - 1) < AGREEMENT
+    mine, theirs = infer_classically(fitted, unit_scales(inputs)), model.fit()
+    largest = np.abs(theirs.params).max()
+    values = [estimate.value for estimate in mine.estimates]
+    np.testing.assert_allclose(values, theirs.params, rtol=AGREEMENT, atol=AGREEMENT * largest)
+    errors = [estimate.standard_error for estimate in mine.estimates]
+    np.testing.assert_allclose(errors, theirs.bse, rtol=AGREEMENT)
+    assert abs(mine.residual_std / np.sqrt(theirs.scale) - 1) < AGREEMENT
+    clustered = model.fit(cov_type="cluster", cov_kwds={"groups": groups})
+    fits = nested_fits(gram_of(counts), names(inputs)[:-1], "y")
+    last = Evidence.clustered(fits, moments).contributions[-1]
+    assert last == pytest.approx(clustered.tvalues[-1] ** 2, rel=1e-8)
