@@ -107,7 +107,7 @@ def _completed(
             future.cancel()
 
 
-def read_ahead(items: Iterator[Item], ahead: int = AHEAD) -> Generator[Item, None, None]:
+def read_ahead(items: Iterator[Item]) -> Generator[Item, None, None]:
     """Yield items in order while a thread takes the next; errors come in their place.
 
     Closing it waits for the one being taken. A single item needs no thread.
@@ -122,7 +122,7 @@ def read_ahead(items: Iterator[Item], ahead: int = AHEAD) -> Generator[Item, Non
         yield from first
         return
     with ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as thread:
-        taken = deque(thread.submit(_take, items) for _ in range(ahead))
+        taken = deque(thread.submit(_take, items) for _ in range(AHEAD))
         try:
             yield from (*first, *second)
             while item := taken.popleft().result():

@@ -4,6 +4,7 @@ Files are written whole, once: no locks, no directories. `fleet_slip.storage.loc
 system, `fleet_slip.storage.objects` one of an object store.
 """
 
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -70,6 +71,7 @@ class Folder(Protocol):
     @property
     def spill(self) -> Path:
         """A folder of this machine for what a query cannot hold in memory."""
+        return Path(tempfile.gettempdir())
 
     is_local: bool = False
     """Whether its files are in a file system of this machine: read twice, they are the same."""
@@ -90,8 +92,8 @@ class Folder(Protocol):
         """Return what another file in its place differs in; None without one, and of a store."""
         return None  # where to look costs what opening costs
 
-    def read(self, path: str, longest: int | None = None) -> bytes:
-        """Return the content of a file, or only its first bytes."""
+    def read(self, path: str) -> bytes:
+        """Return the content of a file."""
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
         """Return the content of files; None for one that is gone, nothing of a link."""

@@ -62,12 +62,12 @@ class LocalFolder(Folder):
             return None
         return found.st_ino, found.st_mtime_ns, found.st_size
 
-    def read(self, path: str, longest: int | None = None) -> bytes:
+    def read(self, path: str) -> bytes:
         with (
             _regular_file(self.path / path, os.O_RDONLY) as descriptor,
             open(descriptor, "rb", closefd=False) as file,
         ):
-            return file.read(-1 if longest is None else longest)
+            return file.read()
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
         return [self._read_or_none(path) for path in paths]

@@ -8,7 +8,6 @@ import contextlib
 import functools
 import io
 import os
-import tempfile
 import threading
 import time
 import uuid
@@ -17,7 +16,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from os import environ
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import duckdb
@@ -31,7 +29,7 @@ from fleet_slip.base import needed
 from fleet_slip.errors import StorageError
 from fleet_slip.storage.checksums import require_content
 from fleet_slip.storage.folder import Content, Folder, StoredFile
-from fleet_slip.storage.storage_errors import object_errors
+from fleet_slip.storage.storage_errors import NoSuchObjectError, object_errors
 
 if TYPE_CHECKING:
     from botocore.credentials import Credentials
@@ -279,10 +277,6 @@ class ObjectFolder(Folder):
     def delta_options(self) -> dict[str, str] | None:
         return delta_options(self.bucket)
 
-    @property
-    def spill(self) -> Path:
-        return Path(tempfile.gettempdir())
-
     def __truediv__(self, name: str) -> Self:
         return replace(self, prefix=self._key(name))
 
@@ -303,17 +297,9 @@ class ObjectFolder(Folder):
         found = [self.found(meta) for page in pages for meta in page]
         return sorted(found, key=lambda file: file.path)
 
-    def read(self, path: str, longest: int | None = None) -> bytes:
-        where = f"{self}/{path}"
-        if longest is None:
-            return b"".join(part for _, part in fetch_parts(self._store, self._key(path), where))
-        with object_errors(where):
-            answer = obstore.get(self._store, self._key(path))
-            if answer.meta["size"] > longest:
-                return bytes(
-                    obstore.get_range(self._store, self._key(path), start=0, length=longest)
-                )
-            return bytes(answer.bytes())
+    def read(self, path: str) -> bytes:
+        parts = fetch_parts(self._store, self._key(path), f"{self}/{path}")
+        return b"".join(part for _, part in parts)
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
         """Return the content of files, None for one that is gone. Many are asked for at once."""
@@ -362,11 +348,9 @@ class ObjectFolder(Folder):
         return client(self.bucket)
 
     def _read_or_none(self, path: str) -> bytes | None:
-        with object_errors(f"{self}/{path}"):
-            try:
-                return bytes(obstore.get(self._store, self._key(path)).bytes())
-            except FileNotFoundError:
-                return None
+        with contextlib.suppress(NoSuchObjectError):
+            return self.read(path)
+        return None
 
     def _key(self, path: str) -> str:
         return f"{self.prefix}/{path}" if self.prefix else path

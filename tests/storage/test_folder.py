@@ -41,7 +41,6 @@ def test_what_is_put_is_read_listed_and_removed(root: Folder) -> None:
     data_root(f"{root}-2").put("other", b"not below data")
     assert (root.names(), folder.names()) == (["models"], ["versions"])
     assert folder.read("versions/1.json") == b"one"
-    assert folder.read("versions/1.json", longest=2) == b"on"
     (file,) = root.files()
     assert (file.path, file.size_bytes, file.age_hours < 1) == ("models/m/versions/1.json", 3, True)
     folder.put("versions/1.json", b"two")
