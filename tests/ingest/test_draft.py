@@ -17,7 +17,7 @@ from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
 from fleet_slip.ingest.vocabulary import parts_of
 from tests.support.measured import read_measured
 from tests.support.reported import call
-from tests.support.suggested import LOGS, wrong_guesses
+from tests.support.suggested import DEGREES, ENGLISH, KMH, LOGS, wrong_guesses
 from tests.support.suggested import suggest as suggest_of
 from tests.support.textbook_car import Car, a_car
 
@@ -39,15 +39,6 @@ def as_logged(car: Car, names: dict[str, str], factors: dict[str, float]) -> pl.
     return pl.DataFrame({names[n]: values * factors.get(n, 1.0) for n, values in car.items()})
 
 
-NAMES = {
-    "ax": "LongAcc", "ay": "LatAcc_obd", "yaw_rate": "YawRate", "steering_wheel": "SW_pos",
-    "wheel_fl": "VelFL", "wheel_fr": "VelFR", "wheel_rl": "VelRL", "wheel_rr": "VelRR",
-    "sideslip": "Correvit_slip_angle",
-}  # fmt: skip
-IN_DEGREES = dict.fromkeys(("yaw_rate", "steering_wheel", "sideslip"), 180 / np.pi)
-IN_KMH = dict.fromkeys(WHEELS, 3.6 * RADIUS_M)
-
-
 @pytest.mark.parametrize("name", LOGS)
 def test_files_of_every_format_are_guessed_right(tmp_path: Path, name: str) -> None:
     assert wrong_guesses(LOGS[name], suggest_of(LOGS[name], tmp_path)) == []
@@ -65,7 +56,7 @@ def test_wheels_of_a_ros_topic_are_never_drafted_in_kmh(tmp_path: Path) -> None:
 
 def test_the_unit_of_a_speed_is_told_by_the_wheels(tmp_path: Path) -> None:
     car = a_car()
-    rows = as_logged(car, NAMES, {**IN_DEGREES, **IN_KMH})
+    rows = as_logged(car, ENGLISH, {**DEGREES, **KMH})
     speed = np.mean([car[name] for name in WHEELS], axis=0) * RADIUS_M
     rows = rows.with_columns(pl.Series("speedo", 3.75 * speed), pl.Series("gear", [3] * 6000))
     rows = rows.with_columns(pl.Series("brake_pressure", np.abs(car["ax"]) * 9))
@@ -96,7 +87,7 @@ ON_A_VOLVO = {
 def test_the_names_of_departments_are_understood(tmp_path: Path, names: dict[str, str]) -> None:
     """Row 1 of COVESA is the front axle; what counts the car is its VIN."""
     car = a_car()
-    rows = as_logged({name: car[name] for name in names}, names, {**IN_DEGREES, **IN_KMH})
+    rows = as_logged({name: car[name] for name in names}, names, {**DEGREES, **KMH})
     rows.insert_column(0, pl.Series("t", np.arange(rows.height) / 100))
     vin = "Vehicle.VehicleIdentification.VIN"
     rows = rows.with_columns(pl.lit("YV1").alias(vin))

@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.definitions import WEIGHT, Definition, Fact, Gate, limit_of
-from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan
@@ -24,47 +23,13 @@ from fleet_slip.grams.check import grams_of
 from fleet_slip.grams.compute import aggregate, by_sql, gram_statement, wide_grams
 from fleet_slip.grams.job import update_grams
 from fleet_slip.warehouse.tables import Warehouse
+from tests.export.models import DEFINITIONS as OF_MODELS
+from tests.export.models import SPEED
 from tests.support.logs import land, log_rows, random_counts
 
-COURSE = features().features["course_difference"]
-
-SPEED = Definition(of="wheel_fl", over="mean", ticks=4, ratio=Fraction(1), bits=16)
-
-DEFINITIONS = {
-    "mean_3": Definition(of="ay", over="mean", ticks=3, ratio=Fraction(16)),
-    "mean_5": Definition(of="ay", over="mean", ticks=5, ratio=Fraction(1, 7), bits=16),
-    "sum_4": Definition(of="ax", over="sum", ticks=4, ratio=Fraction(3, 2), bits=17),
-    "lag_2": Definition(of="yaw_rate", over="lag", ticks=2),
-    "ever": Definition(of="ay", over="running_mean", ratio=Fraction(16)),
-    "changing": Definition(
-        of="change", sql=COURSE.sql, of_bits=18, over="mean", ticks=2, ratio=Fraction(5)
-    ),
-    "heavy": Definition(
-        of="ay",
-        over="mean",
-        ticks=2,
-        fact=Fact(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
-        bits=18,
-    ),
-    "of_suv": Definition(of="ax", fact=Fact(name="vehicle_model", equals="suv")),
-    "below": Definition(
-        of="ay",
-        over="mean",
-        ticks=3,
-        ratio=Fraction(16),
-        gate=Gate(by=SPEED, low=-3, peak=500, high=1501),
-    ),
-    "above": Definition(
-        of="ay", over="mean", ticks=3, ratio=Fraction(16), gate=Gate(by=SPEED, low=500, peak=1501)
-    ),
-    "heavy_above": Definition(
-        of="ay",
-        over="mean",
-        ticks=2,
-        fact=Fact(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
-        bits=18,
-        gate=Gate(by=Definition(of="change", sql=COURSE.sql, of_bits=18), low=-2000, peak=3),
-    ),
+OPEN_ABOVE = Gate(by=SPEED, low=500, peak=1501)
+DEFINITIONS = {name: one for name, one in OF_MODELS.items() if one.number is None} | {
+    "above": Definition(of="ay", over="mean", ticks=3, ratio=Fraction(16), gate=OPEN_ABOVE)
 }
 
 COUNT = st.one_of(
