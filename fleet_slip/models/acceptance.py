@@ -187,9 +187,8 @@ def contest(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest
     """
     for version in incumbents:
         _require_same_features(version)
-    label, winner, found = catalogue().label, selection.winner.model, selection.searched
-    searched = found is not None and winner in found.models
-    inputs = found.inputs if found is not None and searched else winner.signals
+    label, winner, found = catalogue().label, selection.winner.model, selection.searched_winner
+    inputs = found.inputs if found is not None else winner.signals
     feature_set = selection.cohort.feature_set
     models = tuple(counts_model(version.manifest, feature_set) for version in incumbents)
     every = (name for model in models for name in model.signals)
@@ -197,7 +196,7 @@ def contest(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest
     cars = selection.cohort.count_vehicles_with((*signals, label))
     by: FoldKey = "vehicle" if cars >= LEAST_VEHICLES else "drive"
     intercept = selection.intercept
-    if found is not None and searched:
+    if found is not None:
         procedure = searching(found, len(winner.signals), intercept=intercept)
     else:
         procedure = least_squares(inputs, label, intercept=intercept)

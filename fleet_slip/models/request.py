@@ -4,9 +4,9 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_serializer, field_validator, model_validator
 from typing_extensions import Doc
 
 from fleet_slip.base import canonical_json, sha256_of
@@ -223,6 +223,11 @@ INPUTS_TOLD = 30
 """Inputs, or families of them, in a message."""
 
 
+def expand_families(names: Iterable[str]) -> tuple[str, ...]:
+    """Return names of inputs, of a family of windows or gates its members."""
+    return tuple(member for name in names for member in features().members(name))
+
+
 class CandidateModel(Config):
     """A named set of signals or features; a family of windows or gates stands for its members."""
 
@@ -232,7 +237,7 @@ class CandidateModel(Config):
     @field_validator("signals")
     @classmethod
     def _families_are_their_members(cls, signals: tuple[str, ...]) -> tuple[str, ...]:
-        return tuple(member for name in signals for member in features().members(name))
+        return expand_families(signals)
 
     @model_validator(mode="after")
     def _signals_are_inputs(self) -> "CandidateModel":
@@ -240,7 +245,7 @@ class CandidateModel(Config):
         for name in self.signals:
             if name not in inputs:
                 raise ValueError(
-                    f"model {self.name!r}: {name!r} is not an input. Inputs: {_told(inputs)}"
+                    f"model {self.name!r}: {name!r} is not an input. Inputs: {name_inputs(inputs)}"
                 )
         if len(set(self.signals)) < len(self.signals):
             raise ValueError(f"model {self.name!r} names a signal twice")
@@ -251,18 +256,35 @@ class Search(Config):
     """How to choose among many inputs: at most so many columns, by `rule`.
 
     `best` takes the best cross-validated correlation; `worth` the fewest columns whose error is
-    negligibly larger (`fleet_slip.regression.choice`).
+    negligibly larger (`fleet_slip.regression.choice`); `standard error` the fewest whose error is
+    larger by at most one standard error over folds.
     """
 
+    name: str | None = Field(default=None, min_length=1, max_length=40)
+    """Of its models, before the number of columns. Default: the method."""
+    inputs: tuple[Identifier, ...] | None = None
+    """What to search among, families by their members. Default: all of the feature set."""
     method: Literal["forward", "backward", "exchange"] = "forward"
     most: int = Field(default=DEFAULT_MOST, ge=1, le=200)
-    rule: Literal["best", "worth"] = "worth"
+    rule: Literal["best", "worth", "standard error"] = "worth"
+    fewest_drives: int = Field(default=0, ge=0)
+    """Of fewer drives nothing is searched for."""
+
+    @field_validator("inputs")
+    @classmethod
+    def _families_are_their_members(cls, inputs: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        return None if inputs is None else expand_families(inputs)
+
+    def among(self, inputs: Sequence[str]) -> tuple[str, ...]:
+        """Return which of a cohort's inputs are searched."""
+        return tuple(name for name in inputs if self.inputs is None or name in self.inputs)
 
 
 class ModelList(Config):
     """Candidates in their declared order, the feature set and the folds to compare them on.
 
-    `label` may stand for a reference sensor. What a `search` finds joins, and its rule decides.
+    `label` may stand for a reference sensor. What each `search` finds joins, and the rule of the
+    first decides.
     """
 
     description: str = Field(min_length=1)
@@ -270,7 +292,17 @@ class ModelList(Config):
     features: Identifier = PLAIN
     folds: Folding = Folding()
     model: tuple[CandidateModel, ...] = Field(min_length=1)
-    search: Search | None = None
+    search: tuple[Search, ...] = ()
+
+    @field_validator("search", mode="before")
+    @classmethod
+    def _one_search(cls, search: Any) -> Any:
+        return search if isinstance(search, list | tuple) else (search,)
+
+    @field_serializer("search")
+    def _as_written(self, search: tuple[Search, ...]) -> Any:
+        dumped = [one.model_dump(mode="json", exclude_defaults=True) for one in search]
+        return dumped[0] if len(dumped) == 1 else dumped  # the checksum of a list with one
 
     @model_validator(mode="after")
     def _names_differ(self) -> "ModelList":
@@ -284,15 +316,20 @@ class ModelList(Config):
         known = features()
         if self.features not in {PLAIN, *known.sets}:
             raise ValueError(f"features: no feature set is called {self.features!r}")
-        inputs = known.feature_set(self.features).inputs
-        for candidate in self.model:
-            absent = [name for name in candidate.signals if name not in inputs]
-            if absent:
-                raise ValueError(
-                    f"model {candidate.name!r}: {', '.join(absent)} is not in the feature set "
-                    f"{self.features!r}. Its inputs: {', '.join(inputs)}"
-                )
+        if absent := self.absent_from(self.features):
+            inputs = known.feature_set(self.features).inputs
+            raise ValueError(
+                f"{', '.join(absent)} is not in the feature set {self.features!r}. Its inputs: "
+                f"{', '.join(inputs)}"
+            )
         return self
+
+    def absent_from(self, feature_set: str) -> list[str]:
+        """Return what is compared or searched and not an input of a feature set."""
+        known = features().feature_set(feature_set).inputs
+        named = [name for one in self.model for name in one.signals]
+        named += [name for one in self.search for name in one.inputs or ()]
+        return [name for name in dict.fromkeys(named) if name not in known]
 
     @property
     def sha256(self) -> str:
@@ -336,7 +373,7 @@ def require_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
     if unknown := [name for name in order if name not in known]:
         raise QuestionError(
             f"{','.join(order)}: {', '.join(unknown)} is not an input. Inputs of the feature set "
-            f"{feature_set}: {_told(known)}."
+            f"{feature_set}: {name_inputs(known)}."
         )
     if len(set(order)) < len(order):
         raise UsageError(f"{','.join(order)}: an input stands twice.")
@@ -356,7 +393,7 @@ def require_odd(names: Sequence[str], feature_set: str) -> None:
         )
 
 
-def _told(inputs: Iterable[str]) -> str:
+def name_inputs(inputs: Iterable[str]) -> str:
     """Return names of inputs in a line, families by their own, and how many more there are."""
     names = list(features().families(inputs))
     more = f" and {len(names) - INPUTS_TOLD} more (fleet-slip features)"

@@ -14,6 +14,7 @@ from fleet_slip.grams.cohort import Cohort, drive_folds, row_training
 from fleet_slip.grams.folding import ROW_FOLDS, Folding
 from fleet_slip.models.request import Search, SelectionRequest
 from fleet_slip.regression.choice import (
+    ANY_WORTH,
     CROSS_VALIDATION,
     DEFAULT_WORTH,
     FEWEST_FOLDS,
@@ -175,7 +176,9 @@ class SearchedModels:
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs."""
-        return {**self.search.model_dump(), "inputs": len(self.inputs), "sizes": len(self.models)}
+        asked = self.search.model_dump(exclude_defaults=True, exclude={"inputs"})
+        usual = {name: getattr(self.search, name) for name in ("method", "most", "rule")}
+        return {**usual, **asked, "inputs": len(self.inputs), "sizes": len(self.models)}
 
 
 def search_models(
@@ -220,7 +223,7 @@ def searching(found: SearchedModels, size: int, *, intercept: bool) -> Procedure
 
 
 def _model(folds: Folds, sums: Sequence[ErrorSums], fitted: Fit, search: Search) -> CrossValidation:
-    name = f"{search.method} {fitted.size}"
+    name = f"{search.name or search.method} {fitted.size}"
     return assemble(name, folds, sums, fitted.model, input_scales())
 
 
@@ -235,9 +238,11 @@ def _fits(gram: Gram, inputs: Sequence[str], label: str, search: Search) -> list
 def choose_by(
     search: Search | None, models: Sequence[CrossValidation], asked: Worth | None = None
 ) -> Winner:
-    """Return the winner by the rule of a search; a worth that was asked for precedes `best`."""
-    if search is None or search.rule != "best" or asked is not None:
+    """Return the winner by the rule of a search; a worth that was asked for precedes it."""
+    if search is None or search.rule == "worth" or asked is not None:
         return choose(models, asked or DEFAULT_WORTH)
+    if search.rule == "standard error":
+        return choose(models, ANY_WORTH)
     best = max(models, key=lambda model: model.sums.signed_r_squared)
     reason = (
         f"Model {best.name} has the best cross-validated correlation, {best.correlation:.6f}, "

@@ -39,6 +39,7 @@ from fleet_slip.models.request import (
     SelectionRequest,
     inputs_of,
     load_model_list,
+    name_inputs,
     nested_candidates,
     parse_worth,
     require_inputs,
@@ -252,7 +253,7 @@ class Selection(Answer):
     Attributes:
         skipped: candidates that the cohort cannot serve, with the reason.
         choice: how an order or a subset was chosen; None for a list of models.
-        searched: the models of a search, which are among `models`.
+        searched: the models of each search, which are among `models`.
         distances: of an order's nested models from the full and the true one, or why not told.
         intercept: whether models have one; without it they go through the origin.
         model_list, config_sha256: what was compared, such as `table1`, and its checksum.
@@ -270,7 +271,7 @@ class Selection(Answer):
     winner: Winner
     skipped: dict[str, str]
     choice: SearchChoice | None = None
-    searched: SearchedModels | None = None
+    searched: tuple[SearchedModels, ...] = ()
     uncertainty: Uncertainty | None = None
     distances: NestedDistances | str | None = None
     intercept: bool = True
@@ -311,6 +312,11 @@ class Selection(Answer):
     def parts(self, everything: bool = False) -> Iterator[Part]:
         """Return the winner and why, the best models or all, and how sure that is."""
         return summarize(self, everything)
+
+    @property
+    def searched_winner(self) -> SearchedModels | None:
+        """The search that found the winner, if one did."""
+        return next((one for one in self.searched if self.winner.model in one.models), None)
 
     @property
     def rows_without(self) -> int:
@@ -356,7 +362,7 @@ class Selection(Answer):
         nested = {"left_out": self.distances} if isinstance(self.distances, str) else self.distances
         found = {
             "choice": self.choice,
-            "search": self.searched,
+            "search": self.searched_winner or next(iter(self.searched), None),
             "nested": nested,
             "uncertainty": self.uncertainty,
             "without_label": self.without_label,
@@ -372,15 +378,16 @@ def select(
     candidates: Sequence[CandidateModel],
     folds: Folding,
     worth: Worth | None = None,
-    search: Search | None = None,
+    searches: Sequence[Search] = (),
     inputs: Sequence[str] = (),
     *,
     intercept: bool = True,
 ) -> Selection:
-    """Cross-validate each candidate, and what a search finds among inputs; choose the winner.
+    """Cross-validate each candidate, and what searches find among inputs; choose the winner.
 
-    `worth` overrides the search's rule. Candidates with absent or dependent signals are skipped,
-    with the reason. Raises `DataError` if none is left, or no drive has the label.
+    `worth` overrides the rule of the first search. Candidates with absent or dependent signals are
+    skipped, with the reason, and so are searches that need more drives. Raises `DataError` if none
+    is left, or no drive has the label.
     """
     divided = cohort.folds(folds.by, folds.count)
     label = catalogue().label
@@ -397,17 +404,26 @@ def select(
             models.append(validate(candidate, divided, intercept=intercept))
         except (DataError, QuestionError) as error:
             skipped[candidate.name] = str(error)
-    searched = None
-    if search:
-        searched = search_models(cohort, inputs, folds, search, intercept=intercept)
-    if searched is not None:
-        models += searched.models
+    searched: list[SearchedModels] = []
+    for search in searches:
+        if cohort.drive_count < search.fewest_drives:
+            few = f"it needs {search.fewest_drives} drives, and there are {cohort.drive_count}"
+            skipped[f"{search.name or search.method} (search)"] = few
+        elif among := search.among(inputs):
+            searched.append(search_models(cohort, among, folds, search, intercept=intercept))
+            models += searched[-1].models
     if not models:
         reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())
         raise DataError(f"no candidate can be fitted on the cohort. {reasons}")
-    winner = choose_by(search, models, worth)
+    winner = choose_by(searches[0] if searches else None, models, worth)
     return Selection(
-        cohort, folds, tuple(models), winner, skipped, searched=searched, intercept=intercept
+        cohort,
+        folds,
+        tuple(models),
+        winner,
+        skipped,
+        searched=tuple(searched),
+        intercept=intercept,
     )
 
 
@@ -506,7 +522,7 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
     if request.label == BOTH:
         return asked.choose(asked.load(warehouse, condition))
     distances = bool(
-        request.nested and not request.ordered and not _search_of(request, asked.model_list)
+        request.nested and not request.ordered and not _searches_of(request, asked.model_list)
     )
     if not (request.ordered or request.bootstrap or distances):  # the sum of each fold suffices
         return asked.choose(load_cohort(warehouse, condition, asked.feature_set, folds))
@@ -592,6 +608,11 @@ def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str
         )
     if request.by == ROW_FOLDS and named == PLAIN:
         return next(name for name, one in features().sets.items() if one.row_folds)
+    if model_list and (absent := model_list.absent_from(named)):
+        raise QuestionError(
+            f"the feature set {named} lacks columns of {request.models}: {name_inputs(absent)}. "
+            "Take another one, or another list of models."
+        )
     return named
 
 
@@ -602,17 +623,18 @@ def _compare_listed(
     folds: Folding,
 ) -> Selection:
     listed = model_list.model if model_list else ()
-    search = _search_of(request, model_list)
+    searches = _searches_of(request, model_list)
     worth = None if request.worth is None else parse_worth(request.worth)
-    inputs = inputs_of(cohort, request.nested or WHOLE_SET) if search else ()
+    inputs = inputs_of(cohort, request.nested or WHOLE_SET) if searches else ()
     nested = (
         nested_candidates(inputs_of(cohort, request.nested))
-        if request.nested and not search
+        if request.nested and not searches
         else ()
     )
-    if search and not listed:
-        selection = select(cohort, (), folds, worth, search, inputs, intercept=request.intercept)
-        content = {"inputs": list(inputs), **search.model_dump()}
+    if searches and not listed:
+        selection = select(cohort, (), folds, worth, searches, inputs, intercept=request.intercept)
+        (search,) = searches
+        content = {"inputs": list(inputs), **search.model_dump(include={"method", "most", "rule"})}
         label = f"search:{search.method} {search.most}"
         checksum = _checksum(sha256_of(canonical_json(content)), request.worth, request.intercept)
         return replace(selection, model_list=label, config_sha256=checksum)
@@ -621,13 +643,13 @@ def _compare_listed(
         features=cohort.feature_set,
         folds=folds,
         model=(*listed, *nested),
-        search=search,
+        search=searches,
     )
     usual = GIVEN if request.model else request.label
     name = request.models or (usual if listed else None)
     label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
     selection = select(
-        cohort, described.model, folds, worth, search, inputs, intercept=request.intercept
+        cohort, described.model, folds, worth, searches, inputs, intercept=request.intercept
     )
     checksum = _checksum(described.sha256, request.worth, request.intercept)
     return replace(selection, model_list=label, config_sha256=checksum)
@@ -648,7 +670,7 @@ def _checksum(compared: str, worth: str | None, intercept: bool) -> str:
     return sha256_of(canonical_json({"compared": compared, **unusual})) if unusual else compared
 
 
-def _search_of(request: SelectionRequest, model_list: ModelList | None) -> Search | None:
+def _searches_of(request: SelectionRequest, model_list: ModelList | None) -> tuple[Search, ...]:
     if request.search:
         if request.search not in METHODS:
             raise QuestionError(f"unknown search {request.search!r}. Known: {', '.join(METHODS)}.")
@@ -656,8 +678,8 @@ def _search_of(request: SelectionRequest, model_list: ModelList | None) -> Searc
         if request.label:
             # The noise of the course hides in the error what a column is worth to the angle.
             asked["rule"] = "best"
-        return Search.model_validate(asked)
-    return model_list.search if model_list else None
+        return (Search.model_validate(asked),)
+    return model_list.search if model_list else ()
 
 
 def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Selection:

@@ -55,7 +55,7 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
         yield Remark(selection.examined)
     winner = selection.winner
     yield f"winner: {winner.model.name}. {winner.reason}"
-    if selection.searched is not None and winner.model in selection.searched.models:
+    if selection.searched_winner is not None:
         yield f"its columns: {in_families(winner.model.signals)}"
     if selection.choice is not None:
         yield from _choice(selection.choice)
@@ -116,7 +116,7 @@ def _models(selection: "Selection", everything: bool) -> TextTable:
     cohort, models, where = selection.cohort, selection.models, selection.cohort.condition.text
     ranked = sorted(models, key=lambda model: model.pooled.rmse)
     shown = models if everything else [one for one in models if one in ranked[:BEST]]
-    found = () if everything or selection.searched is None else selection.searched.models
+    found = [] if everything else [model for one in selection.searched for model in one.models]
     title = f"{number_of(cohort.drive_count, 'drive')}, {number_of(cohort.rows, 'row')}"
     title += "" if where == TRAINING_DRIVES else f" where {_shortened(where, everything)}"
     title += f"; {number_of(len(models[0].folds), 'fold')} by {selection.folds.by}"

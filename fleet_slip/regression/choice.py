@@ -70,6 +70,10 @@ DEFAULT_WORTH = Worth(math.radians(0.025))
 """A quarter of what the best reference sensors are accurate to, about 0.1 deg."""
 
 
+ANY_WORTH = Worth(0.0)
+"""Any gain that is larger than its standard error."""
+
+
 @dataclass(frozen=True)
 class Shortfall:
     """How much larger a `model`'s RMSE (rad) is than the best's, over the same folds.
@@ -172,6 +176,12 @@ def _reason(winner: Shortfall, best: CrossValidation, near: int, total: int, wor
             f"Model {best.name} has the best cross-validated correlation, {best.correlation:.4f}, "
             f"with {rmse}. The error of {others} is larger by {worth} or more, and by more than "
             "one standard error of the difference."
+        )
+    if not worth.amount:
+        return (
+            f"Model {winner.model.name} has the fewest signals, {len(winner.model.signals)}, of "
+            f"{near} models whose error is at most one standard error larger than the least, of "
+            f"model {best.name} ({len(best.signals)} signals, {rmse}): {winner} over these folds."
         )
     real = "real, but less than" if winner.real else "not real; worth having would be"
     lacks_deg = math.degrees(winner.lacks)

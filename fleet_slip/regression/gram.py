@@ -185,8 +185,7 @@ def require_signals(signals: Sequence[str], wanted: Sequence[str]) -> None:
     missing = [name for name in wanted if name not in signals]
     if missing:
         raise DataError(
-            f"no Gram of {', '.join(missing)}: the drives have {', '.join(signals)}. "
-            "Leave the signal out, or choose a cohort that has it."
+            f"the drives have no {', '.join(missing)}. Leave that out, or choose other drives."
         )
 
 

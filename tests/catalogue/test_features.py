@@ -93,6 +93,8 @@ PHYSICS: dict[str, Callable[[Row], Fraction | None]] = {
     "course_rate": over_speed("ay"),
     "slowness": lambda row: 1 / speed(row) if speed(row) >= 3 else None,
     "ay_signed_square": lambda row: row["ay"] * abs(row["ay"]),
+    "ay_cube": lambda row: row["ay"] ** 3,
+    "yaw_rate_signed_square": lambda row: row["yaw_rate"] * abs(row["yaw_rate"]),
     "steer_mean": lambda row: (row["steer_fl"] + row["steer_fr"]) / 2,
     "steer_speed_squared": lambda row: (row["steer_fl"] + row["steer_fr"]) / 2 * speed(row) ** 2,
     "course_difference": lambda row: (

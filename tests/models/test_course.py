@@ -154,7 +154,7 @@ def test_the_same_again_is_nothing_new_and_the_gate_compares_changes(fleet: Flee
 
 def test_columns_are_searched_for(fleet: Fleet) -> None:
     selection = fleet.cohort("true").select(label="course")
-    found = selection.searched
+    (found,) = selection.searched
     assert found is not None and len(selection.winner.model.signals) <= 6
     assert math.isclose(selection.winner.model.pooled.error_mean_deg, 0, abs_tol=1e-9)
     assert selection.model_list == "course"

@@ -19,6 +19,7 @@ from fleet_slip.models.search import (
     search_models,
     select_inputs,
 )
+from fleet_slip.models.select import select
 from fleet_slip.regression.choice import CROSS_VALIDATION, Rule, select_nested
 from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.regression.folds import cross_validate, least_squares
@@ -171,6 +172,35 @@ def test_a_worth_that_is_asked_for_decides_whatever_the_rule_of_the_list(
     }
     assert asked == {around: 2, "0.025deg": 2, "0.0001deg": 4}
     assert len(choose_by(search, models).model.signals) == (4 if rule == "best" else 2)
+
+
+def test_the_rule_of_one_standard_error_keeps_what_is_real_however_small() -> None:
+    """The weak signals gain 0.0029 deg each, far more than their noise over folds."""
+    cohort = cohort_of(driven(1, (0.00125, 0.4, 0.9, 0.00125), drives=30, noise=3))
+    search = Search(method="exchange", most=4, rule="standard error")
+    models = search_models(cohort, INPUTS, FIVE, search).models
+    assert len(choose_by(search, models).model.signals) == 4
+    idle = search_models(cohort_of(driven(1, STRONG_FIRST, drives=30)), INPUTS, FIVE, search)
+    winner = choose_by(search, idle.models)
+    assert set(winner.model.signals) == {"ay", "yaw_rate"}
+    assert winner.best is winner.model or "one standard error" in winner.reason
+
+
+def test_a_list_searches_among_some_inputs_and_then_all_where_drives_are_enough() -> None:
+    searches = (
+        Search(name="few", method="exchange", most=4, rule="standard error", inputs=("ay", "ax")),
+        Search(name="all", method="exchange", most=4, fewest_drives=9),
+    )
+    for drives, found in ((8, ["few 1", "few 2"]), (9, ["few 1", "few 2", *ALL_SIZES])):
+        cohort = cohort_of(driven(1, STRONG_FIRST, drives=drives))
+        chosen = select(cohort, (), FIVE, searches=searches, inputs=INPUTS)
+        assert [one.name for one in chosen.models] == found
+        assert ("all (search)" in chosen.skipped) == (drives < 9)
+    assert chosen.searched_winner is not None
+    assert set(chosen.winner.model.signals) >= {"ay", "yaw_rate"}
+
+
+ALL_SIZES = [f"all {size}" for size in range(1, 5)]
 
 
 def test_rows_can_be_the_folds() -> None:

@@ -86,7 +86,7 @@ def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
     together = cohort_of(drives, [0, 1, 2] * 4)
     assert both == cross_validate_inputs("two", together, ["x1", "x2"], "y", SCALES)
     assert cross_validate_inputs("three", cohort, ["x3"], "y", SCALES).drives == 6
-    with pytest.raises(DataError, match="no Gram of gyro"):
+    with pytest.raises(DataError, match="the drives have no gyro"):
         cohort.serving(["gyro"], "y")
 
 
