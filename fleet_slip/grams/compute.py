@@ -740,10 +740,7 @@ def _last_if_unknown(kind: Kind) -> tuple[int, bool, int]:
 def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[Kind, PartSums]:
     """Return the sums of a drive's rows, by columns missing and part; raises as `wide_grams`."""
     plan, total = workspace.plan, len(counts.ticks)
-    largest = max(plan.limits)
-    exact_rows = (_EXACT - 1) // largest**2
-    if exact_rows < BLOCK_ROWS or total * largest**2 >= _INT64:
-        raise StorageError(f"the drive has {total:,} rows: too many for 64-bit sums.")
+    exact_rows = _exact_rows(total, max(plan.limits))
     workspace.load(counts)
     complete, totals = PartSums(len(plan.names)), workspace.totals()
     found = {(0, 0): complete}
@@ -757,7 +754,11 @@ def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[
             complete.clipped += clipped
             if not lacks:
                 continue
-        first += _add_by_kind(found, workspace, parts, counts.ticks, first)
+        block, here = workspace.block(first)
+        last = first + len(here)
+        numbers = parts.numbers(counts.ticks[first:last], workspace.beside(first))
+        _add_by_kind(found, block, here, numbers, exact_rows)
+        first = last
     complete.add_totals(totals)
     return {kind: sums for kind, sums in found.items() if sums.n}
 
@@ -766,44 +767,42 @@ def change_sums(
     workspace: Workspace, counts: DriveCounts, times: Sequence[int], late: int = 0
 ) -> dict[Kind, PartSums]:
     """Return the sums of a drive's changes, by columns missing and time; the course is `late`."""
-    largest = 2 * max(workspace.plan.limits)
-    exact_rows = (_EXACT - 1) // largest**2
-    if len(counts.ticks) * largest**2 >= _INT64:
-        raise StorageError(f"the drive has {len(counts.ticks):,} rows: too many for 64-bit sums.")
+    exact_rows = _exact_rows(len(counts.ticks), 2 * max(workspace.plan.limits))
     workspace.load(counts)
     fixes = find_fixes(workspace, counts, late)
     found: dict[Kind, PartSums] = {}
     for part, apart in enumerate(times):
         changes = course_changes(fixes, apart)
-        for (absent, _), rows in _kinds(changes.columns, None):
-            has = [i for i in range(len(changes.columns)) if not absent >> i & 1]
-            sums = found.setdefault((absent, part), PartSums(len(has)))
-            for first in range(0, len(rows), exact_rows):
-                some = rows[first : first + exact_rows]
-                block = changes.columns.take(some, axis=1)
-                sums.add(block if len(has) == len(block) else block[has], changes.clipped[some])
+        numbers = np.full(len(changes.rows), part)
+        _add_by_kind(found, changes.columns, changes.clipped, numbers, exact_rows)
     return found
+
+
+def _exact_rows(rows: int, largest: int) -> int:
+    """Return how many rows are summed exactly in binary64; raises for more than 64 bits hold."""
+    if rows * largest**2 >= _INT64:
+        raise StorageError(f"the drive has {rows:,} rows: too many for 64-bit sums.")
+    return (_EXACT - 1) // largest**2
 
 
 def _add_by_kind(
     found: dict[Kind, PartSums],
-    workspace: Workspace,
-    parts: Parts,
-    ticks: NDArray[Any],
-    first: int,
-) -> int:
-    """Add the rows of a block, which are of several kinds; return how many there are."""
-    block, clipped = workspace.block(first)
-    last = first + len(clipped)
-    numbers = parts.numbers(ticks[first:last], workspace.beside(first)) if parts else None
-    for (absent, part), rows in _kinds(block, numbers):
-        has = [i for i in range(len(block)) if not absent >> i & 1]
-        few = block[np.ix_(np.array(has, dtype=np.int64), rows)]
-        found.setdefault((absent, part), PartSums(len(has))).add(few, clipped[rows])
-    return len(clipped)
+    columns: FloatArray,
+    clipped: FloatArray,
+    numbers: IntArray,
+    at_once: int,
+) -> None:
+    """Add rows of several kinds, given the part of each, so many at once as are exact."""
+    for (absent, part), rows in _kinds(columns, numbers):
+        has = [i for i in range(len(columns)) if not absent >> i & 1]
+        sums = found.setdefault((absent, part), PartSums(len(has)))
+        for first in range(0, len(rows), at_once):
+            some = rows[first : first + at_once]
+            block = columns.take(some, axis=1)
+            sums.add(block if len(has) == len(block) else block[has], clipped[some])
 
 
-def _kinds(block: FloatArray, numbers: IntArray | None) -> Iterator[tuple[Kind, NDArray[np.int64]]]:
+def _kinds(block: FloatArray, numbers: IntArray) -> Iterator[tuple[Kind, NDArray[np.int64]]]:
     lacks = np.isnan(block)
     some = np.flatnonzero(lacks.any(axis=0))  # few, as a rule: patterns take sorting
     pattern_of_row, absents = np.zeros(block.shape[1], dtype=np.int64), [0]
@@ -812,8 +811,7 @@ def _kinds(block: FloatArray, numbers: IntArray | None) -> Iterator[tuple[Kind, 
         patterns, of_some = np.unique(packed, axis=1, return_inverse=True)
         absents += [int.from_bytes(one.tobytes(), "little") for one in patterns.T]
         pattern_of_row[some] = 1 + of_some.reshape(-1)
-    part = 0 if numbers is None else numbers
-    kind_of_row = part * len(absents) + pattern_of_row
+    kind_of_row = numbers * len(absents) + pattern_of_row
     for kind in np.unique(kind_of_row).tolist():
         number, pattern = divmod(kind, len(absents))
         yield (absents[pattern], number), np.flatnonzero(kind_of_row == kind)

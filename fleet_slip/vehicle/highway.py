@@ -5,7 +5,6 @@ positive steering angle turns to the right of the picture.
 """
 
 import math
-from functools import lru_cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -86,11 +85,6 @@ def _steps(
     return Motion(x, place, slopes, before)
 
 
-@lru_cache(maxsize=256)
-def _constants(parameters: VehicleParameters, adhesion: float) -> Constants:
-    return constants(parameters, adhesion)
-
-
 class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
     """A car with four wheels on highway-env's roads.
 
@@ -122,7 +116,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         """Put the car on a road, or none, straight ahead, in m, rad and m/s."""
         self.parameters = self.PARAMETERS if parameters is None else parameters
         self.adhesion = self.ADHESION if adhesion is None else adhesion
-        c = self.constants
+        c = self.constants = constants(self.parameters, self.adhesion)
         self.MASS = c.mass
         self.INERTIA_Z = c.yaw_inertia
         self.LENGTH_A, self.LENGTH_B = c.front, c.rear
@@ -153,11 +147,6 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         if hasattr(vehicle, "color"):
             copy.color = vehicle.color
         return copy
-
-    @property
-    def constants(self) -> Constants:
-        """What the equations know of this car on this road."""
-        return _constants(self.parameters, self.adhesion)
 
     @property
     def motion(self) -> State:

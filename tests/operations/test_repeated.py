@@ -1,16 +1,17 @@
 """Drives of one car that overlap in time are named: their rows count twice."""
 
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pytest
 
-import fleet_slip
-from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.labels import find_repeated
+from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
-from tests.support.measured import csv_text
+from tests.support.logs import land, log_rows, random_counts
 
 BEGAN = datetime(2024, 5, 31, 8, tzinfo=UTC)
 
@@ -89,32 +90,15 @@ def test_one_message_of_a_day_does_not_accuse_the_drives_of_that_day(start_s: in
     )
 
 
-def test_two_recordings_of_a_car_at_once_count_twice_and_quality_says_so(
-    tmp_path: Path, run_command: RunCommand
+def test_quality_names_two_recordings_of_a_car_at_once(
+    warehouse: Warehouse, run_command: RunCommand
 ) -> None:
-    rows = range(4000)
-    plan = {
-        "name": "test",
-        "time": {"column": "t", "format": "%Y-%m-%dT%H:%M:%S%.f%:z"},
-        "drive": {"vehicle_id": "car", "vehicle_model": "sedan"},
-        "signals": {
-            "ax": {"column": "ax", "unit": "m/s^2"},
-            "sideslip": {"column": "beta", "unit": "deg"},
-        },
-    }
-    fleet = fleet_slip.open(tmp_path / "data")
-    for logger, period in (("front", 7), ("rear", 9)):
-        log = {
-            "t": [(BEGAN + timedelta(milliseconds=10 * i)).isoformat() for i in rows],
-            "ax": [f"{i % period / 10:.1f}" for i in rows],
-            "beta": [f"{i % (period - 2) / 10:.1f}" for i in rows],
-        }
-        file = tmp_path / f"{logger}.csv"
-        file.write_text(csv_text(log))
-        fleet.ingest(file, Mapping.model_validate(plan))
-    fleet.gram()
+    rng = np.random.default_rng(1)
+    known: dict[str, Any] = {"started_at": BEGAN, "duration_s": 40.0, "source": "measured"}
+    drives = [log_rows(name, random_counts(rng, 4000), **known) for name in ("front", "rear")]
+    land(warehouse, "both", *drives)
+    update_grams(warehouse)
     told = run_command("quality", "--json")
     assert told.exit_code == 10
-    (finding,) = told.json["findings"]
-    assert finding["kind"] == "repeated"
-    assert finding["figure"].startswith("40 s are in test-")
+    found = [one for one in told.json["findings"] if one["kind"] == "repeated"]
+    assert [(one["drive_id"], one["figure"]) for one in found] == [("rear", "40 s are in front")]

@@ -102,6 +102,9 @@ def test_load_in_the_boot_moves_the_centre_of_gravity_as_statics_asks() -> None:
     points = [(660.0, gyration), (660.0, -gyration), (load_kg, place)]
     inertia = sum(mass * (at - shift) ** 2 for mass, at in points)
     assert loaded.sprung_yaw_inertia_kgm2 == pytest.approx(inertia)
+    # Behind the rear axle it takes understeer away, K = (Wf / Cf − Wr / Cr) / g.
+    heavy = SEDAN.with_sprung_mass(1620.0, -1.9)
+    assert handling(heavy).understeer < 0.7 * handling(SEDAN).understeer
 
 
 def roughness(**road: float) -> list[np.ndarray]:

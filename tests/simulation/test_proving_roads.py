@@ -1,21 +1,13 @@
 """Trials on roads of every class: what is drawn, and that load and banks are in the signals."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 
 from fleet_slip.errors import ConfigError
 from fleet_slip.evaluation.blind import blind_scenarios
-from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
-from fleet_slip.simulation.imperfections import Imperfections, RoadImperfections
-from fleet_slip.simulation.job import simulate_logs
-from fleet_slip.simulation.roads import CLASSES, SpeedLimits, load_track
-from fleet_slip.simulation.sensors import Sensors
-from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
+from fleet_slip.simulation.roads import CLASSES, load_track
+from fleet_slip.vehicle.parameters import load_vehicle
 
-TEXT = find_config("campaigns", "proving_roads").read_text(encoding="utf-8")
 SEDAN = load_vehicle("d_class_sedan")
 
 
@@ -23,30 +15,6 @@ SEDAN = load_vehicle("d_class_sedan")
 def drives() -> tuple[DriveSpec, ...]:
     campaign = load_campaign("proving_roads")
     return campaign.drives(campaign.first_day)
-
-
-def steady(
-    vehicle: VehicleParameters, track: str, speed_mps: float, laps: float, fall_percent: float = 0.0
-) -> dict[str, np.ndarray]:
-    """Return the counts of the last fifth of a drive of exact sensors at a steady speed."""
-    exact = dict.fromkeys((n for n in Sensors.model_fields if n != "gps"), 0.0)
-    campaign = load_campaign("smoke")
-    spec = replace(
-        campaign.drives(campaign.first_day)[0],
-        vehicle=vehicle,
-        sensors=Sensors.model_validate({**exact, "gps": campaign.sensors.gps}),
-        track=load_track(track),
-        adhesion=1.0,
-        limits=SpeedLimits(
-            lateral_mps2=9.0, acceleration_mps2=2.5, braking_mps2=4.0, top_speed_mps=speed_mps
-        ),
-        laps=laps,
-        script=(),
-        flaws=Imperfections(road=RoadImperfections(cross_slope_percent=fall_percent)),
-    )
-    (log,) = simulate_logs([spec])
-    assert log.lost_control_s is None
-    return {name: one[-log.rows // 5 :] for name, one in log.measurement.counts.items()}
 
 
 def test_every_class_of_road_is_driven_at_its_speeds(drives: tuple[DriveSpec, ...]) -> None:
@@ -79,18 +47,3 @@ def test_no_road_of_the_plan_is_a_blind_one() -> None:
         load_track("country_1000000000")
     assert min(one.seed for one in blind_scenarios("ab" * 32)) > 1e9
     assert load_campaign("proving_roads").seed != load_campaign("proving_ground").seed
-
-
-def test_load_behind_the_rear_axle_takes_understeer_away() -> None:
-    """K = (Wf/Cf − Wr/Cr) / g: on the skid pad the loaded car needs less steering."""
-    loaded = SEDAN.with_sprung_mass(1620.0, -1.9)
-    slow, fast = (
-        {car.body.sprung_mass_kg: steady(car, "skid_pad", v, 1.0) for car in (SEDAN, loaded)}
-        for v in (6.0, 17.0)
-    )
-    more = {
-        mass: fast[mass]["steering_wheel"].mean() - slow[mass]["steering_wheel"].mean()
-        for mass in fast
-    }
-    assert more[1620.0] < 0.7 * more[1320.0]
-    assert fast[1620.0]["sideslip"].mean() < fast[1320.0]["sideslip"].mean()

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from fleet_slip.resources import find_config
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
 from fleet_slip.simulation.plan import TrialPlan
 from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, road_with
@@ -11,8 +10,6 @@ from fleet_slip.simulation.scenario import shipped_scenarios
 from fleet_slip.vehicle.batch import LaneDrive, Road
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.whole_drives import simulate_drives
-
-TEXT = find_config("campaigns", "proving_ground").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
