@@ -5,6 +5,7 @@ Nothing here is certain: a suspicion is a relation of vehicle dynamics that a dr
 with the figure that shows it, and what to try. Axes and signs are ISO 8855.
 """
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -181,54 +182,36 @@ LEAST_SPEED_MPS = 3.0
 SPEED = "satellite_speed"
 
 
-def course_fault(signals: "Signals") -> Fault | None:
-    """Return what fault the course of a drive seems to have."""
+def _course(signals: "Signals") -> Iterator[Fault]:
+    """Compare a course with the yaw rate, and with how a car slips; the first fault says most."""
     if not {"course", "yaw_rate"} <= set(signals):
-        return None
+        return
     course, turned = signals["course"], np.cumsum(signals["yaw_rate"]) * float(SAMPLE_TIME_S)
-    change = _wrapped(course[SECOND:] - course[:-SECOND])
-    slope, correlation = slope_of(
-        change, turned[SECOND:] - turned[:-SECOND], np.ones(change.size, dtype=np.bool_)
-    )
+    change, heading = _wrapped(course[SECOND:] - course[:-SECOND]), turned[SECOND:]
+    slope, correlation = slope_of(change, heading - turned[:-SECOND], np.isfinite(change))
     if (slope, correlation) != (1.0, 0.0):  # else it is too little to judge
         figure = f"over a second it changes by {slope:+.2f} times what the yaw rate adds up to"
         if correlation < -LEAST_CORRELATION:
             remedy = "Turn clockwise_from_north, or swap north and east."
-            return Fault("reversed", (COURSE,), figure, remedy)
-        if correlation < LEAST_CORRELATION:
+            yield Fault("reversed", (COURSE,), figure, remedy)
+        elif correlation < LEAST_CORRELATION:
             figure = f"over a second its change hardly goes with the yaw rate ({correlation:+.2f})"
-            remedy = "Is it a course over ground, and of this car?"
-            return Fault("values", (COURSE,), figure, remedy)
-        if not SOUND[0] <= slope <= SOUND[1]:
-            remedy = "Check its unit, and that of the yaw rate."
-            return Fault("scaled", (COURSE,), figure, remedy)
-    return _of_fixes(signals) or _of_relation(_relation(signals, turned))
-
-
-def _of_fixes(signals: "Signals") -> Fault | None:
-    """Return whether few fixes have a course of their own."""
-    if SPEED not in signals:
-        return None
-    fast = signals[SPEED] > LEAST_SPEED_MPS
-    own = float(np.isfinite(signals["course"][fast]).mean()) if fast.any() else 1.0
-    if own >= LEAST_OF_THEIR_OWN:
-        return None
-    figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of backwards"
-    return Fault(
-        "values", (COURSE,), figure, "They are left out. Map it as the receiver reports it."
-    )
-
-
-def _of_relation(relation: CourseRelation | None) -> Fault | None:
-    if relation is None:
-        return None
-    if found := relation.fault or relation.misplaced:
-        return replace(found, signals=(COURSE,))
-    if abs(relation.scale - 1) > MOST_SCALE_ERROR:
+            yield Fault("values", (COURSE,), figure, "Is it a course over ground, and of this car?")
+        elif not SOUND[0] <= slope <= SOUND[1]:
+            yield Fault("scaled", (COURSE,), figure, "Check its unit, and that of the yaw rate.")
+    fast = signals[SPEED] > LEAST_SPEED_MPS if SPEED in signals else np.zeros(0, dtype=np.bool_)
+    own = float(np.isfinite(course[fast]).mean()) if fast.any() else 1.0
+    if own < LEAST_OF_THEIR_OWN:
+        figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of backwards"
+        remedy = "They are left out. Map it as the receiver reports it."
+        yield Fault("values", (COURSE,), figure, remedy)
+    relation = _relation(signals, turned)
+    if relation and (fault := relation.fault or relation.misplaced):
+        yield replace(fault, signals=(COURSE,))
+    elif relation and abs(relation.scale - 1) > MOST_SCALE_ERROR:
         figure = f"it turns {relation.scale:.3f} times as the yaw rate adds up to"
         remedy = "The gyroscope's is off, which learning allows for."
-        return Fault("scale", (COURSE,), figure, remedy)
-    return None
+        yield Fault("scale", (COURSE,), figure, remedy)
 
 
 def _relation(signals: "Signals", turned: FloatArray) -> CourseRelation | None:
@@ -260,28 +243,26 @@ _SMALL = 0.02
 """Part of the usual largest value that noise and zero points reach on the other side."""
 
 
-def find_one_sided(
-    signals: Mapping[str, FloatArray], moving: BoolArray | None
-) -> Iterator[tuple[str, str]]:
-    """Yield the signals that never change their sign, and the figure that shows it.
+def find_one_sided(signals: "Signals", speed: FloatArray | None) -> Iterator[Fault]:
+    """Yield the signals that never change their sign while the car drives.
 
-    `moving` are the ticks to look at, None for all. Nothing is said of a car whose rear wheels show
-    that it does turn to one side, as on an oval.
+    Nothing is said of a car whose rear wheels show that it does turn to one side, as on an oval.
     """
-    if {"wheel_rl", "wheel_rr"} <= set(signals) and _side(
-        signals["wheel_rr"] - signals["wheel_rl"], moving
-    ):
+    rows = moving(speed)
+    rear = ("wheel_rl", "wheel_rr")
+    if set(rear) <= set(signals) and _side(signals[rear[1]] - signals[rear[0]], rows):
         return
     for name in TURNING:
-        if name in signals and (side := _side(signals[name], moving)):
+        if name in signals and (side := _side(signals[name], rows)):
             never, minutes = ("negative" if side > 0 else "positive"), signals[name].size / 6000
-            yield name, f"it is never {never} in {minutes:.0f} min"
+            figure = f"it is never {never} in {minutes:.0f} min"
+            remedy = 'Where another column has its sign: sign = { column = "..." }.'
+            yield Fault("magnitude", (name,), figure, remedy)
 
 
-def _side(values: FloatArray, moving: BoolArray | None) -> int:
+def _side(values: FloatArray, rows: BoolArray) -> int:
     """Return +1 or -1 for values on one side of zero alone, 0 for others, or too few."""
-    looked_at = np.isfinite(values) if moving is None else np.isfinite(values) & moving
-    present = values[looked_at]
+    present = values[np.isfinite(values) & rows]
     if present.size * float(SAMPLE_TIME_S) < LEAST_S:
         return 0
     low, high = np.quantile(present, [0.001, 0.999])
@@ -330,28 +311,29 @@ def on_every_tick(ticks: NDArray[np.int32], counts: Mapping[str, FloatArray]) ->
 
 def find_suspicions(signals: Signals) -> list[Fault]:
     """Return what looks wrong in the signals of one drive; little data raises few suspicions."""
-    still = list(_still(signals))
-    usual = {name: v for name, v in signals.items() if name not in {s.signals[0] for s in still}}
+    found = list(_still(signals))
+    usual = _without(signals, found)
     speed = speed_mps(usual)
-    remedy = 'Where another column has its sign: sign = { column = "..." }.'
-    magnitudes = {
-        name: Fault("magnitude", (name,), figure, remedy)
-        for name, figure in find_one_sided(usual, None if speed is None else moving(speed))
-    }
+    magnitudes = {one.signals[0]: one for one in find_one_sided(usual, speed)}
     sideslip = magnitudes.pop(catalogue().label, None)
-    usual = {name: values for name, values in usual.items() if name not in magnitudes}
-    found = [*still, *magnitudes.values(), *_turning(usual, speed)]
+    found += magnitudes.values()
+    usual = _without(usual, found)
+    found += _turning(usual, speed)
     label: list[Fault] = []
     if speed is not None:
-        for check in (_scales_differ, _axles_swapped):
-            found += check(usual, speed)
+        found += [*_scales_differ(usual, speed), *_axles_swapped(usual, speed)]
         if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
             label = list(_label(usual, speed))  # which is judged by them
     if sideslip and all(one.kind != "biased" for one in label):  # else it is off to one side
         label = [sideslip]
-    if not any(SPEED in one.signals for one in found) and (fault := course_fault(usual)):
-        label.append(fault)
+    if not any(SPEED in one.signals for one in found):
+        label += itertools.islice(_course(usual), 1)
     return [*found, *label]
+
+
+def _without(signals: Signals, faults: Sequence[Fault]) -> Signals:
+    wrong = {name for one in faults for name in one.signals}
+    return {name: values for name, values in signals.items() if name not in wrong}
 
 
 def speed_mps(signals: Signals) -> FloatArray | None:
