@@ -94,12 +94,6 @@ def test_the_course_is_that_of_the_centre_of_gravity(tmp_path: Path, signals: Co
     assert speed == pytest.approx(np.abs(velocity(time_s()[::FIX])), abs=2e-2)
 
 
-def test_an_antenna_that_is_told_wrongly_is_seen(tmp_path: Path) -> None:
-    course = {**VELOCITIES["course"], "antenna_x_m": 0.0}
-    log = read_columns(tmp_path, on_time(), a_mapping(signals={**VELOCITIES, "course": course}))
-    assert np.abs(course_error(log)).max() > 0.03
-
-
 def test_a_fix_that_the_file_holds_is_one_fix(tmp_path: Path) -> None:
     columns = on_time()
     for name in ("vn", "ve"):
@@ -198,7 +192,8 @@ def test_strangers_call_velocities_otherwise(tmp_path: Path, north: str, east: s
     columns = on_time()
     text = suggested(tmp_path, {east: columns["ve"], north: columns["vn"]})
     course = tomllib.loads(text)["signals"]["course"]
-    assert (course["north"], course["east"]) == (north, east)
+    assert course == {"north": north, "east": east, "unit": "m/s"}
+    assert "antenna_x_m and antenna_y_m: to be filled in" in text
 
 
 @pytest.mark.parametrize(
@@ -212,7 +207,8 @@ def test_strangers_call_velocities_otherwise(tmp_path: Path, north: str, east: s
 def test_strangers_call_a_course_otherwise(tmp_path: Path, course: str, speed: str) -> None:
     columns = on_time()
     found = tomllib.loads(suggested(tmp_path, {course: columns["cog"], speed: columns["sog"]}))
-    assert found["signals"]["course"]["column"] == course
+    expected = {"column": course, "unit": "deg", "clockwise_from_north": True}
+    assert found["signals"]["course"] == expected
     assert found["signals"]["satellite_speed"]["column"] == speed
 
 
@@ -223,40 +219,6 @@ def test_the_unit_of_a_speed_does_not_turn_the_course(tmp_path: Path) -> None:
     text = suggested(tmp_path, {"COG": columns["cog"], "SOG": columns["sog"], **wheels})
     found = tomllib.loads(text)["signals"]
     assert (found["course"]["unit"], found["satellite_speed"]["unit"]) == ("deg", "km/h")
-
-
-@pytest.mark.parametrize(
-    ("names", "expected"),
-    [
-        (("VelNorth", "VelEast"), {"north": "VelNorth", "east": "VelEast", "unit": "m/s"}),
-        (("VelEast", "VelNorth"), {"north": "VelNorth", "east": "VelEast", "unit": "m/s"}),
-        (("COG", "GPS speed"), {"column": "COG", "unit": "deg", "clockwise_from_north": True}),
-    ],
-)
-def test_a_draft_finds_the_course_and_asks_for_the_antenna(
-    tmp_path: Path, names: tuple[str, str], expected: Columns
-) -> None:
-    columns = on_time()
-    first, second = ("cog", "sog") if names[0] == "COG" else ("vn", "ve")
-    if names[0] == "VelEast":
-        first, second = "ve", "vn"
-    file = tmp_path / "log.csv"
-    pl.DataFrame(
-        {
-            "time_s": time_s(),
-            "YawRate_rad_s": columns["r"],
-            f"{names[0]}{'' if names[0] == 'COG' else '_mps'}": columns[first],
-            f"{names[1]}{'_kmh' if names[0] == 'COG' else '_mps'}": columns[second],
-        }
-    ).write_csv(file)
-    written = tmp_path / "draft.toml"
-    call(tmp_path / "root", "mapping", "suggest", str(file), "--output", str(written))
-    text = written.read_text()
-    assert "antenna_x_m and antenna_y_m: to be filled in" in text
-    found = tomllib.loads(text)["signals"]["course"]
-    assert {k: v.removesuffix("_mps") if isinstance(v, str) else v for k, v in found.items()} == (
-        expected
-    )
 
 
 def test_a_course_that_stands_still_while_the_car_turns_is_none(tmp_path: Path) -> None:

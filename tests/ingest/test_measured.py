@@ -56,19 +56,6 @@ def test_the_table_has_the_schema_of_the_logs(tmp_path: Path) -> None:
     assert log.quarantine.num_rows == 0
 
 
-def test_units_sign_and_offset(tmp_path: Path) -> None:
-    signals = {
-        "ay": {"column": "ax", "unit": "g", "negate": True, "offset": 0.1},
-        "wheel_fl": {"column": "w", "unit": "rpm"},
-        "vx": {"column": "v", "unit": "km/h"},
-    }
-    columns = {"t": [0, 0.01], "ax": [0.5, -0.5], "w": [600, 0], "v": [90, -9]}
-    log = read_columns(tmp_path, columns, a_mapping(signals=signals))
-    assert physical(log, "ay", 0.001) == pytest.approx([-0.4 * 9.80665, 0.6 * 9.80665], abs=5e-4)
-    assert physical(log, "wheel_fl", 0.01) == pytest.approx([20 * np.pi, 0], abs=5e-3)
-    assert physical(log, "vx", 0.005) == pytest.approx([25, -2.5])
-
-
 def test_absent_values_stay_null(tmp_path: Path) -> None:
     columns = good_columns(4)
     columns["ax"][1] = None
@@ -132,18 +119,6 @@ def test_a_row_without_any_value_is_quarantined(tmp_path: Path) -> None:
     log = read_text(tmp_path, csv_text(good_columns()) + "0.20,,\n\n0.22,1,1\n")
     assert reasons(log) == [(21, "no_value", None), (22, "missing", "time")]
     assert ticks(log)[-1] == 22
-
-
-def test_a_gap_cuts_a_drive(tmp_path: Path) -> None:
-    columns = good_columns(30)
-    columns["t"] = [f"{i / 100 + 5 * (i // 10):.2f}" for i in range(30)]
-    log = read_columns(tmp_path, columns)
-    first = f"test-{log.digest[:12]}-1"
-    assert log.drives["drive_id"].to_pylist() == [
-        name for name in (first, f"{first}-2", f"{first}-3") for _ in range(10)
-    ]
-    assert ticks(log) == [*range(10)] * 3
-    assert log.counts.drives == 3
 
 
 def test_a_clock_that_restarts_begins_a_drive(tmp_path: Path) -> None:
@@ -245,14 +220,6 @@ def test_polars_does_not_warn_of_a_format_in_its_own_words(
     with pytest.raises(InputError, match="19 time_duplicate"):
         read_columns(tmp_path, columns, mapping)
     assert [one for one in recwarn if "%f" in str(one.message)] == []
-
-
-def test_a_rate_replaces_the_column_of_time(tmp_path: Path) -> None:
-    columns = good_columns()
-    del columns["t"]
-    columns["ax"][3] = "x"
-    log = read_columns(tmp_path, columns, a_mapping(time={"rate_hz": 100}))
-    assert ticks(log) == [i for i in range(20) if i != 3]
 
 
 @pytest.mark.parametrize("rate_hz", [20, 50, 64, 100.4, 250, 1000])
