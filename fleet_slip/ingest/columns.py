@@ -457,13 +457,12 @@ class RowCondition(Config):
 
 def describe(conditions: Sequence[RowCondition]) -> str:
     """Return conditions as a message shows them."""
-    return " and ".join(map(_text, conditions))
-
-
-def _text(condition: RowCondition) -> str:
-    said: dict[str, Any] = condition.model_dump(exclude_defaults=True, exclude={"column", "signal"})
-    parts = [f"{key.replace('_', ' ')} {value}" for key, value in said.items()]
-    return f"{condition.column or condition.signal!r} is {' and '.join(parts)}"
+    texts = []
+    for one in conditions:
+        said = one.model_dump(exclude_defaults=True, exclude={"column", "signal"})
+        parts = [f"{key.replace('_', ' ')} {value}" for key, value in said.items()]
+        texts.append(f"{one.column or one.signal!r} is {' and '.join(parts)}")
+    return " and ".join(texts)
 
 
 def text_conditions(text: str, signals: Collection[str]) -> list[dict[str, Any]]:

@@ -86,7 +86,7 @@ class DriveCutter:
         self._grow(rows)
         alone, waiting, known_at = self._isolated(rows, last=last)
         self._waiting = rows.filter(pl.Series(waiting)) if waiting.any() else None
-        refused = [_refuse(rows, alone, "isolated")]
+        refused = [describe_refused(rows, alone, "isolated")]
         unsettled = alone | waiting
         if unsettled.any():
             rows, known_at = rows.filter(pl.Series(~unsettled)), known_at[~unsettled]
@@ -95,8 +95,8 @@ class DriveCutter:
             time = rows["time"].to_numpy()
             twice, backwards = time == before, time < before
             refused += [
-                _refuse(rows, twice, "time_duplicate"),
-                _refuse(rows, backwards, "time_backwards"),
+                describe_refused(rows, twice, "time_duplicate"),
+                describe_refused(rows, backwards, "time_backwards"),
             ]
             if (disordered := twice | backwards).any():
                 rows = rows.filter(pl.Series(~disordered))
@@ -176,20 +176,18 @@ class DriveCutter:
         return [int(part) for part in self._state["part"] if part >= 0]
 
 
-def sample_interval_s(rows: pl.DataFrame) -> float | None:
-    """Return the usual time between two rows of a drive, the median; None without two rows."""
-    rows = rows if rows["part"].is_sorted() else rows.sort("part", maintain_order=True)
-    step, part = np.diff(rows["time"].to_numpy()), rows["part"].to_numpy()
-    median = pl.Series(step[part[1:] == part[:-1]]).median()
-    return float(median) if isinstance(median, float) else None
-
-
 def sample_intervals_s(rows: pl.DataFrame) -> dict[int, float]:
-    """Return the usual time between two rows of each time base; the only one is number 0."""
-    if "base" not in rows.columns:
-        return {0: sample_interval_s(rows) or STEP_S}
-    bases = rows.partition_by("base", as_dict=True)
-    return {number: sample_interval_s(base) or STEP_S for (number,), base in bases.items()}
+    """Return the median time between two rows of each time base; the only one is number 0."""
+    several = "base" in rows.columns
+    bases = rows.partition_by("base", as_dict=True) if several else {(0,): rows}
+    found = {}
+    for (number,), base in bases.items():
+        if not base["part"].is_sorted():
+            base = base.sort("part", maintain_order=True)  # noqa: PLW2901
+        step_s, part = np.diff(base["time"].to_numpy()), base["part"].to_numpy()
+        median = pl.Series(step_s[part[1:] == part[:-1]]).median()
+        found[number] = median if isinstance(median, float) and median else STEP_S
+    return found
 
 
 def _ends(group: IntArray) -> tuple[IntArray, IntArray]:
@@ -210,10 +208,6 @@ def _latest(
     latest = frame.select(pl.col("time").cum_max().over("stretch"))["time"].to_numpy()
     shifted = np.concatenate([[np.nan], latest[:-1]])
     return latest, np.where(heads, before, shifted)
-
-
-def _refuse(rows: pl.DataFrame, which: BoolArray, reason: str) -> pl.DataFrame:
-    return describe_refused(rows, which, reason) if which.any() else no_rows()
 
 
 MAX_OPEN_ROWS = 20_000_000

@@ -311,7 +311,7 @@ def write_batch(
     failures: list[InputError] = []
     copies = local_copies(asked.file for asked in files)
     with copies as open_copy, ThreadPoolExecutor(WRITERS) as writers:
-        batch = _Batch(warehouse, mapping, files, writers, replace)
+        batch = _Writer(warehouse, mapping, files, writers, replace)
         for asked in files:
             try:
                 with (
@@ -353,8 +353,8 @@ class _Longest:
             self._report.suspicions += tuple(find_suspicions(signals_of(self._drive)))
 
 
-class _Batch:
-    """Files that are written together."""
+class _Writer:
+    """Writes files together."""
 
     def __init__(
         self,

@@ -489,6 +489,8 @@ def _split(batch: pl.DataFrame, fields: list[Field]) -> tuple[pl.DataFrame, pl.D
 
 def describe_refused(rows: pl.DataFrame, which: BoolArray | None, reason: str) -> pl.DataFrame:
     """Return rows as bad ones, because of their time: those of a mask, or all."""
+    if which is not None and not which.any():
+        return no_rows()
     bad = rows if which is None else rows.filter(pl.Series(which))
     return bad.select(
         pl.col("row"),

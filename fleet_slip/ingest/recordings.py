@@ -42,13 +42,14 @@ def tables_of(warehouse: Warehouse) -> dict[TableName, Table]:
 
 def keep_drives(drives: Sequence[MeasuredDrive], audit: Audit) -> list[MeasuredDrive]:
     """Return the drives that were not forgotten under any name, nor their cars."""
-    barred = audit.barred(set(map(car_of, drives)), {drive.drive_id for drive in drives})
+    cars = {drive.drive_id: str(drive.metadata["vehicle_id"]) for drive in drives}
+    barred = audit.barred(set(cars.values()), set(cars))
     counts = audit.barred_counts()
     return [
         drive
         for drive in drives
         if drive.drive_id not in barred.drives
-        and car_of(drive) not in barred.vehicles
+        and cars[drive.drive_id] not in barred.vehicles
         and not (counts and drive.counts_digest in counts)
     ]
 
@@ -58,7 +59,10 @@ def keep_refused(refused: pa.Table, audit: Audit, left_out: Collection[str] = ()
 
     A row goes with its car, or with its drive, whose name begins that of each stretch of it.
     """
-    vehicles, named = names_in(refused, "vehicle_id"), names_in(refused, "drive_id")
+    vehicles, named = (
+        set(refused[column].unique().drop_null().cast(pa.string()).to_pylist())
+        for column in ("vehicle_id", "drive_id")
+    )
     barred = audit.barred(vehicles, named)
     drives = barred.drives | set(left_out)
     whole = {name for name in named if any(drive.startswith(f"{name}-") for drive in drives)}
@@ -68,16 +72,6 @@ def keep_refused(refused: pa.Table, audit: Audit, left_out: Collection[str] = ()
             mine = pc.is_in(refused[column].cast(pa.string()), names)
             refused = refused.filter(pc.invert(pc.fill_null(mine, False)))
     return refused
-
-
-def car_of(drive: MeasuredDrive) -> str:
-    """Return the name of the car of a drive."""
-    return str(drive.metadata["vehicle_id"])
-
-
-def names_in(rows: pa.Table, column: str) -> frozenset[str]:
-    """Return the names that stand in a column of rows."""
-    return frozenset(rows[column].unique().drop_null().cast(pa.string()).to_pylist())
 
 
 # Fingerprints recognise a recording: a digest of a file's bytes, or of a drive's counts. Each is a
@@ -292,7 +286,7 @@ class SameRecordings:
             self._replace == "corrected"
             and not changed
             and replaced <= {origin for origin in origins if not origin.drive}
-            and all(drive.startswith(f"{self._mapping}-{_digest(drive)}") for drive in drives)
+            and {re.sub(MEASURED, "", drive) for drive in drives} <= {self._mapping}
         )
         if drives and not gives_way:
             what = "its recording is in the logs"
@@ -334,11 +328,6 @@ def let_return(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
 def are_gone(warehouse: Warehouse, digest: str) -> bool:
     """Whether drives were forgotten, and none is left of a file that was ingested."""
     return bool(Audit(warehouse.root).entries()) and not _drives_of(warehouse, {Origin.of(digest)})
-
-
-def _digest(drive_id: str) -> str:
-    origin = Origin.of_drive(drive_id)
-    return origin.digest if origin else ""
 
 
 def _replaced(there: Named[str, str], origins: frozenset[Origin], name: str) -> frozenset[Origin]:
