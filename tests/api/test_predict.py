@@ -19,15 +19,9 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
-from fleet_slip.models.manifest import (
-    CrossValidated,
-    Manifest,
-    ModelLabel,
-    ModelTerm,
-    SelectedBy,
-    TrainedOn,
-)
+from fleet_slip.models.manifest import ModelTerm
 from fleet_slip.models.registry import ModelVersion
+from tests.support.manifests import manifest
 
 Column = list[float | None]
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
@@ -35,40 +29,21 @@ WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 
 def model(intercept: float, **coefficients: float) -> ModelVersion:
     """A model that nobody published, of signals and features."""
-    label = catalogue()["sideslip"]
     known = features()
-    manifest = Manifest(
-        name="m",
-        label=ModelLabel(signal="sideslip", column=label.column, unit="rad", scale=label.scale),
-        intercept=intercept,
-        intercept_exact=Fraction(intercept),
-        terms=tuple(
-            ModelTerm(
-                signal=name,
-                column=known.of(name).column,
-                unit=known.of(name).unit,
-                scale=known.of(name).scale,
-                sql=known.features[name].sql if name in known.features else "",
-                coefficient=coefficient,
-                coefficient_exact=Fraction(coefficient),
-            )
-            for name, coefficient in coefficients.items()
-        ),
-        cross_validation=CrossValidated(
-            folds_by="drive",
-            folds=5,
-            correlation=0,
-            correlation_standard_error=0,
-            rmse_deg=0,
-            error_mean_deg=0,
-            error_std_deg=0,
-            condition_number=1,
-        ),
-        trained_on=TrainedOn(cohort="true", drives=1, rows=1, logs_version=0, grams_version=0),
-        selected_by=SelectedBy(model_list="", model="", reason="", config_sha256=""),
-        package_version="0",
+    terms = tuple(
+        ModelTerm(
+            signal=name,
+            column=known.of(name).column,
+            unit=known.of(name).unit,
+            scale=known.of(name).scale,
+            sql=known.features[name].sql if name in known.features else "",
+            coefficient=coefficient,
+            coefficient_exact=Fraction(coefficient),
+        )
+        for name, coefficient in coefficients.items()
     )
-    return ModelVersion(1, manifest, "")
+    own = {"intercept": intercept, "intercept_exact": Fraction(intercept), "terms": terms}
+    return ModelVersion(1, manifest().model_copy(update=own), "")
 
 
 LINEAR = model(0.25, ay=-0.0085, yaw_rate=0.0123, steering_wheel=0.1)

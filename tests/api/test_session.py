@@ -37,14 +37,6 @@ def test_a_closed_session_answers_no_more(fleet: Fleet) -> None:
         session.database.execute("SELECT 1")
 
 
-@pytest.mark.parametrize("ask", ["sql", "table"])
-def test_a_session_reads_and_nothing_else(fleet: Fleet, ask: str) -> None:
-    with fleet.session() as session:
-        for query in ("DROP VIEW log", "COPY (SELECT 1) TO 'x.csv'", "SELECT 1; SELECT 2"):
-            with pytest.raises(QuestionError):
-                getattr(session, ask)(query)
-
-
 def test_an_unlocked_session_does_what_it_is_told(fleet: Fleet, tmp_path: Path) -> None:
     with fleet.unlocked_session() as session:
         session.sql(COUNT).write_csv(str(tmp_path / "out.csv"))
