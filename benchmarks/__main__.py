@@ -33,7 +33,6 @@ COMMANDS = (
     "pipeline",
     "gram_variants",
     "cluster",
-    "reliability",
     "crash --kills 30",
 )
 RECORDS = Path(__file__).with_name("figures") / "bench.jsonl"

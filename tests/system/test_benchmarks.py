@@ -34,7 +34,6 @@ TINY = {
     "pipeline": "--root {root} --campaign smoke --threads 1 --gram-rows 200",
     "quality": "{root}",
     "refit": "{root} true",
-    "reliability": "--writers 2 --commits 2 --bits 2",
     "rivals": "{root} smoke --rows 2000 --rivals regression_8,luenberger --drives nominal",
     "simulator": "--seconds 0.01 --threads 1",
     "simulator_profile": "--campaign smoke",
