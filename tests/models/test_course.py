@@ -58,12 +58,18 @@ def uncalibrated(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
     return made
 
 
-@pytest.fixture
-def fleet(uncalibrated: Fleet, tmp_path: Path) -> Fleet:
-    made = fleet_slip.open(shutil.copytree(str(uncalibrated.root), tmp_path / "data"))
+@pytest.fixture(scope="module")
+def calibrated(uncalibrated: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("calibrated") / "data"
+    made = fleet_slip.open(shutil.copytree(str(uncalibrated.root), folder))
     for name in ("calibration", "delay", "windows"):
         made.gram(name)
-    return made
+    return folder
+
+
+@pytest.fixture
+def fleet(calibrated: Path, tmp_path: Path) -> Fleet:
+    return fleet_slip.open(shutil.copytree(calibrated, tmp_path / "data"))
 
 
 def without_label(fleet: Fleet) -> Manifest:

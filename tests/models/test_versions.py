@@ -1,6 +1,8 @@
 """Model versions and aliases: numbered, immutable, verified, and safe with many writers."""
 
 import json
+import multiprocessing
+from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,22 @@ from fleet_slip.storage.documents import Document, DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import PATIENCE_S
 from tests.support.manifests import manifest, publish
-from tests.support.processes import PROCESSES, call_at_once
+
+PROCESSES = multiprocessing.get_context("forkserver")
+PROCESSES.set_forkserver_preload(["fleet_slip.api.fleet"])  # once, for all that are forked
+
+
+def call_at_once(function: Callable[..., object], arguments: Iterable[tuple[Any, ...]]) -> None:
+    """Call a function with each of the arguments; an `AssertionError` if one fails or hangs."""
+    processes = [PROCESSES.Process(target=function, args=one, daemon=True) for one in arguments]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(PATIENCE_S)
+    codes = [process.exitcode for process in processes]
+    for process in processes:
+        process.kill()
+    assert codes == [0] * len(processes), codes
 
 
 def test_versions_are_consecutive_and_the_latest_published_is_champion(tmp_path: Path) -> None:
