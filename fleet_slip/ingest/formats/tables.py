@@ -155,12 +155,8 @@ def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
         return array
     if pa.types.is_date(kind) or pa.types.is_timestamp(kind):
         return _in_calendar(array)
-    if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind):
-        return pc.cast(array, pa.float64(), safe=False)
-    if pa.types.is_null(kind):
-        return pc.cast(array, pa.float64())
-    _require_readable(kind, name, file)
-    return array
+    _require_readable(kind, name, file)  # then it is a number, or null
+    return pc.cast(array, pa.float64(), safe=False)
 
 
 def _require_readable(kind: pa.DataType, name: str, file: Path) -> None:
