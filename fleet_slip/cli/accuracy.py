@@ -343,7 +343,8 @@ def identify(
     """Identify a car's tyres and inertia from labelled drives, as a vehicle file for filters.
 
     Given what scales and a tape measure say, an extended Kalman filter in the car is fitted to the
-    label. Its error on drives that were left out stands beside it.
+    label. Its error on drives that were left out stands beside it. A steering wheel suffices where
+    no angle of the road wheels is logged.
 
     Example: **fleet-slip identify hatchback --mass 1776 --front-axle 1.19 --rear-axle 1.44**
     """
@@ -372,6 +373,13 @@ def identify(
         f"the extended Kalman filter in it errs by {shown['fit_deg']:.4f} deg on these drives"
         + ("." if held_out is None else f", and by {held_out:.4f} deg on those left out.")
     )
+    if found.at_bounds:
+        say(
+            f"at the bound of what cars are: {', '.join(shown['at_bounds'])}. The drives or their "
+            "label contradict the model there: do not take it for the car's."
+        )
+    if found.not_identifiable:
+        say(f"not identifiable from these drives: {', '.join(shown['not_identifiable'])}.")
     if output is not None:
         say(f"written to {output}: a vehicle file, as in configs/vehicles.")
 

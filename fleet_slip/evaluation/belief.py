@@ -162,11 +162,17 @@ def _filter(
 
 
 def estimate(drive: DriveSignals, car: VehicleParameters, noise: YawRateNoise) -> YawRateEstimate:
-    """Estimate the yaw rate at every row from what was measured up to it; gaps are bridged."""
+    """Estimate the yaw rate at every row from what was measured up to it; gaps are bridged.
+
+    One speed in the place of both wheels tells of no turn but where the car stands still.
+    """
+    axle = undriven_axle(drive, car)
     rolling = drive.ax_mps2 > BRAKING_MPS2
+    if np.array_equal(axle.left_mps, axle.right_mps, equal_nan=True):
+        rolling &= axle.left_mps == 0
     yaw_rate, bias = _filter(
         drive.yaw_rate_rad_s,
-        np.where(rolling, undriven_axle(drive, car).yaw_rate_rad_s, np.nan),
+        np.where(rolling, axle.yaw_rate_rad_s, np.nan),
         noise.gyro_bias_std_rad_s**2,
         noise.gyro_std_rad_s**2,
         noise.wheel_yaw_rate_std_rad_s**2,

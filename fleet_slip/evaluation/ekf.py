@@ -16,6 +16,7 @@ a bend: at first the rear wheels are taken to roll without slip, vy = b r. From 
 tyres would slide there, where their force has no slope that leads back.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -44,6 +45,31 @@ INITIAL_STD = (1.0, 1.0, 0.1)
 """Of vx, vy (m/s) and r (rad/s) at the first row."""
 
 
+class SensorErrors(Config):
+    """How a car's steering and lateral acceleration are off."""
+
+    steer_gain: FiniteFloat = Field(default=1.0, ge=0.5, le=2)
+    """Of the road wheels' angle: what is logged is often the steering wheel's over a ratio."""
+    steer_offset_rad: FiniteFloat = Field(default=0.0, ge=-0.2, le=0.2)
+    """Of the road wheels where the car goes straight on."""
+    ay_gain: FiniteFloat = Field(default=1.0, ge=0.7, le=1.5)
+    """Of what is measured: in a bend the body rolls, which adds g times an angle that grows with
+    the acceleration."""
+    ay_offset_mps2: FiniteFloat = Field(default=0.0, ge=-2, le=2)
+
+    def corrected(self, drive: DriveSignals, car: VehicleParameters) -> DriveSignals:
+        """Return what exact sensors would say; road wheels from the steering wheel if need be."""
+        left, right = drive.steer_fl_rad, drive.steer_fr_rad
+        if not drive.has_road_wheels:
+            left = right = drive.steering_wheel_rad / car.steering.ratio
+        return replace(
+            drive,
+            steer_fl_rad=(left - self.steer_offset_rad) / self.steer_gain,
+            steer_fr_rad=(right - self.steer_offset_rad) / self.steer_gain,
+            ay_mps2=(drive.ay_mps2 - self.ay_offset_mps2) / self.ay_gain,
+        )
+
+
 class EkfNoise(Config):
     """Standard deviations: the paper's initial noise; how far the model errs is judgement."""
 
@@ -61,6 +87,7 @@ class EkfNoise(Config):
     adhesion: FiniteFloat = Field(default=1.0, gt=0)
     """What the filter knows of the road."""
     yaw_rate: YawRateNoise = YawRateNoise()
+    sensors: SensorErrors = SensorErrors()
 
 
 TUNABLE = (
@@ -200,6 +227,7 @@ class Inputs(NamedTuple):
 
 def inputs_of(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Inputs:
     """Return what the filter reads of a drive, gaps bridged. Raises `DataError`."""
+    drive = noise.sensors.corrected(drive, car)
     turning = belief.estimate(drive, car, noise.yaw_rate).yaw_rate_rad_s
     vx_mps = measured_speed_mps(drive, car)
     ax_mps2, ay_mps2 = hold_last(drive.ax_mps2, "ax"), hold_last(drive.ay_mps2, "ay")

@@ -1,18 +1,18 @@
 """Identifies a car from drives with a label, as one does without measurements of its tyres.
 
 Given are what scales and a tape measure say: mass, axles, tracks and the wheels' radius. Fitted are
-yaw inertia, the roll stiffness' share in front, the axles' cornering stiffness and the tyres'
-friction, together with the noise of the extended Kalman filter, which errs least then on the
-drives' labels. As a vehicle file the car serves every filter here.
+yaw inertia, the roll stiffness' share in front, the axles' cornering stiffness, the tyres' friction
+and how steering and lateral accelerometer are off, together with the noise of the extended Kalman
+filter, which errs least then on the drives' labels. As a vehicle file the car serves every filter.
 """
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial, reduce
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
@@ -25,7 +25,12 @@ from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, faults_of
 from fleet_slip.errors import DataError, UsageError
 from fleet_slip.evaluation import ekf
-from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive
+from fleet_slip.evaluation.single_track import (
+    STEP_S,
+    DriveSignals,
+    LabelledDrive,
+    measured_speed_mps,
+)
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters
 
 # Finds the parameters of an estimator that suit training drives best, so that rivals are fair.
@@ -162,86 +167,191 @@ class ParameterSearch(Generic[P]):
         return Tuned(best, lowest, evaluations)
 
     def descend(self, start: P) -> Tuned[P]:
-        """Search by Levenberg's method in the parameters' logarithms.
+        """Search by `descend` in the parameters' logarithms. Raises as `rmse_rad`."""
+        at, evaluations = Coordinates(start, self.names), 0
 
-        Several parameters do nearly the same, such as the stiffness of two axles, so that to change
-        one after the other creeps along a valley; the derivatives of the errors show its direction
-        (Levenberg, "A method for the solution of certain non-linear problems in least squares",
-        Quarterly of Applied Mathematics 2, 1944). A parameter without effect stays, and so does one
-        where its model refuses the next value. Raises as `rmse_rad`.
-        """
-        names, evaluations = self.names, 0
-
-        def errors(parameters: P) -> FloatArray:
+        def errors(x: FloatArray) -> FloatArray:
             nonlocal evaluations
             evaluations += 1
-            estimate = partial(self._estimate, parameters)
+            estimate = partial(self._estimate, at.parameters(x))
             return errors_rad(estimate, self.drives, self.executor, EVERY)
 
-        best, found = start, errors(start)
-        there = finite(found)
-        lowest, damping = float(np.mean(found[there] ** 2)), 1e-3
-        for _ in range(ROUNDS):
-            slopes = np.zeros((len(names), int(there.sum())))
-            for place, name in enumerate(names):
-                for change in (STEP, -STEP):
-                    try:
-                        moved = errors(_scaled(best, name, float(np.exp(change))))
-                    except ValueError:
-                        continue
-                    slopes[place] = (moved[there] - found[there]) / change
-                    break
-            normal, slope = slopes @ slopes.T, slopes @ found[there]
-            gained = False
-            while not gained and damping < 1e4:
-                damped = normal + damping * np.trace(normal) / len(names) * np.eye(len(names))
-                step = np.clip(-np.linalg.solve(damped, slope), -LONGEST, LONGEST)
-                damping *= 4
-                candidate = best
-                for name, change in zip(names, step, strict=True):
-                    with suppress(ValueError):  # beyond what it may be: it stays
-                        candidate = _scaled(candidate, name, float(np.exp(change)))
-                tried = errors(candidate)
-                mean = float(np.mean(tried[there] ** 2))
-                if mean < lowest:
-                    gain, gained = 1 - mean / lowest, True
-                    best, found, lowest, damping = candidate, tried, mean, damping / 16
-            if not gained or gain < LEAST_GAIN:
-                break
+        there = finite(errors(np.zeros(len(self.names))))
+        best = at.parameters(descend(lambda x: errors(x)[there], at).x)
         return Tuned(best, self.rmse_rad(best), evaluations)
+
+
+ADDED = {"steer_offset_rad": 0.02, "ay_offset_mps2": 0.2}
+"""Parameters around zero, and by how much they differ from car to car; others are multiplied."""
+
+
+@dataclass(frozen=True)
+class Coordinates(Generic[P]):
+    """Some parameters as a vector that is 0 at a start: logarithms of factors, or units added."""
+
+    start: P
+    names: Sequence[str]
+
+    def parameters(self, x: FloatArray) -> P:
+        """Return the parameters at a place, within what their models allow."""
+        found = self.start
+        for name, change, limits in zip(self.names, x, self.limits, strict=True):
+            value, unit = _value(found, name), ADDED.get(name.rpartition(".")[2])
+            moved = value * float(np.exp(change)) if unit is None else value + unit * float(change)
+            found = _with(found, name, min(max(moved, limits[0]), limits[1]))
+        return found
+
+    @cached_property
+    def limits(self) -> list[tuple[float, float]]:
+        """The least and the largest value of each."""
+        return [_limits(self.start, name) for name in self.names]
+
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """Least and largest coordinates, shape (2, n)."""
+        return np.array([self.place(limits) for limits in zip(*self.limits, strict=True)])
+
+    def place(self, values: Iterable[float]) -> FloatArray:
+        """Return where some values are."""
+        found = []
+        for name, value in zip(self.names, values, strict=True):
+            start, unit = _value(self.start, name), ADDED.get(name.rpartition(".")[2])
+            if unit is not None:
+                found.append((value - start) / unit)
+            else:
+                found.append(math.log(value / start) if value > 0 else -math.inf)
+        return np.array(found)
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Where a descent ended, the loss there, and the derivatives, shape (parameters, residuals)."""
+
+    x: FloatArray
+    loss: float
+    slopes: FloatArray
+
+
+def descend(
+    residuals: Callable[[FloatArray], FloatArray],
+    at: Coordinates[P],
+    x: FloatArray | None = None,
+    rounds: int = ROUNDS,
+) -> Descent:
+    """Search for the least sum of squares by Levenberg's method, within bounds.
+
+    Several parameters do nearly the same, such as the stiffness of two axles, so that to change
+    one after the other creeps along a valley; the derivatives of the errors show its direction
+    (Levenberg, "A method for the solution of certain non-linear problems in least squares",
+    Quarterly of Applied Mathematics 2, 1944). A parameter without effect stays.
+    """
+    lower, upper = at.bounds
+    x = np.zeros(len(at.names)) if x is None else x
+    found = residuals(x)
+    lowest, damping = float(found @ found), 1e-3
+    slopes = np.zeros((len(x), len(found)))
+    for _ in range(rounds):
+        for place in range(len(x)):
+            change = STEP if x[place] + STEP <= upper[place] else -STEP
+            moved = residuals(x + change * (np.arange(len(x)) == place))
+            slopes[place] = (moved - found) / change
+        slope = slopes @ found
+        stuck = ((x <= lower) & (slope > 0)) | ((x >= upper) & (slope < 0))
+        free = np.where(stuck[:, None], 0.0, slopes)
+        normal, gain = free @ free.T, 0.0
+        while not gain and damping < 1e4:
+            damped = normal + damping * np.trace(normal) / len(x) * np.eye(len(x))
+            step = np.clip(-np.linalg.solve(damped, free @ found), -LONGEST, LONGEST)
+            damping *= 4
+            candidate = np.clip(x + step, lower, upper)
+            tried = residuals(candidate)
+            if (loss := float(tried @ tried)) < lowest:
+                gain = 1 - loss / lowest
+                x, found, lowest, damping = candidate, tried, loss, damping / 16
+        if gain < LEAST_GAIN:
+            break
+    return Descent(x, lowest, slopes)
 
 
 def _neighbours(parameters: P, name: str, factor: float) -> list[P]:
     neighbours = []
     for change in (factor, 1 / factor):
         with suppress(ValueError):
-            neighbours.append(_scaled(parameters, name, change))
+            neighbours.append(_with(parameters, name, _value(parameters, name) * change))
     return neighbours
 
 
-def _scaled(parameters: P, name: str, factor: float) -> P:
-    """Return the parameters with one of them multiplied; a dot leads into a nested model."""
+def _value(parameters: Config, name: str) -> float:
+    """Return a parameter; a dot leads into a nested model."""
+    return float(reduce(getattr, name.split("."), parameters))  # type: ignore[arg-type]
+
+
+def _with(parameters: P, name: str, value: float) -> P:
+    """Return the parameters with another value of one."""
     field, _, inner = name.partition(".")
-    value = getattr(parameters, field)
-    changed = _scaled(value, inner, factor) if inner else value * factor
-    return type(parameters).model_validate({**dict(parameters), field: changed})
+    new = _with(getattr(parameters, field), inner, value) if inner else value
+    return type(parameters).model_validate({**dict(parameters), field: new})
+
+
+def _limits(parameters: Config, name: str) -> tuple[float, float]:
+    """Return between which values a parameter may be."""
+    *outer, field = name.split(".")
+    said = type(reduce(getattr, outer, parameters)).model_fields[field].metadata
+    least = (getattr(one, "ge", getattr(one, "gt", None)) for one in said)
+    largest = (getattr(one, "le", None) for one in said)
+    return (
+        next((one for one in least if one is not None), -math.inf),
+        next((one for one in largest if one is not None), math.inf),
+    )
 
 
 class Fitted(Config):
     """What is estimated from drives, within what cars are, and the noise of the filter."""
 
-    stiffness_front: FiniteFloat = Field(default=1.0, ge=0.4, le=2.5)
+    stiffness_front: FiniteFloat = Field(default=1.0, ge=0.2, le=8)
     """Of the axle, over `STIFFNESS_PER_LOAD`."""
-    stiffness_rear: FiniteFloat = Field(default=1.0, ge=0.4, le=2.5)
-    yaw_inertia: FiniteFloat = Field(default=1.0, ge=0.6, le=1.6)
+    stiffness_rear: FiniteFloat = Field(default=1.0, ge=0.2, le=8)
+    yaw_inertia: FiniteFloat = Field(default=1.0, ge=0.4, le=2)
     """Over the sprung mass times both distances to the axles."""
-    front_roll_share: FiniteFloat = Field(default=0.55, ge=0.3, le=0.8)
-    friction: FiniteFloat = Field(default=1.0, ge=0.6, le=1.5)
+    front_roll_share: FiniteFloat = Field(default=0.55, ge=0.05, le=0.95)
+    friction: FiniteFloat = Field(default=1.0, ge=0.4, le=2.5)
+    steering_ratio: FiniteFloat = Field(default=15.0, ge=5, le=30)
+    """Of the steering wheel to the road wheels, where no angle of these is logged."""
     noise: ekf.EkfNoise = ekf.EkfNoise()
 
 
-CAR = ("stiffness_front", "stiffness_rear", "friction", "front_roll_share", "yaw_inertia")
+SPREAD = {
+    "stiffness_front": 0.5,
+    "stiffness_rear": 0.5,
+    "friction": 0.3,
+    "front_roll_share": 0.3,
+    "yaw_inertia": 0.2,
+    "steering_ratio": 0.2,
+    "noise.sensors.steer_gain": 0.05,
+    "noise.sensors.steer_offset_rad": 1.0,
+}
+"""What is found of a car and its sensors, and by how much that differs from car to car: standard
+deviations of logarithms, or in units of `ADDED`."""
+
 NOISE = tuple(f"noise.{name}" for name in ekf.TUNABLE if not name.startswith("stiffness"))
+NOISE_SPREAD = 2.0
+"""Of the logarithm of a noise: next to nothing is known of it."""
+
+BELIEF_RAD = math.radians(0.04)
+"""RMSE over drives that one standard deviation of what is known before is worth: errors of 0.3° of
+some fifty independent pieces of each drive."""
+
+LARGE_RAD = math.radians(1.0)
+"""Larger errors count by their size, not its square: in a spin nobody's tyre model is right."""
+
+STARTS: tuple[Mapping[str, float], ...] = (
+    {},
+    {"stiffness_front": 2.0, "stiffness_rear": 2.0, "noise.ay_std_mps2": 5.0},
+)
+"""Where a search begins: the tyres' force, or the yaw rate alone, tells of the angle."""
+
+TRIED_ROUNDS = 3
+"""How far each start is followed, before the best of them goes on."""
 
 FOLDS = 4
 
@@ -324,7 +434,7 @@ class Measured(Config):
                 "friction_decay_speed_mps": 60.0,
                 "rolling_resistance": 0.012,
             },
-            "steering": {"ratio": 16.0, "lag_s": 0.05, "limit_rad": 8.7},
+            "steering": {"ratio": fitted.steering_ratio, "lag_s": 0.05, "limit_rad": 8.7},
             "drivetrain": {
                 "front_drive_share": self.front_drive_share,
                 "front_brake_share": 0.7,
@@ -354,6 +464,8 @@ class Identified:
         fit_rad: RMSE on them.
         held_out_rad: RMSE on drives that were left out, in `FOLDS` parts; None for a single drive.
         drives: from how many.
+        at_bounds: which parameters ended at the bound of what they may be.
+        not_identifiable: which of the car and its sensors these drives do not tell.
     """
 
     car: VehicleParameters
@@ -361,6 +473,8 @@ class Identified:
     fit_rad: float
     held_out_rad: float | None = None
     drives: int = 0
+    at_bounds: tuple[str, ...] = ()
+    not_identifiable: tuple[str, ...] = ()
 
     def estimate(self, signals: DriveSignals) -> FloatArray:
         """Return what the filter in the car estimates of a drive."""
@@ -389,7 +503,14 @@ class Identified:
                 "yaw_inertia_kgm2": car.body.yaw_inertia_kgm2,
                 "front_roll_share": car.suspension.front_roll_share,
                 "friction": car.tyre.friction,
+                "steering_ratio": car.steering.ratio,
+                "steer_gain": self.noise.sensors.steer_gain,
+                "steer_offset_deg": math.degrees(self.noise.sensors.steer_offset_rad),
+                "ay_gain": self.noise.sensors.ay_gain,
+                "ay_offset_mps2": self.noise.sensors.ay_offset_mps2,
             },
+            "at_bounds": [name.rpartition(".")[2] for name in self.at_bounds],
+            "not_identifiable": [name.rpartition(".")[2] for name in self.not_identifiable],
             "noise": self.noise.model_dump(mode="json"),
             "fit_deg": math.degrees(self.fit_rad),
             "held_out_deg": None if self.held_out_rad is None else math.degrees(self.held_out_rad),
@@ -404,17 +525,97 @@ class Identified:
         return "\n".join(lines) + "\n"
 
 
+MEAN_ROWS = 32
+"""Accelerations are compared as means over so many rows: at 100 Hz they shake."""
+
+LEAST_LATERAL_MPS2 = 0.3
+"""Standard deviation of the lateral acceleration below which a drive tells no gain."""
+
+
+ACCELEROMETER = ("ay_gain", "ay_offset_mps2")
+
+
+def accelerometer(
+    drives: Sequence[LabelledDrive], car: VehicleParameters
+) -> ekf.SensorErrors | None:
+    """Return gain and offset of ay by the label, ay = gain (v̇y + r vx) + offset; None of no bends.
+
+    With vy = vx tan β this is geometry, in which no tyre has a part. By least squares, every drive
+    with the same weight.
+    """
+    square, product = np.zeros((2, 2)), np.zeros(2)
+    for one in drives:
+        vx = measured_speed_mps(ekf.SensorErrors().corrected(one.signals, car), car)
+        vy = vx * np.tan(one.sideslip_rad)
+        turning, measured = (
+            np.convolve(values, np.full(MEAN_ROWS, 1 / MEAN_ROWS), "valid")
+            for values in (one.signals.yaw_rate_rad_s * vx, one.signals.ay_mps2)
+        )
+        gained = vy[MEAN_ROWS - 1 :] - vy[: len(vy) - MEAN_ROWS + 1]
+        true = turning + gained / (MEAN_ROWS - 1) / STEP_S
+        there = np.isfinite(true + measured)
+        if there.any() and true[there].std() > LEAST_LATERAL_MPS2:
+            columns = np.stack([true[there], np.ones(there.sum())])
+            square += columns @ columns.T / there.sum()
+            product += columns @ measured[there] / there.sum()
+    if not square.any():
+        return None
+    at = Coordinates(ekf.SensorErrors(), ACCELEROMETER)
+    return at.parameters(at.place(np.linalg.solve(square, product)))
+
+
 def identify(measured: Measured, drives: Sequence[LabelledDrive], executor: Executor) -> Identified:
-    """Fit a car and the filter's noise to drives. Raises `DataError` without rows of a label."""
+    """Fit a car, its sensors and the filter's noise to drives. Raises `DataError` without a label.
 
-    def estimate(signals: DriveSignals, _: VehicleParameters, tried: Fitted) -> FloatArray:
-        return ekf.estimate(signals, measured.car(tried), tried.noise)
+    Every drive has the same weight, large errors count less than their squares (pseudo-Huber), and
+    what is known of cars before any drive is a further residual of each parameter: what the drives
+    do not tell stays there.
+    """
+    finite(np.concatenate([one.sideslip_rad for one in drives]))
+    told = [np.isfinite(one.sideslip_rad[::EVERY]) for one in drives]
+    wheels = any(one.signals.has_road_wheels for one in drives)
+    unused = "steering_ratio" if wheels else "noise.sensors.steer_gain"
+    names = [name for name in (*SPREAD, *NOISE) if name != unused]
+    sensors = accelerometer(drives, measured.car(Fitted()))
+    start = Fitted(noise=ekf.EkfNoise(sensors=sensors or ekf.SensorErrors()))
+    at = Coordinates(start, names)
+    spread = np.array([SPREAD.get(name, NOISE_SPREAD) for name in names])
 
-    start = Fitted()
-    car = measured.car(start)
-    found = ParameterSearch(estimate, (*CAR, *NOISE), drives, car, executor).descend(start)
-    car = measured.car(found.parameters)
-    return Identified(car, found.parameters.noise, found.rmse_rad, drives=len(drives))
+    def estimate(tried: Fitted, drive: LabelledDrive) -> FloatArray:
+        return ekf.estimate(drive.signals, measured.car(tried), tried.noise)
+
+    def residuals(x: FloatArray) -> FloatArray:
+        estimates = executor.map(partial(estimate, at.parameters(x)), drives)
+        parts = [BELIEF_RAD * x / spread]
+        for found, one, there in zip(estimates, drives, told, strict=True):
+            error = np.nan_to_num((found - one.sideslip_rad)[::EVERY][there], nan=LARGE_RAD)
+            size = LARGE_RAD * np.sqrt(2 * (np.hypot(1, error / LARGE_RAD) - 1))
+            parts.append(np.copysign(size, error) / math.sqrt(max(len(error), 1)))
+        return np.concatenate(parts)
+
+    begins = [at.place([one.get(n, _value(start, n)) for n in names]) for one in STARTS]
+    tried = [descend(residuals, at, begin, TRIED_ROUNDS) for begin in begins]
+    found = descend(residuals, at, min(tried, key=lambda one: one.loss).x)
+    fitted = at.parameters(found.x)
+    estimates = partial(estimate, fitted)
+    inverse = np.linalg.inv(found.slopes @ found.slopes.T)
+    known = np.sqrt(np.diag(inverse)) * BELIEF_RAD / spread
+    ended = np.flatnonzero(np.isclose(found.x, at.bounds, atol=1e-6).any(axis=0))
+    return Identified(
+        measured.car(fitted),
+        fitted.noise,
+        rmse_rad(estimates, drives, executor),
+        drives=len(drives),
+        at_bounds=tuple(names[place] for place in ended),
+        not_identifiable=(
+            *(n for n, left in zip(names, known, strict=True) if n in SPREAD and left > UNKNOWN),
+            *(() if sensors else (f"noise.sensors.{name}" for name in ACCELEROMETER)),
+        ),
+    )
+
+
+UNKNOWN = 0.9
+"""Standard deviation of a parameter over that before any drive, above which drives tell nothing."""
 
 
 def identify_held_out(

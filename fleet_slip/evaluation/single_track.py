@@ -45,10 +45,16 @@ class DriveSignals:
     steer_fr_rad: FloatArray
     gps_vx_mps: FloatArray
     gps_vy_mps: FloatArray
+    steering_wheel_rad: FloatArray
 
     def __len__(self) -> int:
         """Return the number of rows."""
         return len(self.ax_mps2)
+
+    @property
+    def has_road_wheels(self) -> bool:
+        """Whether the angle of any front wheel is logged."""
+        return bool(np.isfinite([self.steer_fl_rad, self.steer_fr_rad]).any())
 
 
 @dataclass(frozen=True)

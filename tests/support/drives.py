@@ -46,6 +46,7 @@ def rolling_drive(
         steer_fr_rad=steer_rad,
         gps_vx_mps=vx_mps + fix,
         gps_vy_mps=vy_mps + fix,
+        steering_wheel_rad=car.steering.ratio * steer_rad,
     )
 
 
@@ -78,6 +79,7 @@ def noisy(drive: DriveSignals, seed: int) -> DriveSignals:
         steer_fr_rad=measured(drive.steer_fr_rad, 0, 0.0002),
         gps_vx_mps=measured(drive.gps_vx_mps, 0, 0.05),
         gps_vy_mps=measured(drive.gps_vy_mps, 0, 0.05),
+        steering_wheel_rad=measured(drive.steering_wheel_rad, 0, 0.003),
     )
 
 
@@ -94,6 +96,7 @@ def mirrored(drive: DriveSignals) -> DriveSignals:
         steer_fl_rad=-drive.steer_fr_rad,
         steer_fr_rad=-drive.steer_fl_rad,
         gps_vy_mps=-drive.gps_vy_mps,
+        steering_wheel_rad=-drive.steering_wheel_rad,
     )
 
 

@@ -32,7 +32,7 @@ from tests.support.measured import csv_text
 from tests.support.own_logs import ingest_own
 
 ROWS = 400
-NO_SIGNALS = DriveSignals(*[np.full(ROWS, np.nan)] * 11)
+NO_SIGNALS = DriveSignals(*[np.full(ROWS, np.nan)] * 12)
 
 
 def a_drive(number: int, *, trip: str | None = None, speed_mps: float = 10.0) -> HeldOutDrive:

@@ -50,6 +50,50 @@ def test_an_identified_car_estimates_better_than_one_with_usual_tyres(
     assert found.held_out_rad is None
 
 
+def test_of_a_car_that_logs_a_steering_wheel_ratio_offset_and_roll_are_found(
+    drive: LabelledDrive, executor: Executor
+) -> None:
+    exact, missing = drive.signals, np.full(len(drive.signals), np.nan)
+    road = (exact.steer_fl_rad + exact.steer_fr_rad) / 2
+    plain = identify(MEASURED, [drive], executor)
+    bias = plain.noise.sensors
+    signals = replace(
+        exact,
+        steer_fl_rad=missing,
+        steer_fr_rad=missing,
+        steering_wheel_rad=18 * (road + 0.01),
+        ay_mps2=1.08 * exact.ay_mps2 + 0.2,
+    )
+    found = identify(MEASURED, [replace(drive, signals=signals)], executor)
+    assert found.car.steering.ratio == pytest.approx(18, rel=0.05)
+    sensors = found.noise.sensors
+    assert sensors.steer_offset_rad - bias.steer_offset_rad == pytest.approx(0.01, abs=0.001)
+    assert sensors.ay_gain / bias.ay_gain == pytest.approx(1.08, rel=0.001)
+    expected = 0.2 + 1.08 * bias.ay_offset_mps2
+    assert sensors.ay_offset_mps2 == pytest.approx(expected, abs=0.001)
+    assert found.fit_rad < 1.2 * plain.fit_rad
+    assert "steer_gain" not in {*found.at_bounds, *found.not_identifiable}
+
+
+def test_a_parameter_at_its_bound_and_one_that_drives_do_not_tell_are_said(
+    drive: LabelledDrive, executor: Executor
+) -> None:
+    found = identify(MEASURED, [drive], executor)
+    assert not found.at_bounds
+    assert {"friction", "yaw_inertia"} <= {*found.not_identifiable}, "nobody slides"
+    shaken = replace(drive, sideslip_rad=-8 * drive.sideslip_rad)  # no tyre does that
+    wrong = identify(MEASURED, [shaken], executor)
+    assert wrong.at_bounds
+    assert wrong.as_dict()["at_bounds"]
+
+
+def test_one_speed_in_the_place_of_all_wheels_tells_of_no_turn(drive: LabelledDrive) -> None:
+    speed = (drive.signals.wheel_rl_rad_s + drive.signals.wheel_rr_rad_s) / 2
+    one = replace(drive.signals, wheel_rl_rad_s=speed, wheel_rr_rad_s=speed)
+    two = rmse_deg(ekf.estimate(drive.signals, CAR, ekf.EkfNoise()), drive)
+    assert rmse_deg(ekf.estimate(one, CAR, ekf.EkfNoise()), drive) < 2 * two
+
+
 def test_what_was_left_out_is_measured_without_it(drive: LabelledDrive, executor: Executor) -> None:
     wrong = replace(drive, drive_id="wrong", sideslip_rad=drive.sideslip_rad + np.radians(1))
     found = identify_held_out(MEASURED, [drive, wrong], executor)
