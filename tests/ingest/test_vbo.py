@@ -1,5 +1,6 @@
 """VBO files of Racelogic: their clock, their units, and what may be wrong with them."""
 
+import math
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -8,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.formats.reading import FileFormats, open_source
-from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.mapping import Mapping, load_mapping
 from tests.support.measured import DRIVE, failure, physical, read_measured, reasons
 from tests.support.reported import call
 
@@ -165,6 +167,21 @@ def test_a_mapping_that_reads_it_as_csv_still_does(tmp_path: Path) -> None:
     rows, also = (read_measured(tmp_path / "a.vbo", one) for one in (mapping(), as_csv))
     for name in ("tick", "ay", "yaw_rate", "vehicle_speed"):
         assert rows.drives[name].to_pylist() == also.drives[name].to_pylist()
+
+
+def test_the_mapping_of_the_page_is_one(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
+    toml = page.partition("## VBO")[2].partition("```toml")[2].partition("```")[0]
+    (tmp_path / "page.toml").write_text(
+        f'name = "page"\n{toml}[drive]\nvehicle_id = "A"\nvehicle_model = "m"\n'
+    )
+    write(tmp_path / "a.vbo", head=HEAD.replace("knots", "kmh").replace(" Yaw\n", " YawRate\n"))
+    log = read_measured(tmp_path / "a.vbo", load_mapping(str(tmp_path / "page.toml")))
+    assert log.counts.rows_kept == ROWS
+    # Values that stay are those of one fix, which stands in its first row.
+    assert physical(log, "satellite_speed", 0.005)[0] == pytest.approx(40 / 3.6, abs=0.003)
+    course = physical(log, "course", float(catalogue()["course"].scale))[0]
+    assert math.sin(course - math.radians(90 - 93.5)) == pytest.approx(0, abs=2e-4)
 
 
 def test_rows_may_be_chosen_by_the_time_and_the_satellites(tmp_path: Path) -> None:
