@@ -40,7 +40,6 @@ TINY = {
     "soak": "--minutes 0.1",
     "start": "--rounds 1",
     "statistics_figures": "{root} smoke --output {folder}",
-    "suggest": "",
     "validation": "",
 }
 """What makes each small. `{root}` is a data root, see `tiny_root`."""
