@@ -14,6 +14,7 @@ from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import (
     CLUSTER,
     DEFAULT_MODELS,
+    DEFAULT_MOST,
     WHOLE_SET,
     SelectionRequest,
     inputs_of,
@@ -78,7 +79,8 @@ class FleetCohort(Rooted):
         """Compare models by cross-validation and choose one; `Fleet.publish` takes the answer.
 
         Drives that are not in order are left out: see `examine`, and `examined` of the answer. Gram
-        rows that the usual list needs are made, if they are not there and that takes seconds.
+        rows that the usual list needs are made, where they are missing, the drives are enough for
+        its columns, and that takes seconds.
         Raises what `examine` raises, `UsageError` for options that do not go together or an invalid
         list, and `DataError` if no model can be fitted.
         """
@@ -87,7 +89,7 @@ class FleetCohort(Rooted):
         examined = self.examine()
         with examined.explaining():
             answer = answer_request(self.warehouse, request, examined.cohort)
-            if answer.remark and self._make_usual(examined.cohort):
+            if answer.remark and self._make_usual(examined.cohort, answer.cohort.drive_count):
                 answer = answer_request(self.warehouse, request, examined.cohort)
         return replace(answer, examined=str(examined))
 
@@ -178,16 +180,22 @@ class FleetCohort(Rooted):
         with open_workers(self.root, threads) as executor:
             return identify_held_out(car, chosen.read(), executor)
 
-    def _make_usual(self, cohort: str) -> bool:
-        """Make the Gram rows of the usual list, if that takes seconds; return whether it did."""
+    def _make_usual(self, cohort: str, drives: int) -> bool:
+        """Make the Gram rows of the usual list, if that takes seconds; return whether it did.
+
+        Not for fewer drives than a champion of so many columns needs.
+        """
         from importlib.util import find_spec
 
         from fleet_slip.grams.gram_files import find_backlog
         from fleet_slip.grams.job import update_grams
         from fleet_slip.grams.reader import cohort_files
+        from fleet_slip.models.acceptance import floor
         from fleet_slip.warehouse.condition import parse_cohort
         from fleet_slip.warehouse.tables import gram_snapshots
 
+        if drives * floor().max_columns_per_drive < DEFAULT_MOST:
+            return False
         name = load_model_list(DEFAULT_MODELS).features
         grams, logs = gram_snapshots(self.warehouse)
         files = cohort_files(self.warehouse, parse_cohort(cohort))

@@ -111,10 +111,10 @@ def test_publishing_computes_the_columns_of_the_usual_list(
     shutil.rmtree(tmp_path / "data/grams")
     shutil.rmtree(tmp_path / "data/models")
     fleet.gram()
-    made = call(tmp_path / "data", "publish", "m", "--cohort", "day = '2024-05-01'")
+    made = call(tmp_path / "data", "publish", "m")
     chosen = fleet.model("m").manifest
     assert (made["new"], chosen.selected_by.model_list) == (True, "estimator")
-    by_hand = fleet.cohort("day = '2024-05-01'").select()
+    by_hand = fleet.cohort().select()
     assert fleet.publish("m", by_hand).reason == "The champion is this very model."
 
 
