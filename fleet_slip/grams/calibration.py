@@ -23,7 +23,7 @@ from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, CAR_NUMBERS, Num
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.car_estimates import KINDS, kinds_by_set
+from fleet_slip.grams.car_estimates import KINDS, LACKING, kinds_by_set
 from fleet_slip.grams.car_evidence import (
     FEWEST_CARS,
     CalibratedNumber,
@@ -254,7 +254,7 @@ def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
 
     With those of the sets that satellites determine more by, as far as there are any.
     """
-    sums = collect_sums(opened.batches(condition), KINDS)
+    sums = collect_sums(opened.batches(condition), KINDS, lacking=LACKING)
     known = features()
     for name, kinds in kinds_by_set().items():
         if name in known.sets:

@@ -24,7 +24,7 @@ from fleet_slip.catalogue.course import (
     turned_scale,
 )
 from fleet_slip.catalogue.facts import BY_COURSE, BY_SATELLITE, NumberName
-from fleet_slip.catalogue.features import input_scales
+from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms, solve
@@ -37,8 +37,8 @@ EVEN = (
 )
 ALIKE = "its rows are too much alike to separate one number from another"
 NO_TYRE = (
-    "what its sensors say of speed fits no tyre: noise made it, or a signal is of another unit or "
-    "sign. See: fleet-slip quality"
+    "ay is too noisy, or rolls too much, for how it drove: its speed comes out as that of no tyre. "
+    "Or a signal is of another unit or sign. See: fleet-slip quality"
 )
 TIGHT_BENDS = (
     "bends are so tight that a bank is not in proportion to them: satellite speed determines it"
@@ -157,12 +157,17 @@ STEERING = Relation(
 """The steering by 1, curvature without the gyroscope's offset, and ay."""
 
 WHEEL_SPEEDS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
+STANDSTILL = "standstill"
+"""The kind of sums over rows below 3 m/s."""
 _COURSE = ("yaw_rate", "ay", *WHEEL_SPEEDS, "curvature", "course_rate", "slowness")
 KINDS: Mapping[str, tuple[str, ...]] = {
     "course": _COURSE,
     "steering": (*_COURSE, "steer_fl", "steer_fr"),
+    STANDSTILL: ("yaw_rate", *WHEEL_SPEEDS),
 }
 """The columns of each kind of sums."""
+LACKING = {STANDSTILL: "slowness"}
+"""Column whose rows are not of a kind."""
 
 
 def _si(**weights: int) -> dict[str, Fraction]:
@@ -317,6 +322,38 @@ def _estimate_steering(
     }
 
 
+# What a car determines that stands still: the bias of its gyroscope, by itself.
+#
+# Rows below 3 m/s have no quotients by speed, and a Gram row of their own. What the wheels turn by
+# in them is taken off.
+
+LONGEST_ROLL_MPS, FEWEST_STILL = Fraction(1, 2), 1000
+"""Mean speed of slow rows that are mostly at standstill, and how many they are at least."""
+STILL = Relation(
+    instruments=(ONE, "wheels"),
+    left=(((ONE, ONE), ("wheels", ONE)), (("wheels", ONE), ("wheels", "wheels"))),
+    right=(("yaw_rate", ONE), ("yaw_rate", "wheels")),
+    noise={},
+)
+"""The yaw rate by 1 and the wheels' differences: b, and one over the tracks. Least squares."""
+
+
+def add_standstill(sums: Mapping[str, Gram], estimates: CarEstimates) -> None:
+    """Add the bias of the gyroscope of a car that stood still, in place of what driving tells.
+
+    Also in place of the course: of a car that turns to one side alone that has a part of its scale.
+    """
+    gram = sums.get(STANDSTILL)
+    if gram is None or gram.n < FEWEST_STILL:
+        return
+    terms = {name: course_terms()[name] for name in ("yaw_rate", "speed", "wheels")}
+    still = ExactSums(gram, terms)
+    solution = solve(STILL.system(still, 0))
+    if solution is not None and still.mean("speed") < LONGEST_ROLL_MPS:
+        of = (STANDSTILL, STILL, terms, Fraction(0))
+        estimates.numbers["yaw_rate_offset"] = CarEstimate(*of, solution[0], (1.0, 0.0), {})
+
+
 # What a satellite receiver determines of a car beyond its own sensors: its speed, and how it slips.
 #
 # The satellite's speed over that of the wheels is the speed ratio, whatever a body that rolls or a
@@ -331,11 +368,12 @@ SLIP = "slip"
 """The kind of sums that determines how a car slips: changes over some seconds."""
 
 LASTING_BY_SATELLITE: Mapping[str, Mapping[NumberName, float]] = {
+    STANDSTILL: {"yaw_rate_offset": 0.0003},
     SATELLITE: {"speed_ratio": 0.0012},
-    SLIP: {"slip_lever": 0.1, "slip_compliance": 0.0003},
+    SLIP: {"yaw_rate_offset": 0.0001, "slip_lever": 0.1, "slip_compliance": 0.0003},
 }
-"""Standard errors that no drive takes away, by kind: tyres slip and wear; a receiver of which we
-know to 5 ms how late it is moves l by the way of that time."""
+"""Standard errors that no drive takes away, by kind: a gyroscope warms up; tyres slip and wear; a
+receiver of which we know to 5 ms how late it is moves l by the way of that time."""
 
 NO_RECEIVER = (
     "no course by satellite: none is logged, or its Gram rows are missing (fleet-slip gram "
@@ -403,7 +441,11 @@ def _slip(gram: Gram | None) -> dict[NumberName, CarEstimate] | str:
     if solution is None or not LEVERS_M[0] <= solution[1] <= LEVERS_M[1]:
         return NO_CAR
     of_plane = (SLIP, CHANGE, terms, Fraction(0))
+    # Over so much time the heading changes by the bias too much, and the label by as little.
+    by_bias = -1 / Fraction(features().feature_set(BY_COURSE).change_s[0])
+    bias, of_bias = by_bias * solution[0], (float(by_bias), 0.0, 0.0, 0.0)
     return {
+        "yaw_rate_offset": CarEstimate(*of_plane, bias, of_bias, {}),
         "slip_lever": CarEstimate(*of_plane, solution[1], (0.0, 1.0, 0.0, 0.0), {}),
         "slip_compliance": CarEstimate(*of_plane, solution[2], (0.0, 0.0, 1.0, 0.0), {}),
     }

@@ -21,6 +21,7 @@ from fleet_slip.grams.car_estimates import (
     CarEstimate,
     CarEstimates,
     add_satellite_estimates,
+    add_standstill,
     bank_of_bends,
     course_terms,
     estimate_numbers,
@@ -229,6 +230,7 @@ class CarEvidence:
         totals = self._totals(slices)
         estimates = estimate_numbers(totals, self._banked)
         add_satellite_estimates(totals, estimates)
+        add_standstill(totals, estimates)
         return estimates
 
     def influence(self, estimate: CarEstimate, at: slice) -> Influence | None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from functools import partial
+from types import MappingProxyType
 from typing import Any, Self
 
 import duckdb
@@ -245,11 +246,13 @@ def collect_sums(
     batches: Iterable[pa.RecordBatch],
     kinds: Mapping[str, tuple[str, ...]],
     *,
+    lacking: Mapping[str, str] = MappingProxyType({}),
     unnamed: bool = False,
 ) -> dict[str, DriveSums]:
     """Return the sums of the columns of each kind over every drive that says whose it is.
 
-    With `unnamed` also over those that do not, as of a car without a name.
+    Rows that have the column that a kind is `lacking` are left out of it. With `unnamed` also over
+    drives that do not say it, as of a car without a name.
     """
     parts: dict[str, list[GramTable]] = defaultdict(list)
     drives: dict[str, list[Drive]] = defaultdict(list)
@@ -262,7 +265,8 @@ def collect_sums(
             cars, days, names_of = (rows[key].to_pylist() for key in _KEY)
             of = list(zip(map(str, cars), days, names_of, strict=True))
             for kind, columns in kinds.items():
-                if set(columns) <= set(names.split(",")):
+                there = set(names.split(","))
+                if set(columns) <= there and lacking.get(kind) not in there:
                     parts[kind].append(table.restrict(columns))
                     drives[kind] += of
     return {kind: _sorted(some, drives[kind]) for kind, some in parts.items()}

@@ -21,6 +21,7 @@ from fleet_slip.grams.car_estimates import (
     EVEN,
     FLAT,
     KINDS,
+    LACKING,
     NO_COURSE,
     NO_RECEIVER,
     NO_TYRE,
@@ -83,7 +84,7 @@ def gram_row(car: str, number: int, counts: dict[str, Any]) -> dict[str, Any]:
 
 def evidence(rows: list[dict[str, Any]], size: int = 7) -> CarEvidence:
     batches = [pa.RecordBatch.from_pylist(rows[i : i + size]) for i in range(0, len(rows), size)]
-    return CarEvidence(collect_sums(batches, KINDS))
+    return CarEvidence(collect_sums(batches, KINDS, lacking=LACKING))
 
 
 @pytest.fixture(scope="module")
@@ -398,3 +399,31 @@ def test_a_warehouse_says_what_is_missing_and_forgets(warehouse: Warehouse) -> N
     for car, value, count, grain in rows:
         assert value == after.cars[car]["ay_offset"].value
         assert abs(value - count * grain) <= grain / 2
+
+
+def test_a_car_that_stood_still_tells_the_bias_of_its_gyroscope() -> None:
+    """Of drives that are too straight to tell anything else; slow turns do not count as bias."""
+    rng = np.random.default_rng(8)
+    columns = ("yaw_rate", "wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
+    rows = []
+    for number in range(3):
+        straight = cars.drive(rng, 2.0)
+        straight["yaw_rate"], straight["ay"] = 0.01 * rng.standard_normal((2, cars.TICKS))
+        rows.append(gram_row("car", number, cars.counts(straight)))
+        rolled = np.arange(4000) < 300  # of rows below 3 m/s
+        turn = 0.4 * rolled * rng.choice([1.0, 0.6, -0.2], 4000)
+        track = 1.55 * turn / 0.31 / 2
+        slow = {"yaw_rate": np.rint((0.0123 + turn + 0.002 * rng.standard_normal(4000)) / 1e-4)}
+        for corner in ("fl", "fr", "rl", "rr"):
+            side = 1 if corner.endswith("r") else -1
+            slow[f"wheel_{corner}"] = np.rint((5.0 * rolled + side * track) / 0.01)
+        counts = np.stack([slow[name].astype(np.int64) for name in columns], axis=1)
+        gram = Gram.from_counts(columns, counts)
+        sums = {"n": gram.n, "sums": list(gram.sums), "products": list(gram.products)}
+        rows.append({**rows[-1], "signals": ",".join(columns), **sums})
+    found = evidence(rows)
+    assert set(found.refusals("car")) >= {"ay_offset", "steering_offset"}
+    one = found.calibrated("car")["yaw_rate_offset"]
+    assert one.value == pytest.approx(0.0123, abs=2e-4)
+    assert one.uncertainty is not None and 0.0003 <= one.uncertainty < 0.001
+    assert (one.drives, one.rows) == (3, 12000)

@@ -90,6 +90,9 @@ def test_the_course_tells_how_a_car_slips(told: CarEvidence) -> None:
     found = told.calibrated("car")
     assert found["slip_lever"].value == pytest.approx(LEVER_M, abs=0.01)
     assert found["slip_compliance"].value == pytest.approx(COMPLIANCE, abs=1e-4)
+    bias = found["yaw_rate_offset"]  # over 4 s the heading gains that much, and the label lacks it
+    assert bias.value == pytest.approx(-BIAS_RAD / 4, abs=3e-5)
+    assert bias.uncertainty is not None and 1e-4 <= bias.uncertainty < 2e-4
 
 
 @pytest.mark.parametrize("times", [0, 5])
