@@ -85,7 +85,7 @@ def evaluate_measured(
     car = car or class_car(cohort.drives["vehicle_model"][0].as_py(), None)
     competition = Competition.of(warehouse, versions, condition, drives, car, executor)
     parts, kinds = parts_to_leave_out(drives), kinds_to_leave_out(drives)
-    whole = len(parts[0]) != len(drives)
+    whole = len({quarter for _, quarter in parts[0]}) > 1
     judged = competition.judge_without(parts)
     of_kinds = judge(competition.judge_without([*kinds.values()])) if kinds else {}
     figures = {name: one for name, one in judge(judged).items() if one.rmse_deg is not None}
