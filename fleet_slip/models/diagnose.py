@@ -74,7 +74,7 @@ class Diagnosis(Answer):
         inflation: variance inflation of each input.
         condition_number: of the inputs' correlation matrix.
         evidence: effective rows and design effect.
-        influential: the cars that `robust` would leave out of a selection, by name.
+        influential: the cars whose influence no honest car has, by name.
     """
 
     DOCUMENT = (
@@ -129,7 +129,7 @@ class Diagnosis(Answer):
                 "there is one drive only: its rows are taken for independent evidence, which they "
                 "are not at 100 Hz, so that the standard errors are far too small."
             )
-        yield from influence_remarks(self.influential, "would be left out by select --robust")
+        yield from influence_remarks(self.influential)
         if self.comparison is not None:
             yield from self.comparison.parts(self.robust, self.cluster)
 

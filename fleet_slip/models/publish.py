@@ -180,7 +180,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
             drives=winner.drives + unlabelled,
             vehicles=selection.cohort.count_vehicles_with(wanted),
             drives_without_log=selection.cohort.count_received_with(wanted) or None,
-            rows=winner.pooled.rows + changes,
+            rows=selection.trained_rows + changes,
             logs_version=selection.cohort.logs_version,
             grams_version=selection.cohort.grams_version,
             drives_sha256=checksum_of_drives(drives),

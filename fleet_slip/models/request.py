@@ -131,8 +131,8 @@ class SelectionRequest:
     robust: Annotated[
         bool,
         Doc(
-            "Leave out the cars whose influence on the model no honest car of their rows has, and "
-            "say which; diagnose says it before."
+            "Let drives whose error is more than three times that of the median drive count less, "
+            "and say which; diagnose says which cars have unusual influence."
         ),
     ] = False
     naive: Annotated[bool, NAIVE] = False

@@ -1,7 +1,7 @@
 """Compares candidate models on a cohort by cross-validation and chooses one; no log row is read."""
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
@@ -19,7 +19,6 @@ from fleet_slip.errors import ConfigError, DataError, NotComputedError, Question
 from fleet_slip.grams.cohort import (
     Cohort,
     Served,
-    clustered_moments,
     drive_folds,
     load_cohort,
     load_mixed_labels,
@@ -27,6 +26,7 @@ from fleet_slip.grams.cohort import (
 from fleet_slip.grams.folding import PARTS, ROW_FOLDS, Folding, make_folding
 from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.reader import open_grams
+from fleet_slip.grams.weights import FULL, Weighed, robust_weights, weighted
 from fleet_slip.models.request import (
     BOTH,
     COURSE,
@@ -79,8 +79,6 @@ from fleet_slip.regression.gram import GramTable, packed_position
 from fleet_slip.regression.orders import METHODS
 from fleet_slip.rendering import Answer, Part
 from fleet_slip.resources import find_config
-from fleet_slip.warehouse.condition import Condition, parse_condition
-from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.tables import Warehouse
 
 SEED = 1
@@ -116,15 +114,6 @@ def influential_cars(served: Served, moments: DriveMoments) -> dict[str, Influen
     names, cars = np.unique(owners, return_inverse=True)
     found = find_influential(moments, cars.astype(np.int64))
     return {str(names[one.car]): one for one in found if names[one.car]}
-
-
-def without_vehicles(condition: Condition, vehicles: Collection[str]) -> Condition:
-    """Return a condition without some cars."""
-    if not vehicles:
-        return condition
-    quoted = ", ".join(map(sql_text, sorted(vehicles)))
-    others = f"(vehicle_id IS NULL OR vehicle_id NOT IN ({quoted}))"
-    return parse_condition(f"{condition.sql} AND {others}")
 
 
 def label_noise_deg(warehouse: Warehouse, cohort: Cohort) -> float | None:
@@ -257,7 +246,7 @@ class Selection(Answer):
         distances: of an order's nested models from the full and the true one, or why not told.
         intercept: whether models have one; without it they go through the origin.
         model_list, config_sha256: what was compared, such as `table1`, and its checksum.
-        left_out: the cars that `robust` left out, and what influence they had.
+        weighed: the drives that `robust` counts less than others, the most unusual first.
         without_label: how good the winner is, if changes of the course alone trained it.
         label_noise_deg: of the label, which every error has in it; None where it is not known.
         request, asked: what was asked for, and of which drives.
@@ -277,7 +266,7 @@ class Selection(Answer):
     intercept: bool = True
     model_list: str = ""
     config_sha256: str = ""
-    left_out: Mapping[str, Influential] = field(default_factory=dict)
+    weighed: Mapping[str, Weighed] = field(default_factory=dict)
     without_label: WithoutLabel | None = None
     label_noise_deg: float | None = None
     request: SelectionRequest = field(default_factory=SelectionRequest)
@@ -321,7 +310,12 @@ class Selection(Answer):
     @property
     def rows_without(self) -> int:
         """Rows of the cohort that tell nothing of the winner: the label or a column is missing."""
-        return max(self.cohort.rows - self.winner.model.pooled.rows, 0)
+        return max(self.cohort.rows - self.trained_rows, 0)
+
+    @property
+    def trained_rows(self) -> int:
+        """Rows that the winner was trained on; of drives that count less, so much of them."""
+        return self.winner.model.pooled.rows // (FULL if self.weighed else 1)
 
     @property
     def beyond_label_noise_deg(self) -> float | None:
@@ -354,7 +348,7 @@ class Selection(Answer):
                 "leaking": self.folds.by == ROW_FOLDS,
             },
             "skipped": self.skipped,
-            "vehicles_left_out": {car: one.times for car, one in self.left_out.items()},
+            "drives_weighed": document_of(self.weighed),
             "label_noise_deg": self.label_noise_deg,
         }
         for model, shortfall in zip(document["models"], self.winner.shortfalls, strict=False):
@@ -517,17 +511,18 @@ class SelectionPlan:
 def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> Selection:
     asked = SelectionPlan.of(request)
     request, folds = asked.request, asked.folds
-    if request.robust and request.label != BOTH:
-        return _answer_without(warehouse, asked, condition)
     if request.label == BOTH:
         return asked.choose(asked.load(warehouse, condition))
     distances = bool(
         request.nested and not request.ordered and not _searches_of(request, asked.model_list)
     )
-    if not (request.ordered or request.bootstrap or distances):  # the sum of each fold suffices
+    of_drives = request.ordered or request.bootstrap or request.robust
+    if not (of_drives or distances):  # the sum of each fold suffices
         return asked.choose(load_cohort(warehouse, condition, asked.feature_set, folds))
-    cohort = asked.load(warehouse, condition)
-    answer = asked.choose(cohort)
+    cohort, weighed = asked.load(warehouse, condition), dict[str, Weighed]()
+    if request.robust:
+        cohort, weighed = _weigh_drives(cohort, asked)
+    answer = replace(asked.choose(cohort), weighed=weighed)
     if distances:
         inputs = inputs_of(cohort, request.nested or WHOLE_SET)
         answer = replace(answer, distances=try_distances(cohort, inputs, folds, request))
@@ -568,19 +563,27 @@ def _may_be_as_good(model: CrossValidation, best: CrossValidation) -> bool:
     return student_t_two_sided(short.rmse / short.standard_error, len(best.folds) - 1) > 0.05
 
 
-def _answer_without(warehouse: Warehouse, asked: SelectionPlan, condition: str) -> Selection:
-    """Select without the cars whose influence on a model of all compared inputs is unusual."""
+def _weigh_drives(cohort: Cohort, asked: SelectionPlan) -> tuple[Cohort, dict[str, Weighed]]:
+    """Return a cohort whose lost drives count less, by a model of all compared inputs."""
     request, model_list = asked.request, asked.model_list
-    cohort = asked.load(warehouse, condition)
     inputs = inputs_of(cohort, request.nested or WHOLE_SET)
     if model_list and model_list.model and not (request.nested or request.search):
         listed = {name for one in model_list.model for name in one.signals}
         inputs = tuple(name for name in cohort.inputs if name in listed)
     served = cohort.serving(inputs)
-    left_out = influential_cars(served, clustered_moments(served, "drive"))
-    others = without_vehicles(cohort.condition, left_out)
-    answer = _answer(warehouse, replace(request, robust=False), others.text)
-    return replace(answer, left_out=left_out)
+    table = served.table if request.intercept else served.table.about_origin()
+    weights = robust_weights(DriveMoments.of(table), intercept=request.intercept)
+    less = np.flatnonzero(weights.parts < FULL)
+    if not len(less):
+        return cohort, {}
+    names = served.drives["drive_id"].to_pylist()
+    of_drive = {names[i]: int(weights.parts[i]) for i in less}
+    parts = np.array([of_drive.get(name, FULL) for name in cohort.drives["drive_id"].to_pylist()])
+    kept, left = cohort.part(parts > 0), parts[parts > 0]
+    each = np.split(left, np.cumsum([len(one) for one in kept.tables])[:-1])
+    tables = tuple(weighted(one, some) for one, some in zip(kept.tables, each, strict=True))
+    found = sorted(less.tolist(), key=lambda i: -float(weights.times[i]))
+    return replace(kept, tables=tables), {names[i]: weights.of(i) for i in found}
 
 
 def _given(request: SelectionRequest) -> ModelList | None:

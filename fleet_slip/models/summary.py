@@ -30,11 +30,11 @@ def remark_without_information(rows: int, of: int) -> Iterator[Remark]:
         )
 
 
-def influence_remarks(cars: Mapping[str, "Influential"], what: str) -> Iterator[Remark]:
-    """Yield which cars have an influence that no honest car has, and what becomes of them."""
+def influence_remarks(cars: Mapping[str, "Influential"]) -> Iterator[Remark]:
+    """Yield which cars have an influence that no honest car has."""
     for car, one in cars.items():
         yield Remark(
-            f"{car} {what}: its influence on the model is {one.times:.0f} times the median one, "
+            f"{car}: its influence on the model is {one.times:.0f} times the median one, "
             f"by what its rows give it ({one.rows:.1%} of all)."
         )
 
@@ -187,7 +187,8 @@ def _left_out(selection: "Selection") -> Iterator[Remark]:
         without = number_of(without_log, "drive")
         yield Remark(f"{without} of these without a log: their cars sent Gram rows.")
     yield from remark_left_out(selection.cohort.left_out, selection.cohort.feature_set)
-    yield from influence_remarks(selection.left_out, "left out")
+    for drive, one in selection.weighed.items():
+        yield Remark(f"{drive}: {one.reason}.")
     if selection.remark:
         yield Remark(selection.remark)
     if selection.without_label is not None:

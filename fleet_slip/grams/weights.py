@@ -1,0 +1,98 @@
+"""Whole-number weights of drives: Gram rows are multiplied by them, so that every sum stays exact.
+
+A weight counts in parts of `FULL`, a power of two. Robust ones take from drives whose label or
+signals were lost: those that a model of all drives fits far worse than it fits the usual one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.base import Record
+from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.gram import GramTable
+
+FULL = 16
+"""The weight of a drive that is as others are."""
+USUAL_ERRORS = 3.0
+"""Root mean squares of the median drive that a drive may have without losing weight."""
+MOST_LOST = 0.1
+"""Of the weight of all rows: where more is unusual, nothing is usual."""
+MOST_ROUNDS = 50
+
+
+@dataclass(frozen=True)
+class Weighed(Record):
+    """A drive that counts less than others.
+
+    Attributes:
+        weight: at most 1.
+        times: root mean square of its residuals over that of the median drive.
+    """
+
+    DOCUMENT = "weight times"
+
+    weight: float
+    times: float
+
+    @property
+    def reason(self) -> str:
+        """Why it lost weight."""
+        return (
+            f"its error is {self.times:.1f} times that of the median drive: it counts "
+            f"{self.weight:.2f} times"
+        )
+
+
+@dataclass(frozen=True)
+class DriveWeights:
+    """The weight of each drive in parts of `FULL`, and `Weighed.times` of each, (drives,)."""
+
+    parts: IntArray
+    times: FloatArray
+
+    def of(self, drive: int) -> Weighed:
+        """Return what became of a drive."""
+        return Weighed(float(self.parts[drive]) / FULL, float(self.times[drive]))
+
+
+def robust_weights(drives: DriveMoments, *, intercept: bool = True) -> DriveWeights:
+    """Return weights min(1, c median rms / rms)^2 of drives, fitted and weighed in turn.
+
+    `drives` are the moments of the inputs, the label last. c is `USUAL_ERRORS`, or so large that no
+    more than `MOST_LOST` of the weight of rows is lost.
+    """
+    each = drives.matrix(drives.packed)[:, int(not intercept) :, int(not intercept) :]
+    rows, limit = drives.packed[:, 0], USUAL_ERRORS
+    found = _weigh(each, rows, limit)
+    while float(rows @ (FULL - found.parts)) > MOST_LOST * FULL * float(rows.sum()):
+        limit *= 1.25
+        found = _weigh(each, rows, limit)
+    return found
+
+
+def weighted(table: GramTable, parts: IntArray) -> GramTable:
+    """Return Gram rows, each times a whole number: exact, with Python's integers where need be."""
+    largest = np.abs(table.products.astype(np.float64)).max(initial=0) * parts.max(initial=0)
+    kind = np.dtype(object) if largest >= 2.0**62 else np.dtype(np.int64)
+    n, sums, products = (one.astype(kind) for one in (table.n, table.sums, table.products))
+    return GramTable(table.signals, n * parts, sums * parts[:, None], products * parts[:, None])
+
+
+def _weigh(each: FloatArray, rows: FloatArray, limit: float) -> DriveWeights:
+    """Fit and weigh in turn until no weight changes; `each` are moments, the label last."""
+    parts = np.full(len(each), FULL, dtype=np.int64)
+    for _ in range(MOST_ROUNDS):
+        total = np.einsum("d,dij->ij", parts.astype(np.float64), each)
+        slopes = np.linalg.pinv(total[:-1, :-1], rcond=1e-13, hermitian=True) @ total[:-1, -1]
+        error = np.append(slopes, -1.0)
+        squares = np.maximum(np.einsum("i,dij,j->d", error, each, error), 0.0) / rows
+        if not (usual := float(np.median(squares))):
+            return DriveWeights(np.full(len(each), FULL, dtype=np.int64), np.ones(len(each)))
+        times = np.sqrt(squares / usual)
+        again = np.rint(FULL * (limit / np.maximum(times, limit)) ** 2)
+        if np.array_equal(again, parts):
+            break
+        parts = again.astype(np.int64)
+    return DriveWeights(parts, times)
