@@ -10,7 +10,6 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial, reduce
 from pathlib import Path
@@ -39,9 +38,8 @@ P = TypeVar("P", bound=Config)
 Estimator = Callable[[DriveSignals, VehicleParameters, P], FloatArray]
 """What every module of this package offers as `estimate`."""
 
-FIRST_FACTOR = 8.0
-LAST_FACTOR = 1.25
-"""The compass ends when changing any parameter by this factor does not help."""
+FARTHER = math.log(4)
+"""In logarithms, how far from what is given `tune` begins as well."""
 
 EVERY = 5
 """Of the rows every so many-th is a residual: neighbours at 100 Hz err alike."""
@@ -53,6 +51,9 @@ LONGEST = 1.0
 """Step of a logarithm at most: what a linearisation promises far away is not believed."""
 
 ROUNDS = 12
+
+TRIED_ROUNDS = 3
+"""How far each start is followed, before the best of them goes on."""
 
 LEAST_GAIN = 1e-3
 """A change must lower the error by this share; else a parameter without effect would wander off."""
@@ -114,71 +115,28 @@ def tune(
     car: VehicleParameters,
     executor: Executor,
 ) -> Tuned[P]:
-    """Return the best of the positive parameters `names` that two searches find from a start.
+    """Return the best of the parameters `names` that searches find from a start and around it.
 
     Each estimator's module lists its own as `TUNABLE`; "yaw_rate.gyro_std_rad_s" is a nested one.
-    A compass finds the right valley, derivatives its bottom. Raises as `rmse_rad`.
+    Raises as `rmse_rad`.
     """
-    search = ParameterSearch(estimator, names, drives, car, executor)
-    first, wide = search.descend(start), search.compass(start)
-    last = search.descend(wide.parameters)
-    evaluations = sum(one.evaluations for one in (first, wide, last))
-    best = min(first, wide, last, key=lambda one: one.rmse_rad)
-    return replace(best, evaluations=evaluations)
+    at, evaluations = Coordinates(start, names), 0
 
+    def estimate(parameters: P, drive: LabelledDrive) -> FloatArray:
+        return estimator(drive.signals, drive.car or car, parameters)
 
-@dataclass(frozen=True)
-class ParameterSearch(Generic[P]):
-    """Two ways to the positive parameters `names` with which an estimator errs least on drives."""
+    def errors(x: FloatArray) -> FloatArray:
+        nonlocal evaluations
+        evaluations += 1
+        return errors_rad(partial(estimate, at.parameters(x)), drives, executor, EVERY)
 
-    estimator: Estimator[P]
-    names: Sequence[str]
-    drives: Sequence[LabelledDrive]
-    car: VehicleParameters
-    executor: Executor
-
-    def _estimate(self, parameters: P, drive: LabelledDrive) -> FloatArray:
-        return self.estimator(drive.signals, drive.car or self.car, parameters)
-
-    def rmse_rad(self, parameters: P) -> float:
-        """Return the RMSE over all rows. Raises as `rmse_rad`."""
-        return rmse_rad(partial(self._estimate, parameters), self.drives, self.executor)
-
-    def compass(self, start: P) -> Tuned[P]:
-        """Search along each parameter's logarithm in turn.
-
-        Each in turn is multiplied and divided by a factor and keeps what lowers the error; when
-        none does, the factor becomes its square root (Kolda, Lewis and Torczon, "Optimization by
-        direct search", SIAM Review 45, 2003). Values that their model refuses are passed over.
-        """
-        best, lowest, evaluations = start, self.rmse_rad(start), 1
-        factor = FIRST_FACTOR
-        while factor > LAST_FACTOR:
-            improved = False
-            for name in self.names:
-                for candidate in _neighbours(best, name, factor):
-                    found = self.rmse_rad(candidate)
-                    evaluations += 1
-                    if found < lowest * (1 - LEAST_GAIN):
-                        best, lowest, improved = candidate, found, True
-                        break
-            if not improved:
-                factor **= 0.5
-        return Tuned(best, lowest, evaluations)
-
-    def descend(self, start: P) -> Tuned[P]:
-        """Search by `descend` in the parameters' logarithms. Raises as `rmse_rad`."""
-        at, evaluations = Coordinates(start, self.names), 0
-
-        def errors(x: FloatArray) -> FloatArray:
-            nonlocal evaluations
-            evaluations += 1
-            estimate = partial(self._estimate, at.parameters(x))
-            return errors_rad(estimate, self.drives, self.executor, EVERY)
-
-        there = finite(errors(np.zeros(len(self.names))))
-        best = at.parameters(descend(lambda x: errors(x)[there], at).x)
-        return Tuned(best, self.rmse_rad(best), evaluations)
+    there = finite(errors(np.zeros(len(names))))
+    sides = np.where(np.arange(len(names)) % 2, 1.0, -1.0)
+    begins = [np.full(len(names), change) for change in (0.0, FARTHER, -FARTHER)]
+    begins += [FARTHER * sides, -FARTHER * sides]
+    found = search(lambda x: errors(x)[there], at, begins)
+    best = at.parameters(found.x)
+    return Tuned(best, rmse_rad(partial(estimate, best), drives, executor), evaluations)
 
 
 ADDED = {"steer_offset_rad": 0.02, "ay_offset_mps2": 0.2}
@@ -235,7 +193,7 @@ class Descent:
 def descend(
     residuals: Callable[[FloatArray], FloatArray],
     at: Coordinates[P],
-    x: FloatArray | None = None,
+    x: FloatArray,
     rounds: int = ROUNDS,
 ) -> Descent:
     """Search for the least sum of squares by Levenberg's method, within bounds.
@@ -246,7 +204,6 @@ def descend(
     Quarterly of Applied Mathematics 2, 1944). A parameter without effect stays.
     """
     lower, upper = at.bounds
-    x = np.zeros(len(at.names)) if x is None else x
     found = residuals(x)
     lowest, damping = float(found @ found), 1e-3
     slopes = np.zeros((len(x), len(found)))
@@ -273,12 +230,13 @@ def descend(
     return Descent(x, lowest, slopes)
 
 
-def _neighbours(parameters: P, name: str, factor: float) -> list[P]:
-    neighbours = []
-    for change in (factor, 1 / factor):
-        with suppress(ValueError):
-            neighbours.append(_with(parameters, name, _value(parameters, name) * change))
-    return neighbours
+def search(
+    residuals: Callable[[FloatArray], FloatArray], at: Coordinates[P], begins: Sequence[FloatArray]
+) -> Descent:
+    """Follow some begins for `TRIED_ROUNDS`, and the best of them to its end."""
+    within = [np.clip(begin, *at.bounds) for begin in begins]
+    tried = [descend(residuals, at, begin, TRIED_ROUNDS) for begin in within]
+    return descend(residuals, at, min(tried, key=lambda one: one.loss).x)
 
 
 def _value(parameters: Config, name: str) -> float:
@@ -349,9 +307,6 @@ STARTS: tuple[Mapping[str, float], ...] = (
     {"stiffness_front": 2.0, "stiffness_rear": 2.0, "noise.ay_std_mps2": 5.0},
 )
 """Where a search begins: the tyres' force, or the yaw rate alone, tells of the angle."""
-
-TRIED_ROUNDS = 3
-"""How far each start is followed, before the best of them goes on."""
 
 FOLDS = 4
 
@@ -594,8 +549,7 @@ def identify(measured: Measured, drives: Sequence[LabelledDrive], executor: Exec
         return np.concatenate(parts)
 
     begins = [at.place([one.get(n, _value(start, n)) for n in names]) for one in STARTS]
-    tried = [descend(residuals, at, begin, TRIED_ROUNDS) for begin in begins]
-    found = descend(residuals, at, min(tried, key=lambda one: one.loss).x)
+    found = search(residuals, at, begins)
     fitted = at.parameters(found.x)
     estimates = partial(estimate, fitted)
     inverse = np.linalg.inv(found.slopes @ found.slopes.T)
