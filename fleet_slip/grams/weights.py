@@ -40,8 +40,8 @@ class Weighed(Record):
     def reason(self) -> str:
         """Why it lost weight."""
         return (
-            f"its error is {self.times:.1f} times that of the median drive: it counts "
-            f"{self.weight:.2f} times"
+            f"its error is {self.times:.1f} times that of the median drive: robust "
+            f"takes it {self.weight:.2f} times"
         )
 
 

@@ -9,14 +9,13 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohort import Cohort, Served, clustered_moments
-from fleet_slip.models.select import influential_cars
-from fleet_slip.models.summary import influence_remarks
+from fleet_slip.grams.weights import Weighed
+from fleet_slip.models.select import lost_drives
+from fleet_slip.models.summary import lost_remarks
 from fleet_slip.regression.choice import nested_fits
 from fleet_slip.regression.drives import (
-    LEAST_CARS,
     ClusterUnit,
     DriveMoments,
-    Influential,
 )
 from fleet_slip.regression.figures import Figures, error_sums
 from fleet_slip.regression.inference import (
@@ -74,7 +73,7 @@ class Diagnosis(Answer):
         inflation: variance inflation of each input.
         condition_number: of the inputs' correlation matrix.
         evidence: effective rows and design effect.
-        influential: the cars whose influence no honest car has, by name.
+        weighed: the drives that `robust` of a selection would count less, by name.
     """
 
     DOCUMENT = (
@@ -82,7 +81,7 @@ class Diagnosis(Answer):
         "effective_rows=evidence.rows design_effect=evidence.design_effect "
         "r_squared=fitted.r_squared residual_std=naive.residual_std condition_number "
         "variance_inflation=inflation by_rows=naive.estimates by_clusters=robust.estimates "
-        "influential? against=comparison?"
+        "drives_weighed=weighed? against=comparison?"
     )
 
     fitted: Fit = field(repr=False)  # holds a Gram matrix and long fractions
@@ -94,7 +93,7 @@ class Diagnosis(Answer):
     condition_number: float
     evidence: Evidence
     comparison: CohortComparison | None = None
-    influential: Mapping[str, Influential] = field(default_factory=dict)
+    weighed: Mapping[str, Weighed] = field(default_factory=dict)
 
     @property
     def clusters(self) -> int:
@@ -129,7 +128,7 @@ class Diagnosis(Answer):
                 "there is one drive only: its rows are taken for independent evidence, which they "
                 "are not at 100 Hz, so that the standard errors are far too small."
             )
-        yield from influence_remarks(self.influential)
+        yield from lost_remarks(self.weighed)
         if self.comparison is not None:
             yield from self.comparison.parts(self.robust, self.cluster)
 
@@ -168,9 +167,7 @@ def diagnose(
         comparison=_compare(served, fitted, moments, against.condition.text, there)
         if against and there
         else None,
-        influential=influential_cars(served, moments)
-        if len(set(_cars(served))) >= LEAST_CARS
-        else {},
+        weighed=lost_drives(served, intercept=intercept),
     )
 
 

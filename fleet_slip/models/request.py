@@ -132,7 +132,7 @@ class SelectionRequest:
         bool,
         Doc(
             "Let drives whose error is more than three times that of the median drive count less, "
-            "and say which; diagnose says which cars have unusual influence."
+            "and say which; diagnose says it before."
         ),
     ] = False
     naive: Annotated[bool, NAIVE] = False

@@ -61,10 +61,8 @@ from fleet_slip.regression.choice import NestedDistances, Rule, Winner, Worth, f
 from fleet_slip.regression.drives import (
     ClusterUnit,
     DriveMoments,
-    Influential,
     Interval,
     bootstrap_correlations,
-    find_influential,
     held_out_products,
     percentile_interval,
 )
@@ -108,12 +106,13 @@ def estimate_uncertainty(
     return Uncertainty(interval, ready.moments.unit)
 
 
-def influential_cars(served: Served, moments: DriveMoments) -> dict[str, Influential]:
-    """Return cars of unusual influence by name, most unusual first. Raises `DataError` for few."""
-    owners = np.array([name or "" for name in served.drives["vehicle_id"].to_pylist()])
-    names, cars = np.unique(owners, return_inverse=True)
-    found = find_influential(moments, cars.astype(np.int64))
-    return {str(names[one.car]): one for one in found if names[one.car]}
+def lost_drives(served: Served, *, intercept: bool) -> dict[str, Weighed]:
+    """Return the drives that `robust` counts less, the most unusual first."""
+    table = served.table if intercept else served.table.about_origin()
+    weights = robust_weights(DriveMoments.of(table), intercept=intercept)
+    less = np.flatnonzero(weights.parts < FULL).tolist()
+    names = served.drives["drive_id"].to_pylist()
+    return {names[i]: weights.of(i) for i in sorted(less, key=lambda i: -float(weights.times[i]))}
 
 
 def label_noise_deg(warehouse: Warehouse, cohort: Cohort) -> float | None:
@@ -570,20 +569,15 @@ def _weigh_drives(cohort: Cohort, asked: SelectionPlan) -> tuple[Cohort, dict[st
     if model_list and model_list.model and not (request.nested or request.search):
         listed = {name for one in model_list.model for name in one.signals}
         inputs = tuple(name for name in cohort.inputs if name in listed)
-    served = cohort.serving(inputs)
-    table = served.table if request.intercept else served.table.about_origin()
-    weights = robust_weights(DriveMoments.of(table), intercept=request.intercept)
-    less = np.flatnonzero(weights.parts < FULL)
-    if not len(less):
+    lost = lost_drives(cohort.serving(inputs), intercept=request.intercept)
+    if not lost:
         return cohort, {}
-    names = served.drives["drive_id"].to_pylist()
-    of_drive = {names[i]: int(weights.parts[i]) for i in less}
+    of_drive = {name: round(one.weight * FULL) for name, one in lost.items()}
     parts = np.array([of_drive.get(name, FULL) for name in cohort.drives["drive_id"].to_pylist()])
     kept, left = cohort.part(parts > 0), parts[parts > 0]
     each = np.split(left, np.cumsum([len(one) for one in kept.tables])[:-1])
     tables = tuple(weighted(one, some) for one, some in zip(kept.tables, each, strict=True))
-    found = sorted(less.tolist(), key=lambda i: -float(weights.times[i]))
-    return replace(kept, tables=tables), {names[i]: weights.of(i) for i in found}
+    return replace(kept, tables=tables), lost
 
 
 def _given(request: SelectionRequest) -> ModelList | None:

@@ -13,9 +13,9 @@ from fleet_slip.regression.inference import Evidence
 from fleet_slip.rendering import Part, Remark, TextTable
 
 if TYPE_CHECKING:
+    from fleet_slip.grams.weights import Weighed
     from fleet_slip.models.search import SearchChoice
     from fleet_slip.models.select import Selection, WithoutLabel
-    from fleet_slip.regression.drives import Influential
 
 TELLING = 0.01
 """Part of a cohort's rows without the label or a signal that is worth a remark."""
@@ -30,13 +30,10 @@ def remark_without_information(rows: int, of: int) -> Iterator[Remark]:
         )
 
 
-def influence_remarks(cars: Mapping[str, "Influential"]) -> Iterator[Remark]:
-    """Yield which cars have an influence that no honest car has."""
-    for car, one in cars.items():
-        yield Remark(
-            f"{car}: its influence on the model is {one.times:.0f} times the median one, "
-            f"by what its rows give it ({one.rows:.1%} of all)."
-        )
+def lost_remarks(drives: Mapping[str, "Weighed"]) -> Iterator[Remark]:
+    """Yield which drives `robust` counts less, and why."""
+    for drive, one in drives.items():
+        yield Remark(f"{drive}: {one.reason}.")
 
 
 MANY_SIGNALS = 30
@@ -187,8 +184,7 @@ def _left_out(selection: "Selection") -> Iterator[Remark]:
         without = number_of(without_log, "drive")
         yield Remark(f"{without} of these without a log: their cars sent Gram rows.")
     yield from remark_left_out(selection.cohort.left_out, selection.cohort.feature_set)
-    for drive, one in selection.weighed.items():
-        yield Remark(f"{drive}: {one.reason}.")
+    yield from lost_remarks(selection.weighed)
     if selection.remark:
         yield Remark(selection.remark)
     if selection.without_label is not None:
