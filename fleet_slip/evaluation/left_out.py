@@ -159,7 +159,7 @@ class Learner:
         Of cars without the label it learns beside those that it was `trained_on`. Raises as
         `load_cohort`.
         """
-        asked = SelectionPlan.of(replace(request, robust=False, bootstrap=None))
+        asked = SelectionPlan.of(replace(request, bootstrap=None))
         mixed = asked.request.label == BOTH
         cohort = asked.load(warehouse, trained_on if mixed else condition)
         return cls(name, asked, cohort, drives, warehouse)

@@ -500,11 +500,15 @@ class SelectionPlan:
 
     def choose(self, cohort: Cohort) -> Selection:
         """Compare and choose on a cohort, whatever drives it is of. Raises as `select`."""
+        weighed: dict[str, Weighed] = {}
+        if self.request.robust:
+            cohort, weighed = _weigh_drives(cohort, self)
         if cohort.unlabelled:
             return weigh(cohort, self.request, self.model_list, self.folds)
         if self.request.ordered:
-            return _search(cohort, self.request, self.folds)
-        return _compare_listed(cohort, self.request, self.model_list, self.folds)
+            return replace(_search(cohort, self.request, self.folds), weighed=weighed)
+        found = _compare_listed(cohort, self.request, self.model_list, self.folds)
+        return replace(found, weighed=weighed)
 
 
 def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> Selection:
@@ -518,10 +522,8 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
     of_drives = request.ordered or request.bootstrap or request.robust
     if not (of_drives or distances):  # the sum of each fold suffices
         return asked.choose(load_cohort(warehouse, condition, asked.feature_set, folds))
-    cohort, weighed = asked.load(warehouse, condition), dict[str, Weighed]()
-    if request.robust:
-        cohort, weighed = _weigh_drives(cohort, asked)
-    answer = replace(asked.choose(cohort), weighed=weighed)
+    answer = asked.choose(asked.load(warehouse, condition))
+    cohort = answer.cohort
     if distances:
         inputs = inputs_of(cohort, request.nested or WHOLE_SET)
         answer = replace(answer, distances=try_distances(cohort, inputs, folds, request))

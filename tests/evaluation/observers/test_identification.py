@@ -9,7 +9,13 @@ import pytest
 
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf
-from fleet_slip.evaluation.identify import Fitted, Measured, identify, identify_held_out
+from fleet_slip.evaluation.identify import (
+    Fitted,
+    Identified,
+    Measured,
+    identify,
+    identify_held_out,
+)
 from fleet_slip.evaluation.single_track import LabelledDrive
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import simulated_drive
@@ -18,10 +24,15 @@ CAR = load_vehicle("d_class_sedan")
 MEASURED = Measured.of(CAR)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def executor() -> Iterator[Executor]:
     with ThreadPoolExecutor(2) as threads:
         yield threads
+
+
+@pytest.fixture(scope="module")
+def identified(drive: LabelledDrive, executor: Executor) -> Identified:
+    return identify(MEASURED, [drive], executor)
 
 
 @pytest.fixture(scope="module")
@@ -42,21 +53,20 @@ def test_the_start_knows_nothing_but_what_was_measured() -> None:
 
 
 def test_an_identified_car_estimates_better_than_one_with_usual_tyres(
-    drive: LabelledDrive, executor: Executor
+    drive: LabelledDrive, identified: Identified
 ) -> None:
-    found = identify(MEASURED, [drive], executor)
+    found = identified
     before = rmse_deg(ekf.estimate(drive.signals, MEASURED.car(Fitted()), ekf.EkfNoise()), drive)
     assert rmse_deg(ekf.estimate(drive.signals, found.car, found.noise), drive) < 0.7 * before
     assert found.held_out_rad is None
 
 
 def test_of_a_car_that_logs_a_steering_wheel_ratio_offset_and_roll_are_found(
-    drive: LabelledDrive, executor: Executor
+    drive: LabelledDrive, identified: Identified, executor: Executor
 ) -> None:
     exact, missing = drive.signals, np.full(len(drive.signals), np.nan)
     road = (exact.steer_fl_rad + exact.steer_fr_rad) / 2
-    plain = identify(MEASURED, [drive], executor)
-    bias = plain.noise.sensors
+    bias = identified.noise.sensors
     signals = replace(
         exact,
         steer_fl_rad=missing,
@@ -71,16 +81,15 @@ def test_of_a_car_that_logs_a_steering_wheel_ratio_offset_and_roll_are_found(
     assert sensors.ay_gain / bias.ay_gain == pytest.approx(1.08, rel=0.001)
     expected = 0.2 + 1.08 * bias.ay_offset_mps2
     assert sensors.ay_offset_mps2 == pytest.approx(expected, abs=0.001)
-    assert found.fit_rad < 1.2 * plain.fit_rad
+    assert found.fit_rad < 1.2 * identified.fit_rad
     assert "steer_gain" not in {*found.at_bounds, *found.not_identifiable}
 
 
 def test_a_parameter_at_its_bound_and_one_that_drives_do_not_tell_are_said(
-    drive: LabelledDrive, executor: Executor
+    drive: LabelledDrive, identified: Identified, executor: Executor
 ) -> None:
-    found = identify(MEASURED, [drive], executor)
-    assert not found.at_bounds
-    assert {"friction", "yaw_inertia"} <= {*found.not_identifiable}, "nobody slides"
+    assert not identified.at_bounds
+    assert {"friction", "yaw_inertia"} <= {*identified.not_identifiable}, "nobody slides"
     shaken = replace(drive, sideslip_rad=-8 * drive.sideslip_rad)  # no tyre does that
     wrong = identify(MEASURED, [shaken], executor)
     assert wrong.at_bounds
