@@ -9,12 +9,11 @@ from typing_extensions import Doc
 from fleet_slip.api.calls import Rooted, open_workers, takes
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.features import features as known_features
-from fleet_slip.errors import UsageError
+from fleet_slip.errors import NotComputedError, UsageError
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import (
     CLUSTER,
     DEFAULT_MODELS,
-    DEFAULT_MOST,
     WHOLE_SET,
     SelectionRequest,
     inputs_of,
@@ -79,19 +78,27 @@ class FleetCohort(Rooted):
         """Compare models by cross-validation and choose one; `Fleet.publish` takes the answer.
 
         Drives that are not in order are left out: see `examine`, and `examined` of the answer. Gram
-        rows that the usual list needs are made, where they are missing, the drives are enough for
-        its columns, and that takes seconds.
+        rows that the usual list needs are made, where they are missing and that takes seconds.
         Raises what `examine` raises, `UsageError` for options that do not go together or an invalid
         list, and `DataError` if no model can be fitted.
         """
         from fleet_slip.models.select import answer_request
 
         examined = self.examine()
+
+        def answer() -> "Selection":
+            return answer_request(self.warehouse, request, examined.cohort)
+
         with examined.explaining():
-            answer = answer_request(self.warehouse, request, examined.cohort)
-            if answer.remark and self._make_usual(examined.cohort, answer.cohort.drive_count):
-                answer = answer_request(self.warehouse, request, examined.cohort)
-        return replace(answer, examined=str(examined))
+            try:
+                found = answer()
+            except NotComputedError:  # a recipe names the list
+                if request.models != DEFAULT_MODELS or not self._make_usual(examined.cohort):
+                    raise
+                found = answer()
+            if found.remark and self._make_usual(examined.cohort):
+                found = answer()
+        return replace(found, examined=str(examined))
 
     def diagnose(
         self,
@@ -180,22 +187,16 @@ class FleetCohort(Rooted):
         with open_workers(self.root, threads) as executor:
             return identify_held_out(car, chosen.read(), executor)
 
-    def _make_usual(self, cohort: str, drives: int) -> bool:
-        """Make the Gram rows of the usual list, if that takes seconds; return whether it did.
-
-        Not for fewer drives than a champion of so many columns needs.
-        """
+    def _make_usual(self, cohort: str) -> bool:
+        """Make the Gram rows of the usual list, if that takes seconds; return whether it did."""
         from importlib.util import find_spec
 
         from fleet_slip.grams.gram_files import find_backlog
         from fleet_slip.grams.job import update_grams
         from fleet_slip.grams.reader import cohort_files
-        from fleet_slip.models.acceptance import floor
         from fleet_slip.warehouse.condition import parse_cohort
         from fleet_slip.warehouse.tables import gram_snapshots
 
-        if drives * floor().max_columns_per_drive < DEFAULT_MOST:
-            return False
         name = load_model_list(DEFAULT_MODELS).features
         grams, logs = gram_snapshots(self.warehouse)
         files = cohort_files(self.warehouse, parse_cohort(cohort))

@@ -269,6 +269,8 @@ class Search(Config):
     rule: Literal["best", "worth", "standard error"] = "worth"
     fewest_drives: int = Field(default=0, ge=0)
     """Of fewer drives nothing is searched for."""
+    columns_per_drive: int | None = Field(default=None, ge=1)
+    """At most so many columns for each drive, where whole drives are the folds."""
 
     @field_validator("inputs")
     @classmethod

@@ -403,7 +403,11 @@ def select(
             few = f"it needs {search.fewest_drives} drives, and there are {cohort.drive_count}"
             skipped[f"{search.name or search.method} (search)"] = few
         elif among := search.among(inputs):
-            searched.append(search_models(cohort, among, folds, search, intercept=intercept))
+            most = search.most
+            if search.columns_per_drive and folds.by not in (PARTS, ROW_FOLDS):
+                most = min(most, search.columns_per_drive * cohort.drive_count)
+            bounded = search.model_copy(update={"most": most})
+            searched.append(search_models(cohort, among, folds, bounded, intercept=intercept))
             models += searched[-1].models
     if not models:
         reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())

@@ -59,7 +59,7 @@ def test_the_bits_are_those_of_other_machines(smoke_root: Path) -> None:
     assert digests == {
         "logs": "b875580a1d17083def2771a1c408763eb3a55e5ba122d59e699d2cce7b2f7c40",
         "grams": "d81339d42929335003f976666893a4ac71b7a9f530338fac71c9c606d61b46d2",
-        "models": "3d2c8d74c3094b2ef884f4634d0f9af4b1cd805c9791c8505bfe4a94e752e404",
+        "models": "80552fbd244ee65df21f2b7b99d4122a49ab0ea59ba5f1c5e83089600e36388a",
     }
 
 

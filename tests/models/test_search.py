@@ -200,6 +200,14 @@ def test_a_list_searches_among_some_inputs_and_then_all_where_drives_are_enough(
     assert set(chosen.winner.model.signals) >= {"ay", "yaw_rate"}
 
 
+def test_few_drives_allow_few_columns() -> None:
+    search = Search(name="few", method="forward", most=4, columns_per_drive=1)
+    for drives, most in ((3, 3), (5, 4)):
+        cohort = cohort_of(driven(1, STRONG_FIRST, drives=drives))
+        chosen = select(cohort, (), FIVE, searches=[search], inputs=INPUTS)
+        assert [one.name for one in chosen.models] == [f"few {n + 1}" for n in range(most)]
+
+
 ALL_SIZES = [f"all {size}" for size in range(1, 5)]
 
 

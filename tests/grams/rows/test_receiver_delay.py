@@ -204,7 +204,8 @@ def test_what_a_course_of_unknown_delay_taught_is_not_published(
     fleet = late_fleet(tmp_path, 0.06, grams=("calibration",))
     drives = [drive for (drive,) in fleet.sql("SELECT drive_id FROM drives").fetchall()]
     few = f"drive_id <= '{sorted(drives)[1]}'"
-    fleet.gram("course", cohort=few)
+    for name in ("course", "windows"):
+        fleet.gram(name, cohort=few)
     selection = fleet.cohort(few).select(label="course", model="steering_mean_16,ay_mean_16")
     with pytest.raises(RefusedError, match=r"not known to 5 ms \(late-0000: \d\d ms, of too few"):
         fleet.publish("late", selection)
