@@ -172,10 +172,11 @@ def _reason(winner: Shortfall, best: CrossValidation, near: int, total: int, wor
     rmse = f"RMSE {best.pooled.rmse_deg:.4f} deg"
     if winner.model is best:
         others = "every other model" if near == 1 else "every model with fewer signals"
+        larger = f"{worth} or more, and by " if worth.amount else ""
         return (
             f"Model {best.name} has the best cross-validated correlation, {best.correlation:.4f}, "
-            f"with {rmse}. The error of {others} is larger by {worth} or more, and by more than "
-            "one standard error of the difference."
+            f"with {rmse}. The error of {others} is larger by {larger}more than one standard error "
+            "of the difference."
         )
     if not worth.amount:
         return (
