@@ -407,8 +407,13 @@ def select(
             if search.columns_per_drive and folds.by not in (PARTS, ROW_FOLDS):
                 most = min(most, search.columns_per_drive * cohort.drive_count)
             bounded = search.model_copy(update={"most": most})
-            searched.append(search_models(cohort, among, folds, bounded, intercept=intercept))
-            models += searched[-1].models
+            try:
+                found = search_models(cohort, among, folds, bounded, intercept=intercept)
+            except DataError as error:  # no drive, or not one in each fold, has all inputs
+                skipped[f"{search.name or search.method} (search)"] = str(error)
+            else:
+                searched.append(found)
+                models += found.models
     if not models:
         reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())
         raise DataError(f"no candidate can be fitted on the cohort. {reasons}")

@@ -161,7 +161,8 @@ def test_a_late_course_teaches_what_one_in_time_does(late_fleet: LateFleet, tmp_
         assert {row[2] for row in corrected_rows(fleet)} <= {
             round(delay_s / 0.0025) + off for off in (-1, 0, 1)
         }
-        fleet.gram("calibration")
+        for name in ("calibration", "windows"):
+            fleet.gram(name)
         selection = fleet.cohort("true").select(label="course", model=MODEL)
         coefficients.append([float(c) for c in selection.winner.model.model.coefficients])
         assert fleet.publish("in_time", selection).new
