@@ -44,7 +44,8 @@ _CAMPAIGN = (
     ("laps = 0.5", "laps = 0.03"),
     ("rows_per_file = 15_000", "rows_per_file = 1_500"),
 )
-_SEARCH = (("most = 24", "most = 3"),)
+_SEARCH = (("most = 14", "most = 2"), ("most = 24", "most = 3"))
+_INPUTS = re.compile(r"(?s)inputs = \[.*?\]\n")
 _WINDOWS = re.compile(r'(?s)(\[sets\.windows\].*?windows = \[).*?"yaw_rate_bias",.*?\]')
 
 
@@ -151,7 +152,9 @@ def write_configs(root: Path) -> None:
     (configs / "models").mkdir(parents=True)
     campaign(root).write_text(_replace(find_config("campaigns", "smoke").read_text(), _CAMPAIGN))
     estimator = _replace(find_config("models", "estimator").read_text(), _SEARCH)
-    (configs / "models" / "estimator.toml").write_text(estimator)
+    anything, found = _INPUTS.subn("", estimator)
+    assert found == 1
+    (configs / "models" / "estimator.toml").write_text(anything)
     features = (folder("configs") / "features.toml").read_text(encoding="utf-8")
     fewer, found = _WINDOWS.subn(r'\1"ay_mean", "yaw_rate_bias"]', features)
     assert found == 1
