@@ -181,7 +181,7 @@ class LogsAndGrams(Rooted):
         """Read measured files as `ingest` does, and store nothing; raises the same.
 
         Reports rows, drives, rejections, each signal's range, and what `ingest` would find wrong: a
-        sign, a unit, swapped wheels, a delay of the label.
+        sign, a unit, swapped wheels.
         """
         from fleet_slip.ingest.load import preview_logs
 

@@ -63,8 +63,8 @@ def ingest(
     files: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Measured logs (CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, DuckDB), or folders "
-            "of them, of which what is new is taken; also s3://, gs:// and az://.",
+            help="Measured logs (CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, TDMS, VBO), or "
+            "folders of them, of which what is new is taken; also s3://, gs:// and az://.",
             show_default=False,
         ),
     ] = None,
@@ -232,7 +232,6 @@ def mapping(
     can: Annotated[
         Path | None, typer.Option(help="Of a CAN trace, its database: DBC, KCD or SYM.")
     ] = None,
-    table: Annotated[str | None, typer.Option(help="Of a DuckDB file, the table.")] = None,
     json: Json = False,
 ) -> None:
     """List what is in a measured log, and draft a mapping for it.
@@ -244,7 +243,7 @@ def mapping(
     """
     if output is not None and output.exists():
         raise UsageError(f"{output}: it exists. Give another name, or remove it.")
-    draft, text = _draft(file, can, table)
+    draft, text = _draft(file, can)
     signals = {guess.profile.channel.name: name for name, guess in draft.guesses.items()}
     channels = [
         {
@@ -274,19 +273,16 @@ def mapping(
         print_parts(["\n" + text])
 
 
-def _draft(
-    file: str, can: Path | None = None, table: str | None = None, name: str | None = None
-) -> "tuple[Draft, str]":
+def _draft(file: str, can: Path | None = None, name: str | None = None) -> "tuple[Draft, str]":
     """Return what a log suggests, and that as a mapping."""
     from fleet_slip.ingest.draft import draft_mapping, name_of, write_draft  # noqa: PLC0415 - takes a while
     from fleet_slip.ingest.formats.can import CanBus, read_can_database  # noqa: PLC0415
     from fleet_slip.ingest.formats.reading import FileFormats  # noqa: PLC0415
-    from fleet_slip.ingest.formats.tables import DuckdbRows  # noqa: PLC0415
     from fleet_slip.ingest.log_files import find_logs, local_copy  # noqa: PLC0415
     from fleet_slip.ingest.profile import profile_file  # noqa: PLC0415
 
     bus = read_can_database(CanBus(database=str(can.absolute())), can.parent) if can else None
-    formats = FileFormats(can=bus, duckdb=DuckdbRows(table=table) if table else None)
+    formats = FileFormats(can=bus)
     logs = find_logs([file])
     if len(logs) > 1:
         raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")

@@ -105,7 +105,7 @@ def _doubted(guesses: dict[str, Guess], suspicions: list[Fault]) -> dict[str, Gu
     """
     found = dict(guesses)
     for one in suspicions:
-        if one.kind in {"late", "absent"}:
+        if one.kind == "absent":
             continue
         concerned = [name for name in one.signals if name in found]
         if one.kind == "stuck":  # a gear, a pedal and a brake may well be
@@ -162,7 +162,7 @@ def as_mapping(
     if COURSE in signals:
         signals[COURSE] |= {"antenna_x_m": 0.0, "antenna_y_m": 0.0}
     formats = profile.formats
-    given: dict[str, Any] = {"csv": formats.csv, "can": formats.can, "duckdb": formats.duckdb}
+    given: dict[str, Any] = {"csv": formats.csv, "can": formats.can}
     drive = {
         **_STAND_IN,
         **{key: source.get("drive", source) for key, source in drive_keys.items()},
@@ -231,8 +231,6 @@ def write_draft(draft: Draft, name: str, place: Path | str | None = None) -> str
         parts.append(_table("csv", keys | decimal_comma))
     if formats.can is not None:
         parts.append(_table("can", {"database": formats.can.database}))
-    if formats.duckdb is not None:
-        parts.append(_table("duckdb", formats.duckdb.model_dump(exclude_none=True)))
     parts.append(f"# {draft.time.reason}\n" + _table("time", draft.time.keys))
     parts.append(_drive(draft))
     parts.append(_signals(draft))

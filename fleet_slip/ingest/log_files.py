@@ -25,8 +25,7 @@ from fleet_slip.storage.storage_errors import (
 
 SUFFIXES = (
     ".csv", ".csv.gz", ".csv.zst", ".parquet", ".pq", ".mf4", ".mdf", ".mat", ".h5", ".hdf5",
-    ".blf", ".asc", ".log", ".trc", ".duckdb", ".ddb", ".mcap", ".tdms",
-    ".vbo",
+    ".blf", ".asc", ".log", ".trc", ".mcap", ".tdms", ".vbo",
 )  # fmt: skip
 
 _HIDDEN = re.compile(r"/\.(?!\.?(/|$))")

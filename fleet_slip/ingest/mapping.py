@@ -43,7 +43,6 @@ from fleet_slip.ingest.formats.can import CanBus, read_can_database
 from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.reading import FileFormats
 from fleet_slip.ingest.formats.source import describe_unknown
-from fleet_slip.ingest.formats.tables import DuckdbRows
 from fleet_slip.resources import find_config
 
 SPEEDS = ("vx", "vehicle_speed")
@@ -178,7 +177,6 @@ class Mapping(Config):
     """Texts that mean "no value", besides the empty one; `nan` also clears NaN in binary files."""
     csv: CsvFormat = CsvFormat()
     can: CanBus | None = added(None)
-    duckdb: DuckdbRows | None = added(None)
     time: TimeBase
     drive: DriveMetadata
     signals: Annotated[
@@ -273,7 +271,7 @@ class Mapping(Config):
     @property
     def formats(self) -> FileFormats:
         """What must be known of a file to open it."""
-        return FileFormats(self.csv, self.can, self.duckdb, self.name, self._plain_numbers)
+        return FileFormats(self.csv, self.can, self.name, self._plain_numbers)
 
     @property
     def _plain_numbers(self) -> PlainNumbers:

@@ -227,7 +227,7 @@ class FileProfile:
 def profile_file(file: Path, formats: FileFormats) -> FileProfile:
     """Look at the first `MOST_ROWS` rows of every channel. Raises `InputError`."""
     with require_unchanged_log(file), file_errors(file), ExitStack() as opened:
-        if formats.can is None and formats.duckdb is None:
+        if formats.can is None:
             layout, units = guess_layout(file)
             formats = FileFormats(csv=layout)
         else:

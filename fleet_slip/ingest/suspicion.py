@@ -1,5 +1,4 @@
-"""What looks wrong in a drive whose values are all well formed: a sign, a unit, swapped wheels, a
-label that comes late.
+"""What looks wrong in a drive whose values are all well formed: a sign, a unit, swapped wheels.
 
 Nothing here is certain: a suspicion is a relation of vehicle dynamics that a drive contradicts,
 with the figure that shows it, and what to try. Axes and signs are ISO 8855.
@@ -25,30 +24,11 @@ from fleet_slip.catalogue.faults import (
 )
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 
-# How signals of a drive go with one another: slopes, fits, a label's delay.
+# How signals of a drive go with one another: slopes and fits.
 
 SECOND = round(1 / float(SAMPLE_TIME_S))
 FEWEST_TICKS = 200
 MOVING_MPS = 2.0
-
-MOST_TICKS = 20_000
-FEWEST_DELAY_TICKS = 1000
-MOST_LAG, FAR_LAG = 50, 150
-"""A label is looked for this many ticks before and after its inputs; from the first on roughly."""
-HALF_CHANGE = 25
-"""The lateral velocity changes over twice so many ticks: the label's noise matters less."""
-EACH = 5
-"""Of what is that smooth, each fifth tick is enough."""
-
-LEAST_EXPLAINED = 0.6
-"""Where accelerations explain less of the change of lateral velocity, they are no witness."""
-LEAST_LAG = 7
-"""Buses hold signals and send them late, up to so many ticks apart from one another."""
-LEAST_KINEMATIC_GAIN, LEAST_GAIN = 0.1, 0.5
-"""A delay explains away this part of a label's variance. Without a delay simulated drives reach .04
-by the accelerations; by the inputs a car's own lag does .40, simulated and real."""
-UNIQUE = 3.0
-"""At delays half a second away the inputs leave so many times as much: a slalom shows no delay."""
 
 
 def moving(speed: FloatArray | None) -> BoolArray:
@@ -85,90 +65,6 @@ def fit(y: FloatArray, inputs: FloatArray, rows: BoolArray) -> tuple[FloatArray,
     left = centred - coefficients @ x
     constant = float(mean - coefficients @ middle)
     return coefficients, constant, 1 - float(left @ left) / total
-
-
-def find_delay(
-    angle_rad: FloatArray,
-    ay_mps2: FloatArray,
-    yaw_rate_rad_s: FloatArray,
-    speed_mps: FloatArray,
-    inputs: Sequence[FloatArray],
-) -> tuple[float, float] | None:
-    """Return the delay of a side-slip angle in s, and what part of its variance it explains away.
-
-    All are of one shape, (n_ticks,). The lateral velocity changes with ay - yaw_rate * speed, at
-    the same moment whatever car it is (Rajamani, Vehicle Dynamics and Control, eq. 2.9): where that
-    can be seen, it settles the matter. Else the delay is that at which the inputs explain the angle
-    best; a car that lags behind its inputs has one, too, so that it must be large. None if there is
-    none to be seen.
-    """
-    rows = moving(speed_mps)
-    if rows.sum() < FEWEST_DELAY_TICKS:
-        return None
-    n = min(angle_rad.size, MOST_TICKS)
-    angle, speed, rows = angle_rad[:n], speed_mps[:n], np.broadcast_to(rows, angle_rad.shape)[:n]
-    turning = yaw_rate_rad_s[:n] * speed
-    moves = np.array([_mean(ay_mps2[:n]), _mean(turning), _mean(speed)])
-    smooth = rows & (np.arange(n) % EACH == 0)
-    left = _unexplained(_change(speed * np.tan(angle)), moves, smooth)
-    if 1 - min(left.values()) > LEAST_EXPLAINED and not _is_one_of_many(left):
-        return _judged(left, LEAST_KINEMATIC_GAIN)
-    left = _unexplained(angle, np.array([*(one[:n] for one in inputs), speed]), rows)
-    if min(left.values()) > 1 / 2 or _is_one_of_many(left):
-        return None
-    return _judged(left, LEAST_GAIN)
-
-
-def is_in_time(angle_rad: FloatArray, course_rad: FloatArray, yaw_rate_rad_s: FloatArray) -> bool:
-    """Return whether a side-slip angle changes when the course does beyond the heading."""
-    n, apart = min(angle_rad.size, MOST_TICKS), 4 * HALF_CHANGE
-    turned = np.cumsum(np.nan_to_num(yaw_rate_rad_s)) * float(SAMPLE_TIME_S)
-    series = np.array([angle_rad, course_rad - turned, turned])[:, :n]
-    changes = series[:, apart:] - series[:, :-apart]
-    angle, slip = (changes[:2] + np.pi) % (2 * np.pi) - np.pi
-    left = _unexplained(angle, np.array([slip, changes[2]]), np.ones(angle.size, dtype=np.bool_))
-    best = min(left, key=lambda lag: left[lag])
-    return 1 - left[best] > LEAST_EXPLAINED and abs(best) < LEAST_LAG
-
-
-def _unexplained(label: FloatArray, inputs: FloatArray, rows: BoolArray) -> dict[int, float]:
-    """Return what part of a label's variance its inputs leave, by how many ticks it is late."""
-    n, m = label.size, FAR_LAG
-    within = slice(m, n - m)
-    some = rows & (np.arange(n) % EACH == 0)
-    near = dict.fromkeys(range(-MOST_LAG, MOST_LAG + 1), rows)
-    return {
-        lag: 1 - fit(label[m + lag : n - m + lag], inputs[:, within], chosen[within])[2]
-        for lag, chosen in (dict.fromkeys(range(-m, m + 1, EACH), some) | near).items()
-    }
-
-
-def _judged(left: dict[int, float], least_gain: float) -> tuple[float, float] | None:
-    best = min(left, key=lambda lag: left[lag])
-    gain = 1 - left[best] / left[0] if left[0] > 0 else 0.0
-    if not LEAST_LAG <= abs(best) < FAR_LAG or gain < least_gain:
-        return None
-    return best * float(SAMPLE_TIME_S), gain
-
-
-def _is_one_of_many(left: dict[int, float]) -> bool:
-    """Return whether the inputs leave nearly as little at quite another delay, as in a slalom."""
-    best = min(left, key=lambda lag: left[lag])
-    return min(left[lag] for lag in left if abs(lag - best) > MOST_LAG) < UNIQUE * left[best]
-
-
-def _change(velocity_mps: FloatArray) -> FloatArray:
-    """Return the mean rate of change around each tick, NaN at both ends."""
-    change = np.full(velocity_mps.size, np.nan)
-    width = 2 * HALF_CHANGE
-    change[HALF_CHANGE:-HALF_CHANGE] = velocity_mps[width:] - velocity_mps[:-width]
-    return change / (width * float(SAMPLE_TIME_S))
-
-
-def _mean(values: FloatArray) -> FloatArray:
-    """Return the mean over the same ticks."""
-    width = 2 * HALF_CHANGE
-    return np.convolve(values, np.ones(width) / width, "same")
 
 
 # What looks wrong in a course: it turns as the yaw rate does, and slips as a car does.
@@ -468,7 +364,7 @@ def _axles_swapped(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
 
 
 def _label(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
-    """Look for the label's delay behind its inputs, its sign, and its unit."""
+    """Look for the label's sign, unit and offset."""
     label = catalogue().label
     if not {label, "yaw_rate", "ay"} <= set(signals):
         return
@@ -480,20 +376,9 @@ def _label(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
         yield Fault("scaled", (label,), figure, "Check its unit: degrees or radians?")
         return
     with np.errstate(divide="ignore", invalid="ignore"):
-        inputs = [signals["ay"], signals["yaw_rate"] / speed, signals["yaw_rate"] * speed]
-    steering = [signals[n] for n in ("steering_wheel", *ROAD_WHEELS) if n in signals]
-    delay = find_delay(angle, signals["ay"], signals["yaw_rate"], speed, [*inputs, *steering])
-    in_time = "course" in signals and is_in_time(angle, signals["course"], signals["yaw_rate"])
-    if delay is not None and not in_time:
-        seconds, gain = delay
-        side = "earlier" if seconds > 0 else "later"
-        figure = (
-            f"its inputs explain it best {abs(seconds):.2f} s {side}, with {gain:.0%} less of its "
-            "variance left"
-        )
-        yield Fault("late", (label,), figure, f"Try delay_s = {seconds:.2f}.", seconds)
+        inputs = np.array([signals["ay"], signals["yaw_rate"] / speed])
     many = large.size >= FEWEST_TICKS and np.quantile(large, 0.9) > LARGE_RAD
-    yield from _lever(signals, np.array(inputs[:2]), rows & (speed < SLOW_MPS), many=bool(many))
+    yield from _lever(signals, inputs, rows & (speed < SLOW_MPS), many=bool(many))
 
 
 def _lever(signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool) -> Iterator[Fault]:

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import duckdb
 import h5py
 import numpy as np
 import pyarrow as pa
@@ -161,62 +160,6 @@ def test_columns_that_unfold_to_many_bytes_are_not_read(
     )
     assert file.stat().st_size < 10**7 / source.BYTES_PER_BYTE
     assert "bytes unfold to" in failure(file)
-
-
-# DuckDB
-
-
-def database(file: Path, *statements: str) -> Path:
-    with duckdb.connect(str(file)) as connection:
-        connection.sql("CREATE TABLE sound AS SELECT i / 100.0 AS t, i / 1e3 AS ax, 0.0 AS beta "
-                       "FROM range(100) AS r(i)")  # fmt: skip
-        for statement in statements:
-            connection.sql(statement)
-    return file
-
-
-ENDLESS = "SELECT i / 100.0 AS t, 0.0 AS ax, 0.0 AS beta FROM range(10000000000000) AS r(i)"
-COMPUTED = {
-    "a view": f"CREATE VIEW log AS {ENDLESS}",
-    "a view by another name": f'CREATE VIEW "LOG" AS {ENDLESS}',
-    "a macro": f"CREATE MACRO log() AS TABLE {ENDLESS}",
-    "a generated column": "CREATE TABLE log (t DOUBLE, ax DOUBLE, beta VARCHAR GENERATED ALWAYS AS "
-    "(repeat('x', 1000000000)))",
-}
-
-
-@pytest.mark.parametrize("statement", COMPUTED.values(), ids=COMPUTED)
-def test_what_a_database_computes_is_not_read(tmp_path: Path, statement: str) -> None:
-    file = database(tmp_path / "log.duckdb", statement)
-    told = failure(file, a_mapping(duckdb={"table": "log"}))
-    assert "what a file computes is not read" in told
-
-
-def test_a_database_cannot_hide_what_it_computes(tmp_path: Path) -> None:
-    hiding = (
-        f"CREATE VIEW log AS {ENDLESS}",
-        "CREATE MACRO lower(x) AS 'sound'",
-        "CREATE MACRO duckdb_tables() AS TABLE SELECT 'measured' AS database_name, 'main' AS "
-        "schema_name, 'log' AS table_name, 1 AS estimated_size, 0 AS table_oid",
-    )
-    file = database(tmp_path / "log.duckdb", *hiding)
-    told = failure(file, a_mapping(duckdb={"table": "log"}))
-    assert "what a file computes is not read" in told
-
-
-def test_equal_rows_of_a_database_are_counted_first(tmp_path: Path) -> None:
-    many = (
-        "CREATE TABLE log AS SELECT 0::DOUBLE AS t, 0::DOUBLE AS ax, 0::DOUBLE AS beta FROM range"
-    )
-    file = database(tmp_path / "log.duckdb", f"{many}(20000000)")
-    assert file.stat().st_size < 10**6
-    assert "20,000,000 rows or more" in failure(file, a_mapping(duckdb={"table": "log"}))
-
-
-def test_rows_in_a_file_beside_a_database_are_not_read(tmp_path: Path) -> None:
-    file = database(tmp_path / "log.duckdb")
-    os.mkfifo(tmp_path / "log.duckdb.wal")
-    assert "beside it is a .wal file" in failure(file, a_mapping(duckdb={"table": "sound"}))
 
 
 # MDF

@@ -16,7 +16,6 @@ import pytest
 import scipy.io
 import scipy.sparse
 from asammdf import MDF, Signal
-from pydantic import ValidationError
 
 from fleet_slip.errors import ExtraError
 from fleet_slip.ingest.formats import matlab, mdf
@@ -305,19 +304,10 @@ def test_the_folders_of_a_hive_partitioned_dataset_are_columns(tmp_path: Path) -
     assert read_measured(other / "part-0.parquet", mapping).digest != log.digest
 
 
-def test_a_table_of_a_duckdb_file(tmp_path: Path) -> None:
-    file = tmp_path / "log.duckdb"
-    with duckdb.connect(str(file)) as database:
-        database.register("arrow", a_table())
-        database.sql('CREATE TABLE "my ""log" AS FROM arrow')
-    drive = {"day": START.date()}
-    require_the_drive(read_measured(file, a_mapping(drive=drive, duckdb={"table": 'my "log'})))
-    assert "needs [duckdb] with table" in failure(file, a_mapping())
-    assert "it has no table 'nothing'" in failure(file, a_mapping(duckdb={"table": "nothing"}))
-    with pytest.raises(ValidationError, match="only tables are read"):
-        a_mapping(duckdb={"table": "t", "query": "SELECT 1"})
-    file.write_bytes(file.read_bytes()[:5000])
-    assert "cannot be read: " in failure(file, a_mapping(duckdb={"table": "log"}))
+def test_a_duckdb_file_is_to_be_written_as_parquet(tmp_path: Path) -> None:
+    with duckdb.connect(str(tmp_path / "log.duckdb")) as database:
+        database.sql("CREATE TABLE log AS SELECT 1 AS t")
+    assert "COPY my_table TO 'log.parquet'" in failure(tmp_path / "log.duckdb", a_mapping())
 
 
 @pytest.mark.parametrize("magic", [b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07"])
@@ -327,14 +317,12 @@ def test_an_archive_is_to_be_unpacked(tmp_path: Path, magic: bytes) -> None:
     assert "it is an archive. Unpack it with" in failure(file, mdf_mapping())
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"), [("a.mf4", "an MDF file"), ("a.mat", "a MATLAB file"), ("a.duckdb", "DuckDB")]
-)
+@pytest.mark.parametrize(("name", "kind"), [("a.mf4", "an MDF file"), ("a.mat", "a MATLAB file")])
 def test_a_file_that_is_not_what_its_name_says_is_refused(
     tmp_path: Path, name: str, kind: str
 ) -> None:
     (tmp_path / name).write_bytes(b"t,ax,beta\n0,1,2\n")
-    assert f"not {'a ' if kind == 'DuckDB' else ''}{kind}" in failure(tmp_path / name, a_mapping())
+    assert f"not {kind}" in failure(tmp_path / name, a_mapping())
 
 
 @pytest.mark.usefixtures("in_process")

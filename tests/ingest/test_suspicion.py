@@ -13,7 +13,6 @@ import fleet_slip
 from fleet_slip.arrays import FloatArray
 from fleet_slip.cli.app import app
 from fleet_slip.errors import AlarmError
-from fleet_slip.ingest import suspicion as relations
 from fleet_slip.ingest.log_faults import _LIMITS, _count_jumps, find_refusals
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_suspicions
 from tests.ingest.test_folders import MAPPING as PLAIN
@@ -104,65 +103,6 @@ def test_a_label_that_no_car_has_needs_no_peers(
     car = a_car()
     wrong = factor * car["sideslip"] + np.radians(offset_deg)
     assert kinds({**car, "sideslip": wrong}) == {(kind, ("sideslip",))}
-
-
-@pytest.mark.parametrize("delay", [-0.2, 0.08, 0.3, 1.0, -1.3])
-def test_a_delay_of_the_label(delay: float) -> None:
-    car = a_car()
-    late = {**car, "sideslip": np.roll(car["sideslip"], round(100 * delay))}
-    found = [one for one in find_suspicions(late) if one.kind == "late"]
-    assert [one.value for one in found] == [
-        pytest.approx(delay, abs=0.011 if abs(delay) < 0.5 else 0.051)
-    ]
-    assert "delay_s" in found[0].remedy
-
-
-def test_a_car_that_lags_behind_its_inputs_is_not_taken_for_a_late_label(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    car = a_car(20.0)
-    ticks, speed = np.arange(car["ay"].size), car["wheel_rl"] * RADIUS_M
-    steer = 0.02 * np.sin(ticks / 40) + 0.02 * np.sin(ticks / 91)
-    angle = -0.8 * np.roll(steer, 25)
-    lazy = {
-        "yaw_rate": speed * steer / 3,
-        "ay": speed * (np.gradient(angle, 0.01) + speed * steer / 3),
-        "steering_wheel": 15 * steer,
-        "sideslip": angle,
-        **{name: car[name] for name in WHEELS},
-    }
-    assert "late" not in {kind for kind, _ in kinds(lazy)}
-    late = {**lazy, "sideslip": np.roll(angle, 20)}
-    assert [s.value for s in find_suspicions(late) if s.kind == "late"] == [
-        pytest.approx(0.2, abs=0.02)
-    ]
-    rough = {**lazy, "ay": lazy["yaw_rate"] * speed}  # no witness, but for the course
-    assert "late" in {kind for kind, _ in kinds(rough)}
-    course = np.where(ticks % 10, np.nan, angle + np.cumsum(lazy["yaw_rate"]) / 100)
-    rough |= {"course": (course + np.pi) % (2 * np.pi) - np.pi, "satellite_speed": speed}
-    assert "late" not in {kind for kind, _ in kinds(rough)}
-    assert "late" in {kind for kind, _ in kinds(rough | {"sideslip": np.roll(angle, 20)})}
-    monkeypatch.setattr(relations, "LEAST_EXPLAINED", 1.0)  # without the witness
-    assert "late" in {kind for kind, _ in kinds(lazy)}
-
-
-def test_a_slalom_shows_no_delay() -> None:
-    """Where all is one sine, half a period later fits as well; a harmonic shows the car's lag."""
-    noise, time_s = np.random.default_rng(1), np.arange(3300) / 100
-    speed = 9.7 + 0.5 * np.sin(0.2 * time_s)
-    curvature, lagging = (
-        0.04 * (np.sin(1.7 * time_s) + 0.2 * np.sin(5.1 * (time_s - lag_s))) for lag_s in (0, 0.29)
-    )
-    yaw_rate = curvature * speed
-    slalom = {
-        "yaw_rate": yaw_rate,
-        "ay": 1.05 * yaw_rate * speed + 0.2 * noise.normal(size=speed.size),
-        "steering_wheel": 45 * curvature,
-        "sideslip": 1.2 * lagging
-        + 0.003 * np.convolve(noise.normal(size=speed.size), np.ones(20) / 20**0.5, "same"),
-        **dict.fromkeys(WHEELS, speed / RADIUS_M),
-    }
-    assert kinds(slalom) == set()
 
 
 STEPS = {"ax": 0.08, "ay": 0.08, "yaw_rate": 0.005, "steering_wheel": 0.026, "sideslip": 0.002}

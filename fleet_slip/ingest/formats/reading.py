@@ -22,9 +22,8 @@ from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 
-import duckdb
 import polars as pl
 import pyarrow as pa
 
@@ -35,26 +34,22 @@ from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.confined_reader import FORMATS, SIZES, Job
 from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
 from fleet_slip.ingest.formats.source import Base, Budget, Channel, Source, unreadable
-from fleet_slip.ingest.formats.tables import MAGIC as DUCKDB_MAGIC
-from fleet_slip.ingest.formats.tables import MAGIC_AT as DUCKDB_AT
-from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, DuckdbRows, open_duckdb, open_parquet
+from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, open_parquet
 from fleet_slip.ingest.formats.vbo import BEGINS as VBO_BEGINS
 from fleet_slip.ingest.formats.vbo import VboSource
 from fleet_slip.ingest.log_files import parts_of
 
 [_HDF5], _HDF5_AT = FORMATS["mat73"].begins, 512
 """A MATLAB file of version 7.3 becomes HDF5 there: MATLAB's own header is before it."""
+_DUCKDB, _DUCKDB_AT = b"DUCK", 8
 _ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
 _BINARY = {
     (".parquet", ".pq"): "a Parquet file",
     (".mf4", ".mdf"): "an MDF file",
     (".mat", ".h5", ".hdf5"): "a MATLAB file of version 5 or 7.3",
-    (".duckdb", ".ddb"): "a DuckDB file",
     (".mcap",): "an MCAP file",
     (".tdms", ".tdms_index"): "a TDMS file",
 }
-
-Said = TypeVar("Said")
 
 
 @dataclass(frozen=True)
@@ -64,14 +59,12 @@ class FileFormats:
     Attributes:
         csv: separator and decimal sign of text.
         can: the database of a CAN trace.
-        duckdb: the rows of a DuckDB file.
         name: the mapping that says it, for messages.
         plain_numbers: which columns of text are numbers, wherever they are used.
     """
 
     csv: CsvFormat = field(default_factory=CsvFormat)
     can: CanBus | None = None
-    duckdb: DuckdbRows | None = None
     name: str = "mapping suggest"
     plain_numbers: PlainNumbers = field(default_factory=PlainNumbers)
 
@@ -144,11 +137,16 @@ def _opened(
         name = name or "can_trace"
     if start.startswith(PARQUET_MAGIC):
         return open_parquet(budget)
-    if start[DUCKDB_AT:].startswith(DUCKDB_MAGIC):
-        rows = _wanted(formats.duckdb, file, "duckdb", 'table = "…"', formats)
-        return open_duckdb(rows, budget)
-    if name == "can_trace":
-        _wanted(formats.can, file, "can", 'database = "….dbc"', formats)
+    if start[_DUCKDB_AT:].startswith(_DUCKDB):
+        raise InputError(
+            f"{shown(file)}: it is a DuckDB file, which is not read. Write the table with DuckDB: "
+            "COPY my_table TO 'log.parquet', and give that."
+        )
+    if name == "can_trace" and formats.can is None:
+        raise InputError(
+            f'{shown(file)}: this format needs [can] with database = "….dbc" in the mapping '
+            f"{formats.name!r}."
+        )
     if name:
         bus = formats.can if name in {"can_trace", "mdf_bus"} else None
         return open_confined(name, bus, budget)
@@ -163,26 +161,15 @@ def _opened(
     return nullcontext(CsvSource(budget, formats.csv, formats.plain_numbers))
 
 
-def _wanted(said: Said | None, file: Path, table: str, key: str, formats: FileFormats) -> Said:
-    """Return what the mapping says of a format that needs it. Raises `InputError`."""
-    if said is None:
-        raise InputError(
-            f"{shown(file)}: this format needs [{table}] with {key} in the mapping "
-            f"{formats.name!r}."
-        )
-    return said
-
-
 @contextmanager
 def file_errors(file: Path) -> Iterator[None]:
-    """Turn what the operating system, Polars, pyarrow and DuckDB raise into an `InputError`."""
+    """Turn what the operating system, Polars and pyarrow raise into an `InputError`."""
     try:
         yield
     except (
         OSError,
         ValueError,
         MemoryError,
-        duckdb.Error,
         pa.ArrowException,
         pl.exceptions.PolarsError,
         pl.exceptions.PanicException,

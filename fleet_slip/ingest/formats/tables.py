@@ -1,27 +1,21 @@
-"""Reads tables, of Parquet and of DuckDB: text, numbers as float64, dates and timestamps."""
+"""Reads Parquet: text, numbers as float64, dates and timestamps."""
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import date
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import unquote
 
-import duckdb
 import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from pydantic import field_validator
 
 from fleet_slip.base import shown
-from fleet_slip.config import Config, Name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.source import Budget, Channel, FormatSource, find_column
-from fleet_slip.limits import memory_bytes
-from fleet_slip.warehouse.database import sql_text
 
 BATCH_ROWS = 2**15
 """Parquet is read in batches of this many rows."""
@@ -178,100 +172,3 @@ def _in_calendar(array: pa.Array) -> pa.Array:
     first, end = (max(-(2**63), min(2**63 - 1, days * per_day)) for days in (_FIRST_DAY, _END_DAY))
     inside = pc.and_(pc.greater_equal(counts, first), pc.less(counts, end))
     return pc.if_else(inside, array, pa.scalar(None, kind))
-
-
-# Reads a table of a DuckDB file.
-
-MAGIC = b"DUCK"
-MAGIC_AT = 8
-_NAME = "measured"
-"""What the file is called as a database."""
-_STORED = """
-    SELECT table_name, estimated_size FROM duckdb_tables()
-    WHERE database_name = $name AND schema_name = 'main' AND lower(table_name) = lower($table)
-    AND table_oid NOT IN (SELECT table_oid FROM duckdb_columns() WHERE is_generated)
-"""
-
-
-class DuckdbRows(Config):
-    """The table of a DuckDB file that is the log."""
-
-    table: Name
-    query: None = None
-    """Read by earlier releases; part of a mapping's identity."""
-
-    @field_validator("query", mode="before")
-    @classmethod
-    def _no_query(cls, query: object) -> None:
-        if query is not None:
-            raise ValueError("only tables are read: store the answer, CREATE TABLE … AS …")
-
-
-class DuckdbSource(FormatSource):
-    """A table of an open DuckDB file, in its order."""
-
-    has_clock = False
-
-    def __init__(
-        self, connection: duckdb.DuckDBPyConnection, table: str, rows: int, file: Path
-    ) -> None:
-        """Take a connection to a file, the table, and how many rows it has."""
-        self._file, self._connection, self._rows = file, connection, rows
-        name = table.replace('"', '""')
-        self._query = f'SELECT * FROM {_NAME}.main."{name}"'
-
-    def channels(self) -> list[Channel]:
-        """Return the columns."""
-        return [Channel(name) for name in self._connection.sql(self._query).columns]
-
-    def find(self, column: str) -> tuple[str, int]:
-        """Return where a column is. Raises `InputError`."""
-        return "", find_column(self._file, [one.name for one in self.channels()], column)
-
-    def count(self, _base: str, _found: dict[str, Any]) -> int:
-        """Return how many rows there are."""
-        return self._rows
-
-    def read(self, _base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
-        """Yield rows. Raises `InputError`."""
-        for batch in self._connection.sql(self._query).to_arrow_reader(BATCH_ROWS):
-            plain = {n: plain_column(batch.column(n), n, self._file) for n in found}
-            yield pl.DataFrame(pa.table(plain))
-
-
-@contextmanager
-def open_duckdb(rows: DuckdbRows, budget: Budget) -> Iterator[DuckdbSource]:
-    """Open a DuckDB file for reading. Raises `InputError`.
-
-    What is read must stand in the file: views, macros and generated columns can compute anything.
-    """
-    file = budget.file
-    if os.path.lexists(f"{file}.wal"):
-        raise InputError(
-            f"{shown(file)}: beside it is a .wal file with rows that are not in it yet. Open and "
-            "close it with DuckDB."
-        )
-    with TemporaryDirectory(prefix="fleet-slip-") as folder:
-        # One thread: the order of rows, and so the ticks, may depend on nothing but the file.
-        settings: dict[str, Any] = {
-            "threads": 1,
-            "memory_limit": f"{memory_bytes() // 2 // 2**20}MiB",
-            "temp_directory": folder,
-            "max_temp_directory_size": f"{budget.unfolded}B",
-            "autoinstall_known_extensions": False,
-            "autoload_known_extensions": False,
-        }
-        with duckdb.connect(config=settings) as connection:
-            connection.execute(f"ATTACH {sql_text(str(file))} AS {_NAME} (TYPE duckdb, READ_ONLY)")
-            connection.execute("SET enable_external_access = false")
-            connection.execute("SET lock_configuration = true")
-            asked = {"name": _NAME, "table": rows.table}
-            stored = connection.execute(_STORED, asked).fetchall()
-            if not stored:
-                raise InputError(
-                    f"{shown(file)}: it has no table {rows.table!r}, or it is a view, or has "
-                    "generated columns: what a file computes is not read. Store it: CREATE TABLE "
-                    "… AS FROM …"
-                )
-            budget.require_rows(stored[0][1])
-            yield DuckdbSource(connection, rows.table, stored[0][1], file)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import can
-import duckdb
 import h5py
 import mcap_ros2.writer
 import nptdms
@@ -134,13 +133,6 @@ def _tdms(file: Path) -> None:
             writer.write_segment([ax, nptdms.ChannelObject("gps", "beta", BETA[rows], wave), note])
 
 
-def _duckdb(file: Path) -> None:
-    table = pa.table({"t": TIME_S, "ax": AX, "beta": BETA})
-    with duckdb.connect(str(file)) as database:
-        database.register("rows", table)
-        database.sql("CREATE TABLE log AS FROM rows")
-
-
 def _csv(file: Path) -> None:
     pl.DataFrame({"t": TIME_S, "ax": AX, "beta": BETA}).write_csv(file)
 
@@ -183,7 +175,6 @@ FORMATS: dict[str, Format] = {
         _mapping("ax", "Data.beta"),
     ),
     "mat73": Format(".mat", _mat73, _mapping("ax", "Data.beta")),
-    "duckdb": Format(".duckdb", _duckdb, _mapping("ax", "beta", duckdb={"table": "log"})),
     "vbo": Format(".vbo", _vbo, _mapping("ax", "beta", **_OWN)),
     "csv_zst": Format(".csv.zst", _compressed, _mapping("ax", "beta")),
 }

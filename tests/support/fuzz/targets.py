@@ -76,7 +76,7 @@ def parquet(rng: random.Random, place: Path) -> None:
 
 
 def logs(rng: random.Random, place: Path) -> None:
-    """Ingest a file of a format of test departments: MDF, CAN traces, MATLAB, DuckDB ..."""
+    """Ingest a file of a format of test departments: MDF, CAN traces, MATLAB ..."""
     data, written = damaged_file(rng)
     _ingest(rng, place, data, written.suffix, written.mapping)
 
