@@ -9,9 +9,6 @@
 -- A feature set may also divide the rows of a drive ("part"), and its features may be clipped to int16 ("clipped" says
 -- how often). The set of the catalogue's own signals has neither, and constants cost nothing.
 --
--- The products of many columns come from several groupings of the same rows: DuckDB keeps the sums of a group in one
--- block of 256 KiB, and divides by zero where they do not fit.
---
 -- INTEGER products: SMALLINT * SMALLINT would overflow. union_by_name: gives DuckDB the files' statistics, from which
 -- it knows that no sum can overflow; without it the query is three times slower.
 WITH drive AS (
@@ -26,7 +23,7 @@ WITH drive AS (
     WHERE tick = 0
 ),
 
-{counted}gram AS (
+gram AS (
     SELECT
         drive_id,
         {absent} AS absent,
@@ -41,7 +38,7 @@ WITH drive AS (
         ]::BIGINT[] AS products
     FROM {counts}
     GROUP BY {group}
-){further}
+)
 
 SELECT
     $feature_set AS feature_set,
@@ -53,7 +50,7 @@ SELECT
     gram.n,
     gram.clipped,
     [s FOR s IN gram.sums IF s IS NOT NULL] AS sums,
-    [p FOR p IN {all_products} IF p IS NOT NULL] AS products{course_late}
+    [p FOR p IN gram.products IF p IS NOT NULL] AS products
 FROM gram
-JOIN drive USING (drive_id){joined}
+JOIN drive USING (drive_id)
 ORDER BY drive.file, drive_id, gram.absent, gram.part

@@ -235,10 +235,9 @@ class LogsAndGrams(Rooted):
     ) -> "CheckReport":
         """Compute the Gram rows of some log files three ways; compare them bit for bit.
 
-        By SQL, by float64 products with exact partial sums, and by Python integers; and with the
-        stored rows. Files are evenly chosen; those of `begin` + 1 are the next ones. Progress is in
-        files. Raises `StorageError` naming the first drive that differs, and `DataError` if there
-        is nothing to check.
+        By the compiled kernel, by SQL where a set has it, and as stored. Files are evenly chosen;
+        those of `begin` + 1 are the next ones. Progress is in files. Raises `StorageError` naming
+        the first drive that differs, and `DataError` if there is nothing to check.
         """
         from fleet_slip.grams.check import check_grams
 

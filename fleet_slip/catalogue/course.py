@@ -26,10 +26,8 @@ from fractions import Fraction
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.arithmetic import nearest_sql
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S, catalogue
-from fleet_slip.resources import read_sql
 
 COURSE, YAW_RATE = "course", "yaw_rate"
 TURNED = "turned"
@@ -51,15 +49,7 @@ by enough in half of it to matter."""
 MOST_LATE, MOST_EARLY = 50, -10
 """Ticks. A course is early where the accelerometer and gyroscope are later than it."""
 COURSE_LATE = "course_late"
-"""Column of `grams`: by how many parts of a tick the course was taken to be late. And the variable
-of the SQL statement that tells it of each car."""
-
-OVER = "hidden_over"
-"""Column of changes: the place of their time among those of the set."""
-WHOLE_TICKS = (
-    f"((hidden_late + {LATE_PARTS // 2 - LATE_PARTS * MOST_EARLY}) // {LATE_PARTS} + {MOST_EARLY})"
-)
-"""Whole ticks in SQL, whose division is towards zero."""
+"""Column of `grams`: by how many parts of a tick the course was taken to be late."""
 
 
 @dataclass(frozen=True)
@@ -100,48 +90,6 @@ def split_late(late: int) -> tuple[int, int]:
     """Return how many whole ticks late a course is, and what its label gains per count of r."""
     whole = (late + LATE_PARTS // 2) // LATE_PARTS
     return whole, (late - whole * LATE_PARTS) * 4 * HALF_TURN // LATE_PARTS
-
-
-def with_changes(
-    rows: str, columns: tuple[str, ...], times: tuple[int, ...], *, in_time: bool
-) -> str:
-    """Return a subquery of the changes over each of some numbers of ticks, `OVER` which it is.
-
-    `rows` has the columns, course and yaw rate, `vehicle_id` and the column `clipped`. With
-    `in_time` the course is moved by what the variable `course_late`, a map from cars to the delays
-    of their receivers, says of the car.
-    """
-    if in_time:
-        statement = read_sql("jobs", "course_in_time.sql")
-        moved = f"({statement.format(rows=rows, whole_ticks=WHOLE_TICKS)})"
-    else:
-        moved = f"(SELECT *, 0 AS hidden_late FROM {rows})"
-    units, label = course_units(), catalogue().label
-    left = f"({units.turn} * hidden_course - {2 * HALF_TURN} * hidden_turned + hidden_rest)"
-    whole = 2 * HALF_TURN * units.turn
-    slow = f"hidden_rate <= {units.slow} AND abs(hidden_turned) <= {units.unturned}"
-    parts = {
-        "rows": moved,
-        "label": label,
-        "left": left,
-        "whole": whole,
-        "turns": nearest_sql(left, str(whole)),
-        "change": nearest_sql(label, str(units.divisor)),
-        "coarser": nearest_sql("hidden_turned", str(COARSER)),
-        "straight": f"CASE WHEN hidden_turned IS NOT NULL THEN ({slow})::BIGINT END",
-        "gain": f"(hidden_late - {WHOLE_TICKS} * {LATE_PARTS}) * {4 * HALF_TURN // LATE_PARTS}",
-        "largest": units.largest,
-        "changes": ",\n            ".join(
-            f"{name}::BIGINT - (max({name}) OVER ago)::BIGINT AS {name}" for name in columns
-        ),
-    }
-    statement = read_sql("jobs", "course_changes.sql")
-    changes = [
-        f"SELECT *, {number} AS {OVER} FROM "
-        f"({statement.format(**parts, ticks=ticks, since=ticks - 1)})"
-        for number, ticks in enumerate(times)
-    ]
-    return f"({' UNION ALL '.join(changes)})"
 
 
 # What changes of the course tell of a car: a few figures, whose usual values are known.

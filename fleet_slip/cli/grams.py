@@ -16,7 +16,7 @@ from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.columns.sql import column_query
 from fleet_slip.config import read_named_file
-from fleet_slip.grams.compute import gram_statement
+from fleet_slip.grams.compute import gram_statement, has_statement
 from fleet_slip.rendering import TextTable
 from fleet_slip.resources import config_files, folder, own_configs
 
@@ -48,7 +48,7 @@ def gram(
     """
     names = (PLAIN, *known_features().sets) if features == ALL_SETS else (features,)
     if sql:
-        for name in names:
+        for name in names if features != ALL_SETS else filter(has_statement, names):
             typer.echo(gram_statement(catalogue(), name))
         return
     with open_workers(fleet.root, cluster or threads) as executor:

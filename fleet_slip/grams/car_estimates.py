@@ -359,7 +359,7 @@ def add_standstill(sums: Mapping[str, Gram], estimates: CarEstimates) -> None:
 # The satellite's speed over that of the wheels is the speed ratio, whatever a body that rolls or a
 # bank adds to the accelerometer. And the course changes by more than the yaw rate's integral as
 # the side-slip angle does, which on roads is l r/v + K ay: the rear axle is l behind the centre of
-# gravity, and gives way by K (`catalogue/course_relation.py`). Both are of speeds by wheels of .31
+# gravity, and gives way by K (`catalogue/course.py`). Both are of speeds by wheels of .31
 # m.
 
 SATELLITE = "satellite_speed"

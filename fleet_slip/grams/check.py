@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.errors import DataError, StorageError
-from fleet_slip.grams.compute import by_sql, wide_grams
+from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
 from fleet_slip.grams.gram_files import find_backlog, is_of_received
 from fleet_slip.grams.gram_rows import is_received
 from fleet_slip.grams.job import unit_name
@@ -38,10 +38,10 @@ class CheckReport:
     def ways(self) -> list[tuple[str, int, str]]:
         """What was compared, in how many drives, and that it was equal."""
         ways = dict.fromkeys(
-            ("SQL against stored Gram rows", "SQL against the kernel"), self.drives
+            ("stored Gram rows against the kernel", "SQL against the kernel"), self.drives
         )
         if self.wide_sets:
-            ways[f"SQL against the kernel: {', '.join(self.wide_sets)}"] = self.wide_drives
+            ways[f"stored against the kernel: {', '.join(self.wide_sets)}"] = self.wide_drives
         return [(way, drives, "yes") for way, drives in ways.items()]
 
 
@@ -95,19 +95,20 @@ def _evenly(files: Sequence[TableFile], count: int, begin: int) -> list[TableFil
 def _compare_ways(
     warehouse: Warehouse, file: TableFile, feature_set: str, places: Iterable[str]
 ) -> int:
-    """Compare SQL with the kernel and with what is stored, if it is there; count drives."""
+    """Compare the kernel with what is stored, if it is there, and with SQL; count drives."""
     identity = features().identity(feature_set)
     stored = stored_grams(warehouse, [file], places, identity).get(file.path, {})
     if not stored and feature_set != PLAIN:
         return 0
     late = recorded_cars(warehouse.grams.snapshot(), identity, file.path)
-    rows = by_sql(warehouse, [file], feature_set, late)
-    from_sql = grams_of(rows)
-    computed = grams_of(wide_grams(warehouse, [file], feature_set, late))
-    for other, found in (("the stored Gram rows", stored), ("the kernel", computed)):
-        if drives := differing_drives(from_sql, found):
+    rows = wide_grams(warehouse, [file], feature_set, late)
+    computed, others = grams_of(rows), {"the stored Gram rows": stored}
+    if has_statement(feature_set):
+        others["SQL"] = grams_of(by_sql(warehouse, [file], feature_set))
+    for other, found in others.items():
+        if drives := differing_drives(computed, found):
             raise StorageError(
-                f"{file.path}: the Gram of drive {drives[0]} by SQL and by {other} of "
+                f"{file.path}: the Gram of drive {drives[0]} by the kernel and by {other} of "
                 f"{feature_set} differ. If the Gram job has not run since the logs changed, run: "
                 "fleet-slip gram. Otherwise the file or a library is damaged: keep both and "
                 "report it."

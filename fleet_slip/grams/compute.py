@@ -25,10 +25,8 @@ from fleet_slip.catalogue.course import (
     COARSER,
     COURSE,
     COURSE_LATE,
-    OVER,
     course_units,
     split_late,
-    with_changes,
 )
 from fleet_slip.catalogue.definitions import COUNT_BITS
 from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, FeatureSet, features
@@ -37,7 +35,7 @@ from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
 from fleet_slip.columns.sql import with_absent, with_columns
 from fleet_slip.compute.tasks import LocalThreads, in_flight, run_tasks
-from fleet_slip.errors import DataError, StorageError
+from fleet_slip.errors import DataError, QuestionError, StorageError
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import TableFile, absent_columns
 from fleet_slip.warehouse.database import open_database, reading_files
@@ -206,8 +204,6 @@ class Parts:
             return _row_fold_sql(self.row_folds)
         if self.block_ticks:
             return f"tick // {self.block_ticks}"
-        if self.times:
-            return OVER
         number = "0"
         for bands in self.bands:
             number = f"({number}) * {len(bands.names)} + {bands.sql}"
@@ -260,8 +256,15 @@ BITS = 63
 """Bits of a BIGINT that are no sign."""
 
 MOST_SUMS = 8_000
-"""Sums of one grouping: DuckDB 2.0.0 ends with SIGFPE where those of a group, 24 bytes each, are
+"""Sums of a grouping: DuckDB 2.0.0 ends with SIGFPE where those of a group, 24 bytes each, are
 longer than its block of 262,144 bytes."""
+
+
+def has_statement(feature_set: str) -> bool:
+    """Whether SQL computes a feature set, too; else the kernel alone does."""
+    one = features().feature_set(feature_set)
+    k = len(one.columns)
+    return not one.change_ticks and k + k * (k + 1) // 2 <= MOST_SUMS
 
 
 def gram_statement(
@@ -274,19 +277,21 @@ def gram_statement(
     """Return the statement that computes the Gram rows of a feature set.
 
     `whole`: no file has a column in only some rows; `absent` are later columns, which none has.
-    Raises `QuestionError` for an unknown set.
+    Raises `QuestionError` for an unknown set, and for one that the kernel alone computes.
     """
     known = features()
     one = known.feature_set(feature_set)
+    if not has_statement(feature_set):
+        raise QuestionError(
+            f"the Gram rows of {feature_set} have no SQL: the compiled kernel alone computes "
+            "changes of the course and sets of many columns. Its columns: fleet-slip features --sql"
+        )
     names = one.columns
     windows = known.definitions(feature_set)
     regimes = [known.regimes[name].of for name in one.regimes]
     used = known.rows(dict.fromkeys([*one.features, *regimes]))
     logs = with_absent(LOGS, absent)
     rows = with_columns(logs, used, windows)
-    if one.change_ticks:
-        columns = (*one.signals, *one.features, *one.windows)
-        rows = with_changes(rows, columns, one.change_ticks, in_time=one.in_time)
     wide = windows or any(feature.bits > COUNT_BITS for feature in used.values())
     kind = "BIGINT" if wide else "INTEGER"
     parts = Parts.of_set(known, one)
@@ -295,15 +300,6 @@ def gram_statement(
     products = [
         f"sum({a}::{kind} * {b}::{kind})" for i, a in enumerate(names) for b in names[: i + 1]
     ]
-    first = MOST_SUMS - len(sums)
-    further = [products[i : i + MOST_SUMS] for i in range(first, len(products), MOST_SUMS)]
-    group = ", ".join(_group(whole=whole, divided=bool(parts)))
-    counted = ""
-    if further:
-        clipped = ", clipped" if used or windows else ""
-        kept = f"{absent_sql} AS absent, {part} AS part{clipped}, {', '.join(names)}"
-        counted = f"counted AS MATERIALIZED (\n    SELECT drive_id, {kept}\n    FROM {rows}\n),\n\n"
-        rows, absent_sql, part, group = "counted", "absent", "part", "drive_id, absent, part"
     return read_sql("jobs", "gram.sql").format(
         drive_columns=", ".join(
             signals.null_sql(name) if name in absent else name for name in signals.drive
@@ -311,43 +307,13 @@ def gram_statement(
         qualified_drive_columns=", ".join(f"drive.{name}" for name in signals.drive),
         absent=absent_sql,
         part=part,
-        counted=counted,
         clipped="sum(clipped)::BIGINT" if used or windows else "0",
         sums=_SEPARATOR.join(sums),
-        products=_SEPARATOR.join(products[:first]),
+        products=_SEPARATOR.join(products),
         counts=rows,
-        group=group,
-        further="".join(_further(i, some) for i, some in enumerate(further)),
-        joined="".join(_joined(i) for i in range(len(further))),
-        all_products=" || ".join(
-            ["gram.products", *(f"further_{i}.products" for i in range(len(further)))]
-        ),
-        course_late=_course_late(one.in_time),
+        group=", ".join(_group(whole=whole, divided=bool(parts))),
         part_name=parts.name_sql("gram.part") if parts else "NULL::VARCHAR",
         names=", ".join(f"'{name}'" for name in names),
-    )
-
-
-def _course_late(in_time: bool) -> str:
-    """Return what a Gram row records of the delay that was corrected in it."""
-    known = f"getvariable('{COURSE_LATE}')[drive.vehicle_id]"
-    return f",\n    {known}::BIGINT AS {COURSE_LATE}" if in_time else ""
-
-
-def _further(number: int, products: Sequence[str]) -> str:
-    """Return further products of the groups, which have their keys to be joined by."""
-    return (
-        f",\n\nfurther_{number} AS (\n    SELECT\n        drive_id,\n        absent,\n"
-        f"        part,\n        [\n            {_SEPARATOR.join(products)}\n"
-        "        ]::BIGINT[] AS products\n    FROM counted\n    GROUP BY drive_id, absent, part\n)"
-    )
-
-
-def _joined(number: int) -> str:
-    other = f"further_{number}"
-    return (
-        f"\nJOIN {other} ON {other}.drive_id = gram.drive_id AND {other}.absent = gram.absent "
-        f"AND {other}.part IS NOT DISTINCT FROM gram.part"
     )
 
 
@@ -411,8 +377,8 @@ def compute_grams(
     with nullcontext(executor) if executor else LocalThreads(cpu_count() or 1) as workers:
         many = 1 if wide else ceil(len(files) / in_flight(workers))
         groups = _groups(files, min(FILES_PER_QUERY, max(1, many)))
-        way = wide_grams if wide else partial(by_sql, threads=1)
-        task = partial(way, warehouse, feature_set=feature_set, late=late)
+        way = partial(wide_grams, late=late) if wide else partial(by_sql, threads=1)
+        task = partial(way, warehouse, feature_set=feature_set)
         yield from _by_tasks(workers, task, groups, progress)
 
 
@@ -447,12 +413,11 @@ def by_sql(
     warehouse: Warehouse,
     files: Sequence[TableFile],
     feature_set: str,
-    late: Late = None,
     threads: int | None = None,
 ) -> pa.Table:
-    """Return the Gram rows of log files as `jobs/gram.sql` defines them, of any feature set."""
+    """Return the Gram rows of log files as `jobs/gram.sql` defines them."""
     with open_database(reading=warehouse.logs.folder, threads=threads) as database:
-        return _query(database, warehouse, files, feature_set, late)
+        return _query(database, warehouse, files, feature_set)
 
 
 def _query(
@@ -460,7 +425,6 @@ def _query(
     warehouse: Warehouse,
     files: Sequence[TableFile],
     feature_set: str,
-    late: Late = None,
 ) -> pa.Table:
     paths = {warehouse.logs.uri(file.path): file.path for file in files}
     # Whether each signal is in all rows of a file or in none, by the Delta log's statistics.
@@ -475,25 +439,14 @@ def _query(
     doing = f"the Gram query over {number_of(len(files), 'log file')} in {warehouse.logs.folder}"
     with reading_files(database, doing):
         database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
-        set_late(database, late)
         rows = database.sql(statement, params={"feature_set": identity}).to_arrow_table()
     relative = pa.array([paths[path] for path in rows["file"].to_pylist()], pa.string())
-    in_time = features().feature_set(feature_set).in_time
     return rows.set_column(rows.schema.get_field_index("file"), "file", relative).cast(
-        warehouse.computed_schema(in_time=in_time)
+        warehouse.computed_schema(in_time=False)
     )
 
 
-def set_late(database: duckdb.DuckDBPyConnection, late: Late) -> None:
-    """Tell the statements of a connection how late the course of each car is."""
-    cars = sorted(late or {})
-    database.execute(
-        f"SET VARIABLE {COURSE_LATE} = map($cars::VARCHAR[], $late::INTEGER[])",
-        {"cars": cars, "late": [(late or {})[car] for car in cars]},
-    )
-
-
-# Sums of the changes from fix to fix of one drive, as `catalogue/course_change.py` says it in SQL.
+# Sums of the changes from fix to fix of one drive, as `catalogue/course.py` defines them.
 #
 # Only rows with a fix are kept, at most one in ten: they fit into memory.
 
@@ -635,7 +588,7 @@ def _rounded(number: IntArray, divisor: int) -> IntArray:
     return np.sign(number) * half
 
 
-# Gram rows of feature sets with windows, from the columns of log files: what SQL says, faster.
+# Gram rows of any feature set, from the columns of log files: what SQL says, faster.
 #
 # Drives are gone through once, in time. Columns are integers below 2^19 in binary64, whose products
 # and block sums stay below 2^53: exact in any order. Sums of blocks have 64 bits.
@@ -650,7 +603,7 @@ def wide_grams(
     feature_set: str,
     late: Mapping[str, int] | None = None,
 ) -> pa.Table:
-    """Return the Gram rows of log files for a feature set, as `jobs/gram.sql` would, sorted.
+    """Return the Gram rows of log files for a feature set, sorted as by `jobs/gram.sql`.
 
     `late` is the course's delay of cars, in parts of a tick. Raises `DataError` for a drive that
     cannot be looked back on, `StorageError` for sums of more than 64 bits.

@@ -96,7 +96,9 @@ def test_damage_is_damage_beside_other_jobs_too(
     gone, *_ = filled.logs.snapshot().files
     (path_of(filled.logs.folder) / gone.path).unlink()
     rng = np.random.default_rng(1)
-    meanwhile(check, "by_sql", lambda: land(filled, "more", log_rows("x", random_counts(rng, 9))))
+    meanwhile(
+        check, "wide_grams", lambda: land(filled, "more", log_rows("x", random_counts(rng, 9)))
+    )
     with pytest.raises(StorageError, match=gone.path.rpartition("/")[2]):
         check_grams(filled, 3)
     assert {finding.kind for finding in verify(filled).damage} >= {"file"}
@@ -109,6 +111,6 @@ def test_a_check_of_tables_that_never_rest_ends(
         filled.grams.fence()
         raise StorageError("a file is gone")
 
-    meanwhile(check, "by_sql", spoil, once=False)
+    meanwhile(check, "wide_grams", spoil, once=False)
     with pytest.raises(StorageError, match="a file is gone"):
         check_grams(filled, 3)

@@ -1,6 +1,7 @@
-"""Changes from fix to fix: kernel, SQL and plain integers agree, and tell the angle's change."""
+"""Changes from fix to fix: kernel and plain integers agree, and give the change of the angle."""
 
 import math
+from collections import defaultdict
 from decimal import Decimal
 from fractions import Fraction
 from typing import Any
@@ -15,15 +16,14 @@ from fleet_slip.catalogue.features import FeatureSet, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.columns.plan import ColumnPlan
-from fleet_slip.grams.check import grams_of
 from fleet_slip.grams.compute import (
     aggregate,
-    by_sql,
     counts_of,
     course_changes,
     find_fixes,
     wide_grams,
 )
+from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 
@@ -54,14 +54,14 @@ def nearest(value: Fraction) -> int:
     return int(math.copysign(math.floor(abs(value) + Fraction(1, 2)), value))
 
 
-def plain_changes(table: pa.Table, late: int = 0) -> dict[int, tuple[int, ...]]:
+def plain_changes(table: pa.Table, late: int = 0, apart: int = APART) -> dict[int, tuple[int, ...]]:
     """Tick of each change, and its last four columns, in words of plain Python."""
     rows = {row["tick"]: row for row in table.to_pylist()}
     units, found = course_units(), dict[int, tuple[int, ...]]()
     whole = math.floor(Fraction(late, 4) + Fraction(1, 2))
     for tick in rows:
-        now, before = (rows.get(t + whole, {}).get("course") for t in (tick, tick - APART))
-        between = [rows.get(t, {}).get("yaw_rate") for t in range(tick - APART, tick + 1)]
+        now, before = (rows.get(t + whole, {}).get("course") for t in (tick, tick - apart))
+        between = [rows.get(t, {}).get("yaw_rate") for t in range(tick - apart, tick + 1)]
         if None in (now, before, *between):
             continue
         turned = between[0] + between[-1] + 2 * sum(between[1:-1])
@@ -94,50 +94,36 @@ def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers(late: int) -
     assert 0 < sum(slow for _, slow, _, _ in expected.values()) < len(expected)
 
 
-@pytest.mark.parametrize(
-    ("name", "late"),
-    [
-        ("course", None),
-        pytest.param("course", {"car-1": -11}, marks=pytest.mark.long),
-        ("three", {"car-1": 34, "other": 1}),
-    ],
-)
-def test_gram_rows_of_the_kernel_are_those_of_the_statement(
-    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, name: str, late: dict[str, int] | None
+@pytest.mark.parametrize("late", [0, 34])
+def test_gram_rows_of_several_times_are_sums_of_the_plain_changes(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, late: int
 ) -> None:
-    """Also of several times, and with what a car knows of itself."""
-    gated = features().members("cornering")[0]
-    windows = ("ay_mean_16", "ay_mean_16_mass", gated, "course_sum_16", "ay_bias")
-    few = FeatureSet(description="few", signals=("ax", "ay"), windows=windows)
-    three = FeatureSet(
-        description="three", of="few", change_s=(Decimal("3.5"), Decimal(4), Decimal(5))
-    )
-    monkeypatch.setitem(features().sets, "few", few)
+    times = (Decimal("3.5"), Decimal(4), Decimal(5))
+    three = FeatureSet(description="three", of="fleet", change_s=times)
     monkeypatch.setitem(features().sets, "three", three)
-    assert features().feature_set("three").windows == windows[:3]
-    land(warehouse, "one", hostile_drive("b", 4000, 1), hostile_drive("a", 300, 2))
-    land(warehouse, "two", hostile_drive("c", 9000, 3), hostile_drive("d", 2500, 4, every=1))
+    drives = {name: hostile_drive(name, 4000, seed) for seed, name in enumerate("ab")}
+    land(warehouse, "one", *drives.values())
     files = warehouse.logs.snapshot().files
-    kernel = wide_grams(warehouse, files, name, late)
-    defined = by_sql(warehouse, files, name, late).cast(kernel.schema)
-    changed = kernel.filter(pc.match_substring(kernel["signals"], TURNED))
-    assert set(changed["drive_id"].to_pylist()) == {"b", "c", "d"}
-    assert {"ay", TURNED, LABEL} <= set(changed["signals"][0].as_py().split(","))
-    assert grams_of(kernel) == grams_of(defined)
-    for column in kernel.column_names:
-        assert kernel[column].to_pylist() == defined[column].to_pylist(), column
-    parts = {"course": {None}, "three": {"3.5 s", "4 s", "5 s"}}
-    assert set(changed["part"].to_pylist()) == parts[name]
-    assert aggregate(warehouse, files, feature_set=name, late=late).equals(kernel)
-    assert set(kernel["course_late"].to_pylist()) == {(late or {}).get("car-1")}
+    rows = aggregate(warehouse, files, feature_set="three", late={"car-1": late})
+    assert set(rows["course_late"].to_pylist()) == {late}
+    found = defaultdict[tuple[str, str], Any](int)
+    for row in rows.filter(pc.match_substring(rows["signals"], TURNED)).to_pylist():
+        gram = Gram(tuple(row["signals"].split(",")), row["n"], row["sums"], row["products"])
+        last = gram.restrict([TURNED, "straight", "straight_course", LABEL])
+        found[row["drive_id"], row["part"]] += np.array([*last.sums, *last.products])
+    for name, table in drives.items():
+        for time_s in times:
+            changes = np.array([*plain_changes(table, late, int(100 * time_s)).values()])
+            products = (changes.T @ changes)[np.tril_indices(4)]
+            expected = [*changes.sum(axis=0).tolist(), *products.tolist()]
+            assert found[name, f"{time_s:f} s"].tolist() == expected
 
 
 def test_a_log_without_a_course_has_no_changes(warehouse: Warehouse) -> None:
     table = hostile_drive("a", 1000, 1)
     land(warehouse, "one", table.drop_columns(["course", "satellite_speed"]))
-    files = warehouse.logs.snapshot().files
-    for rows in (wide_grams(warehouse, files, "course"), by_sql(warehouse, files, "course")):
-        assert (rows["n"].to_pylist(), rows["signals"].to_pylist()) == ([1], [""])
+    rows = wide_grams(warehouse, warehouse.logs.snapshot().files, "course")
+    assert (rows["n"].to_pylist(), rows["signals"].to_pylist()) == ([1], [""])
 
 
 def test_the_label_is_the_change_of_the_side_slip_angle() -> None:

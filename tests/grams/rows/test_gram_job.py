@@ -153,7 +153,7 @@ def test_the_check_finds_a_gram_row_that_is_not_of_its_file(
     warehouse.grams.snapshot().commit(Change(add=[action]))
     with pytest.raises(
         StorageError,
-        match="the Gram of drive a by SQL and by the stored Gram rows of signals differ",
+        match="the Gram of drive a by the kernel and by the stored Gram rows of signals differ",
     ):
         check_grams(warehouse, 1)
     assert DAY in rows["day"].to_pylist()

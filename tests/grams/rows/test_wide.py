@@ -1,6 +1,5 @@
 """Columns over time by the kernel, by SQL and by plain integers: the same, on hostile drives."""
 
-import re
 from fractions import Fraction
 from math import ceil, floor
 from typing import Any
@@ -17,7 +16,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.columns.sql import with_columns
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams import compute as statement
 from fleet_slip.grams.check import grams_of
 from fleet_slip.grams.compute import aggregate, by_sql, gram_statement, wide_grams
@@ -217,25 +216,14 @@ def test_gram_rows_of_the_kernel_are_those_of_the_statement(
     assert aggregate(warehouse, files, feature_set=feature_set).equals(kernel)
 
 
-@pytest.mark.parametrize("feature_set", ["windows", pytest.param("bands", marks=pytest.mark.long)])
-def test_products_of_many_columns_come_from_several_groupings(
-    warehouse: Warehouse, feature_set: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(statement, "MOST_SUMS", 1000)
-    land(warehouse, "one", hostile_drive("b", 400, 1), hostile_drive("a", 2, 2).slice(0, 1))
-    files = warehouse.logs.snapshot().files
-    kernel = wide_grams(warehouse, files, feature_set)
-    assert by_sql(warehouse, files, feature_set).cast(kernel.schema).equals(kernel)
-
-
-def test_duckdb_takes_as_many_sums_of_a_group_as_a_statement_has() -> None:
-    """Some 10,920 of them end DuckDB 2.0.0 with SIGFPE, and a set of 403 columns had 81,809.
+def test_duckdb_takes_as_many_sums_of_a_group_as_a_statement_may_have() -> None:
+    """Some 10,920 of them end DuckDB 2.0.0 with SIGFPE; the kernel alone computes larger sets.
 
     To report upstream: `SELECT sum(i + 0), …, sum(i + 11000) FROM range(9) t(i) GROUP BY i % 3`.
     """
-    text = gram_statement(catalogue(), "gated")
-    groupings = [len(re.findall(r"sum\(\w+::BIGINT \* ", one)) for one in text.split("GROUP BY")]
-    assert max(groupings) <= statement.MOST_SUMS < sum(groupings)
+    for name in ("gated", "course"):
+        with pytest.raises(QuestionError, match="have no SQL"):
+            gram_statement(catalogue(), name)
     sums = ", ".join(f"sum(i + {n})" for n in range(statement.MOST_SUMS))
     with duckdb.connect() as database:
         rows = database.execute(f"SELECT {sums} FROM range(9) t(i) GROUP BY i % 3").fetchall()
