@@ -63,11 +63,11 @@ setup: $(VENV)/.installed
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade --constraint constraints.txt pip
-	$(INSTALL) --constraint constraints.txt --editable '.[compiled,report]'
+	$(INSTALL) --constraint constraints.txt --editable .
 	touch $@
 
 $(VENV)/.dev-installed: $(VENV)/.installed
-	$(INSTALL) --constraint constraints.txt --editable '.[compiled,report]' --group dev
+	$(INSTALL) --constraint constraints.txt --editable . --group dev
 	touch $@
 
 $(VENV)/.docs-installed: $(VENV)/.dev-installed

@@ -9,7 +9,7 @@ def _say(kind: type[BaseException], error: BaseException, trace: TracebackType |
     if isinstance(error, ModuleNotFoundError) and package != "fleet_slip":
         print(
             f"This benchmark needs the package {package}, which is not installed. "
-            "Run: pip install -e '.[compiled,report,highway]' --group dev -c constraints.txt",
+            "Run: pip install -e . --group dev -c constraints.txt",
             file=sys.stderr,
         )
     elif kind.__name__ == "ExtraError":

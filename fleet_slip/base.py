@@ -131,15 +131,10 @@ def needed(extra: str, purpose: str) -> Iterator[None]:
         package = (error.name or "").partition(".")[0]
         if package == "fleet_slip":
             raise
-        raise missing(extra, purpose, package) from None
-
-
-def missing(extra: str, purpose: str, package: str) -> ExtraError:
-    """Return the error that says how to install an extra."""
-    return ExtraError(
-        f"{purpose} needs the package {package}, which is not installed. "
-        f"Run: pip install 'fleet-slip[{extra}]'"
-    )
+        raise ExtraError(
+            f"{purpose} needs the package {package}, which is not installed. "
+            f"Run: pip install 'fleet-slip[{extra}]'"
+        ) from None
 
 
 # How long work tells of its progress.

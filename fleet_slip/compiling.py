@@ -16,14 +16,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from fleet_slip.base import missing
-from fleet_slip.resources import cache_folder
+import llvmlite
+import numba
 
-try:
-    import llvmlite
-    import numba
-except ModuleNotFoundError:  # of an extra: what is compiled says so when it is called
-    numba = None  # type: ignore[assignment]
+from fleet_slip.resources import cache_folder
 
 LOGGER = logging.getLogger("fleet_slip")
 
@@ -40,19 +36,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def _compiler(**options: Any) -> Callable[[Function], Function]:
     def compile_later(function: Function) -> Function:
-        return cast(Function, numba.njit(**options)(function) if numba else _refusing(function))
+        return cast(Function, numba.njit(**options)(function))
 
     return compile_later
-
-
-def _refusing(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return what stands for a function that cannot be compiled here."""
-
-    @functools.wraps(function)
-    def refuse(*_: Any, **__: Any) -> Any:
-        raise missing("compiled", "this runs as compiled code, which", "numba")
-
-    return refuse
 
 
 equation = _compiler(error_model="numpy", forceinline=True)
@@ -76,7 +62,7 @@ def kernel(function: Function) -> Function:
 
     numba keeps the code in a folder that this user alone can write, if there is one.
     """
-    folder = code_folder(f"{numba.__version__} {llvmlite.__version__}") if numba else None
+    folder = code_folder(f"{numba.__version__} {llvmlite.__version__}")
     if folder is None:
         return inner_loop(function)
     config: Any = numba.config

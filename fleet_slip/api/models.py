@@ -19,7 +19,6 @@ from fleet_slip.api.calls import (
     record_call,
 )
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.base import needed
 from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.export.program import Target
@@ -448,10 +447,8 @@ class JudgedModels(PublishedModels):
         Raises `DataError` without an
         evaluation on today's data, and what `model` raises.
         """
+        from fleet_slip.evaluation.report import write_report
         from fleet_slip.storage.local import LocalFolder
-
-        with needed("report", "the report"):
-            from fleet_slip.evaluation.report import write_report
 
         folder = LocalFolder(output) if output else self.root / "report"
         return write_report(self.warehouse, self.resolve(model), folder)
@@ -471,16 +468,16 @@ class JudgedModels(PublishedModels):
         """Write a drive as a page that plays; return the file.
 
         A scenario is simulated for it. Raises `UsageError` for another suffix or an empty part,
-        `QuestionError` for an unknown drive, `ExtraError` without the extra `watch`, and what
+        `QuestionError` for an unknown drive, and what
         `model` raises.
         """
-        with needed("watch", "a page of a drive"):
-            from fleet_slip.evaluation.watch import (
-                drive_frames,
-                is_scenario,
-                scenario_frames,
-                write_page,
-            )
+        from fleet_slip.evaluation.watch import (
+            drive_frames,
+            is_scenario,
+            scenario_frames,
+            write_page,
+        )
+
         if output.suffix != ".html":
             raise UsageError(f"{output}: a drive is shown as a page, which ends with .html.")
         version = self.resolve(model)

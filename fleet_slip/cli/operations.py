@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.base import date_of, needed
+from fleet_slip.base import date_of
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import Json, print_answer, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
@@ -118,8 +118,8 @@ def monitor(
     Example: **fleet-slip monitor waterford --since 2024-05-03**
     """
     if plot:
-        with needed("report", "a chart"):
-            from fleet_slip.operations.monitor import save_chart  # noqa: PLC0415
+        from fleet_slip.operations.monitor import save_chart  # noqa: PLC0415 - draws
+
         save_chart(chart, plot)
     print_answer(chart, json)
 
@@ -146,8 +146,7 @@ def nightly(
     Example: **fleet-slip nightly --landing /srv/logs --mapping logger.toml --model fleet**
     """
     if output is not None:
-        with needed("report", "a summary in files"):
-            from fleet_slip.operations.night import write_summary  # noqa: PLC0415 - draws
+        from fleet_slip.operations.night import write_summary  # noqa: PLC0415 - draws
 
         write_summary(report, output)
     print_answer(report, json)

@@ -9,11 +9,12 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple, SupportsFloat
 
+import gymnasium
 import numba
 import numpy as np
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from fleet_slip.base import needed
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.compiling import equation
 from fleet_slip.errors import UsageError
@@ -76,10 +77,6 @@ def move(
         order = SECOND_ORDER
     return Moved(x, slopes, ax, ay)
 
-
-with needed("highway", "an environment for controllers"):
-    import gymnasium
-    from gymnasium.spaces import Box
 
 Observation = NDArray[np.float32]
 WHEELS = ("fl", "fr", "rl", "rr")

@@ -9,9 +9,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.base import needed
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.vehicle.driver import (
     SAMPLE_S,
@@ -50,11 +52,6 @@ from fleet_slip.vehicle.tyre import arctan2
 # loops over lanes become vector instructions. Blocks are measured from the processor's cache.
 #
 # The physics of the lane kernel: what is around all cars, and how they move on by a step.
-
-with needed("compiled", "simulating drives"):
-    from llvmlite import ir
-    from numba import types
-    from numba.extending import intrinsic
 
 LANES = 8
 """Lanes of the kernel: one or two of a processor's vectors."""

@@ -8,10 +8,11 @@ import math
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+from highway_env.vehicle.dynamics import BicycleVehicle
+from highway_env.vehicle.kinematics import Vehicle
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import needed
-from fleet_slip.compiling import equation
+from fleet_slip.compiling import equation, kernel
 from fleet_slip.vehicle.dynamics import Derivative, derivative
 from fleet_slip.vehicle.integration import (
     FIRST_ORDER,
@@ -30,11 +31,6 @@ from fleet_slip.vehicle.parameters import (
     load_vehicle,
 )
 from fleet_slip.vehicle.tyre import cornering_stiffness
-
-with needed("highway", "the car as a highway-env vehicle"):
-    import numba
-    from highway_env.vehicle.dynamics import BicycleVehicle
-    from highway_env.vehicle.kinematics import Vehicle
 
 NO_SLOPES = Slopes(*(0.0 for _ in Slopes._fields))
 
@@ -56,7 +52,7 @@ class Motion(NamedTuple):
     drift: Place
 
 
-@numba.njit(error_model="numpy")
+@kernel
 def _rates(x: State, u: Controls, c: Constants) -> Derivative:
     return derivative(x, u, c)
 
@@ -67,7 +63,7 @@ def _drift_of(x: State, place: Place) -> Place:
     return Place(x.vx * cosine - x.vy * sine, x.vx * sine + x.vy * cosine, x.yaw_rate)
 
 
-@numba.njit(error_model="numpy", nogil=True)
+@kernel
 def _steps(
     motion: Motion, u: Controls, c: Constants, step: float, count: int, order: float
 ) -> Motion:

@@ -67,12 +67,6 @@ def test_what_is_installed_is_what_was_pinned() -> None:
     assert {name: pinned().get(name) for name in installed} == installed
 
 
-def test_what_computes_columns_over_time_comes_with_what_shows_them() -> None:
-    extras = PROJECT["project"]["optional-dependencies"]
-    for name in ("explore", "watch"):
-        assert set(extras["compiled"]) <= set(extras[name])
-
-
 @pytest.mark.skipif(
     any(required(*GROUPS["docs"])[name] is None for name in required(*GROUPS["docs"])),
     reason="what the group docs needs is known once it is installed: make docs",
