@@ -26,7 +26,7 @@ from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConflictError, InputError, RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive, drive_id
 from fleet_slip.ingest.formats.source import Spool
-from fleet_slip.ingest.log_files import Log, StoredParts, local_copies, local_copy
+from fleet_slip.ingest.log_files import Log, local_copies, local_copy
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.recordings import (
     FILES,
@@ -258,8 +258,6 @@ def _batches(files: Iterable[AskedFile]) -> Iterator[Batch]:
 def _size_of(log: Log) -> int:
     if isinstance(log, StoredFile):
         return log.size_bytes
-    if isinstance(log, StoredParts):
-        return BATCH_BYTES  # or more: it is a batch of its own
     try:
         return log.stat().st_size
     except OSError:

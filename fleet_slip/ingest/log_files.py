@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass
 from functools import cache
 from glob import glob
 from pathlib import Path, PosixPath
@@ -19,9 +18,7 @@ from typing import TypeAlias
 from fleet_slip.base import needed, shown
 from fleet_slip.errors import FleetSlipError, InputError, UsageError
 from fleet_slip.storage.folder import StoredFile
-from fleet_slip.storage.storage_errors import (
-    storage_errors,
-)
+from fleet_slip.storage.storage_errors import storage_errors
 
 SUFFIXES = (
     ".csv", ".csv.gz", ".csv.zst", ".parquet", ".pq", ".mf4", ".mdf", ".mat", ".h5", ".hdf5",
@@ -42,23 +39,12 @@ LONGEST_NAME_BYTES = 255
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 
-@dataclass(frozen=True)
-class StoredParts:
-    """A folder of an object store whose files are parts of one log; as text it is its URL."""
-
-    url: str
-
-    def __str__(self) -> str:
-        """Return the URL."""
-        return self.url
-
-
 class StrayLink(PosixPath):
     """A file found behind a link out of a folder: who fills it may not choose what is read."""
 
 
-Log: TypeAlias = Path | StoredFile | StoredParts
-"""A measured log: a file, or a folder whose files are its parts, here or on an object store."""
+Log: TypeAlias = Path | StoredFile
+"""A measured log: a file, here or on an object store, or a folder whose files are its parts."""
 
 OpenCopy: TypeAlias = Callable[[Log], AbstractContextManager[Path]]
 
@@ -83,12 +69,13 @@ def find_logs(given: Iterable[Place]) -> list[Log]:
 
 def find_whole_logs(given: Iterable[Place]) -> list[Log]:
     """Return folders, each as one log in several files. Raises `UsageError` for anything else."""
-    found: list[Log] = []
-    for place in given:
-        if not is_url(place) and not Path(place).is_dir():
-            raise UsageError(f"{place}: only a folder has the files of one log. Give it.")
-        found.append(StoredParts(str(place).rstrip("/")) if is_url(place) else Path(place))
-    return found
+    folders = list(given)
+    for place in folders:
+        if is_url(place) or not Path(place).is_dir():
+            raise UsageError(
+                f"{place}: only a folder of this machine has the files of one log. Give it."
+            )
+    return [Path(place) for place in folders]
 
 
 def find_files(path: Path) -> list[Path]:
@@ -142,8 +129,8 @@ def parts_of(log: Path) -> list[Path]:
 
 def size_of(log: Log) -> int:
     """Return the bytes of a log, for its progress; 0 where only reading it would show it."""
-    if not isinstance(log, Path):
-        return getattr(log, "size_bytes", 0)
+    if isinstance(log, StoredFile):
+        return log.size_bytes
     try:
         return sum(part.stat().st_size for part in parts_of(log))
     except (InputError, OSError):  # who reads it raises
@@ -157,11 +144,6 @@ def require_inside(file: Path) -> None:
             f"{shown(file)}: it is behind a link that leads out of its folder, and not followed. "
             "Give the file by its own path."
         )
-
-
-def stored_parts(log: StoredFile | StoredParts) -> list[StoredFile]:
-    """Return the objects that one log is in. Raises `InputError` and `StorageError`."""
-    return [log] if isinstance(log, StoredFile) else _stored(log.url)
 
 
 def _stored(url: str) -> list[StoredFile]:
@@ -242,16 +224,15 @@ def local_copies(logs: Iterable[Log]) -> Iterator[OpenCopy]:
         yield open_copy
 
 
-def _copy(log: StoredFile | StoredParts, folder: Path) -> Path:
+def _copy(log: StoredFile, folder: Path) -> Path:
     """Copy a log below a folder, under its path in the bucket: keys may be in its names."""
-    from fleet_slip.ingest.object_inputs import copy_object, parse_url  # noqa: PLC0415 - an extra
+    from fleet_slip.ingest.object_inputs import copy_object  # noqa: PLC0415 - an extra
 
-    for part in stored_parts(log):
-        names = part.path.split("/")
-        if not {"", ".", ".."}.isdisjoint(names) or not all(map(_can_be_copied, names)):
-            raise InputError(f"{shown(part)}: no file may have this name. Give it another.")
-        copy_object(part, folder / part.path)
-    return folder / (log.path if isinstance(log, StoredFile) else parse_url(log.url)[1])
+    names = log.path.split("/")
+    if not {"", ".", ".."}.isdisjoint(names) or not all(map(_can_be_copied, names)):
+        raise InputError(f"{shown(log)}: no file may have this name. Give it another.")
+    copy_object(log, folder / log.path)
+    return folder / log.path
 
 
 def _can_be_copied(name: str) -> bool:

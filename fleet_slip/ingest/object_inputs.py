@@ -2,69 +2,22 @@
 
 import hashlib
 import re
-from collections.abc import Iterator
 from itertools import takewhile
-from os import environ
 from pathlib import Path
 
 import obstore
 from fsspec.utils import glob_translate
-from obstore.exceptions import InvalidPathError
 
-from fleet_slip.base import needed
-from fleet_slip.errors import InputError, StorageError
+from fleet_slip.errors import InputError
 from fleet_slip.storage.folder import StoredFile
-from fleet_slip.storage.objects import (
-    CONNECT_TIMEOUT_S,
-    TIMEOUT_S,
-    ObjectFolder,
-    client,
-    fetch_parts,
-)
-from fleet_slip.storage.storage_errors import (
-    NoSuchObjectError,
-    meaning_of,
-    object_errors,
-    storage_errors,
-)
+from fleet_slip.storage.objects import ObjectFolder, client, fetch_parts
+from fleet_slip.storage.storage_errors import NoSuchObjectError, object_errors, storage_errors
 
 ATTEMPTS = 3
 """So often an object is fetched that does not arrive as the store says that it is."""
 
-_COMPARABLE = re.compile(r"[0-9a-f]{32}(-[1-9][0-9]{0,4})?")
-"""A tag that may be an MD5, or the MD5 of the MD5s of so many parts."""
-
-_PART_SIZES = (5, 8, 10, 15, 16, 25, 32, 50, 64, 100, 128, 256, 512)
-"""Sizes of a part that uploaders choose."""
-
+_MD5 = re.compile(r"[0-9a-f]{32}")
 _URL = re.compile(r"(?P<bucket>(?:s3|gs|az)://[a-z0-9][a-z0-9._-]{1,62})(?:/+(?P<path>.*))?")
-
-
-def list_any_names(bucket: ObjectFolder, path: str) -> Iterator[StoredFile]:
-    """Yield the objects below a folder of a bucket of S3. Raises `StorageError`."""
-    with needed("objects", "a listing of an object store"):
-        from botocore.config import Config  # noqa: PLC0415 - a fifth of a second
-        from botocore.exceptions import BotoCoreError, ClientError  # noqa: PLC0415
-        from botocore.session import Session  # noqa: PLC0415
-    # It finds credentials and endpoints where we do. Paths hold for stores of all makers.
-    limits = {"connect_timeout": CONNECT_TIMEOUT_S, "read_timeout": TIMEOUT_S}
-    store = Session().create_client(
-        "s3",
-        region_name=environ.get("AWS_REGION"),
-        config=Config(s3={"addressing_style": "path"}, **limits),
-    )
-    name = bucket.bucket.removeprefix("s3://")
-    try:
-        pages = store.get_paginator("list_objects_v2").paginate(
-            Bucket=name, Prefix=f"{path}/" if path else ""
-        )
-        for page in pages:
-            for one in page.get("Contents", ()):
-                meta = {"path": one["Key"], "size": one["Size"]}
-                changed = {"last_modified": one["LastModified"], "e_tag": one["ETag"]}
-                yield bucket.found({**meta, **changed})
-    except (BotoCoreError, ClientError) as error:
-        raise StorageError(f"{bucket}/{path}: {meaning_of(error)}") from None
 
 
 def parse_url(url: str) -> tuple[ObjectFolder, str]:
@@ -110,17 +63,16 @@ def find_below(url: str) -> list[StoredFile]:
 def copy_object(file: StoredFile, copy: Path) -> None:
     """Copy an object as a listing found it to a file, whose folder is made.
 
-    Raises `InputError` if it is gone, replaced, or not as its tag's checksum; and `StorageError`.
+    A tag that looks like an MD5 is compared; that of some stores is none: then two transfers that
+    agree must do. Raises `InputError` if the object is gone, replaced, or arrives otherwise; and
+    `StorageError`.
     """
     arrived = set[str]()
     with storage_errors(copy):
         copy.parent.mkdir(parents=True, exist_ok=True)
     for _ in range(ATTEMPTS):
         digest = _copy_once(file, copy)
-        # A tag that looks like a checksum may be none: then two transfers that agree must do.
-        if not _COMPARABLE.fullmatch(file.identity) or digest in arrived:
-            return
-        if digest == file.identity or _is_of_parts(copy, file.identity):
+        if digest in arrived or digest == file.identity or not _MD5.fullmatch(file.identity):
             return
         arrived.add(digest)
     raise InputError(
@@ -147,29 +99,7 @@ def _copy_once(file: StoredFile, copy: Path) -> str:
     return md5.hexdigest()
 
 
-def _is_of_parts(copy: Path, tag: str) -> bool:
-    """Whether a tag is the MD5 of the MD5s of N parts, of any size that uploaders choose."""
-    stated, _, number = tag.partition("-")
-    size, parts = copy.stat().st_size, int(number or 0)
-    lengths = (one * unit for unit in (2**20, 10**6) for one in _PART_SIZES)
-    return any(-(-size // n) == parts and _md5_of_parts(copy, n) == stated for n in lengths)
-
-
-def _md5_of_parts(copy: Path, length: int) -> str:
-    whole = hashlib.md5(usedforsecurity=False)
-    with copy.open("rb") as stream:
-        while part := stream.read(length):
-            whole.update(hashlib.md5(part, usedforsecurity=False).digest())
-    return whole.hexdigest()
-
-
 def _listed(bucket: ObjectFolder, path: str) -> list[StoredFile]:
-    where = f"{bucket}/{path}"
-    with object_errors(where):
-        try:
-            pages = list(obstore.list(client(bucket.bucket), path or None))
-        except InvalidPathError:
-            if not bucket.bucket.startswith("s3://"):
-                raise
-            return sorted(list_any_names(bucket, path), key=str)
+    with object_errors(f"{bucket}/{path}"):
+        pages = list(obstore.list(client(bucket.bucket), path or None))
     return sorted((bucket.found(meta) for page in pages for meta in page), key=str)

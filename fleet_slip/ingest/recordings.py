@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from fleet_slip.base import number_of, shown
 from fleet_slip.errors import RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive
-from fleet_slip.ingest.log_files import Log, StoredParts
+from fleet_slip.ingest.log_files import Log
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.resources import cache_folder, keep_json
 from fleet_slip.storage.folder import StoredFile
@@ -229,8 +229,6 @@ def _state_of(log: Log) -> tuple[int, int | str] | None:
     """Return what changes when the content does; None if that is not known."""
     if isinstance(log, StoredFile):
         return log.size_bytes, log.identity
-    if isinstance(log, StoredParts):
-        return None
     try:
         found = log.stat()
     except OSError:

@@ -1,18 +1,16 @@
-"""Reads the rows of a log, which is a file or several, in bounded batches.
+"""Reads the rows of a log, which is a file or several in a row, in bounded batches.
 
 A batch is a Polars frame with the columns that a mapping uses: text (CSV, text in Parquet), 64-bit
 floats, dates or timestamps. CSV fields stay text, so that what is not a number can be quarantined
-as it was written. A time base goes on from file to file, each open only while it is read.
+as it was written.
 """
 
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import polars as pl
@@ -25,131 +23,33 @@ from fleet_slip.ingest.formats.tables import BATCH_ROWS
 from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.mapping import Mapping
 
-_OpenIt = Callable[[Path], AbstractContextManager[tuple[list[Base], set[str]]]]
-
 _CLOCK = "this file says when each sample was taken: write own_clock = true under [time]"
 _NO_CLOCK = "this file has no clock of its own: write column or rate_hz under [time]"
-
-
-@dataclass
-class _Opened:
-    """An open file, its time bases, their columns, and how many of them are being read."""
-
-    file: ExitStack
-    bases: list[Base]
-    columns: set[str]
-    readers: int = 0
-
-
-class PartBases:
-    """Opens the files of a log, each once for all who read a time base of it at a time."""
-
-    def __init__(self, open_it: _OpenIt) -> None:
-        """Take what opens a file: it gives its time bases, and which columns they have."""
-        self._open_it = open_it
-        self._opened: dict[Path, _Opened] = {}
-
-    def __enter__(self) -> "PartBases":
-        """Begin without open files."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close what readers have left open."""
-        for part in [*self._opened]:
-            self._opened.pop(part).file.close()
-
-    @contextmanager
-    def using(self, part: Path) -> Iterator[_Opened]:
-        """Give a file, open as long as somebody uses it."""
-        if part not in self._opened:
-            with ExitStack() as file:
-                bases, columns = file.enter_context(self._open_it(part))
-                self._opened[part] = _Opened(file.pop_all(), bases, columns)
-        opened = self._opened[part]
-        opened.readers += 1
-        try:
-            with file_errors(part):
-                yield opened
-        finally:
-            opened.readers -= 1
-            if not opened.readers and self._opened.get(part) is opened:
-                del self._opened[part]
-                opened.file.close()
-
-
-class _Stretch(NamedTuple):
-    """The rows of a time base in one file: which of its bases it is, and how many there are."""
-
-    part: Path
-    place: int
-    first_s: float
-    rows: int
-
-
-def join_parts(log: Path, parts: list[Path], mapping: Mapping, opened: PartBases) -> list[Base]:
-    """Return the time bases of a log: what has the same columns goes on from file to file.
-
-    Files follow each other in the order of their first times. Raises `InputError` for a column that
-    no file has.
-    """
-    time = str(mapping.time.key)
-    missing = {name for names in mapping.time_bases().values() for name in names}
-    found: dict[str, list[_Stretch]] = defaultdict(list)
-    for part in parts:
-        with opened.using(part) as there:
-            missing -= there.columns
-            for place, base in enumerate(there.bases):
-                first = next(base.read())
-                name = " ".join(sorted({*first.columns, time}))
-                least = first[time].min()
-                first_s = least if isinstance(least, float) else 0.0
-                found[name].append(_Stretch(part, place, first_s, base.count_rows()))
-    if missing:
-        raise InputError(f"{shown(log)}: no file in it has the column {min(missing)!r}.")
-    for stretches in found.values():
-        stretches.sort(key=lambda stretch: stretch.first_s)
-    names = sorted(found, key=lambda name: found[name][0].first_s)
-    return [
-        Base(
-            name,
-            partial(sum, [stretch.rows for stretch in found[name]]),
-            partial(_read, opened, found[name]),
-        )
-        for name in names
-    ]
-
-
-def _read(opened: PartBases, stretches: list[_Stretch]) -> Iterator[pl.DataFrame]:
-    for stretch in stretches:
-        with opened.using(stretch.part) as there:
-            yield from there.bases[stretch.place].read()
 
 
 def read_batches(log: Path, mapping: Mapping, meter: Meter | None = None) -> Iterator[pl.DataFrame]:
     """Yield the columns of a log that a mapping uses, in its order, in bounded batches.
 
-    Rows of several time bases come as `merge_bases` says. The meter gets how many rows come.
-    Raises `InputError` if a file cannot be read, or a column is missing or ambiguous.
+    Rows of several time bases come as `merge_bases` says; files of one log, in the order of their
+    names, have one. The meter gets how many rows come. Raises `InputError` if a file cannot be
+    read, or a column is missing or ambiguous.
     """
     meter = meter or Meter()
-    wanted, parts, time = mapping.time_bases(), parts_of(log), mapping.time.key
-    if time is None or (len(wanted) == 1 and not mapping.time.own_clock):
-        for part in parts:
-            with _open_part(part, mapping) as source:
-                columns = next(iter(wanted.values()))
-                if meter.is_watched and part == parts[0]:
-                    meter.expect(source.expected_rows(columns), of=part.stat().st_size)
-                yield from Budget.of(part).metered(source.batches(columns))
-    elif len(parts) == 1:
-        with _open_part(log, mapping) as source:
-            bases = _bases_of(source, log, mapping, wanted)
-            if meter.is_watched:
-                meter.expect(sum(map(source.expected_rows, wanted.values())))
-            yield from _merged(bases, mapping)
-    else:
-        with PartBases(partial(_open_bases, mapping)) as opened:
-            bases = join_parts(log, parts, mapping, opened)
-            meter.expect(sum(base.count_rows() for base in bases))
+    wanted, parts = mapping.time_bases(), parts_of(log)
+    for part in parts:
+        with _open_part(part, mapping) as source:
+            if meter.is_watched and part == parts[0]:
+                expected = sum(map(source.expected_rows, wanted.values()))
+                meter.expect(expected, of=part.stat().st_size)
+            if len(wanted) == 1 and not mapping.time.own_clock:
+                yield from Budget.of(part).metered(source.batches(next(iter(wanted.values()))))
+                continue
+            bases = _bases_of(source, part, mapping, wanted)
+            if len(parts) > 1 and len(bases) > 1:
+                raise InputError(
+                    f"{shown(part)}: its signals have {len(bases)} time bases, and files of one "
+                    "log have one. Ingest each file as a log of its own: one trip joins them."
+                )
             yield from _merged(bases, mapping)
 
 
@@ -172,25 +72,6 @@ def _open_part(part: Path, mapping: Mapping) -> Iterator[Source]:
         yield source
 
 
-@contextmanager
-def _open_bases(mapping: Mapping, part: Path) -> Iterator[tuple[list[Base], set[str]]]:
-    """Open a file, which may lack wanted columns; yield its time bases, and the columns it has."""
-    wanted = mapping.time_bases()
-    with _open_part(part, mapping) as source:
-        names = {channel.name for channel in source.channels()}
-        # What several groups of one file have is called NAME@GROUP, there only.
-        all_names = {name for columns in wanted.values() for name in columns}
-        there = names | {name for name in all_names if name.rpartition("@")[0] in names}
-        found = {
-            own: [name for name in columns if name in there]
-            for own, columns in wanted.items()
-            if own is None or own in there
-        }
-        found = {own: columns for own, columns in found.items() if columns}
-        columns = {name for columns in found.values() for name in columns}
-        yield _bases_of(source, part, mapping, found), columns
-
-
 def _bases_of(
     source: Source, part: Path, mapping: Mapping, wanted: dict[str | None, list[str]]
 ) -> list[Base]:
@@ -201,7 +82,6 @@ def _bases_of(
         time = str(mapping.time.key)
         bases = [
             Base(
-                str(own),
                 partial(_count_rows, source, str(own), own == time),
                 partial(_read_with_times, source, part, columns, str(own), time),
             )

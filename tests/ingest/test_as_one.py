@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as ds
 import pytest
@@ -42,19 +41,6 @@ def write_parts(folder: Path, *slices: slice, rows: int = 30) -> Path:
     return folder
 
 
-def write_mdf(file: Path, start: float, *signals: Signal) -> None:
-    with MDF(version="4.10") as mdf:
-        mdf.start_time = START
-        for one in signals:
-            one.timestamps = one.timestamps + start
-            mdf.append([one])
-        mdf.save(file)
-
-
-def signal(name: str, values: object, part: slice) -> Signal:
-    return Signal(np.asarray(values)[part], TIME_S[part], name=name)
-
-
 def test_a_drive_goes_on_from_file_to_file(tmp_path: Path) -> None:
     parts = write_parts(tmp_path / "drive", slice(0, 10), slice(10, 11), slice(11, 30))
     log = read_measured(parts, a_mapping())
@@ -65,25 +51,23 @@ def test_a_drive_goes_on_from_file_to_file(tmp_path: Path) -> None:
     assert log.digest != whole.digest
 
 
-def test_files_of_one_recording_that_follow_one_another(tmp_path: Path) -> None:
+def test_files_with_a_clock_follow_one_another_and_have_one_time_base(tmp_path: Path) -> None:
     logs = tmp_path / "drive"
     logs.mkdir()
-    first, second = slice(0, 40), slice(40, 100)
-    write_mdf(logs / "a.mf4", 0, signal("a_x", AX, second), signal("beta", BETA_DEG, second))
-    write_mdf(logs / "b.mf4", 0, signal("a_x", AX, first), signal("beta", BETA_DEG, first))
+    for name, part in (("a", slice(0, 40)), ("b", slice(40, 100))):
+        file, time_s = logs / f"{name}.mf4", TIME_S[part]
+        pair = [Signal(AX[part], time_s, name="a_x"), Signal(BETA_DEG[part], time_s, name="beta")]
+        with MDF(version="4.10") as mdf:
+            mdf.start_time = START
+            mdf.append(pair)
+            mdf.save(file)
     require_the_drive(read_measured(logs, mdf_mapping()))
-
-
-def test_files_of_one_recording_with_other_channels(tmp_path: Path) -> None:
-    logs = tmp_path / "drive"
-    logs.mkdir()
-    whole = slice(0, 100)
-    write_mdf(logs / "imu.mf4", 0, signal("a_x", AX, whole))
-    write_mdf(logs / "optic.mf4", 0, signal("beta", BETA_DEG, whole))
-    require_the_drive(read_measured(logs, mdf_mapping()))
-    with pytest.raises(InputError, match=r"drive: no file in it has the column 'gamma'"):
-        extra = {"column": "gamma", "unit": "deg/s"}
-        read_measured(logs, mdf_mapping(signals={"yaw_rate": extra}))
+    with MDF(version="4.10") as mdf:
+        for one in pair:
+            mdf.append([one])
+        mdf.save(file, overwrite=True)
+    with pytest.raises(InputError, match=r"b\.mf4: its signals have 2 time bases, and files of"):
+        read_measured(logs, mdf_mapping())
 
 
 def test_a_hive_dataset_is_one_log(tmp_path: Path) -> None:
@@ -129,6 +113,6 @@ def test_a_folder_lands_once_and_not_again_when_it_has_grown(
     with pytest.raises(InputError, match=r"drive: it has changed since it was ingested"):
         call(root, *command)
     assert "1 drive of 30 ticks" in call(root, *command, "--dry-run")
-    with pytest.raises(UsageError, match="only a folder has the files"):
+    with pytest.raises(UsageError, match="only a folder of this machine"):
         call(root, "ingest", str(parts / "part-0.csv"), *command[2:])
     assert ticks(read_measured(parts, a_mapping())) == list(range(30))

@@ -35,7 +35,7 @@ class FakeSource(Source):
 
     def bases(self, columns: Sequence[str]) -> list[Base]:
         return [
-            Base(str(i), lambda f=frame: f.height, partial(self._read, frame, columns))  # type: ignore[misc]
+            Base(lambda f=frame: f.height, partial(self._read, frame, columns))  # type: ignore[misc]
             for i, frame in enumerate(self._frames)
             if {*columns} & {*frame.columns}
         ]

@@ -12,8 +12,6 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.log_files import local_copy
 from fleet_slip.ingest.object_inputs import copy_object, find_object
 from fleet_slip.storage.objects import client
-from tests.ingest.test_as_one import MAPPING as PLAIN
-from tests.ingest.test_as_one import write_parts
 from tests.ingest.test_folders import MAPPING, write_log
 from tests.support.commands import Finished, run_on
 from tests.support.dask_processes import dask_processes
@@ -125,17 +123,6 @@ def test_an_object_that_changes_while_it_is_read_is_refused(here: Path, bucket: 
     put_all(bucket, here / "landing")
     with pytest.raises(InputError, match="it changed while it was read"):
         copy_object(found, here / "other.csv")
-
-
-def test_a_folder_of_a_store_is_one_log(here: Path, server: Server) -> None:
-    write_parts(here / "drive", slice(0, 10), slice(10, 30))
-    (here / "car.toml").write_text(PLAIN)
-    url = server.bucket()
-    put_all(url, here / "drive")
-    ingest(here / "local", str(here / "drive"), "--as-one")
-    (report,) = ingest(here / "root", f"{url}/drive", "--as-one")
-    assert report["drives"] == 1
-    assert state(here / "root") == state(here / "local")
 
 
 def test_what_is_wrong_with_an_object_is_said_of_the_object(here: Path, bucket: str) -> None:

@@ -1,6 +1,5 @@
 """Objects that come slowly, not as they are stored, or under names that are no paths."""
 
-import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -64,20 +63,12 @@ def test_a_store_that_brings_nothing_is_given_up(
         copy_object(found, tmp_path / "log.csv")
 
 
-@pytest.mark.parametrize("parts", [1, 3])
 def test_a_flipped_bit_on_the_way_is_seen_and_fetched_again(
-    parts: int, bucket: str, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bucket: str, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if parts == 1:
-        obstore.put(client(bucket), "log.csv", CONTENT)
-        content = CONTENT
-    else:
-        content = CONTENT * 40
-        store = client(bucket)
-        obstore.put(store, "log.csv", content, use_multipart=True, chunk_size=5 * 2**20)
+    obstore.put(client(bucket), "log.csv", CONTENT)
     found = find_object(f"{bucket}/log.csv")
     assert found is not None
-    assert found.identity.endswith(f"-{parts}" if parts > 1 else hashlib.md5(content).hexdigest())  # noqa: S324
     with server.misbehaving(flipping="log.csv"), pytest.raises(InputError, match="arrived 3 times"):
         copy_object(found, tmp_path / "log.csv")
     copy_once, attempts = object_inputs._copy_once, list[str]()
@@ -89,7 +80,7 @@ def test_a_flipped_bit_on_the_way_is_seen_and_fetched_again(
 
     monkeypatch.setattr(object_inputs, "_copy_once", flipped_first)
     copy_object(found, tmp_path / "log.csv")
-    assert (tmp_path / "log.csv").read_bytes() == content
+    assert (tmp_path / "log.csv").read_bytes() == CONTENT
     assert len(attempts) == 2
 
 
@@ -113,7 +104,6 @@ def test_a_tag_that_is_no_checksum_costs_a_second_transfer(
 @pytest.mark.parametrize(
     "name",
     [
-        *("day/..", "day/../x.csv", "day//x.csv", "day/./x.csv"),
         *("day/a\tb.csv", "day/a\x1bb.csv", "day/a\rb.csv", f"day/{'x' * 256}.csv"),
     ],
 )

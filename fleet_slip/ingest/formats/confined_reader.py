@@ -176,11 +176,11 @@ class _Reader:
         """Return all that can be read."""
         return [astuple(one) for one in self._source.channels()]
 
-    def bases(self, columns: Sequence[str]) -> list[tuple[int, str]]:
-        """Return the number and the name of time bases."""
+    def bases(self, columns: Sequence[str]) -> list[int]:
+        """Return the numbers of time bases."""
         first = len(self._bases)
         self._bases += self._source.bases(columns)
-        return [(number, base.name) for number, base in enumerate(self._bases[first:], first)]
+        return list(range(first, len(self._bases)))
 
     def count(self, number: int) -> int:
         """Return the rows of a time base."""

@@ -258,8 +258,8 @@ class ConfinedSource(Source):
     def bases(self, columns: Sequence[str]) -> list[Base]:
         """Return the time bases that have one of the columns. Raises `InputError`."""
         return [
-            Base(str(name), partial(self._count, number), partial(self._read, number))
-            for number, name in self._ask("bases", list(columns))[0]
+            Base(partial(self._count, number), partial(self._read, number))
+            for number in self._ask("bases", list(columns))[0]
         ]
 
     def _count(self, base: int) -> int:

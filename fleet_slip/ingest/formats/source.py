@@ -57,12 +57,10 @@ class Base:
     """The rows of a log that share their times.
 
     Attributes:
-        name: what goes on in another file of the log has the same.
         count_rows: returns how many rows there are.
         read: yields them in the file's order, in bounded batches of the same columns, at least one.
     """
 
-    name: str
     count_rows: Callable[[], int]
     read: Callable[[], Iterator[pl.DataFrame]]
 
@@ -121,7 +119,7 @@ class FormatSource(Source):
             wanted.setdefault(base, {})[column] = place
         self.prepare(wanted)
         return [
-            Base(base, partial(self.count, base, found), partial(self.read, base, found))
+            Base(partial(self.count, base, found), partial(self.read, base, found))
             for base, found in wanted.items()
         ]
 
