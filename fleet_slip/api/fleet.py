@@ -1,8 +1,11 @@
 """A fleet's warehouse in Python."""
 
 import time
+from collections.abc import Iterable
+from dataclasses import replace
 from datetime import date
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from typing_extensions import Doc
@@ -26,15 +29,16 @@ from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.logs import LogsAndGrams
 from fleet_slip.api.operations import HealthAndUpkeep
 from fleet_slip.catalogue.facts import TRAINING_DRIVES
-from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.request import DEFAULT_MODELS, WORTH
-from fleet_slip.storage.runs import LOGGER, step
+from fleet_slip.storage.runs import LOGGER
 
 if TYPE_CHECKING:
     import duckdb
 
-    from fleet_slip.api.session import RunReport, Session
+    from fleet_slip.api.session import LearnReport, RunReport, Session
+    from fleet_slip.ingest.load import IngestReport
+    from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.operations.night import NightReport
     from fleet_slip.simulation.campaign import Campaign
 
@@ -112,8 +116,7 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         step. Raises what `simulate`, `gram`, `FleetCohort.select` and `publish` raise.
         """
         from fleet_slip.api.session import RunReport, Training
-        from fleet_slip.catalogue.features import features
-        from fleet_slip.models.request import load_model_list, parse_worth
+        from fleet_slip.models.request import parse_worth
         from fleet_slip.simulation.campaign import load_campaign
 
         begun = time.monotonic()
@@ -131,34 +134,81 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
                     workers=executor,
                     progress=of_step(progress, f"simulate {chosen.name}"),
                 )
-                gram = self.gram(workers=executor, progress=of_step(progress, f"gram {PLAIN}"))
-                feature_set = load_model_list(models).features
-                wide = None
-                if feature_set != PLAIN:
-                    wide = self.gram(
-                        feature_set,
-                        cohort=condition,
-                        workers=executor,
-                        progress=of_step(progress, f"gram {feature_set}"),
-                    )
-                for name_of_set in features().beside(feature_set):
-                    self.gram(name_of_set, cohort=condition, workers=executor)
-            refusal, selection = "", None
-            training = Training(model_name, condition, models, worth)
-            publication = training.made_already(self)
-            if publication is None:
-                with step("select"):
-                    selection = training.select(self)
-                with step("publish"):
-                    publication, refusal = training.publish_if_not_worse(
-                        self, selection, replace_marked=True
-                    )
+                training = Training(model_name, condition, models, worth)
+                grams = training.gram(self, executor, progress)
+            selection, publication, refusal = training.publish(self, replace_marked=True)
         return RunReport(
             campaign=chosen.name,
             simulation=simulation,
-            gram=gram,
-            gram_features=wide,
+            grams=grams,
             selection=selection,
+            publication=publication,
+            refusal=refusal,
+            seconds=round(time.monotonic() - begun, 3),
+        )
+
+    @record_call
+    def learn(
+        self,
+        name: Annotated[str, Doc("Name of the model, such as golf.")],
+        logs: Annotated[
+            Iterable[Path | str] | Path | str,
+            Doc("Measured logs, or folders of them, of which what is new is taken."),
+        ],
+        mapping: Annotated["str | Mapping", Doc("A mapping: of configs/mappings, or a TOML file.")],
+        *,
+        workers: Workers = None,
+        progress: ShowStep | None = None,
+    ) -> "LearnReport":
+        """Make a model of measured logs: ingest, gram, select and publish.
+
+        It is trained on the drives of this mapping, without those that are not in order; on their
+        side-slip angle, or on the course where the mapping has no such angle. What is done is not
+        done again. Drives give way to those of a corrected mapping. Files that cannot be used are
+        passed over and are the `problem` of the report; so is a refusal.
+
+        Raises `ConfigError` for an invalid mapping or one that has neither label, and what
+        `ingest`, `gram` and `FleetCohort.select` raise.
+        """
+        from fleet_slip.api.session import LearnReport, Training
+        from fleet_slip.errors import InputError
+        from fleet_slip.ingest.mapping import load_mapping
+
+        begun = time.monotonic()
+        plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
+        training = Training.on_mapping(require_model_name(name), plan)
+        reports: list[IngestReport] = []
+        failure = None
+        waiting = partial(LOGGER.info, "%s: waiting for another run", name)
+        with (
+            self.root.exclusive(f".learn-{name}.lock", waiting),
+            open_workers(self.root, workers) as executor,
+        ):
+            try:
+                self.ingest(
+                    logs,
+                    plan,
+                    replace="corrected",
+                    workers=executor,
+                    each=reports.append,
+                    progress=of_step(progress, "ingest"),
+                )
+            except InputError as error:
+                if not reports:
+                    raise
+                failure = error
+            grams = training.gram(self, executor, progress)
+            examined = self.cohort(training.cohort).examine()
+            training = replace(training, cohort=examined.cohort)
+            with examined.explaining():
+                selection, publication, refusal = training.publish(self)
+        return LearnReport(
+            model=name,
+            mapping=plan.name,
+            ingested=tuple(reports),
+            failure=failure,
+            grams=grams,
+            selection=selection and replace(selection, examined=str(examined)),
             publication=publication,
             refusal=refusal,
             seconds=round(time.monotonic() - begun, 3),

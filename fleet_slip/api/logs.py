@@ -102,6 +102,7 @@ class LogsAndGrams(Rooted):
         `InputError`, when all others are in, for files that cannot be used, or `RepeatedError`
         where these are all in already; `StorageError` and `ClusterError`.
         """
+        from fleet_slip.ingest.assumptions import keep_assumptions
         from fleet_slip.ingest.load import ingest_files, joined
         from fleet_slip.ingest.recordings import KnownFiles
         from fleet_slip.operations.rewriting import take_out
@@ -120,7 +121,8 @@ class LogsAndGrams(Rooted):
             threads = executor if by_file else elsewhere
             out = partial(take_out, self.warehouse)
             read = no_progress if by_file or progress is None else _bytes_of(logs, count)
-            known = KnownFiles.of(self.warehouse, plan) if folders else None
+            remembers = folders or replace == "corrected"
+            known = KnownFiles.of(self.warehouse, plan) if remembers else None
             wanted = logs
             if known is not None and not as_one:  # what is in a folder its size does not show
                 wanted = known.without_landed(logs, warehouse)
@@ -139,6 +141,8 @@ class LogsAndGrams(Rooted):
             finally:
                 if known is not None:
                     known.save()
+                if any(report.new for report in reports):
+                    keep_assumptions(self.root, plan)
             if failures:
                 raise joined(failures)
         order = {str(log): number for number, log in enumerate(logs)}

@@ -133,11 +133,16 @@ class PublishedModels(Rooted):
             require_sound_course,
             require_sound_drives,
         )
-        from fleet_slip.models.publish import manifest_of, with_straight_intercept
+        from fleet_slip.models.publish import (
+            manifest_of,
+            with_assumptions,
+            with_straight_intercept,
+        )
 
         require_model_name(name)
         selection = self._chosen(name, choice)
         manifest = with_straight_intercept(self.warehouse, manifest_of(selection, name), selection)
+        manifest = with_assumptions(self.warehouse, manifest, selection)
         if manifest.learned_from and not force:
             delays_s = require_in_time(self.warehouse, manifest)
             require_sound_course(self.warehouse, manifest, delays_s)

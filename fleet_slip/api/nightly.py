@@ -12,12 +12,10 @@ from typing import TYPE_CHECKING
 from fleet_slip.api.calls import NightRequest, of_step
 from fleet_slip.api.session import Training
 from fleet_slip.base import date_of, number_of
-from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError
 from fleet_slip.ingest.log_files import find_logs, is_url
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.registry import CANDIDATE, ModelVersion
-from fleet_slip.models.request import load_model_list
 from fleet_slip.operations.night import Beginning, NightReport, Nights, NightStep, State
 from fleet_slip.storage.runs import step
 from fleet_slip.warehouse.condition import hash_drive
@@ -196,14 +194,7 @@ class Night:
         return "done", told
 
     def _gram(self) -> Told:
-        wanted = load_model_list(self.training.models).features
-        for name in dict.fromkeys((PLAIN, wanted, *features().beside(wanted))):
-            self.fleet.gram(
-                name,
-                cohort=None if name == PLAIN else self.training.cohort,
-                workers=self.asked.workers,
-                progress=of_step(self.asked.progress, f"gram {name}"),
-            )
+        self.training.gram(self.fleet, self.asked.workers, self.asked.progress)
         return "done", f"Of {number_of(self._now().drives, 'drive')}."
 
     def _quality(self) -> Told:

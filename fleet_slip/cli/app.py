@@ -45,31 +45,32 @@ if TYPE_CHECKING:
 # all else.
 
 GROUPS = {
-    "Begin with": {
+    "Start here": {
         "run": "begin",
+        "mapping": "data",
+        "ingest": "data",
+        "learn": "begin",
         "sql": "sql",
-        "select": "begin",
-        "publish": "begin",
         "show": "models",
+        "evaluate": "accuracy",
+        "export": "models",
     },
     "Data": {
         "simulate": "data",
-        "mapping": "data",
-        "ingest": "data",
         "gram": "grams",
         "features": "grams",
         "init": "data",
     },
     "Models": {
+        "select": "begin",
+        "publish": "begin",
         "models": "models",
         "diff": "models",
         "promote": "models",
         "pin": "models",
-        "export": "models",
     },
     "Accuracy": {
         "score": "accuracy",
-        "evaluate": "accuracy",
         "identify": "accuracy",
         "report": "accuracy",
         "watch": "accuracy",
@@ -245,7 +246,9 @@ def options(
     Logs of many cars become exact Gram matrices; from these every model, cohort and fold follows
     without reading a row again; the winner becomes a numbered model version.
 
-    Start with: **fleet-slip run --campaign smoke**
+    Without logs: **fleet-slip run --campaign smoke**
+
+    With logs of your own: **fleet-slip mapping suggest LOG**, then **fleet-slip learn**
     """
     configure_logs(log)
     if config is not None:

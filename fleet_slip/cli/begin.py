@@ -11,7 +11,7 @@ import typer
 
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.api.session import RunReport
+from fleet_slip.api.session import LearnReport, RunReport
 from fleet_slip.base import number_of
 from fleet_slip.cli.options import RESAMPLING, Unexamined, command
 from fleet_slip.cli.output import All, Json, print_json, print_parts, say
@@ -102,6 +102,26 @@ def run(report: RunReport, fleet: Fleet, everything: All = False, json: Json = F
             say("next:")
             for line in next_steps(fleet, report.campaign, model):
                 say(f"  {line}")
+
+
+@command(Fleet.learn, arguments=["name", "logs"], progress=("", "units"))
+def learn(report: LearnReport, fleet: Fleet, everything: All = False) -> None:
+    """Make a model of measured logs: ingest, gram, select, publish. Repeat it when logs are added.
+
+    It trains on the side-slip angle of the mapping, else on the course over ground. At its end it
+    says what it assumed, and what to type next. Draft the mapping with: fleet-slip mapping suggest
+
+    Example: **fleet-slip learn golf logs/ --mapping golf.toml**
+    """
+    print_parts(report.parts(everything))
+    if report.changed and report.publication:
+        begin, name = f"{program()}{_root_option(fleet)}", report.model
+        cohort = f"campaign = '{report.mapping}'"
+        say("next:")
+        say(f"  {begin} show {name}")
+        say(f"  {begin} export {name} --to c --output {name}")
+        if not report.publication.version.manifest.learned_from:
+            say(f'  {begin} evaluate {name} --cohort "{cohort}"')
 
 
 def next_steps(fleet: Fleet, campaign: str, model: str) -> list[str]:

@@ -170,6 +170,8 @@ def _facts(version: ModelVersion) -> dict[str, str]:
     }
     if learned := manifest.learned_from:
         facts["learned from"] = _teacher(learned)
+    if manifest.assumed:
+        facts["assumed"] = "; ".join(manifest.assumed)
     if one := manifest.imported_from:
         facts["imported"] = f"from {one.reference} of another data root, sha256 {one.sha256}"
     return facts

@@ -102,6 +102,8 @@ READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "campaigns": (list[str] | None, lambda files: files or ()),
     "folds": (str | None, lambda folds: folds),
     "landing": (str, str),
+    "logs": (list[str], list),
+    "mapping": (str, str),
     "model": (str | None, lambda model: model),
     "night": (str | None, lambda night: date_of(night, "--night")),
     "noise": (list[str] | None, lambda values: quantities(values, "--noise")),

@@ -124,6 +124,7 @@ def manifest_of(
         "model": version.reference,
         "sha256": version.sha256,
         "drives_sha256": version.manifest.trained_on.drives_sha256,
+        **({"assumed": version.manifest.assumed} if version.manifest.assumed else {}),
         "angle": {
             "column": angle.column,
             "unit": angle.unit,

@@ -2,6 +2,8 @@
 
 import csv
 import io
+import os
+import re
 from collections.abc import Container
 from datetime import date
 from pathlib import Path
@@ -17,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from fleet_slip.base import canonical_ascii
+from fleet_slip.base import canonical_ascii, shown
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import (
     Config,
@@ -28,7 +30,7 @@ from fleet_slip.config import (
     load_config,
     read_named_file,
 )
-from fleet_slip.errors import ConfigError
+from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest.columns import (
     WHEELS,
     OffsetM,
@@ -147,26 +149,54 @@ class FromColumn(Config):
     column: Name
 
 
+class FromPath(Config):
+    """A drive's metadata that stand in the path of its file, where a pattern of its end has `{}`.
+
+    `{}/*` is the name of the folder, `{}_*` the file's name up to its first underscore. Neither
+    `{}` nor `*` reaches beyond a `/`.
+    """
+
+    path: Name
+
+    @field_validator("path")
+    @classmethod
+    def _has_one_place(cls, path: str) -> str:
+        if path.count("{}") != 1:
+            raise ValueError("write {} once, where the value stands: '{}/*' is the folder's name")
+        return path
+
+    def find(self, file: Path) -> str:
+        """Return what stands there in a file's path. Raises `InputError` for another path."""
+        known = {"{}": "([^/]+?)", "*": "[^/]*"}
+        parts = (known.get(part, re.escape(part)) for part in re.split(r"(\{\}|\*)", self.path))
+        path = os.path.abspath(file)  # noqa: PTH100 - follows no link
+        if not (found := re.search(f"/{''.join(parts)}$", path)):
+            raise InputError(f"{shown(file)}: the path does not end as in path = {self.path!r}.")
+        return found[1]
+
+
+Elsewhere = FromColumn | FromPath
+
 OptionalFact = Annotated[
-    Annotated[Name | FromColumn, AfterValidator(require_drive_column)] | None,
+    Annotated[Name | Elsewhere, AfterValidator(require_drive_column)] | None,
     added(None),
 ]
 
 
 class DriveMetadata(Config):
-    """What is known of each drive, given here or taken from a column; absent stays null."""
+    """What is known of each drive: given here, or from a column or the path; absent is null."""
 
     column: Name | None = None
     """Every value of this column is a drive of its own."""
-    day: date | FromColumn | None = None
+    day: date | Elsewhere | None = None
     """Date of the drive; with timestamps it may be left out and is that of the first row (UTC)."""
-    vehicle_id: Name | FromColumn
-    vehicle_model: Name | FromColumn | None = None
-    track: Name | FromColumn | None = None
-    mass_kg: PositiveFloat | FromColumn | None = None
+    vehicle_id: Name | Elsewhere
+    vehicle_model: Name | Elsewhere | None = None
+    track: Name | Elsewhere | None = None
+    mass_kg: PositiveFloat | Elsewhere | None = None
     tyres: OptionalFact = None
     receiver: OptionalFact = None
-    adhesion: PositiveFloat | FromColumn | None = None
+    adhesion: PositiveFloat | Elsewhere | None = None
 
 
 class Mapping(Config):
@@ -229,6 +259,18 @@ class Mapping(Config):
     def __hash__(self) -> int:
         """Return the hash of what identifies it."""
         return hash(self.canonical_json())
+
+    def for_file(self, file: Path) -> "Mapping":
+        """Return the mapping with what a file's path says of its drives. Raises `InputError`."""
+        given = {name: getattr(self.drive, name) for name in DriveMetadata.model_fields}
+        found = {name: one.find(file) for name, one in given.items() if isinstance(one, FromPath)}
+        if not found:
+            return self
+        try:
+            drive = DriveMetadata.model_validate({**given, **found})
+        except ValidationError as error:
+            raise InputError(f"{shown(file)}: drive: {faults_of(error)}") from None
+        return self.model_copy(update={"drive": drive})
 
     def time_bases(self) -> dict[str | None, list[str]]:
         """Return the columns that the mapping uses, each once, by the column of their times."""

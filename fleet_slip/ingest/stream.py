@@ -299,6 +299,7 @@ def open_measured(
 
     Raises `InputError`, if it changes until the end too.
     """
+    mapping = mapping.for_file(file)
     with require_unchanged_log(file):
         meter = Meter(size_of(file), progress)
         yield MeasuredStream(file, mapping, *_identity(file, mapping), meter)

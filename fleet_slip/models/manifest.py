@@ -255,6 +255,11 @@ class Manifest(Config):
     learned_from: Annotated[LearnedFrom | None, _LEFT_OUT] = None
     """None where it was a reference sensor."""
     imported_from: Annotated[ImportedFrom | None, _LEFT_OUT] = None
+    assumed: Annotated[
+        tuple[Annotated[str, Field(max_length=200)], ...],
+        Field(max_length=100, exclude_if=lambda assumed: not assumed),
+    ] = ()
+    """What the mappings of its logs leave open, and which value stands for it."""
 
     @model_validator(mode="after")
     def _agrees(self) -> "Manifest":

@@ -13,6 +13,10 @@ from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
 from fleet_slip.grams.car_evidence import three_digits
+from fleet_slip.grams.reader import open_grams
+from fleet_slip.ingest.assumptions import FOLDER as ASSUMPTIONS
+from fleet_slip.ingest.assumptions import kept_assumptions
+from fleet_slip.ingest.drives import SOURCE as MEASURED
 from fleet_slip.models.acceptance import judge
 from fleet_slip.models.manifest import (
     CrossValidated,
@@ -226,6 +230,20 @@ def with_straight_intercept(
     own = {"intercept": float(found.intercept), "intercept_exact": found.intercept}
     origin = {"learned_from": learned, "terms": (*manifest.terms, *terms)}
     return manifest.model_copy(update={**own, **origin})
+
+
+def with_assumptions(warehouse: Warehouse, manifest: Manifest, selection: Selection) -> Manifest:
+    """Return a manifest with what the mappings of its drives leave open."""
+    if not (warehouse.root / ASSUMPTIONS).names():
+        return manifest
+    cohort = selection.cohort
+    with open_grams(warehouse, cohort.feature_set, cohort.condition) as opened:
+        rows = opened.label_sources(cohort.condition)
+    mappings = {name for source, name, _ in rows if source == MEASURED and name}
+    assumed = kept_assumptions(warehouse.root, mappings)
+    if assumed and not manifest.learned_from and selection.label_noise_deg is None:
+        assumed += ("the label has no noise: what it has is part of the RMSE",)
+    return manifest.model_copy(update={"assumed": assumed})
 
 
 def drives_of(selection: Selection, name: str) -> bytes:

@@ -1,0 +1,176 @@
+"""`learn` makes a model of measured logs: what each step does, once, and says what it assumed."""
+
+import json
+import math
+import random
+from pathlib import Path
+
+import pytest
+
+import fleet_slip
+from fleet_slip.errors import ConfigError, RefusedError
+from fleet_slip.ingest.assumptions import assumptions_of
+from fleet_slip.ingest.mapping import Mapping, load_mapping
+from tests.support.commands import Finished, run_on
+from tests.support.measured import DRIVE, SIGNALS, TIME, csv_text
+
+MAPPING = """
+name = "own"
+[time]
+column = "t"
+unit = "s"
+[drive]
+vehicle_id = { path = "{}/*" }
+vehicle_model = "own"
+day = { path = "*_{}.csv" }
+[signals]
+ax = { column = "ax", unit = "m/s^2" }
+ay = { column = "ay", unit = "m/s^2" }
+yaw_rate = { column = "r", unit = "rad/s" }
+sideslip = { column = "beta", unit = "rad" }
+"""
+
+
+def write_logs(folder: Path, cars: int, slip: float = -1.0) -> Path:
+    rng = random.Random(5)  # noqa: S311
+    (folder / "own.toml").write_text(MAPPING)
+    for car in range(cars):
+        ay = [3 * math.sin(tick / 30) + rng.gauss(0, 0.05) for tick in range(500)]
+        columns = {
+            "t": [tick / 100 for tick in range(500)],
+            "ax": [rng.gauss(0, 0.3) for _ in ay],
+            "ay": ay,
+            "r": [value / 20 for value in ay],
+            "beta": [slip * value / 200 + rng.gauss(0, 0.0003) for value in ay],
+        }
+        place = folder / "logs" / f"car-{car}" / "drive_2026-05-04.csv"
+        place.parent.mkdir(parents=True)
+        place.write_text(csv_text(columns))
+    return folder / "logs"
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Finished, Finished]:
+    """A folder with logs and a root, and what two calls said."""
+    folder = tmp_path_factory.mktemp("learn")
+    words = ("learn", "golf", write_logs(folder, 6), "--mapping", folder / "own.toml")
+    first = run_on(folder / "root", *words)
+    return folder, first, run_on(folder / "root", *words, "--json")
+
+
+def test_it_publishes_and_says_what_it_assumed_and_what_comes_next(
+    learned: tuple[Path, Finished, Finished],
+) -> None:
+    folder, first, _ = learned
+    assert first.exit_code == 0, first.stderr
+    for said in (
+        "ingested 6 drives, 3,000 rows",
+        "published golf@1. It is the first version.",
+        "assumed, since own does not say otherwise:\n  side-slip sensor at the centre of gravity",
+    ):
+        assert said in first.stderr
+    _, _, lines = first.stderr.partition("next:\n")
+    commands = [line.split(f"--root {folder / 'root'} ")[1] for line in lines.splitlines()]
+    assert [line.split()[0] for line in commands] == ["show", "export", "evaluate"]
+
+
+def test_the_second_time_there_is_nothing_to_do(learned: tuple[Path, Finished, Finished]) -> None:
+    _, _, again = learned
+    assert again.exit_code == 0, again.stderr
+    found = json.loads(again.stdout)
+    assert (found["changed"], found["ingest"], found["select"]) == (False, [], None)
+    assert found["publish"]["version"] == 1
+    assert "sideslip is not delayed (delay_s)" in found["assumed"]
+
+
+def test_cars_and_days_are_those_of_the_paths(learned: tuple[Path, Finished, Finished]) -> None:
+    folder, _, _ = learned
+    fleet = fleet_slip.open(folder / "root")
+    found = fleet.sql("SELECT vehicle_id, day::VARCHAR FROM drives ORDER BY 1").fetchall()
+    assert found == [(f"car-{car}", "2026-05-04") for car in range(6)]
+
+
+def test_show_and_exports_list_the_assumptions(
+    learned: tuple[Path, Finished, Finished], tmp_path: Path
+) -> None:
+    folder, _, _ = learned
+    shown = run_on(folder / "root", "show", "golf")
+    assert "assumed" in shown.stdout
+    fleet = fleet_slip.open(folder / "root")
+    assumed = list(fleet.model("golf").manifest.assumed)
+    for to in ("c", "sql"):
+        fleet.export("golf", to, tmp_path)
+        name = f"sideslip_golf_{to}"
+        assert json.loads((tmp_path / f"{name}_manifest.json").read_text())["assumed"] == assumed
+        assert assumed[0] in (tmp_path / f"{name}_README.md").read_text()
+    assert fleet.verify().damage == []
+
+
+def test_a_version_without_assumptions_is_what_it_was(
+    learned: tuple[Path, Finished, Finished],
+) -> None:
+    folder, _, _ = learned
+    manifest = fleet_slip.open(folder / "root").model("golf").manifest
+    assert "assumed" not in manifest.model_copy(update={"assumed": ()}).model_dump(mode="json")
+
+
+def test_a_corrected_mapping_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
+    logs = write_logs(tmp_path, 4)
+    mapping = load_mapping(str(tmp_path / "own.toml"))
+    fleet = fleet_slip.open(tmp_path / "root")
+    fleet.learn("golf", logs, mapping)
+    ax = mapping.signals["ax"].model_copy(update={"negate": True})
+    corrected = mapping.model_copy(update={"signals": {**mapping.signals, "ax": ax}})
+    report = fleet.learn("golf", logs, corrected)
+    assert sum(one.drives_replaced for one in report.ingested) == 4
+    assert report.problem is None
+    assert fleet.sql("SELECT count(*) FROM drives").fetchall() == [(4,)]
+
+
+def test_a_first_model_of_too_few_drives_is_refused_as_by_publish(tmp_path: Path) -> None:
+    report = fleet_slip.open(tmp_path / "root").learn(
+        "golf", write_logs(tmp_path, 2), str(tmp_path / "own.toml")
+    )
+    assert isinstance(report.problem, RefusedError)
+    assert report.publication is None
+
+
+def test_a_mapping_without_any_label_is_an_error_that_says_so(tmp_path: Path) -> None:
+    logs = write_logs(tmp_path, 1)
+    text = MAPPING[: MAPPING.index("sideslip")]
+    (tmp_path / "own.toml").write_text(text)
+    with pytest.raises(ConfigError, match=r"nothing to learn from\. Map sideslip .* or course"):
+        fleet_slip.open(tmp_path / "root").learn("golf", logs, str(tmp_path / "own.toml"))
+    assert not (tmp_path / "root").exists()
+
+
+def test_a_path_that_does_not_fit_is_an_error(tmp_path: Path) -> None:
+    write_logs(tmp_path, 1)
+    stray = tmp_path / "logs" / "car-0" / "notes.csv"
+    stray.write_text("t,ax,ay,r,beta\n0,0,0,0,0\n")
+    done = run_on(tmp_path / "root", "ingest", stray, "--mapping", tmp_path / "own.toml")
+    assert done.exit_code == 4
+    assert "notes.csv: the path does not end as in path = '*_{}.csv'" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"wheel_fl": {"column": "v", "unit": "km/h", "radius_m": 0.31}}, "wheel radius 0.31 m"),
+        ({"steer": {"column": "s", "unit": "deg"}}, "both front wheels steer alike"),
+        ({}, "side-slip sensor at the centre of gravity"),
+    ],
+)
+def test_what_a_mapping_leaves_open_is_named(changed: dict[str, object], said: str) -> None:
+    mapping = Mapping.model_validate(
+        {"name": "m", "time": TIME, "drive": DRIVE, "signals": {**SIGNALS, **changed}}
+    )
+    assert any(text.startswith(said) for text in assumptions_of(mapping))
+
+
+def test_what_it_says_is_not_assumed() -> None:
+    sure = {"wheel_fl": {"column": "v", "unit": "km/h", "radius_m": 0.3}}
+    mapping = Mapping.model_validate(
+        {"name": "m", "time": TIME, "drive": DRIVE, "signals": {"ax": SIGNALS["ax"], **sure}}
+    )
+    assert assumptions_of(mapping) == ()
