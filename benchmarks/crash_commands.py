@@ -106,13 +106,11 @@ def _removed_long_ago(log: str) -> str:
 
 
 def damage_files(root: Path) -> None:
-    """Flip a bit in a simulated log file and in a Gram file."""
-    warehouse = Warehouse(LocalFolder(root))
-    for table in (warehouse.logs, warehouse.grams):
-        file = Path(table.snapshot().paths[-1])
-        content = bytearray(file.read_bytes())
-        content[len(content) // 2] ^= 1
-        file.write_bytes(content)
+    """Flip a bit in a Gram file."""
+    file = Path(Warehouse(LocalFolder(root)).grams.snapshot().paths[-1])
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
 
 
 LOGS = (SIMULATE, INGEST)
@@ -134,7 +132,7 @@ COMMANDS = (
     Command(
         "repair",
         MODEL,
-        ("verify", "--full", "--repair", "--campaign", "{campaign}"),
+        ("verify", "--full", "--repair"),
         damage_files,
         damaged=True,
     ),

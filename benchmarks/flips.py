@@ -43,7 +43,6 @@ READING: tuple[tuple[str, ...], ...] = (
     ("diagnose", "smoke", "--json"),
     ("what-if", "smoke", "--noise", "ay=0.1", "--json"),
     ("monitor", "smoke", "--since", "2024-05-07", "--json"),
-    ("diff", "smoke@1", "smoke@2", "--json"),
     ("status", "--json"),
     ("verify", "--grams", "--json"),
     ("sql", "SELECT drive_id, avg(ay_mps2), max(tick) FROM log GROUP BY 1 ORDER BY 1", "--json"),

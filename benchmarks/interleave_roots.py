@@ -63,7 +63,7 @@ COMMANDS: Mapping[str, tuple[str, ...]] = {
     "retain": ("forget", "--expired", "--retention", "{retention}"),
     "forget": ("forget", "--vehicle", CAR, "--now"),
     "migrate": ("migrate",),
-    "repair": ("verify", "--repair", "--campaign", "{campaign}"),
+    "repair": ("verify", "--repair"),
 }
 LEFT_BY_KILLED = ("ingest", "simulate", "compact")
 """Commands that were killed before their first commit, where `vacuum` comes in."""
@@ -179,8 +179,7 @@ def _leave_what_killed_jobs_leave(root: Path, inputs: Inputs) -> None:
 
 
 def _lose_files(root: Path) -> None:
-    """Delete a simulated log file, of the second day, and a Gram file."""
-    next(iter(sorted(root.glob(f"logs/day={SECOND_DAY}/mini-*.parquet")))).unlink()
+    """Delete a Gram file."""
     next(iter(sorted(root.glob("grams/*.parquet")))).unlink()
 
 

@@ -11,7 +11,6 @@ from fleet_slip.api.calls import (
     ALIAS,
     MODEL,
     UNEXAMINED,
-    VERSION,
     Rooted,
     ShowProgress,
     count_from_start,
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
 
     from fleet_slip.evaluation.report import Written
     from fleet_slip.export.stepping import Estimator
-    from fleet_slip.models.diff import Difference
     from fleet_slip.models.manifest import Manifest
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.score import Score
@@ -206,16 +204,6 @@ class PublishedModels(Rooted):
         registry = self.registry()
         return registry.load(name, registry.hold(name, alias, "unpin" if off else "pin"))
 
-    def diff(
-        self,
-        one: Annotated[str | ModelVersion, VERSION],
-        other: Annotated[str | ModelVersion, VERSION],
-    ) -> "Difference":
-        """Tell two versions apart: data, signals, coefficients, figures. Raises as `model`."""
-        from fleet_slip.models.diff import compare_versions
-
-        return compare_versions(self.registry(), self.resolve(one), self.resolve(other))
-
     @record_call
     def import_model(self, file: Path) -> ModelVersion:
         """Bring a version in that another data root exported to JSON; return it.
@@ -318,8 +306,7 @@ class JudgedModels(PublishedModels):
         row has the model's signals, `QuestionError` for an invalid condition, and what `model`
         raises.
         """
-        from fleet_slip.models.diff import find_seen
-        from fleet_slip.models.score import score
+        from fleet_slip.models.score import find_seen, score
 
         manifest = self.resolve(model).manifest
         rows, examined = self.scored_rows(cohort, unexamined=unexamined)

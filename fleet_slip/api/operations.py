@@ -1,6 +1,6 @@
 """The part of a `Fleet` that watches the warehouse and looks after it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date
 from typing import TYPE_CHECKING, Annotated, cast
@@ -135,12 +135,7 @@ class HealthAndUpkeep(JudgedModels):
                 "Compute the Gram rows of some log files in several ways, too; compare bit for bit."
             ),
         ] = False,
-        repair: Annotated[
-            bool, Doc("Rebuild Gram rows from the logs, and simulated logs from campaigns.")
-        ] = False,
-        campaigns: Annotated[
-            Sequence[str], Doc("A campaign's TOML file for `repair`, besides those that ship.")
-        ] = (),
+        repair: Annotated[bool, Doc("Rebuild Gram rows from the logs.")] = False,
         workers: Workers = None,
         progress: ShowProgress | None = None,
     ) -> "Verification":
@@ -163,7 +158,7 @@ class HealthAndUpkeep(JudgedModels):
         with open_workers(self.root, workers) as executor:
             found = look()
             if repair:
-                rebuilt = self.repair(found, campaigns)
+                rebuilt = self.repair(found)
                 found = look()
                 found.rebuilt = rebuilt
         if grams and not found.damage:
@@ -171,11 +166,11 @@ class HealthAndUpkeep(JudgedModels):
         return found
 
     @record_call
-    def repair(self, found: "Verification", campaigns: Sequence[str] = ()) -> list[str]:
+    def repair(self, found: "Verification") -> list[str]:
         """Rebuild what `verify` found damaged; return the paths, below the root."""
         from fleet_slip.operations.repair import repair
 
-        return repair(self.warehouse, found, campaigns)
+        return repair(self.warehouse, found)
 
     @record_call
     def compact(

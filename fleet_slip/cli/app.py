@@ -65,7 +65,6 @@ GROUPS = {
         "select": "begin",
         "publish": "begin",
         "models": "models",
-        "diff": "models",
         "promote": "models",
         "pin": "models",
     },

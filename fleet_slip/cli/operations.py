@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.base import date_of
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import Json, print_answer, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
@@ -67,13 +66,6 @@ def calibrate(
         str | None,
         typer.Option(help="Show this car's numbers, and how they go on board.", show_default=False),
     ] = None,
-    since: Annotated[
-        str | None,
-        typer.Option(
-            help="Show instead what has changed in cars from this day on, such as 2024-06-15.",
-            show_default=False,
-        ),
-    ] = None,
     json: Json = False,
 ) -> None:
     """Tell from each car's own drives how its sensors are off: no label, no log row is read.
@@ -84,21 +76,13 @@ def calibrate(
 
     Example: **fleet-slip calibrate**
     """
-    from fleet_slip.grams.calibration import parts_of_changed  # noqa: PLC0415 - loaded by now
-
-    day = date_of(since, "--since")
     if car is not None:
         found.car(car)  # that there is such a car
-    changed = [one for one in found.changed(day) if car in (None, one.car)] if day else []
     if json:
         shown = found.as_dict()
-        if day:
-            shown["changed"] = [vars(one) for one in changed]
         if car is not None:
             shown["cars"] = {car: shown["cars"][car]}
         print_json(shown)
-    elif day:
-        print_parts(parts_of_changed(changed, day))
     else:
         print_parts(found.parts() if car is None else found.parts_of_car(car))
 
@@ -152,7 +136,7 @@ def nightly(
     print_answer(report, json)
 
 
-@command(Fleet.verify, progress=("verify", "bytes"), campaigns="--campaign")
+@command(Fleet.verify, progress=("verify", "bytes"))
 def verify(report: "Verification", fleet: Fleet, repair: bool, json: Json = False) -> None:
     """Verify every byte against its checksum, and everything against everything else.
 

@@ -93,13 +93,12 @@ DETAILS: dict[str, dict[str, Any]] = {
 NAMES = {"condition": "--cohort", "everything": "--all"}
 """Parameters that every command calls otherwise than the API."""
 
-MODELS = ("model", "reference", "name", "one", "other")
+MODELS = ("model", "reference", "name")
 """Parameters that are completed by published models where they are arguments."""
 
 READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "bias": (list[str] | None, lambda values: quantities(values, "--bias")),
     "campaign": (str, str),
-    "campaigns": (list[str] | None, lambda files: files or ()),
     "folds": (str | None, lambda folds: folds),
     "landing": (str, str),
     "logs": (list[str], list),
@@ -107,8 +106,6 @@ READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "model": (str | None, lambda model: model),
     "night": (str | None, lambda night: date_of(night, "--night")),
     "noise": (list[str] | None, lambda values: quantities(values, "--noise")),
-    "one": (str, str),
-    "other": (str, str),
     "others": (list[str] | None, lambda names: names or ()),
     "over": (str | None, lambda over: [one.strip() for one in over.split(",")] if over else ()),
     "scenarios": (list[str] | None, lambda names: names or ()),

@@ -51,12 +51,11 @@ from fleet_slip.evaluation.single_track import (
 )
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.expansion import CarCounts
-from fleet_slip.models.diff import find_seen
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import recipe_of
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest, load_model_list
-from fleet_slip.models.score import calibrated_cars
+from fleet_slip.models.score import calibrated_cars, find_seen
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.runs import LOGGER
 from fleet_slip.vehicle.parameters import VehicleParameters

@@ -6,10 +6,8 @@ came, and a drive that is forgotten is gone from them. `car_evidence` says how s
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import date
-from math import sqrt
 from statistics import median, pstdev
 from typing import Any
 
@@ -17,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import date_of, number_of
+from fleet_slip.base import number_of
 from fleet_slip.catalogue.course import COLUMNS, turned_scale
 from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, CAR_NUMBERS, NumberName
 from fleet_slip.catalogue.features import features, input_scales
@@ -28,10 +26,7 @@ from fleet_slip.grams.car_evidence import (
     FEWEST_CARS,
     CalibratedNumber,
     CarEvidence,
-    Piece,
     Roads,
-    three_digits,
-    with_others,
 )
 from fleet_slip.grams.reader import GramReader, OpenedGrams, collect_sums, open_grams
 from fleet_slip.grams.receiver_delay import (
@@ -44,77 +39,6 @@ from fleet_slip.grams.receiver_delay import (
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
-
-# Which numbers of a car have changed.
-
-SURE_ERRORS = 5.0
-"""Standard errors by which a number has changed. Of 6,300 numbers of simulated cars in which
-nothing changed, before and after some day, none differed by more."""
-
-
-@dataclass(frozen=True)
-class ChangedNumber:
-    """A number of which a car's drives from a day on give another value than those before.
-
-    `uncertainty` is the standard error of the difference; all in the number's unit.
-    """
-
-    car: str
-    number: NumberName
-    before: float
-    after: float
-    uncertainty: float
-
-
-def changed_numbers(evidence: CarEvidence, since: date) -> list[ChangedNumber]:
-    """Return the numbers that are others from a day on, surely; by car.
-
-    Errors that no drive of a car takes away are in both, and not in the difference. How drives
-    differ follows from each half by itself: a car that changed would pass for one that is uneven.
-    Of a car that is more uneven than others, such as by its loads, its own drives show it.
-    """
-    halves = {car: _halves(evidence, car, since) for car in evidence.cars}
-    variances = evidence.variances_of(half for both in halves.values() for half in both)
-    found = []
-    for car, (before, after) in halves.items():
-        (was, _), (now, _) = before, after
-        own = evidence.variances_of((before, after))
-        uneven = {name: max(one, own.get(name, 0.0)) for name, one in variances.items()}
-        of_was, of_now = (
-            with_others(half[0], evidence.scatter(half, uneven, same_roads=True))
-            for half in (before, after)
-        )
-        for name in CAR_NUMBERS:
-            if name in of_was and name in of_now:
-                error = three_digits(sqrt(of_was[name] + of_now[name]))
-                one, other = float(evidence.level(was[name])), float(evidence.level(now[name]))
-                if abs(other - one) > SURE_ERRORS * error:
-                    found.append(ChangedNumber(car, name, one, other, error))
-    return found
-
-
-def _halves(evidence: CarEvidence, car: str, since: date) -> tuple[Piece, Piece]:
-    before, after = {}, {}
-    for kind, at in evidence.slices(car).items():
-        early = sum(day < since for _, day, _ in evidence.sums[kind].drives[at])
-        before[kind] = slice(at.start, at.start + early)
-        after[kind] = slice(at.start + early, at.stop)
-    return (evidence.estimate(before), before), (evidence.estimate(after), after)
-
-
-def parts_of_changed(changed: Sequence[ChangedNumber], since: date) -> Iterator[Part]:
-    """Return a table of the numbers of cars that are others from a day on."""
-    if not changed:
-        yield Remark(f"no number of a car is another since {since}, as far as its drives tell")
-        return
-    rows = ({**vars(one), "unit": CAR_NUMBERS[one.number].unit} for one in changed)
-    yield TextTable(
-        f"changed since {since}, by more than {SURE_ERRORS:g} standard errors",
-        "car|number|unit|before|after|+-",
-        rows,
-        "{car}|{number}|{unit}|{before:.5g}|{after:.5g}|{uncertainty:.2g}",
-        left=3,
-    )
 
 
 @dataclass(frozen=True)
@@ -153,10 +77,6 @@ class Calibration(Answer):
     def roads(self) -> Roads:
         """What the roads of all cars have in common."""
         return self.evidence.roads
-
-    def changed(self, since: date | str) -> list[ChangedNumber]:
-        """Return the numbers of cars that are others from a day on."""
-        return changed_numbers(self.evidence, date_of(since, "since"))
 
     def parts(self) -> Iterator[Part]:
         """Return a table of the numbers over all cars."""

@@ -6,7 +6,7 @@ differ, is that of the whole fleet; how much a car's driving determines is its o
 the same roads again, so that there is a limit to what more of them determine.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import hypot, sqrt
@@ -145,10 +145,6 @@ OF_A_DRIVE: Mapping[NumberName, float] = {"yaw_rate_offset_by_wheels": 0.002}
 the other, and makes wheels slip to that side. Two drives on one circuit do not show it."""
 
 
-Piece = tuple[Mapping[NumberName, CarEstimate], Mapping[str, slice]]
-"""Some drives of a car: what they determine, and where they stand by kind."""
-
-
 @dataclass(frozen=True)
 class CalibratedNumber:
     """One number of one car.
@@ -193,9 +189,7 @@ class CarEvidence:
             if "ay_offset" in estimates
         ]
         self.roads = roads_of(self._banked, offsets)
-        self.variances = self.variances_of(
-            (self.estimates[car], self.slices(car)) for car in self.cars
-        )
+        self.variances = self._variances()
         self.variances_of_one = self._variances_of_one()
 
     def slices(self, car: str, first: int = 0, last: int | None = None) -> dict[str, slice]:
@@ -239,16 +233,17 @@ class CarEvidence:
         sums = DriveTermSums(self._moments[estimate.kind][at], signals, estimate.terms)
         return influence(estimate.relation, sums, float(estimate.noise), estimate.gradient)
 
-    def variances_of(self, pieces: Iterable[Piece]) -> dict[NumberName, float]:
+    def _variances(self) -> dict[NumberName, float]:
         """Return the variance of residuals, as drives differ, of each number's plane.
 
-        A drive's shift, about the number of its piece, has the variance times its share times one
-        less the part of the share in the piece's. Every drive counts the same: errors do not grow
+        A drive's shift, about the number of its car, has the variance times its share times one
+        less the part of the share in the car's. Every drive counts the same: errors do not grow
         with shares as noise does, and uninformative drives would decide for informative ones.
         """
         ratios: dict[NumberName, list[float]] = {}
-        for estimates, slices in pieces:
-            for name, estimate in estimates.items():
+        for car in self.cars:
+            slices = self.slices(car)
+            for name, estimate in self.estimates[car].items():
                 found = self.influence(estimate, slices[estimate.kind])
                 if found is None:
                     continue
@@ -287,23 +282,18 @@ class CarEvidence:
         return found
 
     def scatter(
-        self, piece: Piece, variances: Mapping[NumberName, float], *, same_roads: bool = False
+        self, estimates: Mapping[NumberName, CarEstimate], slices: Mapping[str, slice]
     ) -> dict[NumberName, float]:
-        """Return the variances of what some drives determine, as drives differ.
-
-        With `same_roads`, of what they determine beside other drives on these roads: that they
-        go over them again is no error then.
-        """
-        estimates, slices = piece
+        """Return the variances of what some drives determine, as drives differ."""
         own: dict[NumberName, float] = {}
         for name, estimate in estimates.items():
             found = self.influence(estimate, slices[estimate.kind])
-            if found is None or name not in variances:
+            if found is None or name not in self.variances:
                 continue
             drives = len(found.shares)
-            of_one = self.variances_of_one if drives == 1 else variances
-            again = 1 if same_roads else 1 + drives / ROADS
-            variance = of_one.get(name, variances[name]) * float(found.shares.sum())
+            of_one = self.variances_of_one if drives == 1 else self.variances
+            again = 1 + drives / ROADS
+            variance = of_one.get(name, self.variances[name]) * float(found.shares.sum())
             own[name] = variance * again + OF_A_DRIVE.get(name, 0.0) ** 2 / drives
         return own
 
@@ -311,7 +301,7 @@ class CarEvidence:
         self, estimates: Mapping[NumberName, CarEstimate], slices: Mapping[str, slice]
     ) -> dict[NumberName, float]:
         """Return the standard errors of what some drives determine."""
-        own = self.scatter((estimates, slices), self.variances)
+        own = self.scatter(estimates, slices)
         for name in own:
             by_satellite = LASTING_BY_SATELLITE.get(estimates[name].kind, {})
             own[name] += {**LASTING[self._banked], **by_satellite}.get(name, 0.0) ** 2

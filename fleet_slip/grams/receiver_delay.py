@@ -42,8 +42,6 @@ EARLY = 20
 SPEEDS = (f"satellite_speed_late_{EARLY}", f"satellite_speed_late_{EARLY + SPAN}")
 LASTING_S = 0.003
 """Standard error that is the same in all drives: tilt and low-pass of the accelerometer."""
-SURE_ERRORS = 5.0
-"""Standard errors, of a usual car and of the car itself, by which a delay has changed."""
 TINY = 1e-9
 """Share of the sum of squares that a drive's bend has at least: it may tell nothing."""
 FEWEST_DRIVES = 3
@@ -78,16 +76,6 @@ class ReceiverDelays:
     types: dict[str, Pooled]
 
 
-@dataclass(frozen=True)
-class ChangedDelay:
-    """A car's receiver that is later, or less late, than it was, in s, from the day `since` on."""
-
-    before: float
-    after: float
-    since: str
-    drives: tuple[str, ...]
-
-
 def delay_columns() -> tuple[str, ...]:
     """Return the columns of Gram rows that tell a delay: speeds, then sums of acceleration."""
     lags = range(0, STEP * STEPS + 1, STEP)
@@ -116,32 +104,6 @@ def receiver_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> ReceiverDelays:
             receiver = own.receivers.pop() if len(own.receivers) == 1 else None
             found[car] = replace(one, receiver=receiver)
     return with_types(with_pooled(found))
-
-
-def changed_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, ChangedDelay]:
-    """Return the cars whose receivers are later from some drive on than they were before.
-
-    Looked at is the place where both sides differ by most standard errors, as usual drives do.
-    """
-    halves = {
-        car: split
-        for car, own in _by_car(rows_of_delay).items()
-        if (split := _best_split(own.products)) is not None
-    }
-    squares = [
-        one.drives * ((one.uncertainty or 0.0) ** 2 - LASTING_S**2)
-        for _, *both in halves.values()
-        for one in both
-    ]
-    usual_s = math.sqrt(float(np.median(squares))) if squares else 0.0
-    found = {}
-    for car, (keys, before, after) in halves.items():
-        usual = usual_s * math.sqrt(1 / before.drives + 1 / after.drives)
-        own = math.hypot(before.uncertainty or 0.0, after.uncertainty or 0.0)
-        if abs(after.value - before.value) > SURE_ERRORS * max(usual, own):
-            names = tuple(name for _, name in keys)
-            found[car] = ChangedDelay(before.value, after.value, keys[before.drives][0], names)
-    return found
 
 
 @dataclass
@@ -235,23 +197,6 @@ def _noise(delays: Iterable[ReceiverDelay]) -> float | None:
     known = [one for one in known if one.differing <= WILD * usual * (one.drives - 1)]
     free = sum(one.drives - 1 for one in known)
     return math.fsum(one.differing for one in known) / free if free >= FEWEST_DRIVES - 1 else None
-
-
-def _best_split(
-    products: dict[tuple[str, str], FloatArray],
-) -> tuple[list[tuple[str, str]], ReceiverDelay, ReceiverDelay] | None:
-    """Return the two parts of a car's drives that differ most for their numbers, None for few."""
-    values = np.array(list(products.values()))
-    so_far, count, most = np.cumsum(values, axis=0), 0, 0.0
-    for some in range(FEWEST_DRIVES, len(values) - FEWEST_DRIVES + 1):
-        before, after = _best_lag(so_far[some - 1]), _best_lag(so_far[-1] - so_far[some - 1])
-        if before is not None and after is not None:
-            errors = abs(after - before) / math.sqrt(1 / some + 1 / (len(values) - some))
-            count, most = (some, errors) if errors > most else (count, most)
-    first, then = (_delay(some, 0) if len(some) else None for some in np.split(values, [count]))
-    if first is None or then is None or not (first.uncertainty and then.uncertainty):
-        return None
-    return list(products), first, then
 
 
 def _delay(products: FloatArray, rows: int) -> ReceiverDelay | None:

@@ -7,17 +7,27 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Record
+from fleet_slip.catalogue.facts import RECEIVED
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.compute import counts_of, drives_of_stream
 from fleet_slip.grams.expansion import CarCounts
+from fleet_slip.grams.gram_rows import hash_numbers
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor, predict
+from fleet_slip.models.registry import Registry
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.runs import log_event
-from fleet_slip.warehouse.condition import Condition, asking, parse_cohort, row_columns
+from fleet_slip.warehouse.condition import (
+    Condition,
+    asking,
+    drive_columns,
+    parse_cohort,
+    row_columns,
+)
+from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.tables import Warehouse, connect_tables
 
 BATCH_ROWS = 2**17
@@ -153,3 +163,37 @@ def _figures(estimate_rad: FloatArray, truth_rad: FloatArray) -> Score:
         error_p99_deg=p99,
         error_max_deg=float(size.max()),
     )
+
+
+# Which drives of a cohort a version was trained on, and those that it was not.
+
+
+@dataclass(frozen=True)
+class SeenDrives:
+    """A cohort's drives, those that made a version (None: not kept), the condition of others."""
+
+    drives: int
+    trained: int | None
+    others: Condition
+
+
+def find_seen(
+    warehouse: Warehouse, registry: Registry, manifest: Manifest, condition: str | Condition
+) -> SeenDrives:
+    """Return which drives with a log of a cohort of rows made a version. Raises as `score`."""
+    cohort = cohort_of_rows(condition)
+    view = "log" if cohort.columns - set(drive_columns()) else "drives"
+    logged = f"({cohort.sql}) AND source <> '{RECEIVED}'"
+    query = f"SELECT DISTINCT drive_id FROM {view} WHERE {logged} ORDER BY 1"
+    with connect_tables(warehouse, query) as database, asking(database, cohort):
+        names = database.sql(query).to_arrow_table()["drive_id"]
+    made = registry.trained_drives(manifest)
+    if made is None:
+        return SeenDrives(len(names), None, cohort)
+    seen = made.among(hash_numbers(names))
+    if not seen.any() or seen.all():
+        return SeenDrives(len(names), int(seen.sum()), cohort)
+    kept = [name for name, old in zip(names.to_pylist(), seen, strict=True) if not old]
+    listed = ", ".join(map(sql_text, kept))
+    others = Condition(cohort.text, f"({cohort.sql} AND drive_id IN ({listed}))")
+    return SeenDrives(len(names), int(seen.sum()), others)

@@ -12,15 +12,14 @@ import pyarrow as pa
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.base import Record, number_of
 from fleet_slip.catalogue.course import relate
-from fleet_slip.catalogue.facts import DELAY, TRAINING_DRIVES
+from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.faults import DriveBatches, Fault, find_implausible
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import AlarmError, DataError
+from fleet_slip.errors import AlarmError
 from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
 from fleet_slip.grams.reader import GramReader
-from fleet_slip.grams.receiver_delay import changed_delays
 from fleet_slip.ingest.recordings import Origin
 from fleet_slip.operations.labels import find_odd_days, find_repeated, find_reversed_labels
 from fleet_slip.operations.peers import QualityThresholds, settle, thresholds
@@ -95,7 +94,7 @@ def examine_drives(
     drives = parse_cohort(condition)
     with GramReader(warehouse) as reader:
         models = _vehicle_models(reader, drives)
-        known = _faulty_courses(reader, drives) | _changed_delays(reader, drives)
+        known = _faulty_courses(reader, drives)
         known |= find_wrong_labels(load_cohort(reader, drives), limits)
         reports = [
             examine(load_cohort(reader, drives & of_model), limits, known) for of_model in models
@@ -115,26 +114,6 @@ def _faulty_courses(reader: GramReader, condition: Condition) -> dict[str, Fault
         for drives in course_moments(reader, condition).values()
         for drive, moments in drives.items()
         if (relation := relate(moments)) and (fault := relation.fault)
-    }
-
-
-def _changed_delays(reader: GramReader, condition: Condition) -> dict[str, Fault]:
-    """Return the drives of cars whose receivers' delays changed: one delay corrects them all.
-
-    If there are Gram rows of the set `delay` for all of the cohort.
-    """
-    try:
-        opened = reader.opened(DELAY, condition)
-    except DataError:
-        return {}
-    return {
-        drive: Fault(
-            "changed delay",
-            ("course",),
-            f"{1000 * one.before:.0f} ms late before {one.since}, {1000 * one.after:.0f} ms since",
-        )
-        for one in changed_delays(opened.batches(condition)).values()
-        for drive in one.drives
     }
 
 

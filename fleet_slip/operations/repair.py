@@ -1,40 +1,31 @@
-"""Rebuilds what can be rebuilt: Gram rows from the logs, simulated logs from their campaign.
+"""Rebuilds what can be rebuilt: Gram rows from the logs, and checkpoints from the commits.
 
-Nothing is deleted that was not. Bytes under another name are put back; simulated files have the
-checksum in the name that the Delta log knows, or are refused.
+Nothing is deleted. The bytes of a file that stand under another name are put back.
 """
 
 import contextlib
-from collections.abc import Collection, Iterable, Mapping, Sequence, Set
+from collections.abc import Collection, Set
 
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.grams.gram_files import is_of_received
 from fleet_slip.grams.job import reconcile
 from fleet_slip.operations.verify import Verification, read_whole
-from fleet_slip.resources import config_names
-from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
-from fleet_slip.simulation.job import file_name, simulate_batch
 from fleet_slip.storage.checksums import checksum_in, checksum_of
 from fleet_slip.storage.commits import LATEST, LOG, check_commits
 from fleet_slip.storage.storage_errors import storage_errors
-from fleet_slip.storage.table import Change, TableFile, retrying
+from fleet_slip.storage.table import Change, retrying
 from fleet_slip.warehouse.tables import Warehouse
 
 
-def repair(
-    warehouse: Warehouse, verification: Verification, campaigns: Sequence[str] = ()
-) -> list[str]:
-    """Rebuild what is damaged, also by files of `campaigns`; return what, below the root."""
+def repair(warehouse: Warehouse, verification: Verification) -> list[str]:
+    """Rebuild what is damaged; return what, below the root."""
     logs = {finding.path for finding in verification.damage if finding.kind == "log"}
     rebuilt = _sum_up_again(warehouse, logs)
     damaged = {finding.path for finding in verification.damage if finding.kind == "file"}
     wrong = {f.path.removeprefix("logs/") for f in verification.damage if f.kind == "gram"}
-    found = _find_elsewhere(warehouse, damaged)
-    rebuilt += found
-    rebuilt += _simulate_again(warehouse, damaged - set(found), campaigns)
+    rebuilt += _find_elsewhere(warehouse, damaged)
     lost = {path.removeprefix("logs/") for path in damaged.difference(rebuilt)}
     rebuilt += _drop_wrong(warehouse, damaged, wrong)
     reconcile(warehouse, unreadable=lost)  # also what an interrupted repair has dropped
@@ -80,50 +71,6 @@ def _find_elsewhere(warehouse: Warehouse, damaged: Collection[str]) -> list[str]
                         rebuilt.append(f"{name}/{file.path}")
                 lost = [file for file in lost if f"{name}/{file.path}" not in rebuilt]
     return rebuilt
-
-
-def _simulate_again(
-    warehouse: Warehouse, damaged: Collection[str], campaigns: Sequence[str]
-) -> list[str]:
-    files = [file for file in warehouse.logs.snapshot().files if f"logs/{file.path}" in damaged]
-    if not files:
-        return []
-    known = [load_campaign(name) for name in (*campaigns, *config_names("campaigns"))]
-    drives = _drives_of(warehouse, {file.path for file in files})
-    rebuilt = []
-    for file in files:
-        for batch in _candidates(file, drives.get(file.path, frozenset()), known):
-            if warehouse.logs.restore_file(file, simulate_batch(batch)):
-                rebuilt.append(f"logs/{file.path}")
-                break
-    return rebuilt
-
-
-def _drives_of(warehouse: Warehouse, paths: Collection[str]) -> dict[str, frozenset[str]]:
-    found: dict[str, set[str]] = {}
-    for rows in _readable_grams(warehouse).values():
-        concerned = rows.filter(pc.is_in(rows["file"], pa.array(sorted(paths), pa.string())))
-        for row in concerned.select(["file", "drive_id"]).to_pylist():
-            found.setdefault(row["file"], set()).add(row["drive_id"])
-    return {path: frozenset(drives) for path, drives in found.items()}
-
-
-def _candidates(
-    file: TableFile, drives: Collection[str], campaigns: Iterable[Campaign]
-) -> Iterable[Batch]:
-    """Yield what the file may have been simulated from: its drives, or a batch of its name."""
-    if file.day is None:
-        return
-    for campaign in campaigns:
-        if file.day not in campaign.days():
-            continue
-        specs: Mapping[str, DriveSpec] = {spec.drive_id: spec for spec in campaign.drives(file.day)}
-        if drives and specs.keys() >= set(drives):
-            chosen = tuple(specs[drive] for drive in sorted(drives))
-            yield Batch(campaign.name, file.day, 0, chosen)
-        for batch in campaign.batches(file.day):
-            if f"/{file_name(batch)}-" in file.path:
-                yield batch
 
 
 @retrying

@@ -1,7 +1,7 @@
 """Writes rows again, to compact the logs or to forget drives.
 
 Log files hold whole drives by name and tick, and dictionaries of what occurs: their bytes follow
-from the drives, and can be simulated again.
+from the drives.
 """
 
 import dataclasses

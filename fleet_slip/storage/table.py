@@ -22,7 +22,6 @@ from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundErr
 from deltalake.transaction import AddAction, RemoveAction
 
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
-from fleet_slip.storage.checksums import checksum_in
 from fleet_slip.storage.commits import (
     LATEST,
     LOG,
@@ -602,14 +601,6 @@ class Table:
         for action in actions:
             if action.path not in landed:
                 self.folder.delete(action.path)
-
-    def restore_file(self, file: TableFile, rows: pa.Table) -> bool:
-        """Write a file again if rows make the very bytes that its name tells; False if not."""
-        encoded = self.encode(rows)
-        if encoded.checksum != checksum_in(file.path):
-            return False
-        self.folder.put(file.path, encoded.content)
-        return True
 
     def encode(self, rows: pa.Table) -> Encoded:
         """Return the content of a file with these rows."""

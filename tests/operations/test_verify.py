@@ -5,7 +5,6 @@ import os
 import random
 import shutil
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +15,7 @@ from fleet_slip.errors import StorageError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.find_drives import vacuum
 from fleet_slip.operations.repair import repair
-from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import verify
-from fleet_slip.resources import find_config
-from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.job import simulate_campaign
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
@@ -209,27 +204,3 @@ def test_leftovers_and_a_backlog_are_remarks(filled: Warehouse) -> None:
     report = verify(filled)
     assert not report.damage
     assert [finding.kind for finding in report.findings] == ["backlog", "unreferenced"]
-
-
-@pytest.mark.parametrize("compacted", [False, True])
-def test_simulated_logs_are_rebuilt_to_the_bit(
-    warehouse: Warehouse, tmp_path: Path, compacted: bool
-) -> None:
-    text = find_config("campaigns", "smoke").read_text().replace("laps = 0.5", "laps = 0.03")
-    (tmp_path / "short.toml").write_text(text.replace("15_000", "1_000"))
-    campaign = load_campaign(str(tmp_path / "short.toml"))
-    with ThreadPoolExecutor(1) as executor:
-        simulate_campaign(warehouse, campaign, campaign.days(), executor)
-    update_grams(warehouse)
-    if compacted:
-        compact(warehouse)
-    whole = {path: Path(path).read_bytes() for path in warehouse.logs.snapshot().paths}
-    first, *_, last = whole
-    flip(Path(first), 12345)
-    Path(last).unlink()
-    report = verify(warehouse)
-    assert len(report.damage) == 2
-    assert not repair(warehouse, report)  # the shipped campaign of this name is another one
-    assert len(repair(warehouse, report, [str(tmp_path / "short.toml")])) == 2
-    assert {path: Path(path).read_bytes() for path in whole} == whole
-    assert not verify(warehouse, full=True).damage

@@ -93,6 +93,7 @@ def test_what_is_damaged_is_found_and_made_again(copied: Folder) -> None:
     found = command_on(root, "verify")
     assert found.exit_code == DAMAGE
     assert victim.path in found.stdout
+    root.put("logs/from-the-backup.parquet", whole)
     assert command_on(root, "verify", "--repair").exit_code == 0
     assert root.read(victim.path) == whole
 

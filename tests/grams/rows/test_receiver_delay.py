@@ -213,28 +213,6 @@ def test_what_a_course_of_unknown_delay_taught_is_not_published(
     assert fleet.publish("late", selection, force=True).new
 
 
-def test_quality_names_a_car_whose_delay_changed(late_fleet: LateFleet, tmp_path: Path) -> None:
-    fleet = late_fleet(tmp_path, 0.06)
-    assert not changed(fleet)
-    later = CAMPAIGN.format(0.187) + "\n"
-    (tmp_path / "later.toml").write_text(
-        later.replace('base = "smoke"', 'base = "smoke"\nfirst_day = 2024-06-01')
-    )
-    fleet.simulate(str(tmp_path / "later.toml"))
-    for name in ("signals", "delay"):
-        fleet.gram(name)
-    found = changed(fleet)
-    assert len(found) == 16
-    assert found[0].startswith("5") or found[0].startswith("6")
-    assert found[0].endswith(" ms since")
-    assert " before 2024-06-01, 18" in found[0]
-
-
-def changed(fleet: Fleet) -> list[str]:
-    findings = fleet.quality("true").findings
-    return [one.fault.figure for one in findings if one.fault.kind == "changed delay"]
-
-
 def test_one_wild_car_leaves_the_delays_of_the_others_known() -> None:
     tame = {
         f"car-{number}": ReceiverDelay(0.1, None, 2, 2000, information=40.0, differing=1.0)
