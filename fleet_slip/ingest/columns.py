@@ -76,6 +76,8 @@ WHEELS = "wheel_"
 """How the names of wheel speeds begin."""
 VELOCITY = "m/s"
 MAX_TABLE = 10_000
+CHOOSE = "choose"
+"""What a draft has for a unit that the file does not say, where several are possible."""
 
 COURSE, SPEED = "course", "satellite_speed"
 Component: TypeAlias = Literal["north", "east"]
@@ -157,6 +159,8 @@ class SignalColumn(Config):
 
     def require_unit_of(self, signal: str, si_unit: str) -> None:
         """Raise `ValueError` if the column cannot be this signal."""
+        if self.unit == CHOOSE:
+            raise ValueError("has no unit in the file, and several fit: write the right one")
         is_wheel = signal.startswith(WHEELS)
         if self.radius_m is not None and not is_wheel:
             raise ValueError("has a radius_m, and radius_m is for wheel speeds")

@@ -1,7 +1,8 @@
 """Drafts a mapping for a file: guesses by name, unit and values, corrected by how the car moves.
 
 The draft is read as any mapping is, and what looks wrong in the drives that come out is put right
-where there is one way to do so: a sign, or left for right. The rest is left to a person.
+where there is one way to do so: a sign, or left for right. The rest is left to a person, who also
+chooses a unit where the file has none and several are possible: without it the draft does not load.
 """
 
 import json
@@ -18,16 +19,14 @@ from fleet_slip.base import shown
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import FleetSlipError, InputError
-from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
+from fleet_slip.ingest.columns import CHOOSE, COURSE, SPEED, TimeBase
 from fleet_slip.ingest.guess import (
     Guess,
     TimeGuess,
-    choose_units,
     guess_cars,
     guess_signals,
     guess_time,
     headings,
-    unit_choices,
 )
 from fleet_slip.ingest.load import preview_log, signals_of
 from fleet_slip.ingest.mapping import Mapping
@@ -81,10 +80,10 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     failures: list[str] = []
     suspicions: list[Fault] = []
     try:
-        guesses = choose_units(guesses, drive_of(guesses))
-        drive = drive_of(guesses)
-        guesses = _correct(guesses, find_suspicions(drive))
+        guesses = _correct(guesses, find_suspicions(drive_of(guesses)))
         suspicions = find_suspicions(drive_of(guesses))
+        if any(guess.readings for guess in guesses.values()):  # then sizes show nothing
+            suspicions = [one for one in suspicions if one.kind not in {"scaled", "biased"}]
     except FleetSlipError as error:
         failures = [str(error)]
     guesses = _doubted(guesses, suspicions)
@@ -270,15 +269,16 @@ def _signals(draft: Draft) -> str:
         lines.append(f"# {name}: {'; '.join(guess.reasons)}")
         if guess.component != "east":  # stands beside north
             end = "  # antenna_x_m and antenna_y_m: to be filled in" if name == COURSE else ""
+            if guess.readings:
+                lines.append(f"# Choose the unit: {_choices(guess)}.")
             lines.append(_line(name, guess, draft.guesses) + end)
     for name, guess in draft.questions.items():
         doubts = "; ".join(guess.doubts) or "its name and unit fit several columns"
         lines.append(f"# Which one, if any? {name}: {doubts}")
         if guess.component != "east":
-            alternatives = [guess, *guess.rivals]
-            if guess.is_without_unit and not guess.rivals:
-                alternatives += (guess.because("", **keys) for keys in unit_choices(guess)[1:])
-            lines += ["# " + _line(name, one, draft.questions) for one in alternatives]
+            if guess.readings:
+                lines.append(f"# Choose the unit, too: {_choices(guess)}.")
+            lines += ["# " + _line(name, o, draft.questions) for o in (guess, *guess.rivals)]
     known = {*draft.guesses, *draft.questions}
     absent = [name for name in catalogue().signals if name not in known]
     if absent:
@@ -286,8 +286,18 @@ def _signals(draft: Draft) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _choices(guess: Guess) -> str:
+    """Return the units that are possible, as a person writes them."""
+    return " or ".join(
+        f'"{keys["unit"]}"' + (f" with radius_m = {keys['radius_m']}" if "radius_m" in keys else "")
+        for keys in guess.readings
+    )
+
+
 def _line(name: str, guess: Guess, guesses: dict[str, Guess]) -> str:
     keys = signal_keys(guess)
+    if guess.readings:
+        keys = {key: value for key, value in keys.items() if key != "radius_m"} | {"unit": CHOOSE}
     if guess.component:
         east = guesses[SPEED].column
         keys = {"north": keys["column"], "east": east, "unit": keys["unit"]}

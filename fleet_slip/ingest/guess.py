@@ -4,7 +4,6 @@ Every guess has its reasons as texts, for a person to correct; what speaks again
 and with a doubt it is a question.
 """
 
-import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
@@ -18,17 +17,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.columns import COURSE, SPEED, Component, conversion_factor, reads_clock
 from fleet_slip.ingest.profile import FileProfile, Profile, sample_rate_hz
-from fleet_slip.ingest.suspicion import (
-    LEAST_CORRELATION,
-    RADIUS_M,
-    ROAD_WHEELS,
-    TURNING,
-    WHEELS,
-    SignalRelation,
-    Signals,
-    relations,
-    speed_mps,
-)
+from fleet_slip.ingest.suspicion import RADIUS_M, TURNING, WHEELS
 from fleet_slip.ingest.vocabulary import (
     best_words,
     fits_any,
@@ -47,6 +36,9 @@ _UNIT_FITS = 4.0
 _SIGN_WORDS = {"vz", "vorzeichen", "sign", "signum", "sgn"}
 _ALIKE = 0.02
 
+Keys: TypeAlias = Mapping[str, Any]
+"""Of a signal in a mapping."""
+
 
 @dataclass(frozen=True)
 class Guess:
@@ -58,6 +50,7 @@ class Guess:
         is_weak: whether its name may as well mean something else.
         doubts: what speaks against it.
         rivals: others that its name and unit fit as well.
+        readings: the units that are possible, where the file has none and several are.
     """
 
     signal: str
@@ -67,6 +60,7 @@ class Guess:
     is_weak: bool = False
     doubts: tuple[str, ...] = ()
     rivals: tuple["Guess", ...] = ()
+    readings: tuple[Keys, ...] = ()
 
     @property
     def column(self) -> str:
@@ -115,7 +109,7 @@ def guess_signals(profiles: tuple[Profile, ...]) -> dict[str, Guess]:
         elif score == best[signal] and not _same_values(guess, guesses[signal]):
             first = guesses[signal]
             guesses[signal] = replace(first, rivals=(*first.rivals, guess))
-    guesses = _satellites(guesses)
+    guesses = _agreed(_satellites(guesses))
     signed = {name: _with_sign(guess, profiles) for name, guess in guesses.items()}
     return {name: signed[name] for name in catalogue().signals if name in signed}
 
@@ -198,13 +192,16 @@ def headings(profiles: tuple[Profile, ...], taken: set[str]) -> list[str]:
 def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
     """Return a guess with a unit that the signal can have, or None."""
     name, in_brackets = split_unit(profile.channel.name)
+    several: tuple[Keys, ...] = ()
     text = profile.channel.unit.strip() or in_brackets
     unit = unit_called(text) or unit_behind(name)
     if unit is None:
         largest = float(np.nanquantile(np.abs(profile.values), 0.999))
-        keys = _keys_of_values(signal, largest)
+        several = unit_readings(signal, largest)
+        keys = dict(several[0])
         unknown = f" that is known: {text!r}" if text else ""
-        reason = f"{NO_UNIT}{unknown}; values up to {largest:.3g} look like {keys['unit']}"
+        likely = f" look like {keys['unit']}" if len(several) == 1 else ""
+        reason = f"{NO_UNIT}{unknown}; values up to {largest:.3g}{likely}"
     else:
         reason = f"its unit is {unit}"
         radii = [{}, {"radius_m": RADIUS_M}] if signal.startswith("wheel_") else [{}]
@@ -213,7 +210,8 @@ def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
             return None
         keys = {"unit": unit, **fitting[0]}
     named = f"the format calls it {words!r}" if profile.channel.title else f"its name has {words!r}"
-    guess = Guess(signal, profile, keys, (named, reason))
+    readings = several if len(several) > 1 else ()
+    guess = Guess(signal, profile, keys, (named, reason), readings=readings)
     if signal not in catalogue().signals or catalogue()[signal].cyclic:
         return guess
     known, in_si = catalogue()[signal], guess.largest()
@@ -240,25 +238,58 @@ def _has_unit(signal: str, unit: str, radius_m: float | None = None) -> bool:
     return True
 
 
-def _keys_of_values(signal: str, largest: float) -> dict[str, Any]:
-    """Return the unit that values of a car on a road are likely to have."""
-    if signal.startswith("wheel_"):
-        if largest > 110:
-            return {"unit": "rpm" if largest > 300 else "rad/s"}
-        return {"unit": "km/h", "radius_m": RADIUS_M}
+# Units that a file does not say: those in which its largest value is one of a car on a road.
+
+_USUAL = {
+    "m/s^2": (0.7, 15.0, ("m/s^2", "g")),
+    "rad/s": (0.05, 2.86, ("deg/s", "rad/s")),
+    "rad": (0.01, 0.9, ("deg", "rad")),
+    "m/s": (0.05, 70.0, ("m/s", "km/h", "mph")),
+    "Pa": (1e5, 4e7, ("bar", "kPa")),
+    "1": (0.02, 1.3, ("1", "%")),
+}
+"""Between which values in SI units the largest of a drive is, and the units of files."""
+_USUAL_OF = {"steering_wheel": (0.2, 14.0), COURSE: (1.0, 6.4)}
+_OF_WHEELS: tuple[Keys, ...] = (
+    {"unit": "rad/s"},
+    {"unit": "km/h", "radius_m": RADIUS_M},
+    {"unit": "m/s", "radius_m": RADIUS_M},
+    {"unit": "rpm"},
+)
+_WHEELS_RAD_S = (3.0, 226.0)
+_GROUPS = (("ax", "ay"), ("vx", "vy"), WHEELS, ("steer_fl", "steer_fr"))
+"""Signals of one sensor, which have one unit."""
+
+
+def unit_readings(signal: str, largest: float) -> tuple[Keys, ...]:
+    """Return the units that values up to some size may have, at least one."""
     if signal == "gear":
-        return {"unit": "1"}
-    likely = {
-        "m/s^2": (1.3, "g", "m/s^2"),
-        "rad/s": (2.5, "rad/s", "deg/s"),
-        "rad": ({"steering_wheel": 14.0, COURSE: 6.3}.get(signal, 0.9), "rad", "deg"),
-        "m/s": (70.0, "m/s", "km/h"),
-        "Pa": (400.0, "bar", "kPa"),
-        "1": (1.2, "1", "%"),
-    }
-    si_unit = "m/s" if signal in {"north", "east"} else catalogue()[signal].unit
-    limit, small, large = likely[si_unit]
-    return {"unit": small if largest < limit else large}
+        return ({"unit": "1"},)
+    if signal in WHEELS:
+        choices, (low, high) = _OF_WHEELS, _WHEELS_RAD_S
+    else:
+        si_unit = "m/s" if signal in {"north", "east"} else catalogue()[signal].unit
+        low, high, units = _USUAL[si_unit]
+        low, high = _USUAL_OF.get(signal, (low, high))
+        choices = tuple({"unit": unit} for unit in units)
+    in_si = [largest * si_factor(signal, **keys) for keys in choices]
+    possible = [k for k, value in zip(choices, in_si, strict=True) if low <= value <= high]
+    off = [abs(np.log(max(value, 1e-9) / np.sqrt(low * high))) for value in in_si]
+    return tuple(possible) or (choices[int(np.argmin(off))],)
+
+
+def _agreed(guesses: dict[str, Guess]) -> dict[str, Guess]:
+    """Return the guesses with only those units that all signals of a sensor may have."""
+    found = dict(guesses)
+    for group in _GROUPS:
+        names = [name for name in group if name in found and found[name].is_without_unit]
+        readings = [found[name].readings or (found[name].keys,) for name in names]
+        first = readings[0] if readings else ()
+        common = tuple(keys for keys in first if all(keys in of for of in readings))
+        for name in names if common else ():
+            keys, several = {**found[name].keys, **common[0]}, common if common[1:] else ()
+            found[name] = replace(found[name], keys=keys, readings=several)
+    return found
 
 
 # Guesses where the times of a log are, and which columns identify its cars and trips.
@@ -419,115 +450,3 @@ def _gaps(rate_hz: float | None) -> dict[str, float]:
     if rate_hz is None or rate_hz >= 20:
         return {}
     return {"longest_gap_s": round(2 / rate_hz, 2), "split_gap_s": max(1.0, round(4 / rate_hz))}
-
-
-# Chooses the units that a file does not say, those of all signals together, by how a car moves.
-#
-# The relations are products: the lateral acceleration is yaw rate times speed, so a wrong unit
-# shows as a factor of 3.6, 9.8 or 57, and which signals share it shows whose it is.
-
-_UNLIKELY = 0.7
-"""What it costs not to take the unit that the largest value suggests."""
-_WITH_UNITS = {
-    "m/s^2": ("m/s^2", "g"),
-    "rad/s": ("deg/s", "rad/s"),
-    "rad": ("deg", "rad"),
-    "m/s": ("m/s", "km/h", "mph"),
-}
-_OF_WHEELS = (("rad/s", None), ("km/h", RADIUS_M), ("m/s", RADIUS_M), ("rpm", None))
-_GROUPS = (("ax", "ay"), ("vx", "vy"), WHEELS, ("steer_fl", "steer_fr"))
-"""Signals of one sensor, which have one unit."""
-_TOLERANCES = {"yaw_rate": 0.3, "ax": 0.3, **dict.fromkeys(("steering_wheel", *ROAD_WHEELS), 1.0)}
-"""Of the logarithm of a relation, by its first signal; of others 0.15."""
-
-Keys: TypeAlias = Mapping[str, Any]
-
-
-def choose_units(guesses: dict[str, Guess], drive: Signals) -> dict[str, Guess]:
-    """Return the guesses without a unit with that in which the car moves as cars do."""
-    related, groups = find_relations(drive), _groups(guesses)
-    by = _speed_source(drive)
-    names = {name for one in related for name in (*one.powers, by)}
-    found = dict(guesses)
-    for group in groups:
-        # A car's speed in km/h is that of a faster one in m/s: the largest value does not show it.
-        is_speed = catalogue()[group[0]].unit == "m/s" or group[0] in WHEELS
-        if is_speed and group != [SPEED] and not set(group) & names:
-            units = " or ".join(keys["unit"] for keys in unit_choices(guesses[group[0]]))
-            for name in group:
-                found[name] = found[name].doubted(f"nothing shows whether it is in {units}")
-    if not related or not groups:
-        return found
-    choices = itertools.product(*(unit_choices(guesses[group[0]]) for group in groups))
-    best = min(choices, key=lambda some: _cost(some, groups, guesses, related, by))
-    for group, keys in zip(groups, best, strict=True):
-        for name in group:
-            guess = found[name]
-            if {key: guess.keys.get(key) for key in keys} != keys:
-                changed = guess.because(f"with {keys['unit']} it fits the other signals", **keys)
-                found[name] = replace(changed, doubts=())
-    for name in found.keys() & set(WHEELS):
-        # A wheel of .31 m at 1 rad/s goes 1.1 km/h: the way a car moves does not tell these apart.
-        guess = found[name]
-        is_unsure = guess.is_without_unit and guess.keys["unit"] == "km/h" and not guess.doubts
-        if is_unsure and guess.column.startswith("/"):
-            found[name] = guess.doubted("it may be rad/s as well, and ROS has SI units")
-    return found
-
-
-def find_relations(drive: Signals) -> list[SignalRelation]:
-    """Return how the signals of a drive go with one another, where they do."""
-    speed = speed_mps(drive)
-    alike = {*WHEELS, _speed_source(drive)}  # which have the unit of the speed itself
-    return [
-        one
-        for one in (() if speed is None else relations(drive, speed))
-        if abs(one.correlation) > LEAST_CORRELATION and one.ratio and not alike & set(one.powers)
-    ]
-
-
-def _speed_source(drive: Signals) -> str:
-    """Return the first signal that the speed of a drive is of."""
-    return next((n for n in (*WHEELS, "vx", "vehicle_speed") if n in drive), "vehicle_speed")
-
-
-def _groups(guesses: dict[str, Guess]) -> list[list[str]]:
-    """Return the signals without a unit, those of one sensor together."""
-    open_ones = [
-        name
-        for name, guess in guesses.items()
-        if guess.is_without_unit and not guess.component and name != COURSE
-    ]
-    together = [[name for name in group if name in open_ones] for group in _GROUPS]
-    alone = [[n] for n in open_ones if not any(n in group for group in together)]
-    return [g for g in (*together, *alone) if g and catalogue()[g[0]].unit in _WITH_UNITS]
-
-
-def unit_choices(guess: Guess) -> list[Keys]:
-    """Return what units values without one may have: first the likely one."""
-    units = [(unit, None) for unit in _WITH_UNITS.get(catalogue()[guess.signal].unit, ())]
-    found = list(_OF_WHEELS) if guess.signal.startswith("wheel_") else units
-    first = guess.keys["unit"], guess.keys.get("radius_m")
-    choices = [first, *(one for one in found if one != first)]
-    return [{"unit": unit, "radius_m": radius_m} for unit, radius_m in choices]
-
-
-def _cost(
-    some: tuple[Keys, ...],
-    groups: list[list[str]],
-    guesses: dict[str, Guess],
-    related: list[SignalRelation],
-    by: str,
-) -> float:
-    """Return how little a car moves so with some units, one for each group of signals."""
-    cost, factors = 0.0, dict[str, float]()
-    for group, keys in zip(groups, some, strict=True):
-        for name in group:
-            factors[name] = si_factor(name, **keys) / si_factor(name, **guesses[name].keys)
-            cost += 100.0 * (guesses[name].largest(**keys) > float(catalogue()[name].max))
-        cost += _UNLIKELY * any(guesses[group[0]].keys.get(key) != keys[key] for key in keys)
-    for one in related:
-        off = np.log(abs(one.ratio)) + one.of_speed * np.log(factors.get(by, 1.0))
-        off += sum(power * np.log(factors.get(n, 1.0)) for n, power in one.powers.items())
-        cost += float((off / _TOLERANCES.get(next(iter(one.powers)), 0.15)) ** 2)
-    return cost

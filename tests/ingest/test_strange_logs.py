@@ -128,6 +128,7 @@ def test_a_strangers_log_becomes_the_drives_that_it_has(tmp_path: Path, name: st
         '# vehicle_id = ""': 'vehicle_id = "A"',
     }
     filled['# vehicle_model = ""'] = 'vehicle_model = "m"'
+    filled['"choose"'] = '"m/s"' if name == "student.csv" else '"km/h", radius_m = 0.31'
     for absent, present in filled.items():
         text = text.replace(absent, present)
     mapping.write_text(f"# {text}", encoding="utf-8")

@@ -65,8 +65,14 @@ def score(columns: list[Named], folder: Path) -> Counter[str]:
 
 
 def _judge(columns: list[Named], text: str) -> Counter[str]:
+    asked = [
+        line.replace('"choose"', unit.replace(" with", ","))
+        for units, line in re.findall(r"^# Choose the unit: (.*)\.\n(.*)", text, re.MULTILINE)
+        for unit in units.split(" or ")
+    ]
+    text = re.sub(r"^.*\"choose\".*$", "", text, flags=re.MULTILINE)
     lines = tomllib.loads(text).get("signals", {})
-    asked = re.findall(r"^# (\w+ = \{.*\})", text, re.MULTILINE)
+    asked += re.findall(r"^# (\w+ = \{.*\})", text, re.MULTILINE)
     found: Counter[str] = Counter()
     for column in columns:
         if not column.signal:

@@ -214,8 +214,11 @@ def wrong_guesses(one: Suggested, draft: Draft) -> list[str]:
 def _is_right(one: Suggested, draft: Draft, name: str) -> bool:
     if name not in draft.guesses:
         return False
-    keys = signal_keys(draft.guesses[name])
-    keys.pop("longest_gap_s", None)
-    gain, _ = SignalColumn.model_validate(keys).linear(SI_UNITS[name])
-    expected = 1 / one.factors.get(name, 1.0)
-    return keys["column"] == one.names[name] and bool(np.isclose(gain, expected, rtol=1e-3))
+    guess, expected = draft.guesses[name], 1 / one.factors.get(name, 1.0)
+    for reading in guess.readings or ({},):  # one of those that it asks for
+        keys = {**signal_keys(guess), **reading}
+        keys.pop("longest_gap_s", None)
+        gain, _ = SignalColumn.model_validate(keys).linear(SI_UNITS[name])
+        if keys["column"] == one.names[name] and np.isclose(gain, expected, rtol=1e-3):
+            return True
+    return False
