@@ -166,6 +166,8 @@ class RunReport(Trained):
         simulated = self.simulation
         drives, rows = number_of(simulated.drives, "drive"), number_of(simulated.rows, "row")
         yield Remark(f"simulated {drives}, {rows}")
+        if simulated.changed:
+            yield Remark(simulated.checked)
         yield from self.training_parts(everything)
 
     @property

@@ -43,6 +43,7 @@ def simulate(report: "SimulationReport", campaign: str) -> None:
         f"{report.size_bytes / max(report.rows, 1):.1f} bytes a row"
     )
     say(_joined(written, forgotten=report.drives_forgotten))
+    say(report.checked)
     say(f"{report.seconds:.1f} s, {report.rows / report.seconds:,.0f} rows/s")
 
 

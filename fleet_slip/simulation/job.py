@@ -17,16 +17,17 @@ import pyarrow as pa
 from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import Progress, no_progress
+from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import RefusedError
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec
 from fleet_slip.simulation.receivers import ReceiverLog
-from fleet_slip.simulation.roads import road_with
+from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, road_with
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
 from fleet_slip.storage.table import Change, Snapshot, Unit, retry_conflicts, retrying
 from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
+from fleet_slip.vehicle.imperfections import PERFECT
 from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -34,6 +35,9 @@ from fleet_slip.warehouse.tables import Warehouse
 
 DRIVES_AT_ONCE = 128
 """Drives of a batch that are simulated together, which bounds the memory for their roads."""
+
+TOLERANCE = 1e-9
+"""By how much of its largest value a quantity may depart from highway-env's."""
 
 CHUNK_ROWS = 2**16
 """Rows of a chunk of a column that is the same in all rows of a drive."""
@@ -97,6 +101,21 @@ def lane_drive(spec: DriveSpec) -> LaneDrive:
     felt = spec.distortion() is not None
     road = road_with(road, spec.script)
     return LaneDrive(spec.vehicle, road, spec.adhesion, spec.laps, spec.flaws.car, felt)
+
+
+def check_against_highway_env(spec: DriveSpec) -> None:
+    """Drive the first seconds of a drive by highway-env too, in a slalom.
+
+    Raises `RefusedError` if the kernel, or highway-env itself, is not what it was.
+    """
+    from fleet_slip.vehicle.highway import require_agreement  # noqa: PLC0415 - takes a second
+
+    drive = lane_drive(spec)
+    rolling = np.maximum(drive.road.speed_mps, SLOWEST_MPS)
+    slalom = Manoeuvre("slalom", 0.0, 2.0, 2.0 * spec.adhesion, 1.0)
+    road = road_with(drive.road._replace(speed_mps=rolling, surface=None), [slalom])
+    perfect = replace(drive, road=road, flaws=PERFECT, felt=drive.imperfect)
+    require_agreement(perfect, spec.drive_id, TOLERANCE)
 
 
 def simulate_batch(batch: Batch) -> pa.Table:
@@ -228,6 +247,8 @@ class SimulationReport:
     days_present: int = 0
     """Days that were complete, and so not planned."""
     drives: int = 0
+    drives_checked: int = 0
+    """Drives, one a file, whose first seconds are as highway-env drives them."""
     drives_forgotten: int = 0
     """Drives that were left out: of cars that were forgotten, or forgotten themselves."""
     rows: int = 0
@@ -239,6 +260,12 @@ class SimulationReport:
     def changed(self) -> bool:
         """Whether there was anything to do."""
         return bool(self.batches_written)
+
+    @property
+    def checked(self) -> str:
+        """What was compared with highway-env, as a sentence."""
+        drives = number_of(self.drives_checked, "drive")
+        return f"checked against highway-env: {drives}, equal within {TOLERANCE:g}"
 
 
 @dataclass(frozen=True)
@@ -306,7 +333,8 @@ def simulate_batches(
 ) -> SimulationReport:
     """Simulate the batches that have not landed, and land each.
 
-    Raises `RefusedError` if a different version of a batch is there, `StorageError`, and at the end
+    Raises `RefusedError` if a different version of a batch is there or the cars do not drive as
+    highway-env's, `StorageError`, and at the end
     `ClusterError` for batches that workers died of.
     """
     snapshot = warehouse.logs.snapshot()
@@ -329,6 +357,7 @@ def _simulate(
         if landed := _land(warehouse, result):
             report.batches_written += 1
             report.drives += len(landed.drives)
+            report.drives_checked += bool(landed.drives)
             report.drives_forgotten += len(landed.batch.drives) - len(landed.drives)
             report.rows += landed.rows
             report.size_bytes += landed.action.size if landed.action else 0
@@ -372,6 +401,7 @@ def _write(warehouse: Warehouse, batch: Batch) -> _Written:
     drives = _not_forgotten(warehouse, batch.drives)
     if not drives:
         return _Written(batch, (), None, 0)
+    check_against_highway_env(drives[0])
     rows = simulate_batch(replace(batch, drives=drives))
     action = warehouse.logs.put(file_name(batch), warehouse.logs.encode(rows), batch.day)
     return _Written(batch, drives, action, rows.num_rows)

@@ -25,7 +25,7 @@ from fleet_slip.vehicle.batch_kernel import (
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
 from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections, traits
 from fleet_slip.vehicle.integration import STEP_S
-from fleet_slip.vehicle.parameters import VehicleParameters, constants
+from fleet_slip.vehicle.parameters import Controls, State, VehicleParameters, constants
 
 # The road that a lane's driver follows, as the kernel looks it up.
 
@@ -182,6 +182,24 @@ def simulate_blocks(
         alike = [drives[number] for number in numbers]
         for block in _simulate_alike(alike, imperfect, steps_per_sample):
             yield replace(block, drive=numbers[block.drive])
+
+
+def simulate_samples(drive: LaneDrive, samples: int) -> Iterator[tuple[Controls, State]]:
+    """Yield, sample by sample, what the kernel's driver demands and where that takes the car."""
+    simulate = batch_kernel.simulate_imperfect if drive.imperfect else batch_kernel.simulate
+    routes, roads = _routes([drive])
+    surfaces, cars = surface_table(drive.road), np.array([_car(drive)])
+    memory, book = batch_kernel.empty_lanes()
+    truth, *_ = empty_blocks(drive.imperfect)
+    batch_kernel.begin(memory, book, 0, 0, cars[0], roads[0, batch_kernel.SPEED])
+    column = memory.reshape(batch_kernel.ROWS, batch_kernel.LANES)[:, 0]
+    for sample in range(samples):
+        routes["samples"], ended = sample + 1, np.full((1, 2), NOBODY)
+        book[FIRST, 0] = sample
+        simulate(routes, cars, roads, surfaces, STEPS_PER_SAMPLE, memory, book, truth, ended)
+        demanded = column[batch_kernel.CONTROLS :][: len(Controls._fields)].tolist()
+        moved = column[batch_kernel.STATE :][: len(State._fields)].tolist()
+        yield Controls(*demanded), State(*moved)
 
 
 def _simulate_alike(

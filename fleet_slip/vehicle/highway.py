@@ -7,13 +7,24 @@ positive steering angle turns to the right of the picture.
 import math
 from typing import Any, NamedTuple, Self
 
+import highway_env
 import numpy as np
 from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import equation, kernel
-from fleet_slip.vehicle.dynamics import Derivative, derivative
+from fleet_slip.errors import RefusedError
+from fleet_slip.vehicle.batch import LaneDrive, simulate_samples
+from fleet_slip.vehicle.driver import SAMPLE_S
+from fleet_slip.vehicle.dynamics import (
+    Acceleration,
+    Derivative,
+    WheelForce,
+    WheelForces,
+    derivative,
+    driven_body,
+)
 from fleet_slip.vehicle.integration import (
     FIRST_ORDER,
     SECOND_ORDER,
@@ -33,6 +44,14 @@ from fleet_slip.vehicle.parameters import (
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
 NO_SLOPES = Slopes(*(0.0 for _ in Slopes._fields))
+
+
+CHECKED_SAMPLES = 150
+"""So much of a drive is compared with highway-env: 1.5 s."""
+LEAST_SCALE = 1e-3
+"""Of a quantity that stays near zero, in SI units: a yaw rate on a straight is rounding."""
+AXLES = ("MASS", "INERTIA_Z", "LENGTH_A", "LENGTH_B", "FRICTION_FRONT", "FRICTION_REAR")
+BICYCLE_STATE = ("x", "y", "heading", "speed", "lateral speed", "yaw rate")
 
 
 class Place(NamedTuple):
@@ -55,6 +74,16 @@ class Motion(NamedTuple):
 @kernel
 def _rates(x: State, u: Controls, c: Constants) -> Derivative:
     return derivative(x, u, c)
+
+
+@kernel
+def _rates_on_axles(
+    x: State, along: float, front: float, rear: float, c: Constants
+) -> Acceleration:
+    """Return how the body moves under a force along it and lateral forces of its axles."""
+    half_front = WheelForce(along / 4, front / 2, 0.0, 0.0, 0.0, 0.0)
+    half_rear = WheelForce(along / 4, rear / 2, 0.0, 0.0, 0.0, 0.0)
+    return driven_body(x, WheelForces(half_front, half_front, half_rear, half_rear), c)
 
 
 @equation
@@ -213,3 +242,87 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         self.heading = moved.place.heading
         self.speed, self.lateral_speed, self.yaw_rate = moved.state[:3]
         self.on_state_update()
+
+
+class PlainVehicle(FourWheelVehicle):
+    """`FourWheelVehicle` with all extensions off, which moves as highway-env's own bicycle.
+
+    Its axles have linear tyres, nothing lags or drags, and its speed follows the demand. Rajamani,
+    equations 2.21 to 2.28.
+    """
+
+    def step(self, dt: float) -> None:
+        """Move on by `dt` s in one step of the classical Runge-Kutta method."""
+        before = self.state
+        k1 = self.derivative_func(0.0, before)
+        k2 = self.derivative_func(0.0, before + dt / 2 * k1)
+        k3 = self.derivative_func(0.0, before + dt / 2 * k2)
+        k4 = self.derivative_func(0.0, before + dt * k3)
+        x, y, *motion = (before + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4))[:, 0].tolist()
+        self.position = np.array([x, y])
+        self.heading, self.speed, self.lateral_speed, self.yaw_rate = motion
+
+    def derivative_func(self, time: float, state: FloatArray, **_: Any) -> Any:
+        """Return the rates of highway-env's state under the forces of linear axles, (6, 1)."""
+        del time
+        heading, vx, vy, yaw_rate = (float(value) for value in state[2:, 0])
+        c = self.constants._replace(drag_per_mass=0.0)
+        slip_front = self.action["steering"] - math.atan2(vy + c.front * yaw_rate, vx)
+        slip_rear = -math.atan2(vy - c.rear * yaw_rate, vx)
+        along = c.mass * (self.action["acceleration"] - yaw_rate * vy)
+        front, rear = 2 * self.FRICTION_FRONT * slip_front, 2 * self.FRICTION_REAR * slip_rear
+        x = self._hidden._replace(vx=vx, vy=vy, yaw_rate=yaw_rate)
+        rates = _rates_on_axles(x, along, front, rear, c)
+        cosine, sine = math.cos(heading), math.sin(heading)
+        place = (vx * cosine - vy * sine, vx * sine + vy * cosine, yaw_rate)
+        return np.array([*place, rates.vx, rates.vy, rates.yaw_rate])[:, np.newaxis]
+
+
+def bicycle_of(car: FourWheelVehicle) -> BicycleVehicle:
+    """Return highway-env's own vehicle with a car's mass, inertia, axles and motion."""
+    twin = BicycleVehicle(None, car.position, car.heading, car.speed)
+    for name in (*AXLES, "MAX_SPEED"):
+        setattr(twin, name, getattr(car, name))
+    return twin
+
+
+def require_agreement(drive: LaneDrive, name: str, tolerance: float) -> None:
+    """Raise `RefusedError` if the first seconds of a drive are not as highway-env drives them.
+
+    The kernel's car is compared with `FourWheelVehicle`, and that without its extensions with
+    `BicycleVehicle`, under the demands of the kernel's driver. The drive is of a perfect car.
+    What departs by more than `tolerance` of a quantity's largest value is refused.
+    """
+    speed = float(drive.road.speed_mps[0])
+    car, plain = (
+        kind(None, [0.0, 0.0], speed=speed, parameters=drive.vehicle, adhesion=drive.adhesion)
+        for kind in (FourWheelVehicle, PlainVehicle)
+    )
+    car.MAX_SPEED = plain.MAX_SPEED = math.inf
+    bicycle = bicycle_of(plain)
+    kernel, extended, ours, theirs = [], [], [], []
+    for demands, moved in simulate_samples(drive, CHECKED_SAMPLES):
+        wheel = math.atan(demands.steering_wheel / drive.vehicle.steering.ratio)
+        for vehicle in (car, plain, bicycle):
+            vehicle.act({"steering": wheel, "acceleration": demands.traction})
+            vehicle.step(SAMPLE_S)
+        kernel.append(moved)
+        extended.append(car.motion)
+        ours.append(plain.state[:, 0])
+        theirs.append(bicycle.state[:, 0])
+    for quantities, one, other, vehicle in (
+        (State._fields, kernel, extended, FourWheelVehicle),
+        (BICYCLE_STATE, ours, theirs, BicycleVehicle),
+    ):
+        apart, largest = np.abs(np.subtract(one, other)), np.abs(other).max(axis=0)
+        wrong = np.argwhere(~(apart <= tolerance * np.maximum(largest, LEAST_SCALE)))
+        if not len(wrong):
+            continue
+        tick, quantity = wrong[0]
+        raise RefusedError(
+            f"the simulated car departs from highway-env: {(tick + 1) * SAMPLE_S:.2f} s after the "
+            f"start of {name}, {quantities[quantity]} is {one[tick][quantity]:.9g}, but "
+            f"{other[tick][quantity]:.9g} of {vehicle.__name__}. Its file is not written. The "
+            f"compiler or highway-env {highway_env.__version__} is not as expected: install the "
+            "versions that constraints.txt names, and give the command again."
+        )

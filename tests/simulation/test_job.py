@@ -4,15 +4,20 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 import pytest
+from highway_env.vehicle.dynamics import BicycleVehicle
 
 from fleet_slip.base import no_progress
 from fleet_slip.errors import RefusedError
 from fleet_slip.simulation.campaign import Batch, Campaign, load_campaign
 from fleet_slip.simulation.job import SimulationReport, simulate_batches, simulate_campaign
 from fleet_slip.storage.local import LocalFolder
+from fleet_slip.vehicle import batch_kernel
+from fleet_slip.vehicle.highway import FourWheelVehicle
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.commands import RunCommand
 
 DAYS = 12
 
@@ -87,3 +92,55 @@ def test_days_that_landed_before_they_were_recorded_are_recorded(tmp_path: Path)
     assert [report.rows for report in found] == [0, 0]
     assert [report.days_present for report in found] == [0, DAYS]
     assert found[0].logs_version == found[1].logs_version
+
+
+def broken_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulate = batch_kernel.simulate
+
+    def skewed(*arguments: Any) -> None:
+        simulate(*arguments)
+        arguments[5][batch_kernel.STATE * batch_kernel.LANES] *= 1 + 1e-8  # vx of the first lane
+
+    monkeypatch.setattr(batch_kernel, "simulate", skewed)
+
+
+def broken_bicycle(monkeypatch: pytest.MonkeyPatch) -> None:
+    rates = BicycleVehicle.derivative_func
+
+    def skewed(self: Any, *arguments: Any) -> Any:
+        return rates(self, *arguments) * (1 + 1e-6)
+
+    monkeypatch.setattr(BicycleVehicle, "derivative_func", skewed)
+
+
+def broken_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    step = FourWheelVehicle.step
+    monkeypatch.setattr(FourWheelVehicle, "step", lambda self, dt: step(self, dt * (1 + 1e-7)))
+
+
+@pytest.mark.parametrize(
+    ("breaking", "vehicle"),
+    [
+        (broken_kernel, "FourWheelVehicle"),
+        (broken_step, "FourWheelVehicle"),
+        (broken_bicycle, "BicycleVehicle"),
+    ],
+)
+def test_what_is_not_as_highway_env_drives_is_not_written(
+    breaking: Callable[[pytest.MonkeyPatch], None],
+    vehicle: str,
+    run_command: RunCommand,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    breaking(monkeypatch)
+    done = run_command("simulate", "smoke")
+    assert done.exit_code == RefusedError.exit_code
+    assert "the simulated car departs from highway-env" in done.stderr
+    assert f"of {vehicle}. Its file is not written" in done.stderr
+    assert not list((tmp_path / "data").rglob("*.parquet"))
+
+
+def test_what_was_compared_with_highway_env_is_said_in_one_line(run_command: RunCommand) -> None:
+    said = run_command("simulate", "smoke", "--days", "1").stderr
+    assert said.count("\nchecked against highway-env: 2 drives, equal within 1e-09\n") == 1

@@ -4,58 +4,37 @@ from typing import Any
 
 import gymnasium
 import highway_env
-import numba
 import numpy as np
 import pytest
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
-from highway_env.vehicle.dynamics import BicycleVehicle
 
-from fleet_slip.vehicle.dynamics import Acceleration, WheelForce, WheelForces, driven_body
-from fleet_slip.vehicle.highway import FourWheelVehicle
-from fleet_slip.vehicle.parameters import Constants, Controls, State, load_vehicle
+from fleet_slip.vehicle.highway import FourWheelVehicle, PlainVehicle, bicycle_of
+from fleet_slip.vehicle.parameters import Controls, State, load_vehicle
 from tests.support.rolling import SEDAN, Run, rolling
 
 gymnasium.register_envs(highway_env)
 
 
-def highway_env_s(car: FourWheelVehicle) -> BicycleVehicle:
-    """Return highway-env's own vehicle with the same mass, inertia and tyres."""
-    twin = BicycleVehicle(None, car.position, car.heading, car.speed)
-    for name in ("MASS", "INERTIA_Z", "LENGTH_A", "LENGTH_B", "FRICTION_FRONT", "FRICTION_REAR"):
-        setattr(twin, name, getattr(car, name))
-    return twin
-
-
-@numba.njit(error_model="numpy")
-def body_on_axles(x: State, front: float, rear: float, c: Constants) -> Acceleration:
-    """Return how the body moves under lateral forces of its axles."""
-    half_front = WheelForce(0.0, front / 2, 0.0, 0.0, 0.0, 0.0)
-    half_rear = WheelForce(0.0, rear / 2, 0.0, 0.0, 0.0, 0.0)
-    return driven_body(x, WheelForces(half_front, half_front, half_rear, half_rear), c)
-
-
-def test_under_the_forces_of_its_axles_the_body_moves_as_highway_env_s() -> None:
+def test_without_its_extensions_the_car_moves_as_highway_env_s() -> None:
     """Rajamani, equations 2.21 to 2.28."""
     generator = np.random.default_rng(7)
-    car = FourWheelVehicle(None, [3.0, -2.0], heading=0.3, speed=20.0)
-    twin, c = highway_env_s(car), car.constants
+    car = PlainVehicle(None, [3.0, -2.0], heading=0.3, speed=20.0)
+    twin = bicycle_of(car)
     for _ in range(2000):
         vx, vy, yaw_rate = generator.normal(size=3) * np.array([25.0, 5.0, 1.0])
         vx = vx if abs(vx) > 1 else 25.0
         steering = generator.uniform(-1.2, 1.2)
-        front = 2 * car.FRICTION_FRONT * (steering - np.arctan2(vy + c.front * yaw_rate, vx))
-        rear = -2 * car.FRICTION_REAR * np.arctan2(vy - c.rear * yaw_rate, vx)
-        moved = body_on_axles(rolling(vx, vy=vy, yaw_rate=yaw_rate), front, rear, c)
-        twin.action = {"steering": steering, "acceleration": 0.0}
-        theirs = twin.derivative_func(0.0, np.array([[0.0, 0.0, 0.3, vx, vy, yaw_rate]]).T)
-        np.testing.assert_allclose((moved.vy, moved.yaw_rate), theirs[4:, 0], rtol=1e-12)
+        car.action = twin.action = {"steering": steering, "acceleration": generator.normal()}
+        state = np.array([[0.0, 0.0, 0.3, vx, vy, yaw_rate]]).T
+        ours, theirs = car.derivative_func(0.0, state), twin.derivative_func(0.0, state)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
 def test_at_small_slip_the_car_moves_as_highway_env_s() -> None:
     generator = np.random.default_rng(8)
     car = FourWheelVehicle(None, [3.0, -2.0], heading=0.3, speed=20.0)
-    twin, c = highway_env_s(car), car.constants
+    twin, c = bicycle_of(car), car.constants
     for _ in range(500):
         vx, steering = generator.uniform(15.0, 40.0), generator.uniform(-1e-4, 1e-4)
         vy, yaw_rate = generator.uniform(-1e-4, 1e-4, size=2) * np.array([vx, vx / 3])
