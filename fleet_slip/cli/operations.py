@@ -189,8 +189,8 @@ def forget(
     """Forget a vehicle or drives: in logs, Gram rows and quarantine; mark the models they trained.
 
     No job brings it back, nor one that is under way: its rows are left out, until --allow.
-    `fleet-slip run` and `publish` retrain. With --now it exits with 12 while anything may be left:
-    repeat it.
+    Train them again with `fleet-slip publish NAME`. With --now it exits with 12 while anything may
+    be left: repeat it.
 
     Example: **fleet-slip forget --vehicle car-7 --now**
     """

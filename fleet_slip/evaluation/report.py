@@ -9,6 +9,7 @@ from fleet_slip.evaluation.charts import draw_pictures
 from fleet_slip.evaluation.claims import Status, judge_claims
 from fleet_slip.evaluation.judge import LEAST_COVERAGE
 from fleet_slip.evaluation.kept import PAPER_TABLE_TWO, ReportData, gather
+from fleet_slip.ingest.drives import SOURCE as MEASURED
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.drawing import Picture, draw, png_file, svg_file
 from fleet_slip.pages.page import (
@@ -160,6 +161,7 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         tiles=_tiles(data, counted),
         claims=claims,
         tally={status: counted[status] for status in Status},
+        measured=MEASURED in data.trained.selection.cohort.drives["source"].to_pylist(),
         missing=[one for one in data.shipped if one not in data.evaluated.scenarios],
         provenance=_provenance(data),
         commands=_commands(data),
@@ -174,7 +176,7 @@ def _tiles(data: ReportData, tally: Mapping[Status, int]) -> list[Tile]:
             f"{tally[Status.REPRODUCED] + tally[Status.NOT_REPRODUCED]}",
             f"testable claims reproduced; {tally[Status.NOT_TESTABLE]} cannot be tested here",
         ),
-        Tile(count(data.trained.selection.cohort.rows), f"training rows of {drives}"),
+        Tile(count(data.version.manifest.trained_on.rows), f"training rows of {drives}"),
     ]
     names = (data.version.reference, data.choice)
     both = [data.evaluated.figures("nominal", name) for name in names]
@@ -211,11 +213,16 @@ def _provenance(data: ReportData) -> list[tuple[str, str]]:
 
 
 def _commands(data: ReportData) -> list[str]:
-    reference, campaigns = data.version.reference, data.trained.selection.cohort.drives["campaign"]
+    reference, drives = data.version.reference, data.trained.selection.cohort.drives
+    pairs = zip(drives["source"].to_pylist(), drives["campaign"].to_pylist(), strict=True)
     rows = data.evaluated.comparisons
     fleets = dict.fromkeys(row["fleet"].rpartition("/")[0] for row in rows)
+    measured = f"fleet-slip learn {data.version.manifest.name} LOGS --mapping"
     return [
-        *(f"fleet-slip run --campaign {name}" for name in sorted({*campaigns.to_pylist()})),
+        *(
+            f"{measured if source == MEASURED else 'fleet-slip run --campaign'} {name}"
+            for source, name in sorted({*pairs})
+        ),
         f"fleet-slip evaluate {reference}{''.join(f' --fleet {name}' for name in fleets)}",
         f"fleet-slip report {reference}",
     ]

@@ -13,7 +13,7 @@ out, the median group of them must not be worse off either, each group having on
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import zip_longest
 from typing import Any
@@ -104,6 +104,7 @@ class Comparison:
         incumbents: the champion, and the best of the champions so far if that is another one.
         shortfalls: of the challenger, from each of them, over all rows.
         typical: the same in the median group, where cars are held out.
+        unseen: whether all these rows are of drives that made no incumbent.
     """
 
     by: FoldKey
@@ -111,6 +112,7 @@ class Comparison:
     incumbents: tuple[CrossValidation, ...]
     shortfalls: tuple[Shortfall, ...]
     typical: tuple[Shortfall, ...] = ()
+    unseen: bool = False
 
     @property
     def better(self) -> tuple[CrossValidation, ...]:
@@ -152,7 +154,8 @@ class Comparison:
         )
         return (
             f"on the same {number_of(challenger.rows, 'row')} of "
-            f"{number_of(self.challenger.drives, 'drive')}, held out "
+            f"{number_of(self.challenger.drives, 'drive')}"
+            f"{' that are new to both' if self.unseen else ''}, held out "
             f"in {len(self.challenger.folds)} groups by {self.by}, it has RMSE "
             f"{challenger.rmse_deg:.4f} deg and correlation {challenger.correlation:.4f}; {others}"
         )
@@ -209,10 +212,42 @@ def compare(selection: Selection, incumbents: Sequence[ModelVersion]) -> Compari
     Raises `DataError` or `QuestionError` if no drive has the signals of all, and as `contest`.
     """
     asked = contest(selection, incumbents)
-    label, name = catalogue().label, selection.winner.model.name
     folds = selection.cohort.folds(asked.by, GROUPS)
-    groups = folds.serving(asked.signals, label, sparse=True)
+    groups = folds.serving(asked.signals, catalogue().label, sparse=True)
+    name = selection.winner.model.name
     challenger = cross_validate(name, groups, asked.procedure, input_scales())
+    return _beside(challenger, asked, groups, incumbents)
+
+
+def compare_unseen(
+    registry: Registry, selection: Selection, incumbents: Sequence[ModelVersion]
+) -> Comparison | None:
+    """Compare on the drives alone that made no incumbent: on its own ones it has an advantage.
+
+    None if these are none, all, or of fewer groups than `LEAST_VEHICLES`. Raises as `compare`, and
+    `StorageError` if which drives made an incumbent cannot be read.
+    """
+    made = [registry.trained_drives(one.manifest) for one in incumbents]
+    if None in made or selection.cohort.unlabelled:
+        return None
+    cohort, asked = _some_drives(selection), contest(selection, incumbents)
+    drives = hash_numbers(cohort.drives["drive_id"])
+    known = np.any([one.among(drives) for one in made if one], axis=0)
+    if known.all() or not known.any():
+        return None
+    groups, new = (_folds(cohort, asked, mask) for mask in (np.ones_like(known), ~known))
+    if len(new.names) < LEAST_VEHICLES:
+        return None
+    challenger = _held_out(selection.winner.model.name, asked, groups, new)
+    return replace(_beside(challenger, asked, new, incumbents), unseen=True)
+
+
+def _beside(
+    challenger: CrossValidation,
+    asked: Contest,
+    groups: Folds,
+    incumbents: Sequence[ModelVersion],
+) -> Comparison:
     others = tuple(
         as_it_is(version.reference, model, groups)
         for version, model in zip(incumbents, asked.models, strict=True)
@@ -445,7 +480,7 @@ def _compare(
 
 
 def _held_out(name: str, asked: Contest, groups: Folds, old: Folds) -> CrossValidation:
-    """Cross-validate over all groups, tested on the drives of each that made the champion."""
+    """Cross-validate over all groups, tested on some drives of each."""
     training = dict(zip(groups.names, (train for train, _ in groups.splits()), strict=True))
     tests = [
         held_out_errors(asked.procedure(training[fold]), training[fold], test)
@@ -509,6 +544,8 @@ def judge(
     try:
         incumbents = _incumbents(registry, champion)
         comparison = compare(selection, incumbents)
+        if comparison.better:
+            comparison = compare_unseen(registry, selection, incumbents) or comparison
     except (DataError, QuestionError) as error:
         problems.append(f"the champion {champion.reference} cannot be compared ({error})")
         return Judgement(tuple(problems), "")

@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pytest
 from jinja2 import meta
 
@@ -212,3 +213,18 @@ def test_the_standings_mark_the_smallest_error_of_each_drive(data: ReportData) -
         marked = [name for name, cell in zip(names, cells, strict=True) if cell.mark == "good"]
         least = min(errors.values())
         assert marked == [name for name in names if errors.get(name) == least]
+
+
+def test_a_model_of_measured_drives_says_that_the_test_drives_are_of_other_cars(
+    data: ReportData,
+) -> None:
+    selection = data.trained.selection
+    at = selection.cohort.drives.column_names.index("source")
+    sources = pa.array(["measured"] * selection.cohort.drive_count)
+    drives = selection.cohort.drives.set_column(at, "source", sources)
+    cohort = replace(selection.cohort, drives=drives)
+    trained = replace(data.trained, selection=replace(selection, cohort=cohort))
+    page = render(replace(data, trained=trained), ())
+    assert "the model was trained on measured drives of other cars" in page
+    assert "fleet-slip learn smoke LOGS --mapping smoke" in page
+    assert "fleet-slip run" not in page

@@ -21,6 +21,7 @@ from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.marked_models import models_trained_on
+from fleet_slip.regression.choice import ANY_WORTH
 from fleet_slip.regression.folds import cross_validate, held_out_errors, least_squares
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import stepwise_order
@@ -53,11 +54,18 @@ def counts(rng: np.random.Generator, label: float = 1.0, noise: float = 20.0) ->
     return {name: np.rint(values).astype(np.int16) for name, values in found.items()}
 
 
-def write(warehouse: Warehouse, name: str, drives: int, label: float = 1.0, **about: Any) -> None:
+def write(
+    warehouse: Warehouse,
+    name: str,
+    drives: int,
+    label: float = 1.0,
+    noise: float = 20.0,
+    **about: Any,
+) -> None:
     """Land drives of eight cars and reduce them."""
     rng = np.random.default_rng([*name.encode()])
     rows = [
-        log_rows(f"{name}-{i}", counts(rng, label), vehicle_id=f"car-{i % 8}", **about)
+        log_rows(f"{name}-{i}", counts(rng, label, noise), vehicle_id=f"car-{i % 8}", **about)
         for i in range(drives)
     ]
     land(warehouse, name, *rows)
@@ -153,6 +161,30 @@ def test_the_champion_is_compared_as_it_is_not_fitted_anew(champion: Warehouse) 
     (as_it_is,) = comparison.incumbents
     assert as_it_is.counts.coefficients == counts_model(version.manifest).coefficients
     assert as_it_is.pooled.rows == comparison.challenger.pooled.rows == 48 * ROWS
+
+
+def test_a_champion_has_no_advantage_on_drives_that_made_it(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Few rows, many columns: on its own drives the champion is better than any held-out model."""
+    monkeypatch.setattr("tests.models.acceptance.test_champion_rules.ROWS", 12)
+    monkeypatch.setattr(champion_rules, "worth", lambda: ANY_WORTH)
+    every = ",".join((*CHOICE, *WEAK))
+    write(warehouse, "good", 48, noise=400.0)
+    first = answer_request(warehouse, SelectionRequest(model=every))
+    made = publish(registry_of(warehouse), manifest_of(first, "beta"), first, force=True)
+    write(warehouse, "more", 16, noise=400.0)
+    version, answer = made.version, answer_request(warehouse, SelectionRequest(model=every))
+    assert champion_rules.compare(answer, [version]).better
+    fair = champion_rules.compare_unseen(registry_of(warehouse), answer, [version])
+    assert fair is not None
+    assert fair.challenger.drives == fair.incumbents[0].drives == 16
+    assert not fair.better
+    judged = champion_rules.judge(
+        registry_of(warehouse), version, manifest_of(answer, "beta"), answer
+    )
+    assert "16 drives that are new to both" in judged.reason
+    assert not judged.problems
 
 
 def test_a_search_is_made_again_without_the_cars_that_are_held_out(champion: Warehouse) -> None:
