@@ -19,7 +19,6 @@ from mcap_ros2 import _dynamic
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.confined_reader import open_here
-from fleet_slip.ingest.formats.mdf import compute_formula
 from fleet_slip.ingest.formats.source import Budget
 from tests.support.commands import run_on
 from tests.support.waiting import within
@@ -68,53 +67,6 @@ def refusal(file: Path, name: str, format_name: str = "mdf") -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("formula", "expected"),
-    [
-        ("X1*0.05", X * 0.05),
-        ("pow(X1,2)*0.01", X**2 * 0.01),
-        ("X1^2*0.01", X**2 * 0.01),
-        ("x ** 2 / 1e2", X**2 / 100),
-        ("-X1^2 + 2*(X - 3)/4", -(X**2) + 2 * (X - 3) / 4),
-        ("exp(-X1/100) - ln(abs(X1) + 1)", np.exp(-X / 100) - np.log(np.abs(X) + 1)),
-        ("10 - 4 - X1 / 2 / 5", 6 - X / 10),
-        ("2^-1*X1", X / 2),
-        ("SIN(arctan(X1)) + .5", np.sin(np.arctan(X)) + 0.5),
-        ("7", X * 0 + 7),
-    ],
-)
-@pytest.mark.parametrize("version", ["3.30", "4.10"])
-def test_a_formula_is_computed(tmp_path: Path, formula: str, expected: Any, version: str) -> None:
-    file = write_mdf(tmp_path, {"formula": formula}, version=version)
-    np.testing.assert_allclose(read(file, "ax"), expected, rtol=1e-12)
-
-
-REFUSED = [
-    EVIL, "", "X1 +", "X2*2", "X1 X1", "2X1", "(X1", "X1)", "max(X1, 2)", "log(X1)", "X1.real",
-    "pow(X1)", "sin(X1, 2)", "X1 & 1", "X1 << 2", "1,5*X1", "X1^2^3", "'a'", "[X1]", "True*X1",
-    "lambda: X1", "X1 if X1 else 1",
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("formula", REFUSED)
-def test_what_is_no_formula_is_refused_by_name(tmp_path: Path, formula: str) -> None:
-    assert "'ax': its formula" in refusal(write_mdf(tmp_path, {"formula": formula}), "ax")
-
-
-@pytest.mark.parametrize(
-    "formula",
-    ["(" * 400 + "X1" + ")" * 400, "sin(" * 200 + "X1", "1+" * 10**6 + "X1"],
-)
-def test_a_formula_cannot_overflow_the_stack(formula: str) -> None:
-    with within(), pytest.raises(ValueError, match=r"deep|characters"):
-        compute_formula(formula, X)
-
-
-def test_powers_of_powers_end() -> None:
-    with within():
-        assert np.isinf(compute_formula("pow(9, pow(9, pow(9, 9^9)))", X)).all()
-
-
 @pytest.mark.parametrize("version", ["3.30", "4.10"])
 @pytest.mark.parametrize("nested", [False, True])
 def test_no_formula_is_run(
@@ -126,7 +78,7 @@ def test_no_formula_is_run(
         inner = conversion_utils.from_dict(conversion)
         conversion = {"val_0": 99, "text_0": "SNA", "default_addr": inner}
     file = write_mdf(tmp_path, conversion, version=version)
-    assert "__import__" in refusal(file, "ax")
+    assert "'ax': its conversion is a formula" in refusal(file, "ax")
     assert not (tmp_path / "pwned").exists()
 
 
@@ -148,10 +100,10 @@ def test_no_command_runs_a_formula_where_sympy_is_there(
     mapping = tmp_path / "mapping.toml"
     mapping.write_text(MAPPING)
     done = run_on(tmp_path / "root", "ingest", file, "--mapping", mapping)
-    assert "__import__" in done.stderr, done
+    assert "its conversion is a formula" in done.stderr, done
     told = run_on(tmp_path / "root", "mapping", "suggest", file)
     assert "not read:" in told.stdout + told.stderr
-    assert "channel 'ax': its formula" in " ".join(
+    assert "channel 'ax': its conversion is a formula" in " ".join(
         (told.stdout + told.stderr).replace("#", " ").split()
     )
     assert not list(tmp_path.rglob("pwned"))
@@ -189,12 +141,12 @@ def test_named_ranges_are_null_and_the_rest_is_scaled(
 
 
 @pytest.mark.parametrize("rows", [200, 90])
-def test_named_values_are_null_and_the_rest_is_computed(tmp_path: Path, rows: int) -> None:
+def test_named_values_are_null_and_the_rest_is_physical(tmp_path: Path, rows: int) -> None:
     raw = X[-rows:] / 4
-    inner = conversion_utils.from_dict({"formula": "X1^2"})
+    inner = conversion_utils.from_dict({"a": 2.0, "b": 1.0})
     conversion = {"val_0": 10.5, "text_0": b"SNA", "default_addr": inner}
     file = write_mdf(tmp_path, conversion, raw)
-    np.testing.assert_array_equal(read(file, "ax"), np.where(raw == 10.5, np.nan, raw**2))
+    np.testing.assert_array_equal(read(file, "ax"), np.where(raw == 10.5, np.nan, 2 * raw + 1))
 
 
 def test_names_alone_stay_names(tmp_path: Path) -> None:

@@ -1,9 +1,8 @@
 """Reads ASAM MDF, versions 2 to 4, through asammdf: each channel group is a time base."""
 
-import ast
 import mmap
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -33,8 +32,9 @@ from fleet_slip.ingest.formats.source import (
 # Applies the conversions of an MDF file, of counts to physical values.
 #
 # asammdf hands the formula of a stranger to sympy, which runs it, and where it cannot it leaves the
-# counts. So it is asked for raw values only, and for the arithmetic that has no formula. It also
-# rounds the bounds of ranges, and matches other rows in a long block than in a short one.
+# counts. So it is asked for raw values only, and for the arithmetic that has no formula; formulas
+# are refused. It also rounds the bounds of ranges, and matches other rows in a long block than in a
+# short one.
 
 _NONE, _FORMULA, _RANGES_TO_NUMBERS, _VALUES_TO_TEXT, _RANGES_TO_TEXT, _TABLE, _PLAIN, _TEXT = (
     "none", "formula", "ranges to numbers", "values to text", "ranges to text", "table", "plain",
@@ -51,6 +51,7 @@ _KINDS = {
     },
 }  # fmt: skip
 """What becomes of each type of conversion, of MDF 4 and of MDF 3; others are refused."""
+_NOT_COMPUTED = "its conversion is a formula, which is not computed"
 
 Array = np.ndarray[Any, Any]
 
@@ -74,7 +75,7 @@ def to_physical(conversion: Any, raw: Array) -> Array:
     if kind == _NONE:
         return raw
     if kind == _FORMULA:
-        return compute_formula(conversion.formula, raw)
+        raise ValueError(_NOT_COMPUTED)
     if kind in {_VALUES_TO_TEXT, _RANGES_TO_TEXT, _RANGES_TO_NUMBERS}:
         return _by_ranges(conversion, kind, raw)
     if kind == _TABLE and np.any(np.diff(_listed(conversion, "raw")) < 0):
@@ -92,56 +93,6 @@ def _kind_of(conversion: Any) -> str:
     if number not in kinds:
         raise ValueError(f"a conversion of type {number} is not applied")
     return kinds[number]
-
-
-# A formula, as ASAM MCD-2 MC writes it, is a stranger's text: Python parses it and does not run it.
-
-_LONGEST_FORMULA = 1000
-_FUNCTIONS: dict[tuple[str, int], Callable[..., Any]] = {
-    (name, 1): getattr(np, name)
-    for name in (
-        "sin", "cos", "tan", "asin", "acos", "atan", "arcsin", "arccos", "arctan", "sinh", "cosh",
-        "tanh", "exp", "log10", "sqrt", "abs",
-    )
-} | {("ln", 1): np.log, ("pow", 2): np.power}  # fmt: skip
-_OPERATIONS: dict[type[ast.AST], Callable[..., Any]] = {
-    ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide,
-    ast.Pow: np.power, ast.USub: np.negative, ast.UAdd: np.positive,
-}  # fmt: skip
-
-
-def compute_formula(formula: str, raw: Array) -> Array:
-    """Return a formula's value for each raw one. Raises `ValueError`, which says what is wrong."""
-    if len(formula) > _LONGEST_FORMULA:
-        raise ValueError(f"its formula has more than {_LONGEST_FORMULA:,} characters")
-    try:
-        text = " ".join(formula.strip("\0").split()).replace("^", "**")
-        with np.errstate(all="ignore"):
-            value = _value_of(ast.parse(text, mode="eval").body, raw.astype(np.float64))
-    except (ValueError, SyntaxError, RecursionError, MemoryError, OverflowError) as error:
-        why = error if type(error) is ValueError else "it is damaged, or too deep"
-        raise ValueError(f"its formula {formula[:100]!r} is not computed: {why}") from None
-    return np.array(np.broadcast_to(value, raw.shape))
-
-
-def _value_of(node: ast.expr, raw: Array) -> Any:
-    """Return the value of a part: numbers, the raw value `X` or `X1`, operations, functions."""
-    match node:
-        case ast.Constant(value=int() | float() as number) if type(number) is not bool:
-            return np.float64(number)
-        case ast.Name(id="x" | "X" | "x1" | "X1"):
-            return raw
-        # Of two powers in a row some take the left one first and some the right.
-        case ast.BinOp(op=ast.Pow(), right=ast.BinOp(op=ast.Pow())):
-            pass
-        case ast.BinOp(left, operation, right) if type(operation) in _OPERATIONS:
-            return _OPERATIONS[type(operation)](_value_of(left, raw), _value_of(right, raw))
-        case ast.UnaryOp(operation, operand) if type(operation) in _OPERATIONS:
-            return _OPERATIONS[type(operation)](_value_of(operand, raw))
-        case ast.Call(ast.Name(name), values, []) if (name.lower(), len(values)) in _FUNCTIONS:
-            found = [_value_of(value, raw) for value in values]
-            return _FUNCTIONS[name.lower(), len(values)](*found)
-    raise ValueError(f"{ast.unparse(node)[:30]!r} is not known, or out of place")
 
 
 def _listed(conversion: Any, name: str) -> Array:
@@ -166,16 +117,15 @@ def _by_ranges(conversion: Any, kind: str, raw: Array) -> Array:
         return np.append(_listed(conversion, "phys")[order], conversion.default)[place]
     texts = conversion.referenced_blocks
     parts = [*(texts[f"text_{number}"] for number in order), texts["default_addr"]]
-    if all(isinstance(part, bytes) and b"{X}" not in part for part in parts):
+    if any(isinstance(part, bytes) and b"{X}" in part for part in parts):  # of MDF 3
+        raise ValueError(_NOT_COMPUTED)
+    if all(isinstance(part, bytes) for part in parts):
         return np.array(parts, dtype=bytes)[place]
     values = np.full(raw.shape, np.nan)  # of which some have a name instead
     for number in np.unique(place).tolist():
         part, mine = parts[number], place == number
         if not isinstance(part, bytes):
             values[mine] = to_physical(part, raw[mine])
-        elif b"{X}" in part:  # of MDF 3, between quotes
-            formula = part.decode("latin-1").replace("{X}", "X")
-            values[mine] = compute_formula(formula.strip().strip('"'), raw[mine])
     return values
 
 
