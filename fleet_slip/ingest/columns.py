@@ -3,7 +3,6 @@
 Course and speed over ground are two columns: an angle with a speed, or two velocities.
 """
 
-import itertools
 import operator
 import re
 import warnings
@@ -14,12 +13,10 @@ from functools import cache, reduce
 from typing import Annotated, Any, Literal, TypeAlias
 from zoneinfo import available_timezones
 
-import numpy as np
 import pint
 import polars as pl
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import HALF_TURN, Identifier, Signal, catalogue
 from fleet_slip.config import Config, Name, PositiveFloat, added
 from fleet_slip.ingest.formats.source import OWN_TIME
@@ -75,27 +72,11 @@ OffsetM = Annotated[FiniteFloat, Field(ge=-15, le=15)]
 WHEELS = "wheel_"
 """How the names of wheel speeds begin."""
 VELOCITY = "m/s"
-MAX_TABLE = 10_000
 CHOOSE = "choose"
 """What a draft has for a unit that the file does not say, where several are possible."""
 
 COURSE, SPEED = "course", "satellite_speed"
 Component: TypeAlias = Literal["north", "east"]
-
-
-def _increasing(table: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
-    if table and len(table) < 2:
-        raise ValueError("needs two points at least")
-    if any(left >= right for (left, _), (right, _) in itertools.pairwise(table)):
-        raise ValueError("needs points in ascending order of their first number, each once")
-    return table
-
-
-Table = Annotated[
-    tuple[tuple[FiniteFloat, FiniteFloat], ...],
-    Field(max_length=MAX_TABLE),
-    AfterValidator(_increasing),
-]
 
 
 class SignBit(Config):
@@ -107,7 +88,7 @@ class SignBit(Config):
 
 
 class SignalColumn(Config):
-    """One column of the file: `signal = factor(unit) * (±gain * table(value) + offset) / radius`.
+    """One column of the file: `signal = factor(unit) * (±gain * value + offset) / radius`.
 
     Keys at their default are left out of the mapping's identity where they came after the first
     release, so that a file is not ingested twice because a program learned a word.
@@ -125,8 +106,6 @@ class SignalColumn(Config):
     """Multiplies the value, such as the ratio of a steering gear."""
     radius_m: Annotated[FiniteFloat, Field(ge=0.05, le=2)] | None = added(None)
     """Rolling radius of a wheel whose speed is logged as a velocity."""
-    table: Table = added(())
-    """Points (value, value in `unit`), straight lines between them; outside is out of range."""
     delay_s: FiniteFloat = added(0.0, ge=-10, le=10)
     """How much later than it happened a value stands in the file."""
     interpolate: bool = added(True)
@@ -172,28 +151,11 @@ class SignalColumn(Config):
         conversion_factor(self.unit, self._measured_in(si_unit), signal)
 
     def linear(self, si_unit: str) -> tuple[float, float]:
-        """Return (gain, bias): `value in SI = gain * table(value in the file) + bias`."""
+        """Return (gain, bias): `value in SI = gain * value in the file + bias`."""
         factor = conversion_factor(self.unit, self._measured_in(si_unit))
         if self.radius_m is not None:
             factor /= self.radius_m
         return (-factor if self.negate else factor) * self.gain, factor * self.offset
-
-    def looked_up(self, number: pl.Expr) -> pl.Expr:
-        """Return table(value), NaN outside of the table; the value itself without one."""
-        return number.map_batches(self._interpolate, pl.Float64) if self.table else number
-
-    def is_outside_table(self, number: pl.Expr) -> pl.Expr:
-        """Whether a value is below or above all that the table has."""
-        if not self.table:
-            return pl.lit(value=False)
-        return (number < self.table[0][0]) | (number > self.table[-1][0])
-
-    def _interpolate(self, numbers: pl.Series) -> pl.Series:
-        points: FloatArray = np.array(self.table)
-        values = numbers.to_numpy().astype(np.float64)
-        found = np.interp(values, points[:, 0], points[:, 1], left=np.nan, right=np.nan)
-        found[np.isnan(values)] = np.nan
-        return pl.Series(numbers.name, found).set(numbers.is_null(), None)
 
     def _measured_in(self, si_unit: str) -> str:
         return si_unit if self.radius_m is None and not self.component else VELOCITY

@@ -279,14 +279,13 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
     outside = (count <= least - 0.5) | (count >= most + 0.5)
     problem = find_problems(
         (value.is_null() & present, "not_a_number"),
-        (source.is_outside_table(number), "out_of_range"),
         (~value.is_finite(), "not_finite"),
         (outside, "out_of_range"),
     )
 
     def is_sound(rows: pl.DataFrame) -> bool:
         found = rows[name]
-        if source.table or (found.null_count() and schema[RAW + source.column] == pl.String):
+        if found.null_count() and schema[RAW + source.column] == pl.String:
             return False
         return _lies_within(found, least - 0.5, most + 0.5, signal.scale)
 
@@ -308,9 +307,8 @@ def _signed(
 
 def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
     gain, bias = source.linear(catalogue()[name].unit)
-    value = source.looked_up(number)
     # Otherwise it would change nothing but the sign of zero.
-    return value if (gain, bias) == (1.0, 0.0) else value * gain + bias
+    return number if (gain, bias) == (1.0, 0.0) else number * gain + bias
 
 
 def _lies_within(values: pl.Series, low: float, high: float, scale: Decimal) -> bool:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from fleet_slip.ingest.resampling import build_resampler
-from tests.support.measured import a_mapping, good_columns, physical, read_columns, reasons, ticks
+from tests.support.measured import a_mapping, good_columns, physical, read_columns, ticks
 
 
 def signals(**columns: dict[str, Any]) -> Any:
@@ -29,26 +29,6 @@ def test_a_gain_applies_before_the_offset(tmp_path: Path) -> None:
     log = read_columns(tmp_path, {"t": [0, 0.01], "road": [1, -2]}, signals(steering_wheel=wheel))
     expected = np.radians([-16 + 3, 32 + 3])
     assert physical(log, "steering_wheel", 0.0005) == pytest.approx(expected, abs=2.5e-4)
-
-
-def test_a_table_has_straight_lines_between_its_points(tmp_path: Path) -> None:
-    wheel = {"column": "road", "unit": "deg", "table": [[-10, -180], [0, 0], [10, 150]]}
-    columns = {"t": [0, 0.01, 0.02, 0.03, 0.04], "road": [-10, -5, 5, None, 10]}
-    log = read_columns(
-        tmp_path,
-        columns | {"ax": [0] * 5},
-        signals(steering_wheel=wheel, ax={"column": "ax", "unit": "m/s^2"}),
-    )
-    found = np.degrees(physical(log, "steering_wheel", 0.0005))
-    assert found == pytest.approx([-180, -90, 75, np.nan, 150], abs=0.02, nan_ok=True)
-
-
-def test_values_outside_a_table_are_out_of_range(tmp_path: Path) -> None:
-    wheel = {"column": "road", "unit": "deg", "table": [[-10, -180], [10, 150]]}
-    columns = {"t": [0, 0.01, 0.02, 0.03], "road": [0, 10.5, -11, 1]}
-    log = read_columns(tmp_path, columns, signals(steering_wheel=wheel))
-    bad = [(2, "out_of_range", "steering_wheel"), (3, "out_of_range", "steering_wheel")]
-    assert reasons(log) == bad
 
 
 @pytest.mark.parametrize("first", [0.0, 0.0037], ids=["snapped", "interpolated"])
@@ -97,8 +77,6 @@ def test_placing_keeps_values_and_invents_none(steps: list[float], delay_s: floa
         ("vx", {"unit": "km/h", "radius_m": 0.3}, "radius_m is for wheel speeds"),
         ("ax", {"unit": "g", "gain": 0}, "gain cannot be 0"),
         ("ax", {"unit": "g", "delay_s": 11}, "less than or equal to 10"),
-        ("ax", {"unit": "g", "table": [[0, 1]]}, "needs two points at least"),
-        ("ax", {"unit": "g", "table": [[1, 1], [1, 2]]}, "in ascending order"),
     ],
 )
 def test_what_a_column_cannot_be(signal: str, column: dict[str, Any], message: str) -> None:
@@ -110,7 +88,7 @@ def test_keys_at_their_default_do_not_change_the_identity_of_a_file(tmp_path: Pa
     plain = a_mapping()
     said = a_mapping(
         signals={
-            "ax": {"column": "ax", "unit": "m/s^2", "gain": 1.0, "delay_s": 0.0, "table": []},
+            "ax": {"column": "ax", "unit": "m/s^2", "gain": 1.0, "delay_s": 0.0},
             "sideslip": {"column": "beta", "unit": "deg", "interpolate": True},
         },
         where=[],
