@@ -61,7 +61,7 @@ WRITING: tuple[tuple[str, ...], ...] = (
     ("promote", "smoke", "--previous"),
     ("compact",),
     ("forget", "--drive", "smoke-2024-05-01-0001", "--now"),
-    ("verify", "--repair", "--campaign", "{campaign}"),
+    ("verify", "--repair"),
 )
 
 VERIFY = ("verify", "--json")

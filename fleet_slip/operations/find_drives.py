@@ -17,7 +17,6 @@ from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS
 from fleet_slip.rendering import Remark
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, StoredFile
-from fleet_slip.storage.runs import gather_runs
 from fleet_slip.storage.table import Snapshot, Table
 from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.forgotten import Forgettable
@@ -50,12 +49,11 @@ class VacuumReport:
 def vacuum(
     warehouse: Warehouse, retention_hours: float = RETENTION_HOURS, *, dry_run: bool = False
 ) -> VacuumReport:
-    """Remove what nothing has referred to for some hours; gather the records of runs."""
+    """Remove what nothing has referred to for some hours."""
     warehouse.require()
     found = find_expired(warehouse, retention_hours)
     if not dry_run:
         found = [file for file in found if file.folder.remove(file)]
-        gather_runs(warehouse.root)
     return VacuumReport(
         files=tuple(str(file).removeprefix(f"{warehouse.root}/") for file in found),
         size_bytes=sum(file.size_bytes for file in found),

@@ -25,7 +25,7 @@ from fleet_slip.operations.peers import thresholds
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, Folder
-from fleet_slip.storage.runs import add_runs, find_changed_lines, find_missing_documents, state_of
+from fleet_slip.storage.runs import add_runs, find_changed_lines, state_of
 from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.database import database_errors, open_database
@@ -157,10 +157,7 @@ def status_of(
         *_unfit(warehouse.root),
         *([_FULL.format(free, least)] if free is not None and free < least else []),
         *damaged,
-        *(
-            f"{path}: {what}"
-            for path, what in (*changed, *find_missing_documents(warehouse.root, since))
-        ),
+        *(f"{path}: {what}" for path, what in changed),
     ]
     return WarehouseStatus(
         root=str(warehouse.root),

@@ -41,7 +41,7 @@ from fleet_slip.storage.commits import LOG
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.encoding import Names, read_names
 from fleet_slip.storage.folder import Folder, StoredFile
-from fleet_slip.storage.runs import find_changed_lines, find_missing_documents
+from fleet_slip.storage.runs import find_changed_lines
 from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Snapshot, Table, TableFile, find_commit_faults, on_newest
 from fleet_slip.warehouse.database import database_errors, open_database
@@ -317,13 +317,11 @@ def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:
 
 
 def verify_documents(root: Folder, report: Verification) -> None:
-    """Look for documents and lines of the history that were changed, and documents gone."""
+    """Look for documents and lines of the history that were changed, and gaps of documents."""
     for folder in _document_folders(root):
         report.documents += len(folder.numbers())
         for file, problem in folder.faults().items():
             report.note("document", file.removeprefix(f"{root}/"), problem)
-    for path, problem in find_missing_documents(root):
-        report.note("document", path, problem)
     for path, problem in find_changed_lines(root):
         report.note("document", path, problem)
 

@@ -2,14 +2,10 @@
 
     runs/2026-11.jsonl                        one line when a command starts, one when it ends
     runs/2026-11.jsonl/TIME-RANDOM.jsonl      such lines, on an object store
-    runs/2026-11.jsonl/CHECKSUM.jsonl         lines of that month, gathered
 
 A line is one write, never changed, that ends in a checksum of the bytes before: no lock, and a
 killed run lacks its second line. A changed line differs from a torn one, which lacks its end and is
 skipped, and an old one, which has no checksum.
-
-Every run keeps number and checksum of the newest document of each folder, to tell that the last
-ones are gone; whoever deletes these and rewrites all records leaves no trace: docs/security.md.
 """
 
 import contextlib
@@ -22,7 +18,6 @@ import socket
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -31,8 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 from fleet_slip.errors import HIDDEN, StorageError, hide_passwords
 from fleet_slip.resources import read_sql
-from fleet_slip.storage.documents import DocumentFolder
-from fleet_slip.storage.folder import Folder, StoredFile
+from fleet_slip.storage.folder import Folder
 
 if TYPE_CHECKING:
     import duckdb
@@ -42,19 +36,12 @@ START = 19
 """Place of the start among the fields behind the name, proc(5): ticks since the machine booted."""
 
 FOLDER = "runs"
-NEWEST_DOCUMENTS = "documents"
-"""Name of the newest documents in the record of a run."""
 
 _KEYS = frozenset(
     {"run_id", "command", "arguments", "started_at", "ended_at", "outcome", "exit_code", "error"}
-    | {"seconds", "steps", "host", "process", "process_began", "package_version", NEWEST_DOCUMENTS}
+    | {"seconds", "steps", "host", "process", "process_began", "package_version", "documents"}
 )
 """What lines of earlier versions, which have no checksum, may say."""
-
-LISTINGS = 20
-"""So often records are listed again that were gathered before they were read."""
-
-_DOCUMENT_FOLDER = re.compile(r"forgotten|models/(?!\.\./)[^/]*/(?:versions|history)")
 
 _DIGITS = 32
 _END = b',"sha256":"' + b"0" * _DIGITS + b'"}'
@@ -101,12 +88,9 @@ def find_changed_lines(root: Folder, since: str = "") -> Iterator[tuple[str, str
 def _read_history(root: Folder, since: str = "") -> list[tuple[str, bytes]]:
     """Return the files of the history from a month YYYY-MM on. Raises `StorageError`."""
     folder = root / FOLDER
-    for _ in range(LISTINGS):
-        paths = [f.path for f in folder.files() if _is_record(f.path) and f.path >= since]
-        contents = folder.read_many(paths)
-        if None not in contents:
-            return [(path, content or b"") for path, content in zip(paths, contents, strict=True)]
-    raise StorageError(f"{folder}: other processes keep changing it. Run the command again.")
+    paths = [f.path for f in folder.files() if f.path.endswith(".jsonl") and f.path >= since]
+    contents = folder.read_many(paths)
+    return [(path, content or b"") for path, content in zip(paths, contents, strict=True)]
 
 
 def _intact_records(root: Folder, since: str) -> Iterator[dict[str, Any]]:
@@ -134,48 +118,6 @@ def _parsed(line: bytes) -> dict[str, Any] | None:
 
 def _checksum(body: bytes) -> bytes:
     return hashlib.sha256(body).hexdigest()[:_DIGITS].encode()
-
-
-def newest_documents(root: Folder) -> dict[str, tuple[int, str]]:
-    """Return the newest documents as they are now; nothing of a folder that cannot be read."""
-    found = {}
-    for path in _document_folders(root):
-        documents = DocumentFolder(root / path)
-        with contextlib.suppress(StorageError):
-            if numbers := documents.numbers():
-                found[path] = (numbers[-1], documents.read(numbers[-1]).sha256)
-    return found
-
-
-def find_missing_documents(root: Folder, since: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the folders that lost documents that a run since YYYY-MM had seen, and what."""
-    for path, (number, digest) in sorted(_newest_seen(root, since).items()):
-        documents = DocumentFolder(root / path)
-        newest = max(documents.numbers(), default=0)
-        if newest < number:
-            yield path, f"had {number} documents when a run ended, and has {newest} now"
-            continue
-        with contextlib.suppress(StorageError):  # reported as a document
-            if documents.read(number).sha256 != digest:
-                yield path, f"{number}.json is not the document that a run had seen"
-
-
-def _newest_seen(root: Folder, since: str) -> dict[str, tuple[int, str]]:
-    kept: dict[str, tuple[int, str]] = {}
-    for record in _intact_records(root, since):
-        with contextlib.suppress(ValueError, TypeError, AttributeError):  # one without a checksum
-            for path, (number, digest) in record.get(NEWEST_DOCUMENTS, {}).items():
-                if _DOCUMENT_FOLDER.fullmatch(path) and number >= kept.get(path, (0, ""))[0]:
-                    kept[path] = (number, digest)
-    return kept
-
-
-def _document_folders(root: Folder) -> list[str]:
-    models = [f"models/{name}" for name in (root / "models").names()]
-    return [
-        "forgotten",
-        *(f"{model}/{kind}" for model in models for kind in ("versions", "history")),
-    ]
 
 
 LOGGER = logging.getLogger("fleet_slip")
@@ -290,8 +232,6 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
         end = run.end(error, time.monotonic() - begun)
         log_event("run ended", **{key: end[key] for key in ("outcome", "exit_code", "seconds")})
         if _exists(root):
-            with contextlib.suppress(StorageError):
-                end[NEWEST_DOCUMENTS] = newest_documents(root)
             _append(root, file, *([] if recorded else [run.beginning()]), end)
         _current.reset(token)
 
@@ -382,7 +322,6 @@ def _timestamp(moment: datetime) -> str:
     return moment.isoformat(timespec="microseconds")
 
 
-REMOVALS_AT_ONCE = 16
 RUNNING = "running"
 KILLED = "killed"
 
@@ -443,33 +382,3 @@ def state_of(run: Mapping[str, Any]) -> str:
     began = run.get("process_began")
     now = process_began(run["process"]) if began is not None else None
     return RUNNING if now is None or now == began else KILLED
-
-
-def gather_runs(root: Folder) -> int:
-    """Gather the records of each month in one object, on a store; return how many there were."""
-    folder = root / FOLDER
-    months: dict[str, list[StoredFile]] = defaultdict(list)
-    for file in folder.files():
-        month, _, name = file.path.partition("/")
-        if name and _is_record(name):
-            months[month].append(file)
-    scattered = {month: files for month, files in months.items() if len(files) > 1}
-    for month, files in scattered.items():
-        _gather(folder, month, files)
-    return sum(len(files) for files in scattered.values())
-
-
-def _gather(folder: Folder, month: str, files: list[StoredFile]) -> None:
-    contents = folder.read_many([file.path for file in files])
-    read = {file: content for file, content in zip(files, contents, strict=True) if content}
-    # Sorted and each once: the same records are the same object, whoever gathers them.
-    lines = sorted({line for content in read.values() for line in content.splitlines() if line})
-    whole = b"".join(line + b"\n" for line in lines)
-    target = f"{month}/{hashlib.sha256(whole).hexdigest()[:32]}.jsonl"
-    folder.create(target, whole)
-    with ThreadPoolExecutor(REMOVALS_AT_ONCE) as executor:
-        list(executor.map(folder.remove, (file for file in read if file.path != target)))
-
-
-def _is_record(path: str) -> bool:
-    return path.endswith(".jsonl")

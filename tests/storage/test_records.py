@@ -11,7 +11,7 @@ from fleet_slip.operations.verify import Verification, verify_documents
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import (
     find_changed_lines,
-    find_missing_documents,
+    publishable,
     read_lines,
     recording,
     runs_under_way,
@@ -69,7 +69,6 @@ def test_readers_take_nothing_from_a_changed_line(history: Path) -> None:
     ):
         database.sql("SELECT run_id FROM runs").fetchall()
     assert runs_under_way(root) == []
-    assert list(find_missing_documents(root)) == []
     lines = history.read_text().splitlines()
     history.write_text("\n".join(line for line in lines if "mess_kg" not in line) + "\n")
     with fleet_slip.connect(history.parents[1]) as database:
@@ -91,3 +90,8 @@ def test_lines_of_earlier_versions_have_no_checksum(history: Path) -> None:
     assert read_lines(line) == ([line], [])
     assert read_lines(line.replace(b'"process"', b'"prozess"')) == ([], [1])
     assert read_lines(write_line(record))[0]
+
+
+def test_a_condition_on_a_car_is_not_kept() -> None:
+    arguments = ["select", "--cohort", "vehicle_id = 'WVW1'", "--against=drive_id <> 'd'"]
+    assert publishable(arguments) == ["select", "--cohort", "***", "***"]
