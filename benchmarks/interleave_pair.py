@@ -17,11 +17,7 @@ FATES = ("goes on", "dies", "dies 1 later", "dies 2 later", "dies 3 later")
 ROUNDS = 3
 """So often both commands are given again until nothing fails."""
 PENDING = "pending"
-FORGETTING = ("retain", "forget", "forget_file", "forget_name")
-NOTHING_LEFT = {"forget_file": {0, 5}, "forget_name": {0, 5}}
-"""Exit codes of a command that was done before, where others than 0."""
-NAMING = ("undo", "forget_file", "forget_name")
-"""Commands that hold for what of `later.csv` is there when they commit."""
+FORGETTING = ("retain", "forget")
 UNHARMED = {0, 5, 6, 7, 8, 12}
 """Exit codes of a command that met another; 6 where a file is gone that it was about to read."""
 
@@ -130,7 +126,7 @@ class Pair:
     @staticmethod
     def _look_for_named(root: str, name: str, outcome: Outcome) -> list[str]:
         """Return what is left of `later.csv` just after a command has taken it out."""
-        if name not in NAMING or not _done(name, outcome):
+        if name != "undo" or not _done(name, outcome):
             return []
         return list(forked(lambda: checks.named_findings(root, "later.csv")).result)
 
@@ -154,7 +150,7 @@ def _repeat(
     let_temporary_files_age(root)
     for _ in range(ROUNDS):
         codes = {name: command(root, words, environment) for name, words, environment in given}
-        failed = {n: code for n, code in codes.items() if code not in NOTHING_LEFT.get(n, {0})}
+        failed = {n: code for n, code in codes.items() if code}
         if not failed:
             break
     return len(failed), ", ".join(f"{name} ends with {code}" for name, code in failed.items())

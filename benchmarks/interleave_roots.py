@@ -53,8 +53,6 @@ COMMANDS: Mapping[str, tuple[str, ...]] = {
     "ingest": ("ingest", "{new}", "--mapping", "{mapping}"),
     "replace": ("ingest", "{later}", "--mapping", "{fixed}", "--replace"),
     "undo": ("ingest", "--undo", "later.csv"),
-    "forget_file": ("forget", "--source-file", "later.csv", "--now"),
-    "forget_name": ("forget", "--drive-name", "later", "--now"),
     "gram": ("gram",),
     "publish": PUBLISH,
     "promote": ("promote", "sideslip@1"),

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated
 
 from typing_extensions import Doc
 
@@ -29,12 +29,13 @@ if TYPE_CHECKING:
     from fleet_slip.grams.calibration import Calibration
     from fleet_slip.models.registry import ModelVersion
     from fleet_slip.operations.find_drives import VacuumReport
-    from fleet_slip.operations.forget import Calling, ForgetReport, RetentionReport
+    from fleet_slip.operations.forget import ForgetReport, RetentionReport
     from fleet_slip.operations.monitor import Chart
     from fleet_slip.operations.quality import QualityReport
     from fleet_slip.operations.rewriting import CompactionReport
     from fleet_slip.operations.status import WarehouseStatus
     from fleet_slip.operations.verify import Verification
+    from fleet_slip.warehouse.forgotten import Forgettable
 
 
 @dataclass(frozen=True)
@@ -211,81 +212,48 @@ class HealthAndUpkeep(JudgedModels):
         *,
         vehicle: Annotated[str | None, Doc("The vehicle_id to forget.")] = None,
         drive: Annotated[str | None, Doc("The drive_id to forget.")] = None,
-        drive_name: Annotated[
-            str | None, Doc("The drive_name whose drives are to be forgotten.")
-        ] = None,
-        source_file: Annotated[
-            str | None, Doc("The source_file whose drives are to be forgotten.")
-        ] = None,
         now: Annotated[bool, Doc("Delete the old files at once; compact would later.")] = False,
         progress: ShowProgress | None = None,
     ) -> "ForgetReport":
-        """Forget a vehicle, a drive, or drives of a name or file; mark their models.
+        """Forget a vehicle or a drive; mark the models that were trained on it.
 
-        They leave logs, Gram rows and quarantine, and no job brings them back until `allow`. Others
-        under the same name or file land. While anything is `pending` in the report, repeat it.
-        Progress is in files, or in drives. Raises `UsageError` unless one subject is given,
-        `QuestionError` if there never was such a drive, `StorageError` and `ConflictError`.
+        It leaves logs, Gram rows and quarantine, and no job brings it back until `allow`. While
+        anything is `pending` in the report, repeat it. Progress is in files. Raises `UsageError`
+        unless one subject is given, `QuestionError` if there never was such a drive, `StorageError`
+        and `ConflictError`.
         """
-        from fleet_slip.operations.forget import forget, forget_called
-        from fleet_slip.warehouse.forgotten import Forgettable
+        from fleet_slip.operations.forget import forget
 
-        kind, value = _only(
-            vehicle=vehicle, drive=drive, drive_name=drive_name, source_file=source_file
-        )
-        shown = count_from_start(progress)
+        subject = _subject(vehicle, drive)
         with step("forget") as figures:
-            if kind in ("drive_name", "source_file"):
-                calling = cast("Calling", kind)
-                report = forget_called(self.warehouse, calling, value, now=now, progress=shown)
-            else:
-                subject = Forgettable("drive" if kind == "drive" else "vehicle", value)
-                report = forget(self.warehouse, subject, now=now, progress=shown)
+            report = forget(self.warehouse, subject, now=now, progress=count_from_start(progress))
             figures.rows = report.rows
         return report
 
     @record_call
-    def allow(
-        self,
-        *,
-        vehicle: str | None = None,
-        drive: str | None = None,
-        source_file: str | None = None,
-    ) -> bool:
-        """Let a forgotten vehicle, drive or file land again; return whether that is new.
+    def allow(self, *, vehicle: str | None = None, drive: str | None = None) -> bool:
+        """Let a forgotten vehicle or drive land again; return whether that is new.
 
-        What was forgotten stays so, until `ingest` is given the allowed file, or its drives, again.
-        Raises `UsageError` unless one subject is given, `QuestionError` if it was never forgotten,
-        and `RefusedError` while it is being forgotten.
+        What was forgotten stays so, until `ingest` is given its file again. Raises `UsageError`
+        unless one subject is given, `QuestionError` if it was never forgotten, and `RefusedError`
+        while it is being forgotten.
         """
-        from fleet_slip.warehouse.forgotten import Audit, Forgettable
+        from fleet_slip.warehouse.forgotten import Audit
 
-        kind, name = _only(vehicle=vehicle, drive=drive, source_file=source_file)
         self.warehouse.require()
-        audit, states = Audit(self.root), set[str]()
-        if kind == "source_file":
-            what = f"the file {name!r}"
-            unknown = (
-                f"no drive was forgotten by the name of its file {name!r}. Earlier versions kept "
-                "no such names: allow its drives, or its car."
-            )
-            states.update(audit.allow_from(name).values())
-        else:
-            what = f"{kind} {name!r}"
-            subject = Forgettable("drive" if kind == "drive" else "vehicle", name)
-            unknown = f"{what} was never forgotten."
-            if state := audit.state(subject):
-                states.add(state)
-            if state == "done":
+        subject, audit = _subject(vehicle, drive), Audit(self.root)
+        match audit.state(subject):
+            case None:
+                raise QuestionError(f"{subject.kind} {subject.value!r} was never forgotten.")
+            case "begun":
+                raise RefusedError(
+                    f"{subject.kind} {subject.value!r} is being forgotten. Give the command that "
+                    "forgets it again, until it is done; then allow it."
+                )
+            case "done":
                 audit.allow(subject)
-        if not states:
-            raise QuestionError(unknown)
-        if "begun" in states:
-            raise RefusedError(
-                f"{what} is being forgotten. Give the command that forgets it again, until it is "
-                "done; then allow it."
-            )
-        return "done" in states
+                return True
+        return False
 
     @record_call
     def retain(
@@ -305,9 +273,12 @@ class HealthAndUpkeep(JudgedModels):
         return report
 
 
-def _only(**asked: str | None) -> tuple[str, str]:
-    """Return the one that is given, and its name. Raises `UsageError` for none and for several."""
-    given = [(kind, name) for kind, name in asked.items() if name is not None]
-    if len(given) != 1:
-        raise UsageError(f"give one of {', '.join(asked)}.")
-    return given[0]
+def _subject(vehicle: str | None, drive: str | None) -> "Forgettable":
+    """Return the one that is given. Raises `UsageError` for none and for both."""
+    from fleet_slip.warehouse.forgotten import Forgettable
+
+    if vehicle is not None and drive is None:
+        return Forgettable("vehicle", vehicle)
+    if drive is not None and vehicle is None:
+        return Forgettable("drive", drive)
+    raise UsageError("give a vehicle or a drive.")

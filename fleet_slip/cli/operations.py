@@ -186,7 +186,7 @@ def forget(
     json: Json = False,
     **subject: str | None,
 ) -> None:
-    """Forget a vehicle or drives: in logs, Gram rows and quarantine; mark the models they trained.
+    """Forget a vehicle or a drive: in logs, Gram rows and quarantine; mark models it trained.
 
     No job brings it back, nor one that is under way: its rows are left out, until --allow.
     Train them again with `fleet-slip publish NAME`. With --now it exits with 12 while anything may
@@ -202,8 +202,6 @@ def forget(
     elif allow:
         if now:
             raise UsageError("give one of --allow and --now.")
-        if subject.pop("drive_name") is not None:
-            raise UsageError("give --allow with --vehicle, --drive or --source-file.")
         changed = fleet.allow(**subject)
         if json:
             print_json({"allowed": True, "changed": changed})

@@ -304,7 +304,7 @@ class SameRecordings:
 def let_return(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
     """Withdraw a file of which no drive is left, and whose first one may come back; say if so.
 
-    Only what was forgotten by a drive's or a file's name may: what is too old stays away.
+    Only what was forgotten by a drive's name may: what is too old stays away.
     """
     audit = Audit(warehouse.root)
     if not audit.allows_drives or audit.state(Forgettable("drive", first_drive)) != ALLOWED:

@@ -184,7 +184,7 @@ class OldFile:
 def read_old_files(snapshot: Snapshot) -> Iterator[OldFile]:
     """Yield replaced files and leftovers, with what tells the drives."""
     known = snapshot.removed()
-    wanted = {"drive_id", "drive_name", "source_file", "vehicle_id", "day"}
+    wanted = {"drive_id", "vehicle_id", "day"}
     for file in find_unreferenced(snapshot.table):
         try:
             names = snapshot.table.read_metadata(file.path).schema.to_arrow_schema().names

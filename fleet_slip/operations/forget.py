@@ -8,12 +8,9 @@ logs. What such jobs have written is deleted by them or here.
 """
 
 from collections.abc import Collection, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import date, timedelta
-from typing import Literal, TypeAlias
 
-import pyarrow as pa
 import pyarrow.compute as pc
 from pydantic import Field
 
@@ -32,7 +29,6 @@ from fleet_slip.operations.find_drives import (
     find_old_files,
     locate,
     quarantined_of,
-    read_old_files,
     remove_old_files,
     vacuum,
 )
@@ -48,7 +44,6 @@ from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import config_file, find_config
 from fleet_slip.storage.runs import runs_under_way
 from fleet_slip.storage.table import Change, retrying, rows_in
-from fleet_slip.views import connect
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -116,13 +111,12 @@ def forget(
     *,
     now: bool = False,
     progress: Progress = no_progress,
-    source_file: str | None = None,
 ) -> ForgetReport:
     """Forget drives; with `now`, delete the replaced files at once instead of by `vacuum`.
 
-    `source_file` is the file by whose name they go. It can be repeated after interruptions.
-    `progress` counts files. What was superseded is no drive: of it, `now` deletes the old files.
-    Raises `QuestionError` for no such drive, `StorageError`, `ConflictError`.
+    It can be repeated after interruptions. `progress` counts files. What was superseded is no
+    drive: of it, `now` deletes the old files. Raises `QuestionError` for no such drive,
+    `StorageError`, `ConflictError`.
     """
     audit = Audit(warehouse.root)
     located = locate(warehouse.grams.snapshot(), subject)
@@ -138,7 +132,7 @@ def forget(
             )
     models = audit.models_of(subject)
     if state == ALLOWED or superseded or (drives and state != "begun"):
-        models = _begin(warehouse, audit, subject, drives, located, source_file)
+        models = _begin(warehouse, audit, subject, drives, located)
     for name in (cleared := warehouse.root / "cleared").names():
         cleared.delete(name)  # releases up to 0.2 listed cars there that were not forgotten
     for table in (warehouse.quarantine, warehouse.logs):
@@ -147,7 +141,7 @@ def forget(
     landed = _drives_of(warehouse, subject, located)
     if not landed <= drives:  # they landed before the fence
         drives |= landed
-        models = _begin(warehouse, audit, subject, drives, located, source_file)
+        models = _begin(warehouse, audit, subject, drives, located)
     if drives:
         _forget_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
@@ -180,13 +174,12 @@ def _begin(
     subject: Forgettable,
     drives: Collection[str],
     located: Located,
-    source_file: str | None,
 ) -> list[str]:
     registry = Registry.of(warehouse)
     judged = {name: max(registry.versions(name), default=0) for name in registry.names()}
     models = models_trained_on(warehouse, drives)
     known = () if subject.kind == "before" else digests_of(warehouse, subject, located)
-    audit.begin(subject, len(drives), models, judged, set(known), source_file)
+    audit.begin(subject, len(drives), models, judged, set(known))
     return models
 
 
@@ -230,72 +223,6 @@ def _forget_quarantined(
     add, remove = write_without(snapshot, lambda rows: quarantined_of(rows, subject, drives))
     if remove:
         snapshot.commit_or_discard(Change(add=add, remove=remove, note={"job": "forget"}))
-
-
-Calling: TypeAlias = Literal["drive_name", "source_file"]
-"""A column of `drives` by which people know a drive; several drives may have the same."""
-
-
-def forget_called(
-    warehouse: Warehouse,
-    calling: Calling,
-    value: str,
-    *,
-    now: bool = False,
-    progress: Progress = no_progress,
-) -> ForgetReport:
-    """Forget every drive of a name or file, also what takes the place of some meanwhile.
-
-    Raises `QuestionError` if there is none.
-    """
-    reports, done = [], set[str]()
-    source_file = value if calling == "source_file" else None
-    while drives := _drives_called(warehouse, calling, value, old=now and not done) - done:
-        for drive in sorted(drives):
-            subject = Forgettable("drive", drive)
-            with suppress(QuestionError):  # it was replaced
-                reports.append(forget(warehouse, subject, now=now, source_file=source_file))
-            progress(1, len(drives))
-        done |= drives
-    if not reports:
-        raise QuestionError(
-            f"no drive has {calling} {value!r}. See: "
-            f'fleet-slip sql "SELECT drive_id, {calling} FROM drives"'
-        )
-    return ForgetReport(
-        drives=sum(one.drives for one in reports),
-        rows=sum(one.rows for one in reports),
-        files_rewritten=sum(one.files_rewritten for one in reports),
-        files_removed=sum(one.files_removed for one in reports),
-        models=tuple(sorted({name for one in reports for name in one.models})),
-        old_files_deleted=sum(one.old_files_deleted for one in reports),
-        old_files_left=max(one.old_files_left for one in reports),
-        pending=tuple(dict.fromkeys(name for one in reports for name in one.pending)),
-    )
-
-
-def _drives_called(
-    warehouse: Warehouse, calling: Calling, value: str, *, old: bool
-) -> frozenset[str]:
-    """Return the drives in logs and Gram rows, and in old files too if these are to go."""
-    with connect(warehouse.root, query="drives", scenarios=True) as database:
-        statement = f"SELECT DISTINCT drive_id FROM drives WHERE {calling} = $value"
-        found = {name for (name,) in database.execute(statement, {"value": value}).fetchall()}
-    for rows in _named_rows(warehouse, calling, old=old):
-        if calling in rows.column_names:
-            mine = pc.equal(rows[calling].cast(pa.string()), value)
-            found.update(rows["drive_id"].filter(mine).cast(pa.string()).unique().to_pylist())
-    return frozenset(found)
-
-
-def _named_rows(warehouse: Warehouse, calling: Calling, *, old: bool) -> Iterator[pa.Table]:
-    grams = warehouse.grams
-    for file in grams.snapshot().files:
-        if calling in grams.read_metadata(file.path).schema.to_arrow_schema().names:
-            yield grams.read(file.path, ["drive_id", calling])
-    if old:
-        for table in (warehouse.logs, warehouse.grams):
-            yield from (one.rows for one in read_old_files(table.snapshot()))
 
 
 # How long data is kept: `configs/retention.toml`, or a file of the user's own.

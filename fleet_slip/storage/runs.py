@@ -127,9 +127,7 @@ ARGUMENTS_MAX = 50
 ERROR_MAX = 2000
 """So many characters of a message are kept."""
 
-_PRIVATE_OPTION = re.compile(
-    r"(?i)--?(?:[\w-]*(?:key|token|secret|passw)[\w-]*|vehicle|drive(?:-name)?|source-file)"
-)
+_PRIVATE_OPTION = re.compile(r"(?i)--?(?:[\w-]*(?:key|token|secret|passw)[\w-]*|vehicle|drive)")
 _NAMES = re.compile(r"(?i)\b(?:vehicle_id|drive_id|drive_name|source_file|trip_id)\b")
 _DATA_FILE = re.compile(
     r"(?is).*(\.(?:csv|parquet|pq|mf4|mdf|dat|mat|h5|hdf5|blf|asc|log|trc|mcap|duckdb|ddb|tdms|vbo)"
@@ -256,8 +254,8 @@ def publishable(arguments: Sequence[str]) -> list[str]:
     """Return command line arguments without what the history must not keep.
 
     That is keys, tokens, secrets and passwords, users and queries of URLs, and what may name a
-    person's car, since the history outlives it: --vehicle, --drive, --drive-name, --source-file,
-    conditions on such columns, names of data files.
+    person's car, since the history outlives it: --vehicle, --drive, conditions on such columns,
+    names of data files.
     """
     kept: list[str] = []
     hide_next = False

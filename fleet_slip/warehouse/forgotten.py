@@ -161,17 +161,14 @@ class Audit:
         models: Collection[str],
         judged: Mapping[str, int] | None = None,
         counts: Collection[str] = (),
-        source_file: str | None = None,
     ) -> None:
         """Record what is about to be forgotten.
 
         `models` were trained on it, of all versions up to the `judged` number of each model.
-        `counts` are the digests of its drives' counts. `source_file` is the file by whose name it
-        is forgotten.
+        `counts` are the digests of its drives' counts.
         """
         known = {"drives": drives, "models": sorted(models), "judged": dict(judged or {})}
-        begun = {"event": "begun", **known, "counts": sorted(counts)}
-        self._append(subject, begun, source_file)
+        self._append(subject, {"event": "begun", **known, "counts": sorted(counts)})
 
     def end(self, subject: Forgettable, grams_version: int | None = None) -> None:
         """Record that it is forgotten, and since which version the Gram rows are without it."""
@@ -192,36 +189,14 @@ class Audit:
         """Record that a forgotten car or drive may come back."""
         self._append(subject, {"event": ALLOWED})
 
-    def allow_from(self, source_file: str) -> dict[str, str]:
-        """Let the drives come back that were forgotten by the name of their file.
-
-        Returns the event of each that was its last, by its hash; those under way are left alone.
-        """
-        last, found = self._last_events(), dict[str, str]()
-        for entry in self.entries():
-            if entry.get("source_file") != _digest(f"source_file:{source_file}", entry["key"]):
-                continue
-            subject = _subject_of(entry)
-            found[entry["subject"]] = last[subject]
-            if last[subject] == "done":
-                at = datetime.now(UTC).isoformat(timespec="seconds")
-                known = dict(zip(("kind", "key", "subject"), subject, strict=True))
-                self._folder.append({**known, "at": at, "event": ALLOWED})
-                last[subject] = ALLOWED
-        return found
-
     def _of(self, subject: Forgettable) -> list[Mapping[str, Any]]:
         return [e for e in self.entries() if e["subject"] == subject.digest(e["key"])]
 
-    def _append(
-        self, subject: Forgettable, content: Mapping[str, Any], source_file: str | None = None
-    ) -> None:
+    def _append(self, subject: Forgettable, content: Mapping[str, Any]) -> None:
         # One key, or more if several processes made the first entries at once.
         keys = [entry["key"] for entry in self._of(subject)]
         keys += [e["key"] for e in self.entries() if not e["key"].startswith(_SCRYPT)]
         key = keys[0] if keys else secrets.token_hex(32)
-        if source_file is not None:
-            content = {**content, "source_file": _digest(f"source_file:{source_file}", key)}
         at = datetime.now(UTC).isoformat(timespec="seconds")
         known = {"kind": subject.kind, "subject": subject.digest(key), "key": key, "at": at}
         self._folder.append({**known, **content})

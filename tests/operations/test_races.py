@@ -304,16 +304,11 @@ def test_the_command_says_what_may_be_left_and_finishes_when_it_is_repeated(
 LAPS = {"column": "car", "vehicle_id": "car-of-mine"}
 TAKING_AWAY: dict[str, Callable[[Fleet], int]] = {
     "undo": lambda fleet: fleet.take_back("log.csv"),
-    "forget the file": lambda fleet: fleet.forget(source_file="log.csv", now=True).drives,
-    "forget a name": lambda fleet: fleet.forget(drive_name="lap", now=True).drives,
+    "forget": lambda fleet: sum(
+        fleet.forget(drive=drive, now=True).drives
+        for (drive,) in fleet.sql("SELECT drive_id FROM drives").fetchall()
+    ),
 }
-
-
-def ways(*usual: str) -> list[Any]:
-    """Return all ways to take something away; others than the usual ones are for long runs."""
-    return [
-        way if way in usual else pytest.param(way, marks=pytest.mark.long) for way in TAKING_AWAY
-    ]
 
 
 def corrected() -> Mapping:
@@ -334,22 +329,20 @@ def laps(tmp_path: Path) -> Fleet:
 
 
 @pytest.mark.parametrize("table", ["quarantine", "logs"])
-@pytest.mark.parametrize("way", ways("undo", "forget a name"))
 def test_what_replaced_a_file_meanwhile_goes_with_it(
-    laps: Fleet, way: str, table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    laps: Fleet, table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def replace() -> None:
         laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
 
     just_before_its_commit(monkeypatch, replace, table)
-    assert TAKING_AWAY[way](laps) >= (1 if way == "forget a name" else 2)
-    left = {"slalom"} if way == "forget a name" else set()
-    assert names_in(laps) == left
-    assert laps.sql("SELECT count(*) FROM quarantine").fetchall() == [(len(left),)]
+    assert TAKING_AWAY["undo"](laps) >= 2
+    assert names_in(laps) == set()
+    assert laps.sql("SELECT count(*) FROM quarantine").fetchall() == [(0,)]
     assert not laps.verify(full=True).damage
 
 
-@pytest.mark.parametrize("way", ways("undo", "forget the file"))
+@pytest.mark.parametrize("way", TAKING_AWAY)
 def test_what_is_taken_away_while_it_is_replaced_is_not_doubled(
     laps: Fleet, way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -358,20 +351,16 @@ def test_what_is_taken_away_while_it_is_replaced_is_not_doubled(
     laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
     found = laps.sql("SELECT drive_name, count(DISTINCT drive_id) FROM log GROUP BY ALL").fetchall()
     assert all(many == 1 for _, many in found)
-    assert names_in(laps) >= ({"slalom"} if way != "forget the file" else set())
+    assert names_in(laps) >= ({"slalom"} if way == "undo" else set())
     assert not laps.verify(full=True).damage
 
 
-@pytest.mark.parametrize("way", ways("undo", "forget the file"))
+@pytest.mark.parametrize("way", TAKING_AWAY)
 def test_what_was_superseded_is_no_drive(laps: Fleet, way: str, tmp_path: Path) -> None:
     laps.gram()
     laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
-    assert TAKING_AWAY[way](laps) == (1 if way == "forget a name" else 2)
-    assert names_in(laps) == ({"slalom"} if way == "forget a name" else set())
-    if way != "undo":
-        assert not mentions(tmp_path / "data", "lap")
-        assert laps.ingest(tmp_path / "log.csv", a_mapping(drive=LAPS), replace="all")
-        assert "lap" not in names_in(laps)
+    assert TAKING_AWAY[way](laps) == 2
+    assert names_in(laps) == set()
 
 
 @pytest.mark.long
