@@ -5,7 +5,6 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import date
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
 
 SAMPLE_FILES = 4
 """Log files that a night verifies; the next night takes the next ones."""
-SHOWN_NIGHTS = 30
 
 NEEDS = {
     "quality": ("gram",),
@@ -95,7 +93,6 @@ class Night:
             candidate=now.candidate,
             faults=self.faults,
             chart=self.chart,
-            past=tuple(islice(nights.ended(self.night), SHOWN_NIGHTS)),
             seconds=round(time.monotonic() - began, 3),
         )
         nights.end(report.as_past())

@@ -59,7 +59,6 @@ GROUPS = {
         "simulate": "data",
         "gram": "grams",
         "features": "grams",
-        "init": "data",
     },
     "Models": {
         "select": "begin",

@@ -1,11 +1,6 @@
 """Commands that fill the warehouse: simulate and ingest."""
 
 import logging
-import os
-import re
-import shlex
-import sys
-import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +15,6 @@ from fleet_slip.cli.output import Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.rendering import TextTable
-from fleet_slip.resources import folder as shipped
 from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
@@ -274,7 +268,7 @@ def mapping(
         print_parts(["\n" + text])
 
 
-def _draft(file: str, can: Path | None = None, name: str | None = None) -> "tuple[Draft, str]":
+def _draft(file: str, can: Path | None) -> "tuple[Draft, str]":
     """Return what a log suggests, and that as a mapping."""
     from fleet_slip.ingest.draft import draft_mapping, name_of, write_draft  # noqa: PLC0415 - takes a while
     from fleet_slip.ingest.formats.can import CanBus, read_can_database  # noqa: PLC0415
@@ -289,64 +283,4 @@ def _draft(file: str, can: Path | None = None, name: str | None = None) -> "tupl
         raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
     with local_copy(logs[0]) as copy:
         draft = draft_mapping(copy, profile_file(copy, formats))
-        return draft, write_draft(draft, name or name_of(copy.stem), file)
-
-
-# The command that writes a project of one's own: init.
-
-NAME = re.compile(r"[a-z][a-z0-9_]*")
-OWN = ("publish.toml", "monitor.toml", "retention.toml")
-"""Configs that a project has of its own from the beginning, as they ship."""
-
-
-def init(
-    folder: Annotated[Path, typer.Argument(help="A new or empty folder.", show_default=False)],
-    model: Annotated[
-        str, typer.Option(help="Name of the model and of the mapping: a-z, 0-9, _.")
-    ] = "fleet",
-    log: Annotated[
-        Path | None,
-        typer.Option(
-            help="A measured log, to draft the mapping from. Default: a mapping to fill in.",
-            show_default=False,
-        ),
-    ] = None,
-) -> None:
-    """Write a project: configs to edit, a draft of a mapping, a schedule, and what to type next.
-
-    It is written whole or not at all.
-
-    Example: **fleet-slip init my_fleet --log drive.mf4**
-    """
-    if not NAME.fullmatch(model):
-        raise UsageError(f"--model {model}: write it in lower-case letters, digits and _.")
-    mapping = _draft(str(log), name=model)[1] if log else _template("mapping.toml", model=model)
-    whole = folder.absolute()
-    with storage_errors(folder):
-        if whole.exists() and (not whole.is_dir() or any(whole.iterdir())):
-            raise UsageError(f"{folder}: it is not empty. Name a new folder.")
-        whole.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".init-", dir=whole.parent) as temporary:
-            draft = Path(temporary) / "project"
-            _write(draft, whole, model, mapping)
-            os.rename(draft, whole)  # noqa: PTH104 - takes the place of an empty folder
-    print_parts([(whole / "README.md").read_text(encoding="utf-8").rstrip()])
-
-
-def _write(draft: Path, whole: Path, model: str, mapping: str) -> None:
-    for name in ("configs/mappings", "landing"):
-        (draft / name).mkdir(parents=True)
-    for name in OWN:
-        text = (shipped("configs") / name).read_text(encoding="utf-8")
-        (draft / "configs" / name).write_text(text, encoding="utf-8")
-    (draft / "configs" / "mappings" / f"{model}.toml").write_text(mapping, encoding="utf-8")
-    program = Path(sys.argv[0]).absolute()
-    known = {"folder": shlex.quote(str(whole)), "program": shlex.quote(str(program))}
-    in_cron = {key: text.replace("%", r"\%") for key, text in known.items()}  # else a line's end
-    for name, names in (("README.md", known), ("crontab", in_cron)):
-        (draft / name).write_text(_template(name, model=model, **names), encoding="utf-8")
-
-
-def _template(name: str, **known: str) -> str:
-    text = (shipped("jobs") / "project" / name).read_text(encoding="utf-8")
-    return text.format(**known)
+        return draft, write_draft(draft, name_of(copy.stem), file)

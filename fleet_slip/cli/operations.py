@@ -114,7 +114,7 @@ def nightly(
     output: Annotated[
         Path | None,
         typer.Option(
-            help="Write the summary there: NIGHT.txt, NIGHT.json, NIGHT.html. It names drives; "
+            help="Write the summary there: NIGHT.txt and NIGHT.json. It names drives; "
             "forget does not reach it.",
             show_default=False,
         ),
@@ -130,7 +130,7 @@ def nightly(
     Example: **fleet-slip nightly --landing /srv/logs --mapping logger.toml --model fleet**
     """
     if output is not None:
-        from fleet_slip.operations.night import write_summary  # noqa: PLC0415 - draws
+        from fleet_slip.operations.night import write_summary  # noqa: PLC0415 - loaded by now
 
         write_summary(report, output)
     print_answer(report, json)

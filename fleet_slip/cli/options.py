@@ -2,12 +2,10 @@
 
 import functools
 import inspect
-import os
 import re
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
-from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
@@ -15,86 +13,24 @@ import typer
 from fleet_slip.api.calls import doc_of, open_workers, type_of
 from fleet_slip.base import date_of, document_of, last_day
 from fleet_slip.cli.output import Json, print_json, print_parts
-from fleet_slip.errors import FleetSlipError, UsageError
-from fleet_slip.resources import CONFIG_VARIABLE, config_names
+from fleet_slip.errors import UsageError
 from fleet_slip.storage.runs import recording
-
-# What Tab completes in a shell of the system: names of models, campaigns, lists and feature sets.
-#
-# Completion never fails and never speaks: where names cannot be read, there are none.
-
-Complete = Callable[[typer.Context, str], list[str]]
-
-
-def complete_model(context: typer.Context, incomplete: str) -> list[str]:
-    """Return the models that a word may become, or the versions of one after its @."""
-    import fleet_slip  # noqa: PLC0415 - completion of other words need not wait for it
-    from fleet_slip.models.registry import Registry  # noqa: PLC0415
-
-    options = context.find_root().params
-    try:
-        registry = Registry(fleet_slip.open(options.get("root")).root / "models")
-        name, at, _ = incomplete.partition("@")
-        if at and name in registry.names():
-            versions = [str(number) for number in reversed(registry.versions(name))]
-            found = [f"{name}@{one}" for one in (*registry.history(name).aliases(), *versions)]
-        else:
-            found = registry.names()
-    except (FleetSlipError, OSError):
-        return []
-    return [one for one in found if one.startswith(incomplete)]
-
-
-def complete_names(names: Callable[[], Sequence[str]]) -> Complete:
-    """Return what completes names of configs."""
-
-    def complete(context: typer.Context, incomplete: str) -> list[str]:
-        own = context.find_root().params.get("config")
-        if own is not None:
-            os.environ[CONFIG_VARIABLE] = str(Path(own).absolute())
-        try:
-            return [name for name in names() if name.startswith(incomplete)]
-        except (FleetSlipError, OSError):
-            return []
-
-    return complete
-
-
-def complete_config(kind: str) -> Complete:
-    """Return what completes the names of the configs of one kind, such as `campaigns`."""
-    return complete_names(lambda: config_names(kind))
-
-
-def _feature_sets() -> list[str]:
-    from fleet_slip.catalogue.features import PLAIN, features  # noqa: PLC0415 - others need none
-
-    return [PLAIN, *features().sets]
-
 
 DETAILS: dict[str, dict[str, Any]] = {
     "bootstrap": {"min": 100},
-    "campaign": {"autocompletion": complete_config("campaigns")},
     "days": {"min": 1},
-    "features": {"autocompletion": complete_names(_feature_sets)},
     "folds": {"metavar": "NUMBER|each"},
-    "mapping": {"autocompletion": complete_config("mappings")},
     "max_age_hours": {"min": 0},
-    "models": {"autocompletion": complete_config("models")},
     "most": {"min": 1, "max": 200},
     "repeat": {"min": 2},
     "retention_hours": {"min": 1, "max": 168},
-    "scenarios": {"autocompletion": complete_config("scenarios")},
     "target_rows": {"min": 1},
-    "vehicle": {"autocompletion": complete_config("vehicles")},
-    "what": {"metavar": "SCENARIO|DRIVE", "autocompletion": complete_config("scenarios")},
+    "what": {"metavar": "SCENARIO|DRIVE"},
 }
 """What options need on the command line beside what is said of them in the API."""
 
 NAMES = {"condition": "--cohort", "everything": "--all"}
 """Parameters that every command calls otherwise than the API."""
-
-MODELS = ("model", "reference", "name")
-"""Parameters that are completed by published models where they are arguments."""
 
 READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "bias": (list[str] | None, lambda values: quantities(values, "--bias")),
@@ -242,8 +178,6 @@ def _parameter(one: inspect.Parameter, argument: bool, name: str | None) -> insp
     if one.default is None or one.default is inspect.Parameter.empty:
         details["show_default"] = False
     if argument:
-        if one.name in MODELS:
-            details["autocompletion"] = complete_model
         if one.name == "model":
             details["metavar"] = "MODEL"
         said: Any = typer.Argument(**details)

@@ -1,7 +1,7 @@
 """What a night came to: `Fleet.nightly` returns it, and the next night knows it."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
@@ -11,9 +11,6 @@ from pydantic import PlainSerializer, TypeAdapter
 
 from fleet_slip.base import Record, number_of
 from fleet_slip.errors import AlarmError, FleetSlipError, printable
-from fleet_slip.operations.monitor import Chart, control_chart
-from fleet_slip.pages.drawing import Picture, draw
-from fleet_slip.pages.page import Cell, Mark, ReportTable, Tile, count, fill_in, table
 from fleet_slip.rendering import Answer, Part
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
@@ -21,6 +18,7 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.condition import hash_drive
 
 if TYPE_CHECKING:
+    from fleet_slip.operations.monitor import Chart
     from fleet_slip.operations.quality import SensorFault
 
 NIGHTS_FOLDER = "nights"
@@ -134,7 +132,6 @@ class NightReport(Answer):
             summary names them.
         chart: the errors of the champion of before on the days since it was trained, if there are
             enough days to tell what is usual.
-        past: the nights before, the newest first.
     """
 
     model: str
@@ -149,7 +146,6 @@ class NightReport(Answer):
     candidate: str | None
     faults: "tuple[SensorFault, ...]"
     chart: "Chart | None"
-    past: Sequence[PastNight]
     seconds: float
 
     @property
@@ -256,90 +252,13 @@ class NightReport(Answer):
         }
 
 
-# The summary of a night as files: text, JSON, and one static page.
-
-MARKS: dict[str, Mark] = {"done": "good", "attention": "miss", "failed": "miss", "left out": ""}
-
-
 def write_summary(report: NightReport, folder: Path) -> list[Path]:
-    """Write NIGHT.txt, .json and .html, each as a whole; return them. Raises `StorageError`."""
+    """Write NIGHT.txt and .json, each as a whole; return them. Raises `StorageError`."""
     files = {
         f"{report.night}.txt": f"{report}\n",
         f"{report.night}.json": json.dumps(report.as_dict(), indent=2, default=str) + "\n",
-        f"{report.night}.html": render_night(report),
     }
     place = LocalFolder(folder)
     for name, text in files.items():
         place.put(name, text.encode("utf-8", "backslashreplace"))
     return [folder / name for name in files]
-
-
-def render_night(report: NightReport) -> str:
-    """Return the page of a night."""
-    drawn = None if report.chart is None else draw(_picture(report.chart))
-    return fill_in(
-        "night.html.j2",
-        night=report,
-        tiles=_tiles(report),
-        steps=_steps(report),
-        faults=_faults(report),
-        drawn=drawn,
-        past=_past(report),
-    )
-
-
-def _tiles(report: NightReport) -> list[Tile]:
-    was = f", was {report.before.champion}" if report.moved else ""
-    tiles = [
-        Tile(f"{report.exit_code}", "exit code"),
-        Tile(f"{report.drives:,}", f"drives, {count(report.rows)} rows"),
-        Tile(report.champion or "none", f"champion{was}"),
-        Tile(f"{len(report.new_faults)}", f"newly faulty drives, {len(report.faults)} in all"),
-    ]
-    if report.candidate not in (None, report.champion):
-        tiles.append(Tile(report.candidate or "", "candidate, waits for fleet-slip promote"))
-    return tiles
-
-
-def _steps(report: NightReport) -> ReportTable:
-    rows: list[list[str | Cell]] = [
-        [one.name, Cell(one.state, MARKS[one.state]), one.told, f"{one.seconds:.1f}"]
-        for one in report.steps
-    ]
-    head = ["step", "state", "what came of it", "seconds"]
-    return table("night-steps", "What was done", head, rows, left=3)
-
-
-def _faults(report: NightReport) -> ReportTable | None:
-    if not report.new_faults:
-        return None
-    rows: list[list[str | Cell]] = [
-        [one.drive_id, one.vehicle_id, fault.kind, " ".join(fault.signals), fault.figure]
-        for one, fault in ((one, one.fault) for one in report.new_faults)
-    ]
-    head = ["drive", "car", "fault", "signals", "what shows it"]
-    return table("night-faults", "Sensors not in order since this night", head, rows, left=5)
-
-
-def _past(report: NightReport) -> ReportTable | None:
-    if not report.past:
-        return None
-    rows: list[list[str | Cell]] = []
-    for one, earlier in zip(report.past, [*report.past[1:], None], strict=True):
-        found = [f"{name} {state}" for name, state in one.steps.items() if MARKS[state] == "miss"]
-        more = "" if earlier is None else f"{one.drives - earlier.drives:+,}"
-        outcome = Cell("; ".join(found) or "all went well", "miss" if found else "good")
-        rows.append([str(one.night), outcome, str(one.exit_code), more, one.champion or "none"])
-    head = ["night", "how it went", "exit code", "drives", "champion"]
-    return table("nights", f"The last {number_of(len(rows), 'night')}", head, rows, left=2)
-
-
-def _picture(chart: Chart) -> Picture:
-    new = [day for day in chart.days if not day.training]
-    caption = (
-        f"Mean and standard deviation of the error on {number_of(len(chart.days), 'day')}, "
-        f"{len(new)} of them new; dashed: the limits that the training days set. "
-        f"Beyond a limit: {number_of(len(chart.alarms), 'day')}."
-    )
-    title, shown = f"{chart.model}: error on each day", "Points over the days, beside their limits."
-    return Picture("control-chart", title, caption, shown, lambda size: control_chart(chart, size))

@@ -5,7 +5,6 @@ import re
 import shutil
 import subprocess
 from dataclasses import dataclass
-from datetime import date
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -18,9 +17,7 @@ from pypdfium2 import PdfDocument
 
 import fleet_slip
 from fleet_slip.evaluation.watch import drive_frames, render_watch
-from fleet_slip.operations.night import render_night
 from fleet_slip.pages.drawing import PALETTE
-from tests.support.landing import Landing
 from tests.support.reported import Reported
 
 CHROMIUM = (
@@ -45,20 +42,12 @@ pytestmark = pytest.mark.tools("chromium")
 def pages(
     reported: Reported, smoke_root: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Path]:
-    """The report, the summary of a night, and a drive that plays."""
-    folder = tmp_path_factory.mktemp("pages")
-    landing = Landing(folder / "landing", smoke_root)
-    landing.prepare()
-    landing.land("first", landing.drives()[:4], date(2026, 10, 5), yaw_rate_rad_s="0.01")
-    night = fleet_slip.open(folder / "data").nightly(
-        landing.folder, str(landing.mapping), "fleet", models="table1"
-    )
+    """The report, and a drive that plays."""
     fleet = fleet_slip.open(smoke_root)
     frames = drive_frames(fleet.warehouse, "smoke-2024-05-01-0000", fleet.model("smoke"))
-    made = {"night": render_night(night), "watch": render_watch(frames)}
-    for name, text in made.items():
-        (folder / f"{name}.html").write_text(text, encoding="utf-8")
-    return {"report": reported.page, **{name: folder / f"{name}.html" for name in made}}
+    file = tmp_path_factory.mktemp("pages") / "watch.html"
+    file.write_text(render_watch(frames), encoding="utf-8")
+    return {"report": reported.page, "watch": file}
 
 
 def browse(page: Path, folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
@@ -85,7 +74,7 @@ def asked(page: Path, folder: Path, script: str, *flags: str) -> Any:
 
 @pytest.mark.tools("axe.min.js")
 @pytest.mark.parametrize("flags", [("--window-size=1200,1000",), ("--window-size=500,900", DARK)])
-@pytest.mark.parametrize("name", ["report", "night", "watch"])
+@pytest.mark.parametrize("name", ["report", "watch"])
 def test_axe_has_no_complaint(
     pages: dict[str, Path], name: str, flags: tuple[str, ...], tmp_path: Path
 ) -> None:
@@ -101,7 +90,7 @@ def test_axe_has_no_complaint(
     assert found["passed"] > 20
 
 
-@pytest.mark.parametrize("name", ["report", "night", "watch"])
+@pytest.mark.parametrize("name", ["report", "watch"])
 def test_a_narrow_screen_need_not_be_scrolled_across(
     pages: dict[str, Path], name: str, tmp_path: Path
 ) -> None:
@@ -119,7 +108,7 @@ def test_a_narrow_screen_need_not_be_scrolled_across(
     assert wide <= seen
 
 
-@pytest.mark.parametrize("name", ["report", "night"])
+@pytest.mark.parametrize("name", ["report"])
 def test_paper_has_no_half_empty_pages(pages: dict[str, Path], name: str, tmp_path: Path) -> None:
     file = tmp_path / "page.pdf"
     browse(pages[name], tmp_path, "--no-pdf-header-footer", f"--print-to-pdf={file}")
