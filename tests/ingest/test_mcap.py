@@ -223,17 +223,8 @@ def write_mixed(file: Path, notes: list[str]) -> list[dict[str, Any]]:
     return said
 
 
-@pytest.mark.parametrize(
-    "notes",
-    [
-        pytest.param(["same"] * 400, id="all alike"),
-        pytest.param([f"{i:04}" for i in range(400)], id="texts of one length"),
-        pytest.param(["x" * (i % 7) for i in range(400)], id="texts of other lengths"),
-        pytest.param(["a"] * 200 + ["longer"] * 200, id="alike for a while"),
-    ],
-)
-def test_what_is_decoded_at_once_is_what_the_decoder_says(tmp_path: Path, notes: list[str]) -> None:
-    said = write_mixed(tmp_path / "log.mcap", notes)
+def test_all_kinds_of_numbers_are_read(tmp_path: Path) -> None:
+    said = write_mixed(tmp_path / "log.mcap", ["x" * (i % 7) for i in range(400)])
     names = ["small", "wide", "single", "large"]
     with mcap_log.open_mcap(Budget.of(tmp_path / "log.mcap")) as source:
         columns = [*(f"/mixed.{name}" for name in names), "/mixed.more[2]"]
@@ -244,21 +235,3 @@ def test_what_is_decoded_at_once_is_what_the_decoder_says(tmp_path: Path, notes:
     stamps = [START_NS + i * 10**7 for i in range(400)]
     times = [float(at // 10**9) + float(at % 10**9) * 1e-9 for at in stamps]
     assert rows[OWN_TIME].to_list() == times
-
-
-def test_alike_messages_are_not_decoded_one_by_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_mixed(tmp_path / "log.mcap", ["same"] * 400)
-    looked = []
-
-    def look(_message: Any, published_ns: int) -> float:
-        looked.append(published_ns)
-        return published_ns * 1e-9
-
-    monkeypatch.setattr(mcap_log, "stamp_s", look)
-    with mcap_log.open_mcap(Budget.of(tmp_path / "log.mcap")) as source:
-        source.bases(["/mixed.large", "/mixed.more[0]"])
-        assert not looked
-        source.bases(["/mixed.on"])
-    assert len(looked) == 400, "a truth is no number with a place of its own"
