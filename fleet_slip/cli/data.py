@@ -231,8 +231,8 @@ def mapping(
 ) -> None:
     """List what is in a measured log, and draft a mapping for it.
 
-    Channels are guessed by name, unit and values; signs, and which wheel is which, by how the car
-    moves. Each guess has its reason as a comment, for a person to check.
+    Channels are guessed by name, unit and values. Each guess has its reason as a comment, for a
+    person to check; signs, and which wheel is which, a dry run of the ingest shows.
 
     Example: **fleet-slip mapping suggest drive.mf4**
     """

@@ -1,8 +1,8 @@
-"""Drafts a mapping for a file: guesses by name, unit and values, corrected by how the car moves.
+"""Drafts a mapping for a file: guesses by name, unit and values, each with its reasons.
 
-The draft is read as any mapping is, and what looks wrong in the drives that come out is put right
-where there is one way to do so: a sign, or left for right. The rest is left to a person, who also
-chooses a unit where the file has none and several are possible: without it the draft does not load.
+What is doubtful stays a question, as a comment. A unit that the file does not say is chosen by a
+person where several are possible: until then the draft does not load. Signs, and which wheel is
+which, a dry run of the ingest shows.
 """
 
 import json
@@ -10,15 +10,13 @@ import re
 import shlex
 import textwrap
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from datetime import date
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from fleet_slip.base import shown
-from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import FleetSlipError, InputError
+from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import CHOOSE, COURSE, SPEED, TimeBase
 from fleet_slip.ingest.guess import (
     Guess,
@@ -28,13 +26,9 @@ from fleet_slip.ingest.guess import (
     guess_time,
     headings,
 )
-from fleet_slip.ingest.load import preview_log, signals_of
-from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.profile import FileProfile
-from fleet_slip.ingest.suspicion import Signals, find_suspicions
 
 _MOST_REFUSED = 20
-_STAND_IN: dict[str, Any] = {"vehicle_id": "car", "vehicle_model": "car", "day": date(2000, 1, 1)}
 
 
 @dataclass(frozen=True)
@@ -51,7 +45,7 @@ class Draft:
     drive: dict[str, dict[str, str]]
     """The columns that identify cars and trips, by key of `[drive]`."""
     open_questions: tuple[str, ...]
-    """What looks wrong in what it makes of the file, or why it makes nothing."""
+    """What only a person knows, and what of the file was not read."""
 
 
 def draft_mapping(file: Path, profile: FileProfile) -> Draft:
@@ -67,56 +61,22 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     bases = [guess.profile.channel.base for guess in guesses.values()]
     time = guess_time(profile, {guess.column for guess in guesses.values()}, bases, group)
 
-    def drive_of(guesses: dict[str, Guess]) -> Signals:
-        """Return the signals of the longest drive, of all guesses that the catalogue can hold."""
-        usable = {name: guess for name, guess in guesses.items() if not guess.doubts}
-        if COURSE in usable and not {SPEED, "yaw_rate"} <= set(usable):
-            usable.pop(COURSE)
-        if not usable:
-            return {}
-        _, drive = preview_log(file, as_mapping(profile, time, usable, drive_keys))
-        return signals_of(drive) if drive is not None else {}
-
-    failures: list[str] = []
-    suspicions: list[Fault] = []
-    try:
-        guesses = _correct(guesses, find_suspicions(drive_of(guesses)))
-        suspicions = find_suspicions(drive_of(guesses))
-        if any(guess.readings for guess in guesses.values()):  # then sizes show nothing
-            suspicions = [one for one in suspicions if one.kind not in {"scaled", "biased"}]
-    except FleetSlipError as error:
-        failures = [str(error)]
-    guesses = _doubted(guesses, suspicions)
+    guesses = {name: _doubted(guess, guesses) for name, guess in guesses.items()}
     asked_for = {name for name, guess in guesses.items() if guess.doubts or guess.rivals}
     if COURSE in guesses and asked_for & {COURSE, SPEED, "yaw_rate"}:
         asked_for |= {COURSE, SPEED}  # which stand together
     sure = {name: guess for name, guess in guesses.items() if name not in asked_for}
     left = {name: guess for name, guess in guesses.items() if name in asked_for}
-    notes = (*failures, *map(str, suspicions), *_notes(profile, guesses), *_refused(profile))
+    notes = (*_notes(profile, guesses), *_refused(profile))
     return Draft(file, profile, time, sure, left, drive_keys, notes)
 
 
-def _doubted(guesses: dict[str, Guess], suspicions: list[Fault]) -> dict[str, Guess]:
-    """Return the guesses with what the car's motion has against them.
-
-    Of several signals that contradict one another, those are doubted of which the file does not
-    say the unit, if there are some. A weak name without a unit needs something that agrees.
-    """
-    found = dict(guesses)
-    for one in suspicions:
-        if one.kind == "absent":
-            continue
-        concerned = [name for name in one.signals if name in found]
-        if one.kind == "stuck":  # a gear, a pedal and a brake may well be
-            concerned = [n for n in concerned if catalogue()[n].unit not in {"1", "Pa"}]
-        weak = [n for n in concerned if found[n].is_without_unit or found[n].is_weak]
-        for name in weak or concerned:
-            found[name] = found[name].doubted(one.figure)
-    agreeing = {"yaw_rate", "ay", "steering_wheel"} & set(guesses)
-    for name, guess in guesses.items():
-        if guess.is_weak and guess.is_without_unit and len(agreeing - {name}) < 1:
-            found[name] = found[name].doubted("its name may mean something else, and so its unit")
-    return found
+def _doubted(guess: Guess, guesses: dict[str, Guess]) -> Guess:
+    """Return a guess, doubted if a weak name without a unit has nothing beside it that agrees."""
+    agreeing = {"yaw_rate", "ay", "steering_wheel"} & set(guesses) - {guess.signal}
+    if guess.is_weak and guess.is_without_unit and not agreeing:
+        return guess.doubted("its name may mean something else, and so its unit")
+    return guess
 
 
 def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
@@ -150,26 +110,6 @@ def _refused(profile: FileProfile) -> Iterator[str]:
         yield f"not read: {more:,} channels more."
 
 
-def as_mapping(
-    profile: FileProfile,
-    time: TimeGuess,
-    guesses: dict[str, Guess],
-    drive_keys: dict[str, dict[str, str]],
-) -> Mapping:
-    """Return a mapping of the guesses, with stand-ins for what nobody said of the drive."""
-    signals = {name: signal_keys(guess) for name, guess in guesses.items()}
-    if COURSE in signals:
-        signals[COURSE] |= {"antenna_x_m": 0.0, "antenna_y_m": 0.0}
-    formats = profile.formats
-    given: dict[str, Any] = {"csv": formats.csv, "can": formats.can}
-    drive = {
-        **_STAND_IN,
-        **{key: source.get("drive", source) for key, source in drive_keys.items()},
-    }
-    given |= {"missing": profile.missing, "drive": drive}
-    return Mapping.model_validate({"name": "draft", "time": time.keys, "signals": signals, **given})
-
-
 def signal_keys(guess: Guess) -> dict[str, Any]:
     """Return the keys of a signal in a mapping, those that are not usual."""
     keys = {"column": guess.column, **guess.keys}
@@ -177,24 +117,6 @@ def signal_keys(guess: Guess) -> dict[str, Any]:
     if rate_hz is not None and rate_hz < 20 and guess.signal not in {COURSE, SPEED}:
         keys["longest_gap_s"] = round(2 / rate_hz, 2)
     return keys
-
-
-def _correct(guesses: dict[str, Guess], suspicions: list[Fault]) -> dict[str, Guess]:
-    """Return the guesses with signs turned and pairs swapped, each with its figure."""
-    corrected = dict(guesses)
-    for one in suspicions:
-        if one.kind == "reversed":
-            (name,) = one.signals
-            if name in corrected and name != COURSE:  # which a person turns
-                turned = None if corrected[name].keys.get("negate") else True
-                corrected[name] = corrected[name].because(one.figure, negate=turned)
-        elif one.kind == "swapped" and len(one.signals) == 2 and {*one.signals} <= {*corrected}:
-            left, right = one.signals
-            corrected[left], corrected[right] = (
-                replace(corrected[right].because(one.figure), signal=left),
-                replace(corrected[left].because(one.figure), signal=right),
-            )
-    return corrected
 
 
 # Writes a draft of a mapping as TOML, each guess with its reasons as a comment.

@@ -7,7 +7,7 @@ with the figure that shows it, and what to try. Axes and signs are ISO 8855.
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -179,7 +179,7 @@ LONGEST_M, LARGE_RAD = 8.0, 0.15
 LARGEST_COLLINEAR = 0.995
 LEAST_LEVER_M, LONGEST_LEVER_M, LONGEST_PART = 0.6, 2.6, 0.75
 """The rear axle is so far behind the centre of gravity, and by this part of the wheelbase."""
-USUAL_WHEELBASE_M, STEERING_RATIO = 2.7, 15.0
+STEERING_RATIO = 15.0
 WHEELBASE_M = (2.0, 4.5)
 """Beyond, it is the road wheels that are in doubt."""
 LARGEST_ZERO_RAD = math.radians(0.7)
@@ -187,7 +187,7 @@ LARGEST_ZERO_RAD = math.radians(0.7)
 SLOW_MPS, SURE_EXPLAINED = 20.0, 0.85
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 ROAD_WHEELS = ("steer_fl", "steer")
-LEAST_CORRELATION, SURE_CORRELATION = 0.6, 0.9
+LEAST_CORRELATION = 0.6
 _SOUND_RATIOS = {
     **dict.fromkeys((*WHEELS, "vx", "vehicle_speed"), (0.7, 1.4)),
     SPEED: SOUND,
@@ -266,84 +266,54 @@ def _turning(signals: Signals, speed: FloatArray | None) -> Iterator[Fault]:
         yield from axes_swapped(moments).values()
 
 
-@dataclass(frozen=True)
-class SignalRelation:
-    """A quantity of a drive that should be another one.
-
-    Attributes:
-        powers: of signals in the first over the second; `of_speed` is that of the car's speed.
-        expected: what the second is called; nothing for one that is roughly known.
-        ratio: the first over the second.
-        correlation: of the two.
-    """
-
-    powers: Mapping[str, int]
-    of_speed: int
-    expected: str
-    ratio: float
-    correlation: float
+Comparison: TypeAlias = tuple[tuple[str, ...], str, float, float]
+"""Signals; what the first should be; its ratio to that, and its correlation with it."""
 
 
-def relations(signals: Signals, speed: FloatArray) -> Iterator[SignalRelation]:
+def _compared(signals: Signals, speed: FloatArray) -> Iterator[Comparison]:
     """Yield what the signals of a moving car have to do with one another."""
     rows = moving(speed)
-
-    def relate_to(
-        expected: FloatArray, values: FloatArray, powers: dict[str, int], of_speed: int, name: str
-    ) -> SignalRelation:
-        return SignalRelation(powers, of_speed, name, *slope_of(values, expected, rows))
-
     for name in (*WHEELS, "vx", "vehicle_speed", SPEED):
         if name in signals:
             own = signals[name] * (RADIUS_M if name in WHEELS else 1.0)
             both = rows & np.isfinite(own) & np.isfinite(speed)
             if both.sum() >= FEWEST_TICKS:
                 ratio = float(np.median(own[both] / speed[both]))
-                yield SignalRelation({name: 1}, -1, "the speed of the wheels", ratio, 1.0)
+                yield (name,), "the speed of the wheels", ratio, 1.0
     yaw_rate, ay = signals.get("yaw_rate"), signals.get("ay")
     if yaw_rate is not None and {"wheel_rl", "wheel_rr"} <= set(signals):
         turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M
-        yield relate_to(turn, yaw_rate, {"yaw_rate": 1}, -1, "the yaw rate of the rear wheels")
+        named = "the yaw rate of the rear wheels"
+        yield ("yaw_rate",), named, *slope_of(yaw_rate, turn, rows)
     if yaw_rate is not None and ay is not None:
-        powers = {"ay": 1, "yaw_rate": -1}
-        yield relate_to(yaw_rate * speed, ay, powers, -1, "yaw rate times speed")
+        yield ("ay", "yaw_rate"), "yaw rate times speed", *slope_of(ay, yaw_rate * speed, rows)
     if "ax" in signals and speed.size >= 4 * FEWEST_TICKS:
         change = np.full(speed.size, np.nan)
         change[SECOND // 2 : -SECOND // 2] = speed[SECOND:] - speed[:-SECOND]
         smooth = np.convolve(np.nan_to_num(signals["ax"]), np.ones(SECOND) / SECOND, "same")
-        yield relate_to(change, smooth, {"ax": 1}, -1, "the change of speed")
+        yield ("ax",), "the change of speed", *slope_of(smooth, change, rows)
     wheel = signals.get("steering_wheel")
     angle = next((name for name in ROAD_WHEELS if name in signals), None)
     if wheel is not None and angle is not None:
-        powers = {"steering_wheel": 1, angle: -1}
-        yield relate_to(STEERING_RATIO * signals[angle], wheel, powers, 0, "15 times the other")
-    turning = "ay" if yaw_rate is None else "yaw_rate"
-    for name in ("steering_wheel", *ROAD_WHEELS) if turning in signals else ():
-        if name in signals:
-            of_speed = 1 if turning == "yaw_rate" else 2
-            with np.errstate(divide="ignore", invalid="ignore"):
-                bend = USUAL_WHEELBASE_M * signals[turning] / speed**of_speed
-            bend *= STEERING_RATIO if name == "steering_wheel" else 1.0
-            yield relate_to(bend, signals[name], {name: 1, turning: -1}, of_speed, "")
+        expected = STEERING_RATIO * signals[angle]
+        yield ("steering_wheel", angle), "15 times the other", *slope_of(wheel, expected, rows)
 
 
 def _scales_differ(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
     """Compare the size of signals with that of others of the same; and the sign of `ax`."""
-    for one in relations(signals, speed):
-        names = tuple(one.powers)
+    for names, expected, slope, correlation in _compared(signals, speed):
         low, high = _SOUND_RATIOS.get(names[0], (0.4, 2.5))
-        if names == ("ax",) and one.correlation < -LEAST_CORRELATION:
-            figure = f"its correlation with the change of speed is {one.correlation:+.2f}"
+        if names == ("ax",) and correlation < -LEAST_CORRELATION:
+            figure = f"its correlation with the change of speed is {correlation:+.2f}"
             yield Fault("reversed", names, figure, "Write negate = true.")
             continue
-        ratio = one.ratio if one.correlation > 0 else -one.ratio
-        too_weak = abs(one.correlation) <= LEAST_CORRELATION or not one.expected
-        if too_weak or ratio <= 0 or low <= ratio <= high:
+        ratio = slope if correlation > 0 else -slope
+        if abs(correlation) <= LEAST_CORRELATION or ratio <= 0 or low <= ratio <= high:
             continue
         large = max(ratio, 1 / ratio)
         factor = min(_FACTORS, key=lambda f: abs(np.log(f / large)))
         near = f" ({factor:g} is between {_FACTORS[factor]})" if 0.6 < factor / large < 1.7 else ""
-        figure = f"it is {ratio:.3g} times {one.expected}{near}"
+        figure = f"it is {ratio:.3g} times {expected}{near}"
         yield Fault("scaled", names, figure, "Check the units.")
 
 

@@ -159,7 +159,7 @@ class Suggested:
 
     Attributes:
         names: column of each signal.
-        factors: value in the file of one SI unit; negative where the axis is the other way round.
+        factors: value in the file of one SI unit;.
         least_mps: the car's least speed.
         formats: what is known of the file beside it.
     """
@@ -172,16 +172,11 @@ class Suggested:
     formats: FileFormats = field(default_factory=FileFormats)
 
 
-_SWAPPED = {**ENGLISH, "wheel_rl": "VelRR", "wheel_rr": "VelRL"}
-_RIGHT = {**DEGREES, **KMH, "ay": -1.0}
 LOGS: dict[str, Suggested] = {
     "CSV, names of a race team, km/h and degrees": Suggested(
         ".csv", _csv(ENGLISH, {**DEGREES, **KMH}), ENGLISH, {**DEGREES, **KMH}
     ),
     "CSV, German names, decimal commas": Suggested(".csv", _german_csv, GERMAN, {**DEGREES, **KMH}),
-    "CSV, y to the right, rear wheels swapped": Suggested(
-        ".csv", _csv(_SWAPPED, _RIGHT), _SWAPPED, _RIGHT
-    ),
     "Parquet, SI": Suggested(".parquet", _parquet, ENGLISH, {}, 2.5),
     "MDF 4, g and degrees, a label of 10 Hz": Suggested(
         ".mf4", _mdf, ENGLISH, {"ax": 1 / G_MPS2, "ay": 1 / G_MPS2, **DEGREES}
