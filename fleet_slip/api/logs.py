@@ -21,7 +21,7 @@ from fleet_slip.api.calls import (
     unless_local,
     within_reach,
 )
-from fleet_slip.base import Progress, last_day, no_progress
+from fleet_slip.base import last_day
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import InputError
 from fleet_slip.storage.runs import step
@@ -91,7 +91,7 @@ class LogsAndGrams(Rooted):
         the view `quarantine`. Of folders, at any depth, and patterns, the logs are taken that have
         not landed unchanged. Objects are given as URLs.
         Returns a report of each file read, in order; `each` gets it once the file is committed.
-        Progress is in files for folders and patterns, else in bytes.
+        Progress is in files.
         Without a cluster, threads read a folder's small files; large ones are read one by one, by
         all cores.
 
@@ -117,10 +117,8 @@ class LogsAndGrams(Rooted):
                 logs = [one.absolute() if isinstance(one, Path) else one for one in logs]
             figures.rows = 0
             warehouse = within_reach(self.warehouse, executor)
-            by_file = folders and not as_one
-            threads = executor if by_file else elsewhere
+            threads = executor if folders and not as_one else elsewhere
             out = partial(take_out, self.warehouse)
-            read = no_progress if by_file or progress is None else _bytes_of(logs, count)
             remembers = folders or replace == "corrected"
             known = KnownFiles.of(self.warehouse, plan) if remembers else None
             wanted = logs
@@ -130,14 +128,13 @@ class LogsAndGrams(Rooted):
                 count(landed, len(logs))
             try:
                 for report in ingest_files(
-                    warehouse, wanted, plan, threads, known, read, replace, out, failures
+                    warehouse, wanted, plan, threads, known, replace, out, failures
                 ):
                     reports.append(report)
                     figures.rows += report.counts.ticks if report.new else 0
                     if each is not None:
                         each(report)
-                    if by_file:
-                        count(1, len(logs))
+                    count(1, len(logs))
             finally:
                 if known is not None:
                     known.save()
@@ -270,20 +267,3 @@ def _chosen_logs(
     given = [files] if isinstance(files, Path | str) else list(files)
     logs = find_whole_logs(given) if as_one else find_logs(given)
     return plan, logs, any(map(names_several, given))
-
-
-def _bytes_of(logs: "Iterable[Log]", told: Progress) -> Progress:
-    """Return what counts the bytes read of each log among those that all have."""
-    from fleet_slip.ingest.log_files import size_of
-
-    total = sum(map(size_of, logs))
-    left = total
-
-    def count(more: int, _of_one: int) -> None:
-        nonlocal left
-        more = min(more, left)  # a batch is written again at a conflict
-        left -= more
-        if total:
-            told(more, total)
-
-    return count

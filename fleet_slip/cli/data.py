@@ -135,7 +135,7 @@ def ingest(
                     seen.add((one.kind, one.signals))
                     say(f"{report.file}: looks wrong: {one}", logging.WARNING)
 
-        with progress(*(("ingest", "files") if folders else ("read", "bytes"))) as show:
+        with progress("ingest", "files") as show:
             reports = fleet.ingest(
                 files,
                 mapping,

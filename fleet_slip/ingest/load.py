@@ -19,7 +19,7 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.base import Progress, Record, no_progress, number_of
+from fleet_slip.base import Record, number_of
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import as_arrow, catalogue
 from fleet_slip.compute.tasks import run_tasks
@@ -186,7 +186,6 @@ def ingest_files(
     mapping: Mapping,
     executor: Executor | None = None,
     known: KnownFiles | None = None,
-    progress: Progress = no_progress,
     replace: Replace = "no",
     take_out: TakeOut | None = None,
     failures: list[InputError] | None = None,
@@ -195,16 +194,13 @@ def ingest_files(
 
     An executor's workers read batches in any order, but its threads none of large files, each of
     which keeps all cores busy. `known` remembers what is in. A recording that is there is refused,
-    unless it is to be replaced: then `take_out` takes it out in the same commit. `progress` counts
-    bytes of each file that this process reads.
+    unless it is to be replaced: then `take_out` takes it out in the same commit.
 
     Errors of files come at the end: `failures` takes them, or `InputError` names all, or
     `RepeatedError` where all are there already. Raises `ClusterError` for files that workers died
     of.
     """
     write = partial(write_batch, warehouse, mapping, replace=replace)
-    if executor is None:
-        write = partial(write, progress=progress)
     warehouse.logs.require_writable(mapping.signal_names)
     failed: list[InputError] = []
     asked = (AskedFile(file, known.digest_of(file) if known else None) for file in files)
@@ -299,12 +295,11 @@ def write_batch(
     warehouse: Warehouse,
     mapping: Mapping,
     files: Batch,
-    progress: Progress = no_progress,
     replace: Replace = "no",
 ) -> WrittenBatch:
     """Read files, and write their rows together: one data file a day. Nothing is committed.
 
-    A file that cannot be used is a failure of its own. `progress` counts bytes of each file.
+    A file that cannot be used is a failure of its own.
     """
     failures: list[InputError] = []
     copies = local_copies(asked.file for asked in files)
@@ -314,7 +309,7 @@ def write_batch(
             try:
                 with (
                     open_copy(asked.file) as file,
-                    open_measured(file, mapping, progress) as stream,
+                    open_measured(file, mapping) as stream,
                 ):
                     one = batch.write(stream, asked)
             except BaseException as error:

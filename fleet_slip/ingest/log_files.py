@@ -127,16 +127,6 @@ def parts_of(log: Path) -> list[Path]:
     return files
 
 
-def size_of(log: Log) -> int:
-    """Return the bytes of a log, for its progress; 0 where only reading it would show it."""
-    if isinstance(log, StoredFile):
-        return log.size_bytes
-    try:
-        return sum(part.stat().st_size for part in parts_of(log))
-    except (InputError, OSError):  # who reads it raises
-        return 0
-
-
 def require_inside(file: Path) -> None:
     """Raise `InputError` for a link that leads out of the folder in which it was found."""
     if isinstance(file, StrayLink):

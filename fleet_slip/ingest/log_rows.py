@@ -27,7 +27,7 @@ from fleet_slip.ingest.columns import (
     describe,
 )
 from fleet_slip.ingest.formats.csv import CUT, EXTRA_FIELDS
-from fleet_slip.ingest.formats.source import BASE, Meter
+from fleet_slip.ingest.formats.source import BASE
 from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
 from fleet_slip.ingest.time_bases import DISORDER, HELD, ROW, read_batches
 
@@ -374,15 +374,15 @@ class RowChecker:
         keys: what the numbers in the column `group` stand for.
     """
 
-    def __init__(self, file: Path, mapping: Mapping, meter: Meter) -> None:
+    def __init__(self, file: Path, mapping: Mapping) -> None:
         """Take a file that is not open yet."""
-        self._file, self._mapping, self._meter = file, mapping, meter
+        self._file, self._mapping = file, mapping
         self.rows = self.left_out = 0
         self.keys = DriveKeys()
 
     def blocks(self) -> Iterator[CheckedBlock]:
         """Yield the rows of each batch. Raises `InputError`."""
-        for batch in read_batches(self._file, self._mapping, self._meter):
+        for batch in read_batches(self._file, self._mapping):
             yield self._check(batch)
         if not self.rows:
             raise InputError(f"{shown(self._file)}: it has a header and no rows. Export it again.")

@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from fleet_slip.base import Progress, canonical_ascii, no_progress, number_of, shown
+from fleet_slip.base import canonical_ascii, number_of, shown
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
@@ -30,10 +30,9 @@ from fleet_slip.ingest.drives import (
     to_ticks,
 )
 from fleet_slip.ingest.formats.reading import log_digest, require_unchanged_log
-from fleet_slip.ingest.formats.source import Meter
 from fleet_slip.ingest.formats.tables import partition_keys
 from fleet_slip.ingest.log_faults import LogFaults
-from fleet_slip.ingest.log_files import parts_of, size_of
+from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.log_rows import (
     CheckedBlock,
     RowChecker,
@@ -96,13 +95,11 @@ class MeasuredStream:
     `<mapping>-<digest>-<number>`, and `-2`, `-3` … follow where a gap in time cut one.
     """
 
-    def __init__(
-        self, file: Path, mapping: Mapping, digest: str, content: str, meter: Meter
-    ) -> None:
-        """Take the file, the mapping, the digest of both, that of the file alone, and a meter."""
+    def __init__(self, file: Path, mapping: Mapping, digest: str, content: str) -> None:
+        """Take the file, the mapping, the digest of both, and that of the file alone."""
         self.file, self.mapping, self.digest, self.content = file, mapping, digest, content
         self.prefix = f"{mapping.name}-{digest[:12]}"
-        self.checker, self._meter = RowChecker(file, mapping, meter), meter
+        self.checker = RowChecker(file, mapping)
         self.counts = IngestCounts()
         self.longest: MeasuredDrive | None = None
         self._refused = Counter[tuple[str, str]]()
@@ -122,11 +119,9 @@ class MeasuredStream:
             longest_s = LONGEST_DRIVE_S * min([1.0, *(s / STEP_S for s in intervals_s.values())])
             cutter = DriveCutter(self.mapping.time, longest_s)
             for block in chain(early, blocks):
-                self._meter.count(block.read)
                 yield self._piece(cutter, block, intervals_s)
             no_more = CheckedBlock(block.rows.clear(), no_rows(), block.read)
             yield self._piece(cutter, no_more, intervals_s, last=True)
-        self._meter.end()
         self.counts.quarantined = dict(sorted(self.counts.quarantined.items()))
         self._require_usable()
 
@@ -292,17 +287,11 @@ class MeasuredStream:
 
 
 @contextmanager
-def open_measured(
-    file: Path, mapping: Mapping, progress: Progress = no_progress
-) -> Iterator[MeasuredStream]:
-    """Open a measured file; progress is in its bytes.
-
-    Raises `InputError`, if it changes until the end too.
-    """
+def open_measured(file: Path, mapping: Mapping) -> Iterator[MeasuredStream]:
+    """Open a measured file. Raises `InputError`, if it changes until the end too."""
     mapping = mapping.for_file(file)
     with require_unchanged_log(file):
-        meter = Meter(size_of(file), progress)
-        yield MeasuredStream(file, mapping, *_identity(file, mapping), meter)
+        yield MeasuredStream(file, mapping, *_identity(file, mapping))
 
 
 def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:

@@ -18,7 +18,7 @@ import polars as pl
 from fleet_slip.base import shown
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.reading import file_errors, open_source
-from fleet_slip.ingest.formats.source import BASE, Base, Budget, Meter, Source
+from fleet_slip.ingest.formats.source import BASE, Base, Budget, Source
 from fleet_slip.ingest.formats.tables import BATCH_ROWS
 from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.mapping import Mapping
@@ -27,20 +27,16 @@ _CLOCK = "this file says when each sample was taken: write own_clock = true unde
 _NO_CLOCK = "this file has no clock of its own: write column or rate_hz under [time]"
 
 
-def read_batches(log: Path, mapping: Mapping, meter: Meter | None = None) -> Iterator[pl.DataFrame]:
+def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
     """Yield the columns of a log that a mapping uses, in its order, in bounded batches.
 
     Rows of several time bases come as `merge_bases` says; files of one log, in the order of their
-    names, have one. The meter gets how many rows come. Raises `InputError` if a file cannot be
+    names, have one. Raises `InputError` if a file cannot be
     read, or a column is missing or ambiguous.
     """
-    meter = meter or Meter()
     wanted, parts = mapping.time_bases(), parts_of(log)
     for part in parts:
         with _open_part(part, mapping) as source:
-            if meter.is_watched and part == parts[0]:
-                expected = sum(map(source.expected_rows, wanted.values()))
-                meter.expect(expected, of=part.stat().st_size)
             if len(wanted) == 1 and not mapping.time.own_clock:
                 yield from Budget.of(part).metered(source.batches(next(iter(wanted.values()))))
                 continue

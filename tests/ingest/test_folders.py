@@ -87,6 +87,13 @@ def test_the_logs_of_a_folder_land_together_and_once(folder: Path) -> None:
     assert len(drives(folder)) == 6
 
 
+def test_progress_is_in_files(folder: Path) -> None:
+    told: list[tuple[int, int]] = []
+    fleet = fleet_slip.open(folder.parent / "root")
+    fleet.ingest(folder, a_mapping(), progress=lambda done, total: told.append((done, total)))
+    assert told == [(number, 5) for number in range(1, 6)]
+
+
 def test_what_lands_does_not_depend_on_batches_or_order(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

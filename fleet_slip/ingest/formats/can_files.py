@@ -336,7 +336,7 @@ class CanSource(FormatSource):
         """Return how many frames of a message have one of the signals."""
         if any(signal.multiplexer_ids is None for signal in signals.values()):
             return self._frames[_key(self._messages[name])].sizes_on(self._bus.channel).total()
-        return sum(table.height for table in self.read(name, signals))
+        return super().count(name, signals)
 
     def read(self, name: str, signals: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield the signals of one message; rows are frames that have one of them."""

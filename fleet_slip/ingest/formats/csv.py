@@ -7,7 +7,7 @@ from functools import cached_property
 from io import BufferedReader, BytesIO
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Literal
+from typing import Annotated, BinaryIO, Literal
 
 import numpy as np
 import polars as pl
@@ -104,8 +104,6 @@ def first_lines(file: Path, csv_format: CsvFormat, most: int) -> list[str]:
 BLOCK_BYTES = 2**22
 """CSV is parsed in blocks of about this size."""
 
-_SAMPLE_BYTES = 2**18
-
 LINE_BLOCKS = 4
 """Blocks that one line may fill. Where it fills more, usually a quote was not closed."""
 
@@ -156,14 +154,6 @@ class CsvSource(FormatSource):
     def find(self, column: str) -> tuple[str, int]:
         """Return where a column stands. Raises `InputError`."""
         return "", find_column(self._file, self._names, column)
-
-    def count(self, _base: str, _found: dict[str, Any]) -> int:
-        """Return how many lines the file has, if those of its begin are like all others."""
-        with self._file.open("rb") as stream:
-            sample = stream.read(_SAMPLE_BYTES)
-        lines = sample.count(b"\n") - 1  # without the header
-        is_text = lines > 0 and b"\0" not in sample
-        return round(self._budget.size * lines / len(sample)) if is_text else 0
 
     def read(self, _base: str, found: dict[str, int]) -> Iterator[pl.DataFrame]:
         """Yield the columns as text or plain numbers, and `EXTRA_FIELDS`."""

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fleet_slip.base import Progress, needed, no_progress, shown
+from fleet_slip.base import needed, shown
 from fleet_slip.errors import InputError
 
 OWN_TIME = "\0time"
@@ -83,10 +83,6 @@ class Source(ABC):
         `OWN_TIME` with a clock. Raises `InputError`, for a missing or ambiguous column too.
         """
 
-    def expected_rows(self, columns: Sequence[str]) -> int:
-        """Return about how many rows `batches` yields; 0 where only reading them shows it."""
-        return sum(base.count_rows() for base in self.bases(columns))
-
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield the rows of each time base that has one of the columns, base by base."""
         for base in self.bases(columns):
@@ -100,9 +96,9 @@ class FormatSource(Source):
     def find(self, column: str) -> tuple[str, Any]:
         """Return the name of a column's time base, and its place there. Raises `InputError`."""
 
-    @abstractmethod
     def count(self, base: str, found: dict[str, Any]) -> int:
         """Return how many rows some columns of a base have, by their places."""
+        return sum(rows.height for rows in self.read(base, found))
 
     @abstractmethod
     def read(self, base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
@@ -198,33 +194,6 @@ def missing_column(file: object, column: str, names: Sequence[str]) -> InputErro
     there = ", ".join(repr(name[:80]) for name in names[:_SHOWN_COLUMNS])
     more = f" and {len(names) - _SHOWN_COLUMNS:,} more" if len(names) > _SHOWN_COLUMNS else ""
     return InputError(f"{shown(file)}: no column {column!r}.{hint} Its columns are {there}{more}.")
-
-
-class Meter:
-    """A share of a log's bytes: that of its rows which were read."""
-
-    def __init__(self, size: int = 0, progress: Progress = no_progress) -> None:
-        """Take the bytes of the log, and what to call with how many more of them are done."""
-        self._size, self._progress, self.is_watched = size, progress, progress is not no_progress
-        self._done = self._rows = 0
-
-    def expect(self, rows: int, of: int = 0) -> None:
-        """Take about how many rows come, or come of so many bytes; 0 where that is not known."""
-        self._rows = rows * self._size // of if of else rows
-
-    def count(self, rows: int) -> None:
-        """Report how many rows were read so far."""
-        if self._rows:
-            self._report(self._size * min(rows, self._rows) // self._rows)
-
-    def end(self) -> None:
-        """Report that all was read."""
-        self._report(self._size)
-
-    def _report(self, done: int) -> None:
-        if done > self._done:
-            self._progress(done - self._done, self._size)
-            self._done = done
 
 
 # A small file can stand for anything. What it may become while it is decoded follows from its size

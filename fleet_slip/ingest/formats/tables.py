@@ -43,7 +43,7 @@ class ParquetSource(FormatSource):
         self._file, self._stream = budget.file, stream
         parquet = pq.ParquetFile(stream)
         _require_within(budget, parquet.metadata)
-        self._schema, self._rows = parquet.schema_arrow, parquet.metadata.num_rows
+        self._schema = parquet.schema_arrow
         keys = partition_keys(budget.file).items()
         self._keys = {name: text for name, text in keys if name not in self._schema.names}
 
@@ -58,10 +58,6 @@ class ParquetSource(FormatSource):
         if column not in self._keys:  # before anything is decoded: one list can be all of a file
             _require_readable(self._schema.field(column).type, column, self._file)
         return "", self._keys.get(column)
-
-    def count(self, _base: str, _found: dict[str, Any]) -> int:
-        """Return how many rows there are."""
-        return int(self._rows)
 
     def read(self, _base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield rows. Raises `InputError`."""
