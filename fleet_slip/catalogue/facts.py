@@ -26,7 +26,6 @@ DELAY = "delay"
 
 NumberName = Literal[
     "yaw_rate_offset",
-    "yaw_rate_offset_by_wheels",
     "ay_offset",
     "steering_offset",
     "speed_ratio",
@@ -63,8 +62,6 @@ def round_number(value: Fraction, grain: Fraction) -> int | None:
 _NUMBERS: tuple[tuple[NumberName, Unit, str, str], ...] = (
     ("yaw_rate_offset", "rad/s", "0.00000625",
      "What the gyroscope says when the car does not turn, by ay over speed"),
-    ("yaw_rate_offset_by_wheels", "rad/s", "0.00000625",
-     "The same by the differences of the wheels: tells whether both agree"),
     ("ay_offset", "m/s^2", "0.0000625",
      "What the accelerometer says to the side when the car goes straight"),
     ("steering_offset", "rad", "0.00000625",

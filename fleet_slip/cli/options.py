@@ -38,7 +38,7 @@ READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "folds": (str | None, lambda folds: folds),
     "landing": (str, str),
     "logs": (list[str], list),
-    "mapping": (str, str),
+    "mapping": (str, lambda mapping: mapping),
     "model": (str | None, lambda model: model),
     "night": (str | None, lambda night: date_of(night, "--night")),
     "noise": (list[str] | None, lambda values: quantities(values, "--noise")),

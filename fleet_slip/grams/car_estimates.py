@@ -1,11 +1,9 @@
-"""From the sums of a car's drives to its numbers: three relations between its sensors.
+"""From the sums of a car's drives to its numbers: two relations between its sensors.
 
 A car without side-slip of its own accord turns as fast as its velocity does, and a road that is
 banked in bends takes a part of the lateral acceleration that grows with their curvature:
 ay = d + rho v (r - b) + s r/v, with the offsets d and b, and the true speed rho v. On flat roads s
-is zero, and what is left is a plane, r = b + (ay/v)/rho - (d/rho)/v. The same yaw
-rate is one of the wheels' differences; unequal radii add wheel speed times their difference, tyres
-under load ay times speed: r = b + (differences)/track + e v + f ay v. And a steering angle is one
+is zero, and what is left is a plane, r = b + (ay/v)/rho - (d/rho)/v. And a steering angle is one
 of curvature and of ay (Ackermann angle and understeer). Means over drives make the changes of
 side-slip vanish. The gyroscope's noise is in r and in r/v. Where both are inputs beside each other
 it is taken out of their squares.
@@ -92,7 +90,6 @@ TIGHT_1PM = Fraction(1, 50)
 grow with curvature any more: it looks like speed."""
 
 OF_COURSE: tuple[NumberName, ...] = ("yaw_rate_offset", "ay_offset", "speed_ratio")
-OF_WHEELS: tuple[NumberName, ...] = ("yaw_rate_offset_by_wheels",)
 OF_STEERING: tuple[NumberName, ...] = ("steering_offset", "steer_per_curvature", "understeer")
 """The numbers of each relation."""
 
@@ -125,24 +122,6 @@ COURSE = Relation(
     noise={(3, 1): (ONE, ONE), (3, 3): ("slowness", "slowness")},
 )
 """ay by 1, r v, v and r/v: the unknowns d, rho, -rho b and the bank of bends."""
-
-WHEELS = Relation(
-    instruments=COURSE.instruments,
-    left=(
-        ((ONE, ONE), ("wheels", ONE), ("speed", ONE), ("ay", "speed")),
-        (("slowness", ONE), ("wheels", "slowness"), (ONE, ONE), ("ay", ONE)),
-        (("course_rate", ONE), ("wheels", "course_rate"), ("ay", ONE), ("ay", "ay")),
-        (("curvature", ONE), ("wheels", "curvature"), ("yaw_rate", ONE), ("ay", "yaw_rate")),
-    ),
-    right=(
-        ("yaw_rate", ONE),
-        ("yaw_rate", "slowness"),
-        ("yaw_rate", "course_rate"),
-        ("yaw_rate", "curvature"),
-    ),
-    noise={(3, 4): (ONE, "slowness")},
-)
-"""The yaw rate by 1, the wheels' differences, v and ay v: the unknowns b and three of the tyres."""
 
 STEERING = Relation(
     instruments=(ONE, "bend", "ay"),
@@ -206,14 +185,13 @@ def estimate_numbers(sums: Mapping[str, Gram | None], banked: bool) -> CarEstima
     estimates = CarEstimates()
     course, steering = sums.get("course"), sums.get("steering")
     if course is None or course.n == 0:
-        estimates.take((*OF_WHEELS, *OF_COURSE, *OF_STEERING), NO_COURSE)
+        estimates.take((*OF_COURSE, *OF_STEERING), NO_COURSE)
         return estimates
     of_course = ExactSums(course, course_terms())
     noise = gyroscope_noise(course, steering)
     if of_course.variance("course_rate") < LEAST_TURNING_RAD_S**2 or noise is None:
-        estimates.take((*OF_WHEELS, *OF_COURSE, *OF_STEERING), STRAIGHT)
+        estimates.take((*OF_COURSE, *OF_STEERING), STRAIGHT)
         return estimates
-    estimates.take(OF_WHEELS, _estimate_wheels(of_course, noise))
     change = LEAST_CHANGE_OF_SPEED[banked] * of_course.mean("slowness")
     if of_course.variance("slowness") < change**2:
         estimates.take((*OF_COURSE, *OF_STEERING), EVEN)
@@ -286,15 +264,6 @@ def _estimate_course(
         lean, terms = Fraction(name == "ay_offset"), course_terms()
         found[name] = CarEstimate("course", relation, terms, noise, value, gradient, {}, lean)
     return found
-
-
-def _estimate_wheels(sums: ExactSums, noise: Fraction) -> dict[NumberName, CarEstimate] | str:
-    solution = solve(WHEELS.system(sums, noise))
-    if solution is None:
-        return ALIKE
-    of_wheels = ("course", WHEELS, course_terms(), noise)
-    one = CarEstimate(*of_wheels, solution[0], (1.0, 0.0, 0.0, 0.0), {})
-    return {"yaw_rate_offset_by_wheels": one}
 
 
 def _estimate_steering(

@@ -125,13 +125,11 @@ PAIRS = 300
 
 LASTING: Mapping[bool, Mapping[NumberName, float]] = {
     False: {
-        "yaw_rate_offset_by_wheels": 0.001,
         "steering_offset": 0.00004,
         "speed_ratio": 0.0015,
     },
     True: {
         "yaw_rate_offset": 0.0007,
-        "yaw_rate_offset_by_wheels": 0.001,
         "steering_offset": 0.0002,
         "speed_ratio": 0.03,
     },
@@ -139,10 +137,6 @@ LASTING: Mapping[bool, Mapping[NumberName, float]] = {
 """Standard errors that no drive takes away, on flat and on banked roads: noise flattens and wheels
 slip. Where bends are banked, a body that leans 2 to 6 degrees per g makes its accelerometer say 3
 to 10 % more, which is no speed."""
-
-OF_A_DRIVE: Mapping[NumberName, float] = {"yaw_rate_offset_by_wheels": 0.002}
-"""Standard error that each drive adds however informative: a circuit turns to one side more than to
-the other, and makes wheels slip to that side. Two drives on one circuit do not show it."""
 
 
 @dataclass(frozen=True)
@@ -294,7 +288,7 @@ class CarEvidence:
             of_one = self.variances_of_one if drives == 1 else self.variances
             again = 1 + drives / ROADS
             variance = of_one.get(name, self.variances[name]) * float(found.shares.sum())
-            own[name] = variance * again + OF_A_DRIVE.get(name, 0.0) ** 2 / drives
+            own[name] = variance * again
         return own
 
     def uncertainties(
@@ -315,20 +309,16 @@ class CarEvidence:
         """Return a number as it is without the lean of the roads."""
         return estimate.value - (self.roads.lean or 0) * estimate.by_lean
 
-    def calibrated(
-        self, car: str, drives: int | None = None, *, leaning: bool = False
-    ) -> dict[NumberName, CalibratedNumber]:
-        """Return the numbers of a car, by all of its drives or by the first so many.
+    def calibrated(self, car: str) -> dict[NumberName, CalibratedNumber]:
+        """Return the numbers of a car, by all of its drives.
 
-        `ay_offset` is missing where it cannot be separated from the lean of the roads; with
-        `leaning` it is there with it, as the accelerometer says on these roads.
+        `ay_offset` is missing where it cannot be separated from the lean of the roads.
         """
-        slices = self.slices(car, 0, drives)
-        estimates = self.estimates[car] if drives is None else self.estimate(slices)
+        slices, estimates = self.slices(car), self.estimates[car]
         sure = self.uncertainties(estimates, slices)
         found: dict[NumberName, CalibratedNumber] = {}
         for name in CAR_NUMBERS:
-            if name in estimates and (leaning or not self._hidden(name)):
+            if name in estimates and not self._hidden(name):
                 at = slices[estimates[name].kind]
                 rows = int(self.sums[estimates[name].kind].table.n[at].sum())
                 value = self.level(estimates[name])

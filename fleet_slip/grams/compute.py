@@ -343,13 +343,12 @@ def aggregate(
     warehouse: Warehouse,
     files: Sequence[TableFile],
     feature_set: str = PLAIN,
-    executor: Executor | None = None,
     late: Late = None,
 ) -> pa.Table:
     """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive."""
     in_time = features().feature_set(feature_set).in_time
     empty = warehouse.computed_schema(in_time=in_time).empty_table()
-    rows = compute_grams(warehouse, files, no_progress, feature_set, executor, late)
+    rows = compute_grams(warehouse, files, no_progress, feature_set, late=late)
     return pa.concat_tables([empty, *rows])
 
 
