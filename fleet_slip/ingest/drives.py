@@ -522,30 +522,11 @@ def _metadata(
     return {
         **known,
         "started_at": _EPOCH + timedelta(seconds=start_s) if dated else None,  # to the microsecond
-        **_facts_of(mapping, known),
         "drive_id": name,
         "source": SOURCE,
         "campaign": mapping.name,
         "saturated": 0,  # what is outside its range is quarantined, not clipped
     }
-
-
-def _facts_of(mapping: Mapping, known: dict[str, Any]) -> dict[str, Any]:
-    """Return what the mapping's table adds to what is known of a car. Raises `InputError`."""
-    vehicles = mapping.vehicle_facts()
-    if not vehicles:
-        return {}
-    vehicle = known["vehicle_id"]
-    facts = next((facts for facts in vehicles if facts.vehicle_id == vehicle), None)
-    if facts is None:
-        raise InputError(
-            f"the car {vehicle!r} is not in the table of vehicles of the mapping "
-            f"{mapping.name!r}. Add a row for it."
-        )
-    new = {name: fact for name, fact in facts.model_dump().items() if known.get(name) is None}
-    if new.get("vehicle_model", "") is None:
-        raise InputError(f"nobody says the vehicle_model of the car {vehicle!r}. Add it.")
-    return new
 
 
 class Trips:

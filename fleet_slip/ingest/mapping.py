@@ -1,7 +1,5 @@
 """The mapping of a measured log: which column is which signal, in which unit, with which sign."""
 
-import csv
-import io
 import os
 import re
 from collections.abc import Container
@@ -28,9 +26,8 @@ from fleet_slip.config import (
     added,
     faults_of,
     load_config,
-    read_named_file,
 )
-from fleet_slip.errors import ConfigError, InputError
+from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import (
     WHEELS,
     OffsetM,
@@ -85,7 +82,7 @@ class LabelSensor(Config):
             raise ValueError("label: to move it needs a speed: vx, vehicle_speed or four wheels")
 
 
-# What is known of each car, from a table beside the mapping.
+# What is known of each drive, from the mapping, a column or the path.
 
 Fact = TypeVar("Fact")
 
@@ -98,49 +95,6 @@ def require_drive_column(fact: Fact, info: ValidationInfo) -> Fact:
             "configs/signals.toml"
         )
     return fact
-
-
-OptionalColumn = Annotated[
-    Annotated[Name, AfterValidator(require_drive_column)] | None, added(None)
-]
-
-
-class VehicleFacts(Config):
-    """One car: what its drives say unless the mapping's `[drive]` says it."""
-
-    vehicle_id: Name
-    vehicle_model: Name | None = None
-    mass_kg: PositiveFloat | None = None
-    tyres: OptionalColumn = None
-    receiver: OptionalColumn = None
-
-
-def read_vehicle_facts(file: Path) -> tuple[VehicleFacts, ...]:
-    """Read a CSV file: vehicle_id, and any other facts. Raises `ConfigError`, with the line."""
-    content = read_named_file(file)
-    try:
-        lines = csv.DictReader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
-        columns, rows = lines.fieldnames or (), list(lines)
-    except (ValueError, csv.Error):
-        columns, rows = (), []
-    if "vehicle_id" not in columns:
-        raise ConfigError(
-            f"{file}: vehicle_id is missing. A table of cars is CSV in UTF-8, whose first line "
-            f"names its columns: {', '.join(VehicleFacts.model_fields)}."
-        )
-    found = []
-    for line, row in enumerate(rows, 2):
-        try:
-            facts = VehicleFacts.model_validate({key: text or None for key, text in row.items()})
-        except ValidationError as error:
-            raise ConfigError(f"{file}: line {line}: {faults_of(error)}") from None
-        found.append(facts)
-    names = [facts.vehicle_id for facts in found]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise ConfigError(f"{file}: the car {twice!r} stands in it twice.")
-    if not found:
-        raise ConfigError(f"{file}: it has no row. It needs a header and one row for each car.")
-    return tuple(found)
 
 
 class FromColumn(Config):
@@ -191,7 +145,7 @@ class DriveMetadata(Config):
     day: date | Elsewhere | None = None
     """Date of the drive; with timestamps it may be left out and is that of the first row (UTC)."""
     vehicle_id: Name | Elsewhere
-    vehicle_model: Name | Elsewhere | None = None
+    vehicle_model: Name | Elsewhere
     track: Name | Elsewhere | None = None
     mass_kg: PositiveFloat | Elsewhere | None = None
     tyres: OptionalFact = None
@@ -216,8 +170,6 @@ class Mapping(Config):
     """Where the label's sensor is, and whether it measures two velocities instead of an angle."""
     where: tuple[RowCondition, ...] = added(())
     """Conditions that a row meets, all of them, or is left out and only counted; also as text."""
-    vehicles: tuple[VehicleFacts, ...] | Name = added(())
-    """What is known of each car; a text is the path of a CSV file, seen from the mapping's own."""
 
     @field_validator("where", mode="before")
     @classmethod
@@ -249,8 +201,6 @@ class Mapping(Config):
             self.label.require_signals(self.signals)
         if self.drive.day is None and not self.time.is_dated:
             raise ValueError("drive.day is needed: the time has no date. Give a date or a column")
-        if self.drive.vehicle_model is None and not self.vehicles:
-            raise ValueError("drive.vehicle_model is needed, or 'vehicles', a table of the cars")
         for name, signal in self.signals.items():
             if signal.time is not None and self.time.unit is None:
                 raise ValueError(f"signals.{name}: 'time' needs [time] with 'column' and 'unit'")
@@ -326,12 +276,6 @@ class Mapping(Config):
         columns = frozenset(numbers - set(self.common_columns()))
         return PlainNumbers(columns, tuple(float(text) for text in self.missing if is_number(text)))
 
-    def vehicle_facts(self) -> tuple[VehicleFacts, ...]:
-        """Return what is known of each car. Raises `ConfigError` if its file was not read."""
-        if isinstance(self.vehicles, str):
-            raise ConfigError(f"{self.vehicles}: not read. Load the mapping by its name or path.")
-        return self.vehicles
-
     def canonical_json(self) -> str:
         """The mapping as JSON that does not depend on the order or layout of its TOML file."""
         return canonical_ascii(self.model_dump(mode="json"))
@@ -350,10 +294,7 @@ def load_mapping(name_or_path: str) -> Mapping:
     """Load a mapping by name from `configs/mappings`, or by path. Raises `ConfigError`."""
     file = find_config("mappings", name_or_path)
     mapping = load_config(file, Mapping)
-    folder = Path(str(file)).parent
-    if isinstance(mapping.vehicles, str):
-        facts = read_vehicle_facts(folder / mapping.vehicles)
-        mapping = mapping.model_copy(update={"vehicles": facts})
     if mapping.can is not None:
-        mapping = mapping.model_copy(update={"can": read_can_database(mapping.can, folder)})
+        database = read_can_database(mapping.can, Path(str(file)).parent)
+        mapping = mapping.model_copy(update={"can": database})
     return mapping

@@ -10,7 +10,6 @@ import pytest
 from fleet_slip.config import LONGEST_FILE_BYTES, load_config, read_named_file
 from fleet_slip.errors import ConfigError, FleetSlipError, InputError
 from fleet_slip.ingest.formats.can import CanBus, parse_database, read_can_database
-from fleet_slip.ingest.mapping import read_vehicle_facts
 from fleet_slip.models.acceptance import Floor
 from fleet_slip.resources import CONFIG_VARIABLE, config_file, find_config
 from tests.support.commands import RunCommand
@@ -23,7 +22,7 @@ def read_database(file: Path) -> Any:
     return parse_database(read_can_database(CanBus(database=file.name), file.parent))
 
 
-READERS = {"cars.csv": read_vehicle_facts, "car.dbc": read_database}
+READERS = {"car.dbc": read_database}
 readers = pytest.mark.parametrize(("name", "read"), READERS.items(), ids=READERS)
 Read = Callable[[Path], Any]
 

@@ -3,9 +3,11 @@ from typing import Any
 
 import pytest
 
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError
 from fleet_slip.ingest.mapping import load_mapping
-from fleet_slip.resources import config_names
+from fleet_slip.resources import config_file, config_names
+from tests.support.measured import read_columns
 
 GOOD = """
 name = "car"
@@ -103,3 +105,29 @@ def test_mistakes_are_named_by_file_key_and_reason(
 def test_an_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="race_car_250lm"):
         load_mapping("no_such_mapping")
+
+
+def test_tyres_need_a_column_of_the_catalogue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = config_file("signals.toml").read_text(encoding="utf-8")
+    start = shipped.index("[drive.tyres]")
+    own = shipped[:start] + shipped[shipped.index("[drive.adhesion]") :]
+    (tmp_path / "signals.toml").write_text(own, encoding="utf-8")
+    monkeypatch.setenv("FLEET_SLIP_SIGNALS", str(tmp_path / "signals.toml"))
+    catalogue.cache_clear()
+    try:
+        with pytest.raises(ConfigError, match=r"drive\.tyres: the catalogue has no such drive"):
+            load(tmp_path, GOOD.replace('"m" }', '"m", tyres = "winter" }'))
+        assert load(tmp_path, GOOD)
+    finally:
+        catalogue.cache_clear()
+
+
+@pytest.mark.parametrize("fact", ["tyres", "receiver"])
+def test_a_fact_of_a_column_is_known_of_each_drive(tmp_path: Path, fact: str) -> None:
+    said = GOOD.replace('"m" }', f'"m", {fact} = {{ column = "shoes" }} }}')
+    columns = {"t": [0, 0.01, 0, 0.01], "shoes": ["slick"] * 2 + ["wet"] * 2, "a": [0.1] * 4}
+    mapping = load(tmp_path, said.replace(STEER, ""))
+    drives = read_columns(tmp_path, columns, mapping).drives.to_pylist()
+    assert {d[fact] for d in drives} == {"slick", "wet"}
