@@ -198,6 +198,7 @@ MODEL = Doc(
     "NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. Default: "
     "the only one that there is."
 )
+VERSION = Doc("NAME, NAME@VERSION or NAME@ALIAS. NAME alone is its champion.")
 ALIAS = Doc("The alias to move.")
 CAMPAIGN = Doc("A campaign of configs/campaigns, or the path of a TOML file.")
 DAYS = Doc("Simulate the first N days only. Default: all.")

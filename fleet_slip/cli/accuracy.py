@@ -338,6 +338,12 @@ def identify(
     output: Annotated[
         Path | None, typer.Option(help="Write the vehicle file here.", show_default=False)
     ] = None,
+    campaign: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write a campaign in the car here, for publish --prior.", show_default=False
+        ),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Identify a car's tyres and inertia from labelled drives, as a vehicle file for filters.
@@ -359,9 +365,10 @@ def identify(
         front_drive_share=front_drive,
         threads=threads,
     )
-    if output is not None:
-        with storage_errors(output):
-            output.write_text(found.as_toml(), encoding="utf-8")
+    for file, text in ((output, found.as_toml()), (campaign, found.as_campaign())):
+        if file is not None:
+            with storage_errors(file):
+                file.write_text(text, encoding="utf-8")
     shown = found.as_dict()
     if json:
         return print_json(shown)
@@ -382,6 +389,8 @@ def identify(
         say(f"not identifiable from these drives: {', '.join(shown['not_identifiable'])}.")
     if output is not None:
         say(f"written to {output}: a vehicle file, as in configs/vehicles.")
+    if campaign is not None:
+        say(f"written to {campaign}. Train with it: fleet-slip publish NAME --prior {campaign}")
 
 
 # Commands that show: report, watch, explore.

@@ -1,4 +1,4 @@
-"""Commands that serve models: models, show, promote, pin, export."""
+"""Commands that serve models: models, show, promote, pin, diff, export."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -168,6 +168,11 @@ def _facts(version: ModelVersion) -> dict[str, str]:
         "selected": f"model {chosen.model} of {chosen.model_list}",
         "why": chosen.reason,
     }
+    if prior := manifest.prior:
+        facts["prior"] = (
+            f"{prior.campaign}: {number_of(prior.drives, 'simulated drive')} of "
+            f"{', '.join(prior.vehicles)}, each row with the weight {prior.weight}"
+        )
     if learned := manifest.learned_from:
         facts["learned from"] = _teacher(learned)
     if manifest.assumed:
@@ -208,6 +213,14 @@ def pin(version: ModelVersion, name: str, alias: str, off: bool) -> None:
     """
     done = "is pinned to version {}" if not off else "is version {}; publications may move it"
     say(f"{name}@{alias} {done.format(version.version)}")
+
+
+@command(Fleet.diff, arguments=["one", "other"])
+def diff() -> None:
+    """Tell two versions of a model apart: data, prior, signals, coefficients, figures.
+
+    Example: **fleet-slip diff waterford@1 waterford@2**
+    """
 
 
 @command(Fleet.export, arguments=["model"])

@@ -42,6 +42,8 @@ READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "model": (str | None, lambda model: model),
     "night": (str | None, lambda night: date_of(night, "--night")),
     "noise": (list[str] | None, lambda values: quantities(values, "--noise")),
+    "one": (str, str),
+    "other": (str, str),
     "others": (list[str] | None, lambda names: names or ()),
     "over": (str | None, lambda over: [one.strip() for one in over.split(",")] if over else ()),
     "scenarios": (list[str] | None, lambda names: names or ()),

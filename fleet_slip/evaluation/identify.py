@@ -473,11 +473,22 @@ class Identified:
 
     def as_toml(self) -> str:
         """Return the car as a vehicle file."""
+        return "\n".join(self._lines("")) + "\n"
+
+    def as_campaign(self) -> str:
+        """Return a campaign in the car, on the roads of the campaign `prior`."""
+        name = f"prior_{self.car.name}"
+        head = [f"name = {json.dumps(name)}", f"description = {json.dumps(IDENTIFIED)}"]
+        head += ['base = "prior"', "", "[[plan.vehicles]]"]
+        return "\n".join([*head, *self._lines("plan.vehicles.")]) + "\n"
+
+    def _lines(self, within: str) -> list[str]:
         lines = [f"name = {json.dumps(self.car.name)}"]
         lines.append(f"description = {json.dumps(self.car.description)}")
         for part, values in self.car.model_dump(exclude={"name", "description"}).items():
-            lines += ["", f"[{part}]", *(f"{name} = {value!r}" for name, value in values.items())]
-        return "\n".join(lines) + "\n"
+            rows = (f"{name} = {value!r}" for name, value in values.items())
+            lines += ["", f"[{within}{part}]", *rows]
+        return lines
 
 
 MEAN_ROWS = 32

@@ -183,7 +183,7 @@ class Learner:
         stored = pa.schema([*self.cohort.drives.schema, ("sums", _SUMS), ("products", _SUMS)])
         return with_gram_rows(self.cohort, pa.Table.from_pylist(found, schema=stored))
 
-    def choose(self, left_out: LeftOut) -> Selection:
+    def choose(self, left_out: LeftOut, prior: Cohort | None = None) -> Selection:
         """Choose on what is left in, in folds of drives where its own key knows only one.
 
         Of a single drive that is left in, or of quarters, each quarter counts as a drive.
@@ -200,11 +200,13 @@ class Learner:
         values = cohort.drives[FOLD_KEYS[asked.folds.by]].unique()
         if len(values) < 2 or (divided and asked.folds.by == ROW_FOLDS):
             asked = replace(asked, folds=Folding(by="drive", count=asked.folds.count))
-        return asked.choose(cohort)
+        return asked.choose(replace(cohort, beside=prior) if prior else cohort)
 
-    def estimate(self, left_out: LeftOut, cars: CarCounts) -> tuple[list[str], list[FloatArray]]:
+    def estimate(
+        self, left_out: LeftOut, cars: CarCounts, prior: Cohort | None = None
+    ) -> tuple[list[str], list[FloatArray]]:
         """Return the columns that are chosen without some parts, and an estimate of all drives."""
-        selection = self.choose(left_out)
+        selection = self.choose(left_out, prior)
         manifest = manifest_of(selection, "left_out")
         model = Predictor.of(with_straight_intercept(self.warehouse, manifest, selection))
         apart = {i for i, _ in left_out}

@@ -30,7 +30,7 @@ from fleet_slip.evaluation.filters import (
     choose_evenly,
     class_car,
 )
-from fleet_slip.evaluation.identify import IDENTIFIED, Fitted, Measured, identify
+from fleet_slip.evaluation.identify import IDENTIFIED, Fitted, Identified, Measured, identify
 from fleet_slip.evaluation.judge import JudgedDrive, judge, spread_over
 from fleet_slip.evaluation.left_out import (
     QUARTERS,
@@ -49,13 +49,15 @@ from fleet_slip.evaluation.single_track import (
     follow,
     measured_speed_mps,
 )
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.models.predict import Predictor
+from fleet_slip.models.prior import simulate_prior
 from fleet_slip.models.publish import recipe_of
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.score import calibrated_cars, find_seen
+from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.runs import LOGGER
 from fleet_slip.vehicle.parameters import VehicleParameters
@@ -82,6 +84,7 @@ def evaluate_measured(
     cohort = load_cohort(warehouse, condition)
     drives = read_measured_drives(warehouse, cohort)
     car = car or class_car(cohort.drives["vehicle_model"][0].as_py(), None)
+    car = car or next(filter(None, map(identified_prior, map(prior_of, versions))), None)
     competition = Competition.of(warehouse, versions, condition, drives, car, executor)
     parts, kinds = parts_to_leave_out(drives), kinds_to_leave_out(drives)
     whole = len({quarter for _, quarter in parts[0]}) > 1
@@ -162,6 +165,8 @@ class Competition:
     cars: CarCounts
     executor: Executor
     told: dict[str, str]
+    _identified: dict[LeftOut, Identified] = field(default_factory=dict)
+    _priors: dict[tuple[str, str], Cohort] = field(default_factory=dict)
     _without: dict[LeftOut, Estimates] = field(default_factory=dict)
     _failed: set[str] = field(default_factory=set)
 
@@ -243,17 +248,36 @@ class Competition:
         found: Estimates = {}
         for name, learner in self.learners.items():
             try:
-                found[name] = learner.estimate(left_out, self.cars)
+                found[name] = learner.estimate(left_out, self.cars, self._prior(learner, left_out))
             except (DataError, QuestionError) as error:
                 if name not in self._failed:
                     LOGGER.warning("%s does not compete everywhere: %s", name, error)
                 self._failed.add(name)
         return found
 
-    def _filtered(self, left_out: LeftOut) -> Estimates:
-        """Estimate by filters that are tuned, in cars identified, on what is left in."""
-        if self.measured is None:
-            return {}
+    def _prior(self, learner: Learner, left_out: LeftOut) -> Cohort | None:
+        """Return a learner's prior, in a car identified on what is left in if it was identified."""
+        name, feature_set = learner.asked.request.prior, learner.asked.feature_set
+        if name is None:
+            return None
+        campaign = load_campaign(name)
+        if (measured := self.measured) and identified_prior(campaign):
+            vehicles = (self.identified(measured, left_out).car,)
+            plan = campaign.plan.model_copy(update={"vehicles": vehicles})
+            campaign = campaign.model_copy(update={"plan": plan})
+        key = campaign.digest, feature_set
+        if key not in self._priors:
+            self._priors[key] = simulate_prior(campaign, feature_set, self.executor)
+        return self._priors[key]
+
+    def identified(self, measured: Measured, left_out: LeftOut) -> Identified:
+        """Return the car that is identified on what is left in. Raises as `identify`."""
+        if left_out not in self._identified:
+            left_in = self._left_in(left_out)
+            self._identified[left_out] = identify(measured, left_in, self.executor)
+        return self._identified[left_out]
+
+    def _left_in(self, left_out: LeftOut) -> list[LabelledDrive]:
         others = [
             one.without([quarter for i, quarter in left_out if i == number])
             for number, one in enumerate(self.drives)
@@ -262,8 +286,14 @@ class Competition:
         if sum(len(one.signals) for one in others) > TUNING_DRIVES * TUNING_S * SAMPLE_RATE_HZ:
             begin = TUNING_S * SAMPLE_RATE_HZ
             others = [one.beginning(begin) for one in choose_evenly(others, TUNING_DRIVES)]
+        return others
+
+    def _filtered(self, left_out: LeftOut) -> Estimates:
+        """Estimate by filters that are tuned, in cars identified, on what is left in."""
+        if self.measured is None:
+            return {}
         found: Estimates = {}
-        for name, (knows, estimate, about) in self._tuned(self.measured, others).items():
+        for name, (knows, estimate, about) in self._tuned(self.measured, left_out).items():
             self.told[name] = knows
             found[name] = about, [np.full(len(one.rows), np.nan) for one in self.drives]
             for i in {i for i, _ in left_out}:
@@ -271,8 +301,9 @@ class Competition:
                     found[name][1][i] = estimate(self.drives[i].drive.signals)
         return found
 
-    def _tuned(self, measured: Measured, others: Sequence[LabelledDrive]) -> dict[str, Known]:
+    def _tuned(self, measured: Measured, left_out: LeftOut) -> dict[str, Known]:
         """Return each filter by name, tuned on drives in the car of the file and the identified."""
+        others = self._left_in(left_out)
         ready: dict[str, Known] = {
             "kinematic": ("geometry", partial(_rolling, measured.car(Fitted())), None)
         }
@@ -280,7 +311,7 @@ class Competition:
         if self.vehicle is not None and self.vehicle.description != IDENTIFIED:
             cars["tuned"] = ("the vehicle's file", self.vehicle)
         try:
-            identified = identify(measured, others, self.executor)
+            identified = self.identified(measured, left_out)
         except DataError as error:
             LOGGER.warning("no car is identified: %s", error)
             if self.vehicle is not None:
@@ -304,6 +335,18 @@ class Competition:
                     about = tuned.model_dump(mode="json")
                     ready[name] = (f"{knows}, and labels to be tuned by", estimate, about)
         return ready
+
+
+def prior_of(version: ModelVersion) -> Campaign | None:
+    """Return the campaign of a version's prior, if it has one. Raises `ConfigError`."""
+    name = recipe_of(version)[0].prior if version.manifest.prior else None
+    return load_campaign(name) if name else None
+
+
+def identified_prior(campaign: Campaign | None) -> VehicleParameters | None:
+    """Return the car of a prior that was identified from drives; None of another."""
+    cars = campaign.plan.vehicles if campaign else ()
+    return cars[0] if len(cars) == 1 and cars[0].description == IDENTIFIED else None
 
 
 def _judged(drive: LabelledDrive, car: Measured | None) -> BoolArray:

@@ -35,6 +35,7 @@ from fleet_slip.grams.folding import (
 )
 from fleet_slip.grams.gram_rows import Hashes
 from fleet_slip.grams.reader import HASHES, GramReader, OpenedGrams, open_grams
+from fleet_slip.grams.weights import FULL, weighted
 from fleet_slip.regression.choice import TrainingFolds
 from fleet_slip.regression.drives import (
     ClusterUnit,
@@ -80,8 +81,8 @@ class Cohort:
         tables: the Gram rows in the order of `drives`, by signals; none if only sums were kept.
         sums, folding: the Gram of each fold, if only these were kept, and what the folds are of.
         source: where the Gram rows were read, and can be read again.
-        unlabelled, weight: Gram rows of drives without the label: in no fold, always trained on,
-            with this weight, where rows with the label have 1.
+        beside, weight: Gram rows that are in no fold and always trained on, with this weight, where
+            the others have 1: changes of the course of drives without the label, or a prior.
     """
 
     condition: Condition
@@ -94,8 +95,18 @@ class Cohort:
     sums: CohortFolds | None = None
     folding: Folding | None = None
     source: Warehouse | GramReader | None = None
-    unlabelled: "Cohort | None" = None
+    beside: "Cohort | None" = None
     weight: Fraction = Fraction(1)
+
+    @property
+    def unlabelled(self) -> "Cohort | None":
+        """What is beside, if it is of drives without the label."""
+        return self.beside if features().feature_set(self.feature_set).change_ticks else None
+
+    @property
+    def prior(self) -> "Cohort | None":
+        """What is beside, if it is of simulated drives."""
+        return None if self.unlabelled else self.beside
 
     @property
     def rows(self) -> int:
@@ -117,11 +128,11 @@ class Cohort:
     def inputs(self) -> tuple[str, ...]:
         """What a search may choose of the columns that any drive has, in the set's order.
 
-        Beside drives without the label those that some of these have as well.
+        Of what is beside those that it has as well.
         """
         known = {name for kind in _kinds(self.drives) for name in kind.split(",")}
-        if self.unlabelled is not None:
-            known &= set(self.unlabelled.inputs)
+        if self.beside is not None:
+            known &= set(self.beside.inputs)
         return tuple(n for n in features().searched(self.feature_set) if n in known)
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
@@ -168,21 +179,24 @@ class Cohort:
         (`EACH`: never); by `speed` in bands; by `part` or `row` as the feature set has them. Raises
         `QuestionError` if it has none. Where only sums were kept the Gram rows are read again.
         """
+        folds = self._own_folds(by, count)
+        if self.beside is None:
+            return folds
+        beside = tuple(table.total() for table in self.beside.tables)
+        return replace(folds, beside=beside, weight=self.weight)
+
+    def _own_folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
         folding = Folding(by=by, count=count)
         if self.sums is not None and folding == self.folding:
             return self.sums
         if self.sums is not None and self.source is not None:
             again = load_cohort(self.source, self.condition, self.feature_set, folding)
-            return again.folds(by, count)
+            return again._own_folds(by, count)
         require_divided(self.feature_set, by, count)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
         if self.unlabelled and by == "vehicle" and len(set(values)) == 1:
             by, values = "drive", self.drives[FOLD_KEYS["drive"]].to_pylist()
-        folds = CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
-        if self.unlabelled is None:
-            return folds
-        beside = tuple(table.total() for table in self.unlabelled.tables)
-        return replace(folds, beside=beside, weight=self.weight)
+        return CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
 
     def serving(self, inputs: Sequence[str]) -> Served:
         """Return the drives with the label and all inputs, a Gram row each. Raises `DataError`."""
@@ -203,6 +217,19 @@ class Cohort:
         masks = np.split(wanted, stops)
         kept = [table.take(m) for table, m in zip(self.tables, masks, strict=True) if m.any()]
         return replace(self, tables=tuple(kept), drives=self.drives.filter(pa.array(wanted)))
+
+    def weighed(self, parts: IntArray) -> "Cohort":
+        """Return the cohort with each of its Gram rows so many times, and `FULL` times the others.
+
+        Rows of weight zero are left out.
+        """
+        kept, left = self.part(parts > 0), parts[parts > 0]
+        each = np.split(left, np.cumsum([len(one) for one in kept.tables])[:-1])
+        beside = self.beside
+        if beside is not None:
+            beside = beside.weighed(np.full(len(beside.drives), FULL))
+        tables = tuple(weighted(one, some) for one, some in zip(kept.tables, each, strict=True))
+        return replace(kept, tables=tables, beside=beside)
 
 
 def _kinds(drives: pa.Table) -> list[str]:
@@ -368,7 +395,7 @@ def load_mixed_labels(
         labelled,
         feature_set=changes.feature_set,
         tables=tuple(about_mean(table) for table in labelled.tables),
-        unlabelled=changes.part(alone),
+        beside=changes.part(alone),
     )
 
 

@@ -4,7 +4,9 @@ A weight counts in parts of `FULL`, a power of two. Robust ones take from drives
 signals were lost: those that a model of all drives fits far worse than it fits the usual one.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import date
 
 import numpy as np
 
@@ -70,6 +72,15 @@ def robust_weights(drives: DriveMoments, *, intercept: bool = True) -> DriveWeig
         limit *= 1.25
         found = _weigh(each, rows, limit)
     return found
+
+
+def age_weights(days: Sequence[date], half_life_days: int) -> IntArray:
+    """Return weights of drives by day, in parts of `FULL`: half as much for each half-life.
+
+    Ages are before the newest of the days.
+    """
+    age = np.array([(max(days) - day).days for day in days])
+    return np.rint(FULL * 0.5 ** (age / half_life_days)).astype(np.int64)
 
 
 def weighted(table: GramTable, parts: IntArray) -> GramTable:

@@ -217,6 +217,17 @@ class LearnedFrom(Config):
     intercept_spread_deg: FiniteFloat
 
 
+class Prior(Config):
+    """Simulated drives that a model was trained on beside its cohort: `rows` of this `weight`."""
+
+    campaign: str
+    campaign_sha256: Sha256
+    vehicles: tuple[str, ...]
+    drives: Count
+    rows: Count
+    weight: ExactFraction
+
+
 Asked = bool | int | Annotated[str, Field(max_length=100_000)]
 
 
@@ -254,6 +265,7 @@ class Manifest(Config):
     package_version: str
     learned_from: Annotated[LearnedFrom | None, _LEFT_OUT] = None
     """None where it was a reference sensor."""
+    prior: Annotated[Prior | None, _LEFT_OUT] = None
     imported_from: Annotated[ImportedFrom | None, _LEFT_OUT] = None
     assumed: Annotated[
         tuple[Annotated[str, Field(max_length=200)], ...],

@@ -24,6 +24,7 @@ from fleet_slip.models.manifest import (
     Manifest,
     ModelLabel,
     ModelTerm,
+    Prior,
     SelectedBy,
     TrainedDrives,
     TrainedOn,
@@ -35,6 +36,7 @@ from fleet_slip.models.select import GIVEN, Selection, checksum_of_list
 from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.regression.folds import CrossValidation
 from fleet_slip.rendering import Answer, Part, Remark
+from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.warehouse.condition import parse_cohort, with_all_drives
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -197,6 +199,22 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
             asked=asked_of(selection),
         ),
         package_version=package_version("fleet-slip"),
+        prior=_prior_of(selection),
+    )
+
+
+def _prior_of(selection: Selection) -> Prior | None:
+    prior, name = selection.cohort.prior, selection.request.prior
+    if prior is None or name is None:
+        return None
+    campaign = load_campaign(name)
+    return Prior(
+        campaign=campaign.name,
+        campaign_sha256=campaign.digest,
+        vehicles=tuple(sorted(set(prior.drives["vehicle_model"].to_pylist()))),
+        drives=prior.drive_count,
+        rows=prior.rows,
+        weight=selection.cohort.weight,
     )
 
 

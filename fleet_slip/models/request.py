@@ -152,6 +152,21 @@ class SelectionRequest:
         ),
     ] = None
     most: Annotated[int | None, Doc(f"Most columns of `search`. Default: {DEFAULT_MOST}.")] = None
+    half_life: Annotated[
+        int | None,
+        Doc(
+            "Days after which a drive counts half as much, a quarter after twice as many, and so "
+            "on, before the cohort's newest day."
+        ),
+    ] = None
+    prior: Annotated[
+        str | None,
+        Doc(
+            "A campaign of configs/campaigns, or a TOML file, whose simulated drives join the "
+            "training, with the weight that serves the cohort's held-out drives best, zero among "
+            "them: fleet-slip identify --campaign."
+        ),
+    ] = None
     bootstrap: Annotated[
         int | None,
         Doc("Confidence interval of the winner's correlation by drawing the drives so many times."),
@@ -195,6 +210,16 @@ class SelectionRequest:
             raise UsageError(
                 "course+sideslip compares a list of models, one model or a search: leave out "
                 "nested, rank, criterion, all_subsets, naive, robust and bootstrap."
+            )
+        ranked = self.ordered or (self.nested and not self.search)
+        if self.prior and (self.label or ranked or self.bootstrap):
+            raise UsageError(
+                "a prior joins models of a list, one model or a search: leave out label, rank, "
+                "criterion, all_subsets, naive, bootstrap, and nested without search."
+            )
+        if self.half_life is not None and (self.half_life < 1 or self.label == BOTH):
+            raise UsageError(
+                "half_life: a whole number of days from 1 on, and not with course+sideslip."
             )
         if self.search and self.ordered:
             raise UsageError(

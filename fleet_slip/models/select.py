@@ -26,7 +26,8 @@ from fleet_slip.grams.cohort import (
 from fleet_slip.grams.folding import PARTS, ROW_FOLDS, Folding, make_folding
 from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.reader import open_grams
-from fleet_slip.grams.weights import FULL, Weighed, robust_weights, weighted
+from fleet_slip.grams.weights import FULL, Weighed, age_weights, robust_weights
+from fleet_slip.models.prior import simulate_prior
 from fleet_slip.models.request import (
     BOTH,
     COURSE,
@@ -77,6 +78,7 @@ from fleet_slip.regression.gram import GramTable, packed_position
 from fleet_slip.regression.orders import METHODS
 from fleet_slip.rendering import Answer, Part
 from fleet_slip.resources import find_config
+from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.warehouse.tables import Warehouse
 
 SEED = 1
@@ -246,6 +248,7 @@ class Selection(Answer):
         intercept: whether models have one; without it they go through the origin.
         model_list, config_sha256: what was compared, such as `table1`, and its checksum.
         weighed: the drives that `robust` counts less than others, the most unusual first.
+        full: how many times a row of full weight counts.
         without_label: how good the winner is, if changes of the course alone trained it.
         label_noise_deg: of the label, which every error has in it; None where it is not known.
         request, asked: what was asked for, and of which drives.
@@ -266,6 +269,7 @@ class Selection(Answer):
     model_list: str = ""
     config_sha256: str = ""
     weighed: Mapping[str, Weighed] = field(default_factory=dict)
+    full: int = 1
     without_label: WithoutLabel | None = None
     label_noise_deg: float | None = None
     request: SelectionRequest = field(default_factory=SelectionRequest)
@@ -304,7 +308,9 @@ class Selection(Answer):
     @property
     def searched_winner(self) -> SearchedModels | None:
         """The search that found the winner, if one did."""
-        return next((one for one in self.searched if self.winner.model in one.models), None)
+        signals = self.winner.model.signals
+        of_search = (s for s in self.searched if signals in [one.signals for one in s.models])
+        return next(of_search, None)
 
     @property
     def rows_without(self) -> int:
@@ -314,7 +320,7 @@ class Selection(Answer):
     @property
     def trained_rows(self) -> int:
         """Rows that the winner was trained on; of drives that count less, so much of them."""
-        return self.winner.model.pooled.rows // (FULL if self.weighed else 1)
+        return self.winner.model.pooled.rows // self.full
 
     @property
     def beyond_label_noise_deg(self) -> float | None:
@@ -510,14 +516,22 @@ class SelectionPlan:
     def choose(self, cohort: Cohort) -> Selection:
         """Compare and choose on a cohort, whatever drives it is of. Raises as `select`."""
         weighed: dict[str, Weighed] = {}
+        full = 1
+        if self.request.half_life:
+            days = cohort.drives["day"].to_pylist()
+            cohort, full = cohort.weighed(age_weights(days, self.request.half_life)), FULL
         if self.request.robust:
             cohort, weighed = _weigh_drives(cohort, self)
-        if cohort.unlabelled:
-            return weigh(cohort, self.request, self.model_list, self.folds)
-        if self.request.ordered:
-            return replace(_search(cohort, self.request, self.folds), weighed=weighed)
-        found = _compare_listed(cohort, self.request, self.model_list, self.folds)
-        return replace(found, weighed=weighed)
+            full *= FULL if weighed else 1
+        if prior := cohort.prior:
+            found = weigh_prior(cohort, prior, self)
+        elif cohort.unlabelled:
+            found = weigh(cohort, self.request, self.model_list, self.folds)
+        elif self.request.ordered:
+            found = _search(cohort, self.request, self.folds)
+        else:
+            found = _compare_listed(cohort, self.request, self.model_list, self.folds)
+        return replace(found, weighed=weighed, full=full)
 
 
 def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> Selection:
@@ -528,10 +542,15 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
     distances = bool(
         request.nested and not request.ordered and not _searches_of(request, asked.model_list)
     )
-    of_drives = request.ordered or request.bootstrap or request.robust
-    if not (of_drives or distances):  # the sum of each fold suffices
-        return asked.choose(load_cohort(warehouse, condition, asked.feature_set, folds))
-    answer = asked.choose(asked.load(warehouse, condition))
+    of_drives = request.ordered or request.bootstrap or request.robust or request.half_life
+    if of_drives or distances:
+        cohort = asked.load(warehouse, condition)
+    else:  # the sum of each fold suffices
+        cohort = load_cohort(warehouse, condition, asked.feature_set, folds)
+    if request.prior:
+        prior = simulate_prior(load_campaign(request.prior), asked.feature_set)
+        cohort = replace(cohort, beside=prior)
+    answer = asked.choose(cohort)
     cohort = answer.cohort
     if distances:
         inputs = inputs_of(cohort, request.nested or WHOLE_SET)
@@ -545,6 +564,44 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
 
 WEIGHTS = tuple(Fraction(4) ** power for power in range(4, -5, -1))
 """Weights of a change of the course that are tried, where a row with the label has 1."""
+
+PRIOR_SHARES = (Fraction(0), *(Fraction(4) ** power for power in range(-5, 2)))
+"""Weights of all rows of a prior that are tried, where the rows of the cohort have 1 together."""
+
+
+def weigh_prior(cohort: Cohort, prior: Cohort, asked: "SelectionPlan") -> Selection:
+    """Choose the columns on the cohort alone, then the weight of its prior by held-out drives.
+
+    A prior does not choose columns: in a car that few drives identified badly its drives would
+    agree on the wrong ones.
+    """
+    alone = replace(cohort, beside=None)
+    first = _compare_listed(alone, asked.request, asked.model_list, asked.folds)
+    chosen = CandidateModel(name="prior", signals=first.winner.model.signals)
+    one = Fraction(2) ** round(math.log2(cohort.rows / prior.rows))
+    tried = {
+        weight: validate(
+            chosen,
+            replace(cohort, weight=weight).folds(asked.folds.by, asked.folds.count),
+            intercept=asked.request.intercept,
+        )
+        for weight in (one * share for share in PRIOR_SHARES)
+    }
+    weight, best = min(tried.items(), key=lambda each: each[1].pooled.rmse)
+    unaided = tried[Fraction(0)]
+    told = "The prior has no weight: held-out drives are estimated worse with it."
+    if weight:
+        told = (
+            f"With the prior, {weight} of the weight for each row, its RMSE is "
+            f"{best.pooled.rmse_deg:.4f} deg, without it {unaided.pooled.rmse_deg:.4f} deg."
+        )
+    reason = f"{first.winner.reason} {told}"
+    return replace(
+        first,
+        cohort=replace(cohort, weight=weight),
+        models=(*first.models, best),
+        winner=replace(first.winner, model=best, reason=reason),
+    )
 
 
 def weigh(
@@ -585,10 +642,7 @@ def _weigh_drives(cohort: Cohort, asked: SelectionPlan) -> tuple[Cohort, dict[st
         return cohort, {}
     of_drive = {name: round(one.weight * FULL) for name, one in lost.items()}
     parts = np.array([of_drive.get(name, FULL) for name in cohort.drives["drive_id"].to_pylist()])
-    kept, left = cohort.part(parts > 0), parts[parts > 0]
-    each = np.split(left, np.cumsum([len(one) for one in kept.tables])[:-1])
-    tables = tuple(weighted(one, some) for one, some in zip(kept.tables, each, strict=True))
-    return replace(kept, tables=tables), lost
+    return cohort.weighed(parts), lost
 
 
 def _given(request: SelectionRequest) -> ModelList | None:

@@ -18,7 +18,7 @@ def hashes(names: list[str]) -> list[int]:
     return sorted(hash_numbers(pa.array(names)).tolist())
 
 
-def cohort(unlabelled: Cohort | None = None) -> Cohort:
+def cohort(beside: Cohort | None = None) -> Cohort:
     columns = {
         "drive_hash": hash_numbers(pa.array([drive for drive, _ in ROWS])),
         "vehicle_hash": [7] * len(ROWS),
@@ -31,7 +31,8 @@ def cohort(unlabelled: Cohort | None = None) -> Cohort:
         logs_version=1,
         grams_version=1,
         drives=pa.table(columns),
-        unlabelled=unlabelled,
+        beside=beside,
+        feature_set="course" if beside else "signals",
     )
 
 

@@ -1,0 +1,37 @@
+"""Simulated drives as a prior: their Gram rows join those of real ones, with a weight.
+
+They are a function of a campaign's file: made apart from the data root whenever they are needed,
+they are in no cohort.
+"""
+
+import os
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from fleet_slip.grams.cohort import Cohort, load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.simulation.campaign import Campaign
+from fleet_slip.simulation.job import simulate_campaign
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.tables import Warehouse
+
+NOT_LOST = "lost_control_s IS NULL"
+"""The drives of a prior in which the driver kept the car."""
+
+
+def simulate_prior(
+    campaign: Campaign, feature_set: str, executor: Executor | None = None
+) -> Cohort:
+    """Return the Gram rows of a campaign's drives in which the car was not lost.
+
+    Raises `QuestionError` for a set that simulated drives do not have, as `load_cohort`.
+    """
+    workers = nullcontext(executor) if executor else ThreadPoolExecutor(os.cpu_count())
+    with TemporaryDirectory(prefix="fleet-slip-prior-") as folder, workers as threads:
+        warehouse = Warehouse(LocalFolder(Path(folder)))
+        simulate_campaign(warehouse, campaign, campaign.days(), threads)
+        update_grams(warehouse, feature_set=feature_set)
+        return replace(load_cohort(warehouse, NOT_LOST, feature_set), source=None)

@@ -1,0 +1,196 @@
+"""`--prior`: simulated drives join the training; `--half-life`: old drives count less."""
+
+import json
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fleet_slip
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.evaluation import measured as module
+from fleet_slip.evaluation.identify import Fitted, Identified, Measured
+from fleet_slip.evaluation.measured import identified_prior
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.weights import age_weights
+from fleet_slip.models.prior import simulate_prior
+from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.least_squares import fit
+from fleet_slip.simulation.campaign import load_campaign
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.commands import done_on, run_on
+from tests.support.logs import land, log_rows
+from tests.support.own_logs import ingest_own
+
+INPUTS = "ax,ay,yaw_rate"
+FEW = """
+name = "few"
+description = "A few drives of a prior"
+base = "prior"
+number_of_days = 1
+drives_per_day = 2
+
+[plan]
+tracks = ["city_1"]
+"""
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> str:
+    file = tmp_path_factory.mktemp("prior") / "few.toml"
+    file.write_text(FEW)
+    return str(file)
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("own")
+    ingest_own(folder / "data", folder, cars=6)
+    return folder / "data"
+
+
+def times(gram: Gram, weight: int) -> Gram:
+    return sum((gram for _ in range(weight - 1)), gram)
+
+
+def test_a_prior_is_weighed_exactly_and_written_down(own: Path, few: str) -> None:
+    fleet = fleet_slip.open(own)
+    found = fleet.cohort().select(model=INPUTS, prior=few)
+    prior = simulate_prior(load_campaign(few), "signals")
+    weight = found.cohort.weight
+    signals = (*INPUTS.split(","), catalogue().label)
+    (simulated,) = prior.tables
+    real = load_cohort(fleet.warehouse).serving(INPUTS.split(",")).table.total()
+    both = times(real.restrict(signals), weight.denominator)
+    if weight:
+        both += times(simulated.total().restrict(signals), weight.numerator)
+    by_hand = fit(both, INPUTS.split(","), catalogue().label).model
+    assert by_hand == found.winner.model.counts
+    assert prior.rows > 1000 and found.cohort.drive_count == 6
+    alone = fleet.cohort().select(model=INPUTS)
+    assert found.winner.model.pooled.rmse <= alone.winner.model.pooled.rmse
+
+
+def test_a_version_names_its_prior_and_is_trained_so_again(own: Path, few: str) -> None:
+    made = done_on(own, "publish", "with", "--model", INPUTS, "--prior", few, "--force")
+    fleet = fleet_slip.open(own)
+    manifest = fleet.model("with").manifest
+    assert manifest.prior is not None
+    assert (manifest.prior.campaign, manifest.prior.drives) == ("few", 2)
+    assert manifest.prior.campaign_sha256 == load_campaign(few).digest
+    assert manifest.trained_on.drives == 6, "those of the cohort"
+    assert "few: 2 simulated drives" in done_on(own, "show", "with").stdout
+    assert "With the prior" in made.stdout + made.stderr
+    again = json.loads(done_on(own, "publish", "with", "--json").stdout)
+    assert not again["new"], "it is trained as it was, to the same bits"
+    half = ("--half-life", "30", "--force")
+    done_on(own, "publish", "with", "--model", INPUTS, *half)
+    facts = json.loads(done_on(own, "diff", "with@1", "with@2", "--json").stdout)["facts"]
+    assert facts["prior.campaign"] == {"one": "few", "other": None}
+    assert facts["selected_by.asked.half_life"]["other"] == 30
+    drives = json.loads(done_on(own, "sql", "SELECT DISTINCT source FROM drives", "--json").stdout)
+    assert "simulated" not in str(drives), "it is not in the warehouse"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--nested", "ay,yaw_rate"),
+        ("--rank", "tstat"),
+        ("--bootstrap", "100"),
+        ("--label", "course"),
+    ],
+)
+def test_what_a_prior_does_not_join_is_refused(own: Path, few: str, words: tuple[str, ...]) -> None:
+    done = run_on(own, "select", "--prior", few, *words)
+    assert done.exit_code == 2
+    assert "a prior joins" in done.stderr
+    unknown = run_on(own, "select", "--model", INPUTS, "--prior", "nowhere")
+    assert unknown.exit_code == 3
+    assert "nowhere" in unknown.stderr
+
+
+def test_a_wrong_prior_gets_next_to_no_weight(
+    own: Path, few: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its label is reversed: whatever is taken of it makes held-out drives worse."""
+    prior = simulate_prior(load_campaign(few), "signals")
+    (table,) = prior.tables
+    label = table.signals.index(catalogue().label)
+    sums, products = table.sums.copy(), table.products.copy()
+    sums[:, label] *= -1
+    rows = label * (label + 1) // 2 + np.arange(label)
+    products[:, rows] *= -1
+    wrong = type(table)(table.signals, table.n, sums, products)
+    reversed_prior = prior.__class__(**{**vars(prior), "tables": (wrong,)})
+    monkeypatch.setattr("fleet_slip.models.select.simulate_prior", lambda *_: reversed_prior)
+    found = fleet_slip.open(own).cohort().select(model=INPUTS, prior=few)
+    assert found.cohort.weight * prior.rows / found.cohort.rows < 1 / 500
+
+
+def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
+    own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is left out must not be in the prior by way of the car."""
+    car = Measured(name="own", mass_kg=1500, front_axle_m=1.2, rear_axle_m=1.5)
+    seen: list[int] = []
+    simulated: list[float] = []
+
+    def identify(measured: Measured, drives: list[object], executor: object) -> Identified:
+        seen.append(len(drives))
+        fitted = Fitted(stiffness_rear=1.0 + len(seen) / 100)
+        return Identified(measured.car(fitted), fitted.noise, 0.0)
+
+    def simulate(campaign: object, feature_set: str, executor: object) -> object:
+        vehicle = identified_prior(campaign)  # type: ignore[arg-type]
+        assert vehicle is not None
+        simulated.append(vehicle.suspension.rear_stiffness_factor)
+        return prior
+
+    found = Identified(car.car(Fitted()), Fitted().noise, 0.0)
+    file = tmp_path / "own.toml"
+    file.write_text(found.as_campaign())
+    campaign = load_campaign(str(file))
+    assert identified_prior(campaign) == found.car
+    few_drives = campaign.model_copy(update={"number_of_days": 1, "drives_per_day": 2})
+    prior = simulate_prior(few_drives, "signals")
+    monkeypatch.setattr("fleet_slip.models.select.simulate_prior", lambda *_: prior)
+    done_on(own, "publish", "identified", "--model", INPUTS, "--prior", file, "--force")
+    monkeypatch.setattr(module, "identify", identify)
+    monkeypatch.setattr(module, "simulate_prior", simulate)
+    monkeypatch.setattr(module, "FILTERS", ())
+    fleet = fleet_slip.open(own)
+    content = fleet.evaluate_measured("identified", "true").content
+    assert content["vehicle"] == "own", "it brings its car along"
+    assert set(seen) == {5} and len(seen) == content["parts"]
+    assert len(set(simulated)) == len(simulated) == content["parts"]
+
+
+def test_old_drives_count_less(tmp_path: Path) -> None:
+    """By rows: each of a drive of today sixteen times, of one a half-life ago eight times."""
+    random = np.random.default_rng(1)
+    warehouse, rows = Warehouse(LocalFolder(tmp_path / "data")), []
+    for number, day in enumerate((date(2026, 5, 1), date(2026, 5, 11), date(2026, 5, 21))):
+        ay, yaw_rate = random.integers(-3000, 3000, (2, 100))
+        label = np.rint((0.05 + 0.01 * number) * ay - 0.02 * yaw_rate + random.normal(0, 10, 100))
+        counts = {"ay": ay, "yaw_rate": yaw_rate, "sideslip": label}
+        counts = {name: one.astype(np.int16) for name, one in counts.items()}
+        land(warehouse, f"d{number}", log_rows(f"d{number}", counts), day=day)
+        stacked = np.column_stack([ay, yaw_rate, np.ones(100), label])
+        rows.append(np.repeat(stacked, 4 * 2**number, axis=0))
+    update_grams(warehouse)
+    found = fleet_slip.open(tmp_path / "data").cohort().select(model="ay,yaw_rate", half_life=10)
+    every = np.concatenate(rows)
+    slopes = np.linalg.lstsq(every[:, :3], every[:, 3], rcond=None)[0]
+    assert [*found.winner.model.counts.weights.values()] == pytest.approx(slopes[:2])
+    assert found.trained_rows == 175
+    refused = run_on(tmp_path / "data", "select", "--model", "ay,yaw_rate", "--half-life", "0")
+    assert refused.exit_code == 2 and "half_life" in refused.stderr
+
+
+def test_weights_halve_with_age() -> None:
+    days = [date(2026, 1, 31), date(2026, 1, 21), date(2026, 1, 11), date(2025, 1, 1)]
+    assert age_weights(days, 10).tolist() == [16, 8, 4, 0]
