@@ -588,12 +588,12 @@ def weigh_prior(cohort: Cohort, prior: Cohort, asked: "SelectionPlan") -> Select
         for weight in (one * share for share in PRIOR_SHARES)
     }
     weight, best = min(tried.items(), key=lambda each: each[1].pooled.rmse)
-    unaided = tried[Fraction(0)]
+    alone_deg = first.winner.model.pooled.rmse_deg
     told = "The prior has no weight: held-out drives are estimated worse with it."
     if weight:
         told = (
             f"With the prior, {weight} of the weight for each row, its RMSE is "
-            f"{best.pooled.rmse_deg:.4f} deg, without it {unaided.pooled.rmse_deg:.4f} deg."
+            f"{best.pooled.rmse_deg:.4f} deg, without it {alone_deg:.4f} deg."
         )
     reason = f"{first.winner.reason} {told}"
     return replace(
