@@ -18,7 +18,7 @@ def test_candidates_wait_are_compared_and_promoted(
     assert "worse than the champion" in waiting["reason"]
     assert run_command("show", "smoke", "--json").json["version"] == 1
     compared = run_command("diff", "smoke@champion", "smoke@candidate")
-    assert "trained_on.feature_set" in compared.stdout and "sha256" not in compared.stdout
+    assert "selected_by.asked.features" in compared.stdout and "sha256" not in compared.stdout
     assert "8 made both, 0 only smoke@1, 0 only smoke@2" in compared.stderr
     assert "are the same estimator" in run_command("diff", "smoke@1", "smoke@1").stderr
     shadow = run_command("score", "smoke@candidate", "--against", "champion", "--json").json
