@@ -117,9 +117,9 @@ class Night:
         warehouse = self.fleet.warehouse
         logs = warehouse.logs.snapshot().rows
         if name != "ingest" and not (logs or warehouse.grams.snapshot().rows):
-            return "No drive has landed yet."
+            return "No drive is in the logs yet."
         if name == "verify" and not logs:
-            return "There is no log to compute Gram rows from again."
+            return "There are no logs to verify."
         undone = [one.name for one in self.steps if one.state in ("failed", "left out")]
         missing = [one for one in NEEDS.get(name, ()) if one in undone]
         return f"{missing[0]} was not done." if missing else ""
@@ -158,7 +158,7 @@ class Night:
         landing = self.asked.landing
         if not is_url(landing) and not Path(landing).is_dir():
             raise InputError(
-                f"{landing}: no such folder. Name the folder where logs land, or mount it."
+                f"{landing}: no such folder. Name the inbox folder for logs, or mount it."
             )
         try:
             find_logs([self.asked.landing])
@@ -182,7 +182,7 @@ class Night:
         told = f"{number_of(max(rows, 0), 'new row')}."
         if replaced := sum(one.drives_replaced for one in reports):
             drives = number_of(replaced, "drive")
-            told = f"{told} The mapping was corrected: its drives are in place of {drives}."
+            told = f"{told} The mapping was corrected: {drives} replaced."
         if again:
             return "attention", f"{told} Left out: {again}"
         if wrong := {str(found): one.file for one in reports for found in one.alarms}:
@@ -201,8 +201,8 @@ class Night:
         hashes = {hash_drive(self.training.name, one.drive_id) for one in self.faults}
         new = len(hashes - self.before.known)
         told = (
-            f"{number_of(found.drives, 'drive')} examined: {new} newly not in order, "
-            f"{len(hashes)} in all, which train no model."
+            f"{number_of(found.drives, 'drive')} checked: {new} newly faulty, {len(hashes)} "
+            "faulty in all, left out of training."
         )
         return "attention" if new else "done", told
 
@@ -244,8 +244,8 @@ class Night:
         told = of_step(self.asked.progress, "verify")
         checked = self.fleet.check(SAMPLE_FILES, begin=self.night.toordinal(), progress=told)
         return "done", (
-            f"{number_of(checked.rows, 'row')} of {number_of(checked.files, 'file')} are what was "
-            "written, and their Gram rows what they must be."
+            f"{number_of(checked.rows, 'row')} of {number_of(checked.files, 'file')} and their "
+            "Gram rows verified."
         )
 
     def _retain(self) -> Told:

@@ -247,8 +247,8 @@ class HealthAndUpkeep(JudgedModels):
                 raise QuestionError(f"{subject.kind} {subject.value!r} was never forgotten.")
             case "begun":
                 raise RefusedError(
-                    f"{subject.kind} {subject.value!r} is being forgotten. Give the command that "
-                    "forgets it again, until it is done; then allow it."
+                    f"{subject.kind} {subject.value!r} is still being forgotten. Repeat "
+                    "that command until it is done, then allow it."
                 )
             case "done":
                 audit.allow(subject)

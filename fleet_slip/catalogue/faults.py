@@ -22,6 +22,17 @@ if TYPE_CHECKING:
     from fleet_slip.regression.gram import GramTable
 
 
+KINDS = {
+    "absent": "no sign in",
+    "cars": "several cars in",
+    "no slip": "no slip in",
+    "place": "misplaced",
+    "time": "unknown",
+    "values": "wrong values of",
+}
+"""Kinds of faults that are said in other words before the signals."""
+
+
 @dataclass(frozen=True)
 class Fault:
     """What looks wrong.
@@ -42,7 +53,8 @@ class Fault:
 
     def __str__(self) -> str:
         """Return it as one line."""
-        return f"{self.kind} {', '.join(self.signals)}? {self.figure}. {self.remedy}"
+        kind = KINDS.get(self.kind, self.kind)
+        return f"{kind} {', '.join(self.signals)}? {self.figure}. {self.remedy}"
 
     @property
     def does_harm(self) -> bool:

@@ -129,8 +129,8 @@ def _measured(content: Mapping[str, Any]) -> Iterator[Part]:
     )
     if content["vehicle"] is None:
         yield (
-            "No filter competes: no car is known. Say what it measures (--mass, --front-axle, "
-            "--rear-axle), or name a vehicle file with --vehicle."
+            "No filter was evaluated: the car is unknown. Give --mass, --front-axle and "
+            "--rear-axle, or a vehicle file with --vehicle."
         )
 
 
@@ -215,17 +215,15 @@ def _score_table(scores: Mapping[str, Mapping[str, Any]]) -> TextTable:
 def _trained(found: Score, reference: str) -> Iterator[Remark]:
     """Yield which drives made the model: on these its error is that of a fit."""
     if found.drives_trained is None:
-        yield Remark(
-            f"{reference} does not say which drives it was trained on: these may be among them."
-        )
+        yield Remark(f"{reference} does not record its training set: these drives may be in it.")
     elif found.drives_left_out:
         left = number_of(found.drives_left_out, "drive")
         yield Remark(f"left out: {left} of {found.drives:,} that {reference} was trained on.")
     elif found.drives_trained:
         yield Remark(
             f"{reference} was trained on {found.drives_trained:,} of these "
-            f"{number_of(found.drives or 0, 'drive')}: there the error is that of the fit. New "
-            f"drives: fleet-slip evaluate {reference}"
+            f"{number_of(found.drives or 0, 'drive')}: there the error is that of the fit. For "
+            f"new drives: fleet-slip evaluate {reference}"
         )
 
 
@@ -382,8 +380,8 @@ def identify(
     )
     if found.at_bounds:
         say(
-            f"at the bound of what cars are: {', '.join(shown['at_bounds'])}. The drives or their "
-            "label contradict the model there: do not take it for the car's."
+            f"at the bound of plausible values: {', '.join(shown['at_bounds'])}. Drives or label "
+            "contradict the model there: do not use it as the car's value."
         )
     if found.not_identifiable:
         say(f"not identifiable from these drives: {', '.join(shown['not_identifiable'])}.")

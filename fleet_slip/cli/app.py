@@ -264,7 +264,8 @@ def run_app() -> int:
     exit_code = _exit_code_of_app()
     if reason := streams.unprinted():
         say(
-            f"error: standard output: {reason}. What was asked for is done, not all printed.",
+            f"error: standard output: {reason}. The command was done, but its output is "
+            "incomplete.",
             logging.ERROR,
         )
         exit_code = exit_code or StorageError.exit_code
@@ -284,8 +285,8 @@ def _exit_code_of_app() -> int:
             raise
         mebibytes = memory_bytes() // 2**20
         say(
-            f"error: out of memory: this process may have {mebibytes:,} MiB for data. Ask for less "
-            "at once, or give it more.",
+            f"error: out of memory: the limit of this process is {mebibytes:,} MiB. Reduce the "
+            "request, or raise the limit.",
             logging.ERROR,
         )
         return StorageError.exit_code
@@ -301,8 +302,8 @@ def _exit_code_of_app() -> int:
 def _end_interrupted(error: BaseException | None) -> int:
     """Say that Ctrl-C was pressed; end the process at once if a query cannot be stopped."""
     say(
-        "interrupted: what was committed is kept, and nothing is half written. Give the same "
-        "command again to go on.",
+        "interrupted: committed work is kept, nothing is half written. Repeat the command to "
+        "continue.",
         logging.WARNING,
     )
     while error is not None:

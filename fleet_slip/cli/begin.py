@@ -143,8 +143,8 @@ def _say_of_lost(fleet: Fleet, campaign: str, model: str) -> None:
     if lost:
         cohort = f"campaign = '{campaign}' AND lost_control_s IS NULL"
         say(
-            f"in {lost:,} of {number_of(drives, 'drive')} the car was lost, and the model learned "
-            "from them, too. Without them:"
+            f"in {lost:,} of {number_of(drives, 'drive')} the car lost control; the model was "
+            "trained on these, too. Without them:"
         )
         say(f'  {program()}{_root_option(fleet)} publish {model} --cohort "{cohort}"')
 

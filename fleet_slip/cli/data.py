@@ -43,10 +43,10 @@ def simulate(report: "SimulationReport", campaign: str) -> None:
 
 def _joined(*parts: str, replaced: int = 0, forgotten: int = 0) -> str:
     """Return one sentence of what there is to say, and of drives that gave way or did not come."""
-    allow = "fleet-slip forget --allow lets them come back"
+    allow = "fleet-slip forget --allow readmits them"
     parts += (
-        f"in place of {number_of(replaced, 'drive')}" if replaced else "",
-        f"{number_of(forgotten, 'drive')} left out, forgotten ({allow})" if forgotten else "",
+        f"{number_of(replaced, 'drive')} replaced" if replaced else "",
+        f"{number_of(forgotten, 'drive')} skipped: forgotten before ({allow})" if forgotten else "",
     )
     return "; ".join(filter(None, parts))
 
@@ -107,14 +107,14 @@ def ingest(
     others = dry_run or as_one or replace
     if undo is not None:
         if files or mapping or others:
-            raise UsageError("--undo takes out and brings nothing in: give it alone.")
+            raise UsageError("--undo only removes drives: give it alone.")
         _take_back(fleet, undo, json)
     elif not files:
-        raise UsageError("give files; or --undo alone, to take drives out again.")
+        raise UsageError("give files to ingest, or --undo to remove drives.")
     elif mapping is None:
         if others:
             raise UsageError(
-                "give --mapping: without it files are tables of Gram rows (docs/export.md)."
+                "give --mapping: without it, files must be tables of Gram rows (docs/export.md)."
             )
         counted = [fleet.ingest_counted(file) for file in files]
         if json:
@@ -158,8 +158,8 @@ def _require_sound(reports: "list[IngestReport]") -> None:
     for report in reports:
         for one in report.alarms:
             raise AlarmError(
-                f"{report.file}: {one} Rows that were not refused are in. Give the command again "
-                "with --replace when the mapping is right."
+                f"{report.file}: {one} Its rows are stored. Correct the mapping and repeat the "
+                "command with --replace."
             )
 
 
@@ -170,13 +170,13 @@ def _take_back(fleet: Fleet, what: str, json: bool) -> None:
         print_json({"drives_taken_out": drives})
     elif not drives:
         say(
-            f"nothing to undo: no drive of the logs came from a file {what!r}, or through a "
-            'mapping of this name. See: fleet-slip sql "SELECT drive_id, source_file FROM drives"'
+            f"nothing to undo: no drive came from a file or through a mapping named {what!r}. "
+            'See: fleet-slip sql "SELECT drive_id, source_file FROM drives"'
         )
     else:
         say(
-            f"{number_of(drives, 'drive')} taken out, Gram rows and all; to land again, their "
-            "files must be given again"
+            f"{number_of(drives, 'drive')} removed with their Gram rows; to load them again, "
+            "ingest their files again"
         )
 
 
@@ -193,7 +193,7 @@ def _ingested(what: str, reports: "Sequence[IngestReport]") -> str:
     ticks, drives = (sum(getattr(one.counts, name) for one in new) for name in ("ticks", "drives"))
     return _joined(
         f"{what}: {number_of(ticks, 'row')} in {number_of(drives, 'drive')}",
-        f"not as the mapping's conditions ask: {number_of(left_out, 'row')}" if left_out else "",
+        f"excluded by the mapping's conditions: {number_of(left_out, 'row')}" if left_out else "",
         f"in quarantine: {number_of(refused.total(), 'row')} ({reasons})" if refused else "",
         replaced=sum(report.drives_replaced for report in new),
         forgotten=sum(report.drives_forgotten for report in new),
@@ -208,9 +208,7 @@ def _show_previews(previews: "list[Preview]", json: bool) -> None:
         for preview in previews:
             print_parts(preview.parts())
     if suspicions := sum(len(preview.alarms) for preview in previews):
-        raise AlarmError(
-            f"{number_of(suspicions, 'thing')} to look at before ingesting. Nothing was stored."
-        )
+        raise AlarmError(f"{number_of(suspicions, 'suspicion')}, see above. Nothing was stored.")
 
 
 # The command that helps to write mappings.
@@ -237,7 +235,7 @@ def mapping(
     Example: **fleet-slip mapping suggest drive.mf4**
     """
     if output is not None and output.exists():
-        raise UsageError(f"{output}: it exists. Give another name, or remove it.")
+        raise UsageError(f"{output} exists. Choose another name, or remove it.")
     draft, text = _draft(file, can)
     signals = {guess.profile.channel.name: name for name, guess in draft.guesses.items()}
     channels = [

@@ -61,7 +61,10 @@ def gram(
     for report in reports:
         print_parts(report.parts())
     if not (any(one.gram_rows for one in reports) or fleet.warehouse.logs.snapshot().files):
-        say(f"{fleet.root}: there are no logs yet. They come with: fleet-slip run, or ingest")
+        say(
+            f"{fleet.root}: no logs yet. Load some with fleet-slip ingest, or simulate with "
+            "fleet-slip run"
+        )
 
 
 def _run_gram(

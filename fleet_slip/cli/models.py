@@ -37,7 +37,7 @@ def models(
         _import_model(fleet, name, file, json)
         return
     if name == "import" and name not in fleet.registry().names():
-        raise UsageError("which file? Run: fleet-slip models import FILE")
+        raise UsageError("name the file: fleet-slip models import FILE")
     rows = fleet.models(name).to_pylist()
     if json:
         print_json(rows)
@@ -65,7 +65,9 @@ def models(
 
 def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> None:
     if word != "import":
-        raise UsageError(f"{word!r}: a file is for import. Run: fleet-slip models import {file}")
+        raise UsageError(
+            f"unknown action {word!r}. To import the file: fleet-slip models import {file}"
+        )
     version = fleet.import_model(file)
     origin = version.manifest.imported_from
     if json:
@@ -198,8 +200,8 @@ def promote(version: ModelVersion, alias: str, previous: bool) -> None:
     """
     name = version.manifest.name
     say(
-        f"{name}@{alias} is version {version.version} again, and stays so until: fleet-slip "
-        f"promote NAME@VERSION, or fleet-slip pin {name} --off"
+        f"{name}@{alias} is version {version.version} again, and pinned until: fleet-slip promote "
+        f"NAME@VERSION, or fleet-slip pin {name} --off"
         if previous
         else f"{name}@{alias} is now version {version.version}"
     )

@@ -206,7 +206,7 @@ def forget(
         if json:
             print_json({"allowed": True, "changed": changed})
         else:
-            say("its new rows are taken again from now on; what was forgotten stays forgotten")
+            say("its new rows are accepted again from now on; what was forgotten stays forgotten")
     else:
         with progress("forget", "files") as show:
             report = fleet.forget(**subject, now=now, progress=show)

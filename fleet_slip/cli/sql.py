@@ -148,7 +148,7 @@ def _show(session: Session, text: str, limit: int | None, everything: bool) -> N
     shown = session.compute(text, lambda answer: _drawn(_first(answer, limit), width, rows))
     typer.echo(shown)
     if _CUT.search(shown):
-        say("not all rows, columns or texts are shown whole. Name those to see: SELECT …; or --all")
+        say("output truncated. Select fewer columns, or: --all")
 
 
 def _readable(answer: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
@@ -208,5 +208,5 @@ def _representation_errors() -> Iterator[None]:
         yield
     except (pa.ArrowException, ValueError, OverflowError) as error:
         raise QuestionError(
-            f"the result cannot be printed: {error}. Cast the column, such as: CAST(sums AS TEXT)"
+            f"cannot print the result: {error}. Cast the column, such as: CAST(sums AS TEXT)"
         ) from None

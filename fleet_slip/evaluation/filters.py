@@ -295,7 +295,7 @@ def filter_bank(
             one.module,
             _key(one, drives, car),
             partial(_tuned, one, drives, car, executor),
-            f"{one.name} competes as it is, for it cannot be tuned",
+            f"{one.name} left untuned",
         )
         if found:
             before[one.module] = type(one.parameters).model_validate(found["parameters"])

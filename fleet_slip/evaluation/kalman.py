@@ -139,9 +139,7 @@ def fuse(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) ->
     """
     fixes = np.flatnonzero(np.isfinite(drive.gps_vx_mps) & np.isfinite(drive.gps_vy_mps))
     if not len(fixes):
-        raise DataError(
-            "the drive has no GPS fix, which the Kalman filter begins with. Choose drives with GPS."
-        )
+        raise DataError("no GPS fix, which the Kalman filter starts from. Choose drives with GPS.")
     means = _filter(
         hold_last(drive.ax_mps2, "ax"),
         hold_last(drive.ay_mps2, "ay"),

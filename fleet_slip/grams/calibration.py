@@ -97,7 +97,7 @@ class Calibration(Answer):
             left=2,
         )
         if not any(one.uncertainty for cars in self.cars.values() for one in cars.values()):
-            yield Remark("no car has two drives: how sure the numbers are cannot be told")
+            yield Remark("no car has two drives: uncertainties cannot be estimated")
         yield from self._remarks_on_roads()
 
     def parts_of_car(self, car: str) -> Iterator[Part]:

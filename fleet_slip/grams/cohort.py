@@ -327,14 +327,14 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
     """Return the error that tells why a condition leaves no drive."""
     if left_out := opened.count_left_out(condition):
         return NotComputedError(
-            f"all {number_of(left_out, 'drive')} of the cohort {condition.text!r} are of cars that "
-            "sent Gram rows of the logged signals and no log. Select with features = signals."
+            f"all {number_of(left_out, 'drive')} of the cohort {condition.text!r} have no log: "
+            "their cars sent Gram rows of logged signals. Use --features signals."
         )
     one = features().feature_set(features().name_of(opened.identity))
     if one.change_s:
         return DataError(
-            f"no drive of the cohort {condition.text!r} has fixes of a satellite receiver that are "
-            f"{one.change_text} apart: nothing tells the course. Choose another cohort, or map the "
+            f"no drive of the cohort {condition.text!r} has satellite fixes {one.change_text} "
+            "apart, so there is no course to learn from. Choose another cohort, or map the "
             "course and ingest again: docs/course.md."
         )
     examples = opened.database.execute(
@@ -344,9 +344,9 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
     ).fetchone()
     sources, campaigns = examples or ("", "")
     return DataError(
-        f"no drive satisfies the cohort condition {condition.text!r}. The warehouse has sources "
-        f"{sources} and campaigns {campaigns}. See the columns with: "
-        'fleet-slip sql "DESCRIBE drives"'
+        f"no drive matches the cohort condition {condition.text!r}. The warehouse has sources "
+        f'{sources} and campaigns {campaigns}. See the columns with: fleet-slip sql "DESCRIBE '
+        'drives"'
     )
 
 

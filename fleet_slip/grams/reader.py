@@ -203,18 +203,16 @@ def _require_complete(
         unknown = find_backlog(logs, grams, features().identity(PLAIN)).missing
         if unknown:
             raise NotComputedError(
-                f"which drives satisfy {condition.text!r} is not known: {len(unknown)} log files "
-                "have no Gram rows yet. Run: fleet-slip gram && fleet-slip gram "
-                f"--features {feature_set}"
+                f"{feature_set} features are missing: {len(unknown)} log files have no Gram rows "
+                f"yet. Run: fleet-slip gram && fleet-slip gram --features {feature_set}"
             )
     missing = [file for file in backlog.missing if file.path in files]
     if missing or backlog.stale & files:
         everything = condition.text in {ALL_DRIVES, TRAINING_DRIVES}
         cohort = "" if everything else f" --cohort {shlex.quote(condition.text)}"
         raise NotComputedError(
-            f"the feature set {feature_set}, as it is defined now, has not been computed for "
-            f"{len(missing)} of {len(files)} log files of the cohort. Run: fleet-slip gram "
-            f"--features {feature_set}{cohort}"
+            f"{feature_set} features are missing for {len(missing)} of {len(files)} log files of "
+            f"the cohort. Run: fleet-slip gram --features {feature_set}{cohort}"
         )
 
 

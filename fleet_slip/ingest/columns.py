@@ -52,7 +52,7 @@ def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
         return _NUMBERS[unit]
     # The pattern keeps pint from evaluating arithmetic: '9^9^9^9' would never end.
     if len(unit) > _LONGEST_UNIT or not _EXPRESSION.fullmatch(unit):
-        raise ValueError(f"is in {unit[:_LONGEST_UNIT]!r}, which is not a unit; {needs}")
+        raise ValueError(f"has the invalid unit {unit[:_LONGEST_UNIT]!r}; {needs}")
     registry = pint.application_registry
     name = "standard_gravity" if unit == "g" and si_unit == "m/s^2" else unit
     if name not in registry:  # a digit after a letter is a power, as in m/s2
@@ -61,7 +61,7 @@ def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
         root = registry.Quantity(1.0, name).to_root_units()
         wanted = registry.Quantity(1.0, si_unit).to_root_units()
     except (pint.PintError, ValueError, TypeError, AttributeError):
-        raise ValueError(f"is in {unit!r}, which is not a known unit; {needs}") from None
+        raise ValueError(f"has the unknown unit {unit!r}; {needs}") from None
     if root.units != wanted.units:
         raise ValueError(f"is in {unit!r}, {needs}")
     return float(root.magnitude) / float(wanted.magnitude)
@@ -142,7 +142,7 @@ class SignalColumn(Config):
             raise ValueError("has no unit in the file, and several fit: write the right one")
         is_wheel = signal.startswith(WHEELS)
         if self.radius_m is not None and not is_wheel:
-            raise ValueError("has a radius_m, and radius_m is for wheel speeds")
+            raise ValueError("has radius_m, which is for wheel speeds only")
         if self.radius_m is None and is_wheel and self._is_velocity():
             raise ValueError(
                 f"is a velocity in {self.unit!r}; {signal} needs an angular velocity: add "
@@ -195,17 +195,17 @@ def require_satellites(signals: Named[str, SignalColumn]) -> None:
         return
     if course.component is None and course.clockwise_from_north is None:
         raise ValueError(
-            "signals.course: say whether it is clockwise_from_north = true, as receivers give it, "
-            "or false, counterclockwise from east"
+            "signals.course: set clockwise_from_north = true (as receivers give it) or false "
+            "(counterclockwise from east)"
         )
     if course.antenna_x_m is None or course.antenna_y_m is None:
         raise ValueError(
-            "signals.course: say where the antenna is, in m: antenna_x_m before the centre of "
-            "gravity, antenna_y_m to the left of it. A metre that is forgotten is a degree in bends"
+            "signals.course: set antenna_x_m (forward of the centre of gravity) and antenna_y_m "
+            "(left of it). A 1 m error costs about 1° in bends"
         )
     for needed in (SPEED, "yaw_rate"):
         if needed not in signals:
-            raise ValueError(f"signals.course: it needs {needed} beside it")
+            raise ValueError(f"signals.course: needs {needed}, too")
     speed = signals[SPEED]
     if (course.time, course.delay_s) != (speed.time, speed.delay_s):
         raise ValueError("signals.course: time and delay_s are one receiver's: give both alike")
@@ -476,7 +476,7 @@ def _of_signal(name: str, found: re.Match[str]) -> dict[str, Any]:
         raise ValueError(f"{name} is a signal, which is compared with a number")
     unit = catalogue()[name].unit
     if found["unit"] is None and unit != "1":
-        raise ValueError(f"{name} {found['sign']} {found['number']}: of which unit? Say it: {unit}")
+        raise ValueError(f"{name} {found['sign']} {found['number']}: add the unit: {unit}")
     try:
         factor = conversion_factor(found["unit"] or "1", unit, name)
     except ValueError as error:

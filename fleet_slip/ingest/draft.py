@@ -75,7 +75,7 @@ def _doubted(guess: Guess, guesses: dict[str, Guess]) -> Guess:
     """Return a guess, doubted if a weak name without a unit has nothing beside it that agrees."""
     agreeing = {"yaw_rate", "ay", "steering_wheel"} & set(guesses) - {guess.signal}
     if guess.is_weak and guess.is_without_unit and not agreeing:
-        return guess.doubted("its name may mean something else, and so its unit")
+        return guess.doubted("name and unit are ambiguous")
     return guess
 
 

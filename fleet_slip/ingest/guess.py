@@ -354,7 +354,7 @@ def guess_time(
             return _with_date(guess, beside)
         return guess
     keys = {"rate_hz": 100, "assumed": True}
-    reason = "no channel looks like a time: 100 Hz is a mere assumption. Find out, correct it"
+    reason = "no channel looks like a time: 100 Hz is assumed. Correct it"
     return TimeGuess(keys, f"{reason}, and remove assumed", 100.0)
 
 

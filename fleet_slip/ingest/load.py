@@ -280,7 +280,7 @@ def joined(failures: list[InputError]) -> InputError:
     more = len(failures) - FAILURES_SHOWN
     kind = RepeatedError if all(isinstance(o, RepeatedError) for o in failures) else InputError
     return kind(
-        f"{number_of(len(failures), 'file')} cannot be used; all others are in. {first}"
+        f"{number_of(len(failures), 'file')} cannot be used; all others are stored. {first}"
         + (f" And {more:,} more." if more > 0 else "")
     )
 

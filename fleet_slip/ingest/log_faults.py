@@ -76,19 +76,21 @@ class LogFaults:
     ) -> Iterator[Fault]:
         """Yield what looks wrong, once all drives were looked at; see `find_refusals`."""
         yield from find_refusals(refused, rows, reasons)
-        remedy = "Map the column that identifies the car or trip."
+        remedy = "Set vehicle_id or drive.column."
         for name, jumps in self._jumps.most_common(1):
             if jumps:
-                figure = f"{jumps:,} jumps from row to row are larger than any car can make"
+                figure = (
+                    f"it jumps implausibly between rows ({jumps:,} times), as if cars were mixed"
+                )
                 yield Fault("cars", (name,), figure, remedy)
         twice = sum(_overlaps(under_way) for under_way in self._under_way.values())
         if twice:
-            figure = f"one car is under way twice at a time, {twice:,} times"
+            figure = f"drives of one car overlap in time ({twice:,} times)"
             yield Fault("repeated", ("time",), figure, remedy)
         yield from _unmapped_cars(self._file, self._mapping, self._drives)
         if self._mapping.time.assumed:
-            figure = f"the log has no times, and {self._mapping.time.rate_hz:g} Hz are assumed"
-            remedy = "Find out, correct rate_hz, and remove assumed = true."
+            figure = f"the log has no time column; {self._mapping.time.rate_hz:g} Hz is assumed"
+            remedy = "Set the true rate_hz and remove assumed = true."
             yield Fault("time", ("rate_hz",), figure, remedy)
 
 
@@ -103,7 +105,7 @@ def find_refusals(
     several = {key: count for key, count in refused.items() if count > most}
     for (name, reason), count in several.items():
         kind, remedy = _REFUSED.get(reason, ("values", "Look at the column."))
-        figure = f"{count:,} of {rows:,} rows are refused for it, {reason}"
+        figure = f"{count:,} of {rows:,} rows were refused: {reason}"
         yield Fault(kind, (name,), figure, remedy)
     others = Counter(reasons)
     for (_, reason), count in several.items():
@@ -111,11 +113,11 @@ def find_refusals(
     if others.total() <= most:
         return
     ((reason, count),) = others.most_common(1)
-    figure = f"{others.total():,} of {rows:,} rows are refused, {count:,} as {reason}"
+    figure = f"{others.total():,} of {rows:,} rows were refused, {count:,} of them: {reason}"
     if reason.startswith(_OF_TIME):
         remedy = "Check the column of times, its unit and its format"
         if reason in {"time_duplicate", "time_backwards"}:
-            remedy += ", and map the column that identifies the car or trip if there are several"
+            remedy += ", and set vehicle_id or drive.column if the file mixes cars or trips"
         yield Fault("values", ("time",), figure, f"{remedy}.")
     else:
         yield Fault("values", ("rows",), figure, "Look at the view quarantine.")

@@ -97,8 +97,8 @@ def _require_no_root(place: Place, is_root: bool) -> None:
     """Raise `InputError` for a data root: what is in it is in it."""
     if is_root:
         raise InputError(
-            f"{shown(place)}: it is, has or is in a data root, whose logs were ingested before. "
-            "Name the folder where logs land."
+            f"{shown(place)}: part of a data root, whose logs are stored already. Name the folder "
+            "of your logs."
         )
 
 
@@ -131,8 +131,8 @@ def require_inside(file: Path) -> None:
     """Raise `InputError` for a link that leads out of the folder in which it was found."""
     if isinstance(file, StrayLink):
         raise InputError(
-            f"{shown(file)}: it is behind a link that leads out of its folder, and not followed. "
-            "Give the file by its own path."
+            f"{shown(file)}: a link out of its folder, which is not followed. Give the file by "
+            "its own path."
         )
 
 
@@ -220,7 +220,7 @@ def _copy(log: StoredFile, folder: Path) -> Path:
 
     names = log.path.split("/")
     if not {"", ".", ".."}.isdisjoint(names) or not all(map(_can_be_copied, names)):
-        raise InputError(f"{shown(log)}: no file may have this name. Give it another.")
+        raise InputError(f"{shown(log)}: invalid file name. Rename it.")
     copy_object(log, folder / log.path)
     return folder / log.path
 

@@ -385,11 +385,11 @@ class RowChecker:
         for batch in read_batches(self._file, self._mapping):
             yield self._check(batch)
         if not self.rows:
-            raise InputError(f"{shown(self._file)}: it has a header and no rows. Export it again.")
+            raise InputError(f"{shown(self._file)}: a header without rows. Export it again.")
         if self.left_out == self.rows:
             raise InputError(
-                f"{shown(self._file)}: none of its {self.rows:,} rows meets the condition of the "
-                f"mapping {self._mapping.name!r}: {describe(self._mapping.where)}."
+                f"{shown(self._file)}: none of {self.rows:,} rows meets the condition of mapping "
+                f"{self._mapping.name!r}: {describe(self._mapping.where)}."
             )
 
     def _check(self, batch: pl.DataFrame) -> CheckedBlock:

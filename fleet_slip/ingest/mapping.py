@@ -200,7 +200,9 @@ class Mapping(Config):
         if self.label is not None:
             self.label.require_signals(self.signals)
         if self.drive.day is None and not self.time.is_dated:
-            raise ValueError("drive.day is needed: the time has no date. Give a date or a column")
+            raise ValueError(
+                "drive.day is missing, and the time has no date. Set a date, a column or a path"
+            )
         for name, signal in self.signals.items():
             if signal.time is not None and self.time.unit is None:
                 raise ValueError(f"signals.{name}: 'time' needs [time] with 'column' and 'unit'")

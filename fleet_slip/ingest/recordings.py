@@ -268,8 +268,8 @@ class SameRecordings:
         for origin in Fingerprints(self._batch).find(fingerprints):
             # Another one: the same bytes count once anyway.
             raise RepeatedError(
-                f"{shown(log)}: it has the recording of {shown(self._files[origin.digest])}, "
-                "which is ingested with it. Leave one of them out."
+                f"{shown(log)}: same recording as {shown(self._files[origin.digest])}. Leave one "
+                "of them out."
             )
         if self._logs_have is None:
             self._logs_have = Fingerprints(self._logs.units)
@@ -287,14 +287,13 @@ class SameRecordings:
             and {re.sub(MEASURED, "", drive) for drive in drives} <= {self._mapping}
         )
         if drives and not gives_way:
-            what = "its recording is in the logs"
+            what = "this recording is in the logs already"
             what = "it has changed since it was ingested" if changed else what
             source, more = shown(there[drives[0]]), number_of(len(drives), "drive")
             such = drives[0] if len(drives) == 1 else f"{more}, {drives[0]} …"
             raise RepeatedError(
-                f"{shown(log)}: {what}, and would count twice: {such} from {source}. To put "
-                "this in its place, give the command again with --replace; to take the old one "
-                f"out: fleet-slip ingest --undo {source}"
+                f"{shown(log)}: {what} and would count twice: {such} from {source}. To replace "
+                f"the old one: --replace. To remove it: fleet-slip ingest --undo {source}"
             )
         self._batch.update(fingerprints)
         self._files[Origin.of(digest).digest] = log

@@ -166,8 +166,8 @@ class MeasuredStream:
                 drives.append(self._drive(ended, intervals_s))
         if self._open.number_of_rows > MAX_OPEN_ROWS:
             raise InputError(
-                f"{shown(self.file)}: more than {MAX_OPEN_ROWS:,} rows of drives that alternate, "
-                "and none of them ends. Sort the file by drive and time."
+                f"{shown(self.file)}: more than {MAX_OPEN_ROWS:,} rows of interleaved drives. "
+                "Sort the file by drive and time."
             )
         bad = join_refused(refused)
         self._count_refused(bad)
@@ -220,7 +220,7 @@ class MeasuredStream:
         counts, name = self.counts, self.mapping.name
         if counts.drives > MAX_DRIVES and counts.rows_kept < SHORT_ROWS * counts.drives:
             raise InputError(
-                f"{shown(self.file)}: it falls into more than {MAX_DRIVES:,} drives, of "
+                f"{shown(self.file)}: it splits into more than {MAX_DRIVES:,} drives of "
                 f"{counts.rows_kept / counts.drives:.0f} rows on average. Check time, split_gap_s "
                 f"and the drive's column in the mapping {name!r}."
             )
@@ -238,8 +238,8 @@ class MeasuredStream:
             reasons = ", ".join(f"{n:,} {reason}" for reason, n in several.most_common())
             example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
             raise InputError(
-                f"{file}: none of its {number_of(several.total(), 'row')} is usable ({reasons}; "
-                f"first: {example}). Check columns, units and time in the mapping {name!r}."
+                f"{file}: none of {number_of(several.total(), 'row')} is usable ({reasons}; "
+                f"first: {example}). Check columns, units and time in mapping {name!r}."
             )
         if not counts.ticks:
             raise InputError(

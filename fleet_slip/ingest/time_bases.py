@@ -23,8 +23,8 @@ from fleet_slip.ingest.formats.tables import BATCH_ROWS
 from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.mapping import Mapping
 
-_CLOCK = "this file says when each sample was taken: write own_clock = true under [time]"
-_NO_CLOCK = "this file has no clock of its own: write column or rate_hz under [time]"
+_CLOCK = "this file has its own clock: set own_clock = true under [time]"
+_NO_CLOCK = "this file has no clock: set column or rate_hz under [time]"
 
 
 def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:

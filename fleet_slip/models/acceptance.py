@@ -145,7 +145,7 @@ class Comparison:
     def __str__(self) -> str:
         challenger = self.challenger.pooled
         others = "; ".join(
-            f"the coefficients of {one.name} have {one.pooled.rmse_deg:.4f} deg and "
+            f"{one.name} as published has {one.pooled.rmse_deg:.4f} deg and "
             f"{one.pooled.correlation:.4f}, difference {shortfall}"
             + (f", in the median group {typical}" if typical else "")
             for one, shortfall, typical in zip_longest(
@@ -355,8 +355,8 @@ def require_sound_drives(
     found, looked_at, measured = _look(warehouse, manifest, made)
     if measured and len(manifest.terms) > settled and (lacks := find_lacks(manifest)):
         raise RefusedError(
-            f"{manifest.name} was not published: {'; '.join(lacks)}. Ingest more drives, choose "
-            "fewer columns, or publish it with force all the same."
+            f"{manifest.name} was not published: {'; '.join(lacks)}. Ingest more drives or choose "
+            "fewer columns. To publish it anyway: --force"
         )
     if made is not None and looked_at < FEWEST_NEW:
         return
@@ -368,10 +368,9 @@ def require_sound_drives(
         if used.isdisjoint(signals) or 2 * len(examples) + (made is not None) <= looked_at:
             continue
         raise RefusedError(
-            f"{manifest.name} was not published: {len(examples)} of {looked_at} drives that were "
-            f"looked at contradict what any car does: {examples[0]} Publish it with "
-            "force all the same, or correct the mapping and run: fleet-slip ingest LOGS --mapping "
-            "M --replace"
+            f"{manifest.name} was not published: {len(examples)} of {looked_at} inspected drives "
+            f"contradict the motion of any car: {examples[0]} Correct the mapping and run: "
+            "fleet-slip ingest LOGS --mapping M --replace. To publish it anyway: --force"
         )
 
 
@@ -441,7 +440,9 @@ def odd_gain(registry: Registry, selection: Selection, champion: ModelVersion) -
         if known.any() and not known.all():
             return _compare(selection, champion, cohort, known)
     except DataError as error:
-        LOGGER.warning("whether it is better on odd drives alone was not judged: %s", error)
+        LOGGER.warning(
+            "not checked whether the improvement comes only from unusual drives: %s", error
+        )
     return None
 
 
@@ -472,10 +473,10 @@ def _compare(
     if shortfall.negligible:
         return None
     return (
-        f"it is better on odd drives alone: on the drives that made {champion.reference} it has "
-        f"{challenger.pooled.rmse_deg:.4f} deg where the champion has "
-        f"{incumbent.pooled.rmse_deg:.4f} deg, difference {shortfall}, and on the new ones the "
-        f"champion has {on_new:.4f} deg. Look at these before they teach"
+        "the improvement comes only from unusual new drives: on the training set of "
+        f"{champion.reference} it has {challenger.pooled.rmse_deg:.4f} deg and the champion "
+        f"{incumbent.pooled.rmse_deg:.4f} deg, difference {shortfall}; on the new drives the "
+        f"champion has {on_new:.4f} deg. Check these before training"
     )
 
 
@@ -526,8 +527,8 @@ class Judgement:
         """Raise `RefusedError` if there are problems."""
         if self.problems:
             raise RefusedError(
-                f"{name} was not published: {'; '.join(self.problems)}. Look at the data, or "
-                "publish it with force all the same."
+                f"{name} was not published: {'; '.join(self.problems)}. Check the data. To "
+                "publish it anyway: --force"
             )
 
 
@@ -551,32 +552,32 @@ def judge(
         return Judgement(tuple(problems), "")
     if comparison.contradicted:
         problems.append(
-            f"the label runs against what {champion.reference} estimates: is it reversed? "
-            f"{comparison}"
+            f"the label has the opposite sign of the estimates of {champion.reference}. Is it "
+            f"reversed? {comparison}"
         )
     better = [one.name for one in comparison.better]
     if champion.reference in better:
         problems.append(f"it is worse than the champion: {comparison}")
     elif better:
         problems.append(
-            f"it is worse than {better[0]}, the best of the champions so far, from which small "
-            f"steps have led away: {comparison}. To begin anew at the champion: fleet-slip promote "
-            f"{champion.reference}"
+            f"it is worse than {better[0]}, the best champion so far, after several small losses: "
+            f"{comparison}. To accept the present champion as the new reference: fleet-slip "
+            f"promote {champion.reference}"
         )
     then = champion.manifest
     if then.learned_from is None and manifest.learned_from is None:
         was, now = then.cross_validation.rmse_deg, comparison.incumbents[0].pooled.rmse_deg
         if now > ODD * was and not problems:
             problems.append(
-                f"{champion.reference} had an RMSE of {was:.4f} deg on drives that did not train "
-                f"it, and has {now:.4f} deg on these: most of it comes from drives unlike those "
-                f"that vouch for it. Look at them before they teach: {comparison}"
+                f"{champion.reference} had a cross-validated RMSE of {was:.4f} deg and has "
+                f"{now:.4f} deg here: these drives differ from its training set. Check them "
+                f"before training: {comparison}"
             )
     try:
         if not problems and (odd := odd_gain(registry, selection, champion)):
             problems.append(odd)
     except StorageError as error:
-        problems.append(f"it cannot be judged on the drives that made the champion: {error}")
+        problems.append(f"no comparison on the champion's training set: {error}")
     best = next((one.version for one in incumbents if one.reference == comparison.best), None)
     return Judgement(tuple(problems), str(comparison), best, comparison.drifts)
 
@@ -611,11 +612,11 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
     problems = [*_unsure(delays, cars), *_not_corrected(delays, cars)]
     if problems:
         raise RefusedError(
-            f"{manifest.name} was not published: a course that is late looks like a side-slip "
-            f"angle, and {'; '.join(problems)}. The view calibration has the number receiver_delay "
-            "of each car. Choose other cars, more drives of them, or tell the type of their "
-            "receivers: receiver in a mapping or its table of cars. To publish all the same: "
-            f"fleet-slip publish {manifest.name} --label course --force"
+            f"{manifest.name} was not published: a late course looks like side-slip, and "
+            f"{'; '.join(problems)}. The view calibration has receiver_delay of each car. Choose "
+            "other cars, add drives, or set the receiver type (receiver in a mapping or its "
+            f"table of cars). To publish it anyway: fleet-slip publish {manifest.name} --label "
+            "course --force"
         )
     return {car: max(_left(delays[car], corrected), key=abs) for car, corrected in cars.items()}
 
@@ -624,9 +625,9 @@ def _unsure(delays: Mapping[str, ReceiverDelay], cars: Iterable[str]) -> Iterato
     known = {car: delays[car] for car in cars if car in delays}
     unsure = {c: d for c, d in known.items() if d.uncertainty is None or d.uncertainty > SURE_S}
     if unsure:
-        yield f"delays are not known to {1000 * SURE_S:g} ms ({_named(unsure)})"
+        yield f"delays are not estimated to {1000 * SURE_S:g} ms ({_named(unsure)})"
     if untold := sum(car not in delays for car in cars):
-        yield f"that of {number_of(untold, 'car')} is not known at all: their drives do not tell it"
+        yield f"that of {number_of(untold, 'car')} cannot be estimated from their drives"
 
 
 def _not_corrected(
@@ -656,7 +657,7 @@ def _named(delays: Mapping[str, ReceiverDelay]) -> str:
 
 def _said(one: ReceiverDelay) -> str:
     if one.uncertainty is None:
-        return f"{1000 * one.value:.0f} ms, of too few drives to be sure"
+        return f"{1000 * one.value:.0f} ms, from too few drives"
     return f"{1000 * one.value:.0f} +- {1000 * one.uncertainty:.0f} ms"
 
 
@@ -679,8 +680,7 @@ def require_sound_course(
     more = f", and {len(faults) - SHOWN} more" if len(faults) > SHOWN else ""
     raise RefusedError(
         f"{manifest.name} was not published: the course of {len(faults)} of "
-        f"{number_of(len(cars), 'car')} is not that of a car "
-        f"({named}{more}). {first.remedy} Then ingest "
-        "again, or choose other cars; fleet-slip quality names the drives. To publish all the "
-        f"same: fleet-slip publish {manifest.name} --label course --force"
+        f"{number_of(len(cars), 'car')} is implausible ({named}{more}). {first.remedy} Then "
+        "ingest again, or choose other cars; fleet-slip quality lists the drives. To publish it "
+        f"anyway: fleet-slip publish {manifest.name} --label course --force"
     )

@@ -125,8 +125,8 @@ class Diagnosis(Answer):
         )
         if self.cluster == "row":
             yield Remark(
-                "there is one drive only: its rows are taken for independent evidence, which they "
-                "are not at 100 Hz, so that the standard errors are far too small."
+                "only one drive: standard errors take its rows as independent, which they are "
+                "not at 100 Hz, and are far too small."
             )
         yield from lost_remarks(self.weighed)
         if self.comparison is not None:

@@ -448,13 +448,13 @@ def _decide(
     """Decide what becomes of a challenger. Raises `RefusedError`."""
     champion = registry.champion(manifest.name)
     if champion and champion.manifest.same_estimator(manifest):
-        return _Decision("The champion is this very model.", champion)
+        return _Decision("The champion is the same model.", champion)
     held = registry.history(manifest.name).held_by(CHAMPION)
     judgement = judge(registry, champion, manifest, selection)
     if not force and not candidate:
         judgement.require_passed(manifest.name)
     if champion and judgement.drifts and not (force or candidate or held):
-        reason = f"The champion stays, since it is better for sure. {judgement.reason}"
+        reason = f"The champion stays: it is significantly better. {judgement.reason}"
         return _Decision(reason, champion)
     best = None if judgement.problems else judgement.best
     return _Decision(judgement.reason, None, candidate or held is not None, held, best)
@@ -479,7 +479,7 @@ def _why(name: str, held: AliasMove | None) -> str:
     if held is None:
         return "It is a candidate"
     done = f"{_DONE[held.command]} on {held.at:%Y-%m-%d %H:%M} UTC"
-    return f"{name}@{held.version} stays champion since it was {done}"
+    return f"{name}@{held.version} stays champion: it was {done}"
 
 
 _DONE = {"rollback": "rolled back to", "pin": "pinned"}

@@ -306,8 +306,8 @@ class Registry:
         manifest = parse_document(document.content, Manifest, f"{name}@{version}", "its manifest")
         if manifest.name != name:
             raise StorageError(
-                f"{name}@{version}: its manifest is of the model {manifest.name}. Restore the file "
-                "from a backup, or publish again."
+                f"{name}@{version}: its manifest names the model {manifest.name}. Restore the "
+                "file from a backup, or publish again."
             )
         return ModelVersion(version, manifest, document.sha256)
 

@@ -422,7 +422,7 @@ def select(
                 models += found.models
     if not models:
         reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())
-        raise DataError(f"no candidate can be fitted on the cohort. {reasons}")
+        raise DataError(f"no candidate model can be fitted: {reasons}")
     winner = choose_by(searches[0] if searches else None, models, worth)
     return Selection(
         cohort,
@@ -472,13 +472,13 @@ def _answer_usual(warehouse: Warehouse, request: SelectionRequest, condition: st
     logged = replace(request, models=LOGGED_MODELS)
     if request.features or request.by in (ROW_FOLDS, PARTS):
         return _answer(warehouse, logged, condition)
-    why = "Gram rows that cars counted are of the logged signals alone."
+    why = "Gram rows sent by cars hold logged signals only."
     if warehouse.logs.snapshot().rows:
         try:
             return _answer(warehouse, replace(request, models=DEFAULT_MODELS), condition)
         except NotComputedError as error:
             why = str(error)
-    remark = f"compared {LOGGED_MODELS}, not the usual list {DEFAULT_MODELS}: {why}"
+    remark = f"Using model list {LOGGED_MODELS} instead of {DEFAULT_MODELS}: {why}"
     return replace(_answer(warehouse, logged, condition), remark=remark)
 
 

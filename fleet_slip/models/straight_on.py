@@ -87,8 +87,8 @@ def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) 
     cars = [one for one in every if one is not None]
     if not cars:
         raise DataError(
-            f"every car of {condition.text!r} drove alike all the time: nothing tells how its "
-            "sensors are off. Choose more drives, or a model that knows no intercept: "
+            f"cannot determine the intercept: all driving of {condition.text!r} is alike, so no "
+            "sensor offset can be estimated. Choose more drives, or a model without intercept: "
             "--no-intercept."
         )
     rows, means, variances = np.array([(c.rows, c.intercept, c.variance) for c in cars]).T

@@ -25,8 +25,8 @@ def remark_without_information(rows: int, of: int) -> Iterator[Remark]:
     """Yield how many rows of a cohort told nothing, if they are more than windows begin with."""
     if rows > TELLING * of:
         yield Remark(
-            f"{rows:,} of {number_of(of, 'row')} tell nothing: the label or a signal of the model "
-            "is missing there."
+            f"{rows:,} of {number_of(of, 'row')} skipped: the label or a signal of the model is "
+            "null."
         )
 
 
@@ -62,8 +62,8 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
     yield from _left_out(selection)
     if selection.cohort.unlabelled:
         yield Remark(
-            f"a change of the course has {selection.cohort.weight} times the weight of a row with "
-            "the label; the figures are of the angle about its mean in each drive with the label."
+            f"a course change weighs {selection.cohort.weight} times as much as a labelled row; "
+            "the figures are of the angle about its mean in each drive with the label."
         )
     if selection.folds.by in (PARTS, BANDS):
         model = winner.model
@@ -76,19 +76,19 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
         )
     if selection.folds.by == ROW_FOLDS:
         yield Remark(
-            "folds of rows leak: each test row's neighbours at 100 Hz are training rows, so that "
-            "these figures are those of the fit, not of prediction. Compare with --by drive."
+            "folds of rows leak: neighbours of each test row at 100 Hz are training rows, so "
+            "these are errors of the fit, not of prediction. Compare with --by drive."
         )
     if isinstance(selection.distances, str):
-        yield Remark(f"the distances of the nested models cannot be told: {selection.distances}")
+        yield Remark(f"distances of the nested models unknown: {selection.distances}")
     for name, reason in selection.skipped.items():
         one, *others = reason.split("; ")
         more = f"; and {number_of(len(others), 'relation')} more, see --json." if others else ""
-        yield Remark(f"model {name} was left out: {one}{more}")
+        yield Remark(f"Skipped model {name}: {one}{more}")
     if selection.choice is not None and (honest := selection.choice.honest) is not None:
         yield (
-            "made again inside every training fold, the whole choice has a correlation of "
-            f"{honest.correlation:.4f} and an RMSE of {honest.pooled.rmse_deg:.4f} deg."
+            "with the whole selection repeated inside every fold: correlation "
+            f"{honest.correlation:.4f}, RMSE {honest.pooled.rmse_deg:.4f} deg."
         )
     if (found := selection.uncertainty) is not None:
         interval = found.interval
@@ -147,10 +147,10 @@ def _label_noise(selection: "Selection") -> Remark:
     """Return how much of the errors is noise of the label they are measured against."""
     noise = selection.label_noise_deg
     if noise is None:
-        return Remark("how noisy the label is, is not known: all errors have its noise in them.")
+        return Remark("label noise unknown: it is part of every RMSE here.")
     return Remark(
-        f"all errors have the label's own noise in them, {noise:.4f} deg; without it the "
-        f"winner has {selection.beyond_label_noise_deg:.4f} deg."
+        f"every RMSE here includes the label's noise, {noise:.4f} deg; without it the winner has "
+        f"{selection.beyond_label_noise_deg:.4f} deg."
     )
 
 
@@ -166,13 +166,12 @@ def _without_label(told: "WithoutLabel") -> Iterator[Remark]:
     yield Remark(f"{figures}.")
     if (side := told.one_way) is not None:
         yield Remark(
-            f"cars turn to the {side} nearly always: columns that differ between left and right "
-            "alone, such as ay and its square, cannot be told apart, nor can offsets. Add drives "
-            "that turn to the other side."
+            f"nearly all turns are to the {side}: ay and its square cannot be separated, nor can "
+            "offsets. Add drives with turns to the other side."
         )
     yield Remark(
-        "changes do not show the constant (see show of a published version), nor what a course "
-        "that is late or an antenna in another place would add."
+        "course changes do not reveal the intercept (see fleet-slip show), a late course or a "
+        "misplaced antenna."
     )
 
 
@@ -182,7 +181,7 @@ def _left_out(selection: "Selection") -> Iterator[Remark]:
         yield from remark_without_information(selection.rows_without, selection.cohort.rows)
     if without_log := selection.cohort.count_received_with():
         without = number_of(without_log, "drive")
-        yield Remark(f"{without} of these without a log: their cars sent Gram rows.")
+        yield Remark(f"{without} of these have no log: their cars sent Gram rows.")
     yield from remark_left_out(selection.cohort.left_out, selection.cohort.feature_set)
     yield from lost_remarks(selection.weighed)
     if selection.remark:
@@ -203,7 +202,7 @@ def in_families(signals: Sequence[str]) -> str:
 
 
 def _worth(evidence: Evidence) -> str:
-    return f"taking {evidence.kind} for independent, the cohort is worth {evidence.rows:,.0f} rows"
+    return f"with {evidence.kind} as independent observations: {evidence.rows:,.0f} effective rows"
 
 
 def _distances(found: NestedDistances) -> Iterator[Part]:

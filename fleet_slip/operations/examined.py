@@ -88,8 +88,8 @@ class Examined:
         if not self.missing:
             return ""
         return (
-            f"{number_of(self.missing, 'measured drive')} not examined: the Gram rows of their "
-            "signals are not there. Run: fleet-slip gram"
+            f"{number_of(self.missing, 'measured drive')} not checked for faulty sensors: their "
+            "Gram rows are missing. Run: fleet-slip gram"
         )
 
     def __str__(self) -> str:
@@ -97,12 +97,12 @@ class Examined:
         said = []
         if self.made:
             drives = number_of(self.made, "measured drive")
-            said.append(f"made the Gram rows of {drives} that were not there, to examine them.")
+            said.append(f"computed missing Gram rows of {drives} for the sensor check.")
         if self.found:
             out = number_of(len(self.found), "drive")
             said.append(
-                f"{out} of {self.drives:,} left out, not in order: {self._faults_text}. See "
-                "fleet-slip quality; --unexamined takes them all the same."
+                f"{out} of {self.drives:,} left out: faulty sensors ({self._faults_text}). See: "
+                "fleet-slip quality. To use them anyway: --unexamined"
             )
         return " ".join([*said, self.lacking]).strip()
 
@@ -123,8 +123,9 @@ class Examined:
             ):
                 raise
             raise DataError(
-                f"none of {number_of(self.drives, 'drive')} is in order: {self._faults_text}. "
-                "See fleet-slip quality; --unexamined takes them all the same."
+                f"All {number_of(self.drives, 'drive')} have faulty sensors "
+                f"({self._faults_text}); none left to train on. See: fleet-slip quality. To use "
+                "them anyway: --unexamined"
             ) from None
 
     def findings(self, warehouse: Warehouse) -> tuple[SensorFault, ...]:
@@ -200,7 +201,7 @@ def find_trainable(warehouse: Warehouse, cohort: str) -> Examined:
         update_grams(warehouse)
         examined = leave_out_faulty(warehouse, cohort)
     if examined.missing:
-        raise UnexaminedError(f"{examined.lacking}; or take them all the same, unexamined")
+        raise UnexaminedError(f"{examined.lacking}, or use them unchecked: --unexamined")
     return replace(examined, made=made)
 
 

@@ -76,32 +76,32 @@ class ForgetReport(Answer):
     def parts(self) -> Iterator[Part]:
         """Return remarks: what was forgotten, what is left, and which models to train again."""
         if not self.changed:
-            yield Remark("nothing to do, it was forgotten before")
+            yield Remark("nothing to do: it was forgotten before")
             return
         yield Remark(
             f"{number_of(self.drives, 'drive')} forgotten, {number_of(self.rows, 'row')}: "
-            f"{number_of(self.files_rewritten, 'file')} "
-            f"written again without them, {self.files_removed} removed"
+            f"{number_of(self.files_rewritten, 'file')} rewritten without them, "
+            f"{self.files_removed} removed"
         )
         if self.old_files_deleted:
             yield Remark(f"{self.old_files_deleted} old files with them deleted")
         if self.old_files_left:
             yield Remark(
-                f"{self.old_files_left} old files still have them until fleet-slip compact removes "
-                "them; repeat with --now to delete them at once"
+                f"{self.old_files_left} old files keep them until the next fleet-slip compact; to "
+                "delete these now: --now"
             )
         if self.models:
             names = dict.fromkeys(one.partition("@")[0] for one in self.models)
             again = ", ".join(f"fleet-slip publish {name}" for name in names)
-            yield Remark(f"trained on them: {', '.join(self.models)}. Train again with: {again}")
+            yield Remark(f"trained on them: {', '.join(self.models)}. To train again: {again}")
 
     def require_all(self) -> None:
         """Raise `PendingError` while anything may have the drives."""
         if self.pending:
             raise PendingError(
-                f"{len(self.pending)} may still have its rows, in files that no reader sees: "
-                f"{', '.join(self.pending[:PENDING_SHOWN])}. Repeat this command when they have "
-                "ended, or for files of killed jobs after an hour."
+                f"{len(self.pending)} jobs or files may still hold its rows, unseen by readers: "
+                f"{', '.join(self.pending[:PENDING_SHOWN])}. Repeat this command when these have "
+                "ended; for files of killed jobs, after an hour."
             )
 
 

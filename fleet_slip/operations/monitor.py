@@ -21,7 +21,6 @@ import matplotlib as mpl
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 
-from fleet_slip.base import number_of
 from fleet_slip.catalogue.features import PLAIN, features, input_scales
 from fleet_slip.errors import AlarmError, ConfigError, DataError, StorageError
 from fleet_slip.grams.cohort import remark_left_out, sum_days
@@ -157,9 +156,9 @@ def monitor(
     training = [day < since if since else last is not None and day <= last for day in days]
     if sum(training) < limits.min_training_days:
         raise DataError(
-            f"{version.reference} was trained on {number_of(sum(training), 'day')} of the cohort "
-            f"{condition.text!r}, too few to tell what is usual. {limits.min_training_days} "
-            "days are needed. Choose another cohort, or a later first new day."
+            f"Drift charts need {limits.min_training_days} training days; {version.reference} has "
+            f"{sum(training)} in the cohort {condition.text!r}. Choose another cohort, or a later "
+            "--since."
         )
     models = _models(manifest, feature_set, grams, training)
     found = []

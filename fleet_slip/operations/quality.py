@@ -63,8 +63,8 @@ class QualityReport(Answer):
         """Return a table of the findings."""
         peers = "other" if self.compared else "too few"
         examined = (
-            f"{number_of(self.drives, 'drive')} examined, {self.compared:,} of them beside their "
-            f"peers ({peers} drives of a car or vehicle model)"
+            f"{number_of(self.drives, 'drive')} checked, {self.compared:,} of them against peers "
+            f"({peers} drives of a car or vehicle model)"
         )
         if self.findings:
             header = "drive|car|fault|signals|what shows it"

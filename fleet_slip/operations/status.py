@@ -34,7 +34,7 @@ from fleet_slip.warehouse.tables import Warehouse
 SECONDS_PER_HOUR = 3600
 LEAST_MEMORY_BYTES = 2**30
 """The largest command that was measured, `verify` of files of a million rows, takes 828 MiB."""
-_FULL = "the disk has {:.1%} left, less than {:.0%}"
+_FULL = "disk {:.1%} free, below {:.0%}"
 
 REMEMBERED = timedelta(days=366)
 """Commands that last ran before that are not shown, so that old runs need not be read."""
@@ -85,7 +85,7 @@ class WarehouseStatus(Answer):
     problems: tuple[str, ...]
 
     def __repr__(self) -> str:
-        found = "; ".join(self.problems) or "nothing calls for attention"
+        found = "; ".join(self.problems) or "no problem found"
         return f"<{type(self).__name__}: {self.root}, newest day {self.newest_day}; {found}>"
 
     def parts(self) -> Iterator[Part]:
@@ -122,7 +122,7 @@ class WarehouseStatus(Answer):
     def problem(self) -> AlarmError | None:
         """That something calls for attention."""
         found = number_of(len(self.problems), "matter")
-        return AlarmError(f"{found}, above, to be looked after.") if self.problems else None
+        return AlarmError(f"{found} found, see above.") if self.problems else None
 
 
 def status_of(
@@ -277,7 +277,7 @@ def _stale(age: float | None, backlog_age: float | None, limit: float | None) ->
     elif age > limit:
         problems.append(f"no data has been committed for {age:.1f} h, more than {limit:g} h")
     if backlog_age is not None and backlog_age > limit:
-        problems.append(f"a log file has been waiting for its Gram rows for {backlog_age:.1f} h")
+        problems.append(f"a log file has had no Gram rows for {backlog_age:.1f} h")
     return problems
 
 

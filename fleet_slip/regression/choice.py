@@ -175,23 +175,28 @@ def _reason(winner: Shortfall, best: CrossValidation, near: int, total: int, wor
         larger = f"{worth} or more, and by " if worth.amount else ""
         return (
             f"Model {best.name} has the best cross-validated correlation, {best.correlation:.4f}, "
-            f"with {rmse}. The error of {others} is larger by {larger}more than one standard error "
-            "of the difference."
+            f"with {rmse}. The gain over {others} is {larger}more than one standard error, so it "
+            "is significant."
         )
     if not worth.amount:
         return (
-            f"Model {winner.model.name} has the fewest signals, {len(winner.model.signals)}, of "
-            f"{near} models whose error is at most one standard error larger than the least, of "
-            f"model {best.name} ({len(best.signals)} signals, {rmse}): {winner} over these folds."
+            f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of "
+            f"the {near} models within one standard error of the best. The gain of model "
+            f"{best.name} ({len(best.signals)} signals, {rmse}), {winner}, is not significant."
         )
-    real = "real, but less than" if winner.real else "not real; worth having would be"
+    real = (
+        "significant, but less than the required"
+        if winner.real
+        else "not significant; required are"
+    )
     lacks_deg = math.degrees(winner.lacks)
-    lacking = "" if worth.relative else f", what an independent error of {lacks_deg:.2g} deg adds"
+    lacking = (
+        "" if worth.relative else f" (as if an independent error of {lacks_deg:.2g} deg were added)"
+    )
     return (
         f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of the "
-        f"{near} models whose error is negligibly larger than that of model {best.name}, the best "
-        f"({len(best.signals)} signals, {rmse}). The difference, {winner} over the same folds"
-        f"{lacking}, is {real} {worth}."
+        f"{near} models that are about as good as model {best.name}, the best "
+        f"({len(best.signals)} signals, {rmse}). Its gain, {winner}{lacking}, is {real} {worth}."
     )
 
 

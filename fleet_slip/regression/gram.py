@@ -184,9 +184,7 @@ def require_signals(signals: Sequence[str], wanted: Sequence[str]) -> None:
     """Raise `DataError` for a wanted signal that is absent."""
     missing = [name for name in wanted if name not in signals]
     if missing:
-        raise DataError(
-            f"the drives have no {', '.join(missing)}. Leave that out, or choose other drives."
-        )
+        raise DataError(f"these drives lack {' and '.join(missing)}.")
 
 
 def positions(signals: Sequence[str], wanted: Sequence[str]) -> list[int]:

@@ -306,7 +306,7 @@ def _require_reading(database: duckdb.DuckDBPyConnection, text: str) -> None:
     if tree["error"]:
         raise QuestionError(
             "only queries are allowed here (SELECT, WITH, DESCRIBE, SUMMARIZE, EXPLAIN; a PIVOT "
-            "with IN): the warehouse is written by the jobs alone."
+            "with IN)."
         )
 
 
@@ -316,10 +316,7 @@ def _checked(node: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(kind, str):
         return node
     if kind.endswith("_NODE") and kind not in QUERY_NODES:
-        raise QuestionError(
-            "the query would write: only reading is allowed here. The warehouse is written by the "
-            "jobs alone."
-        )
+        raise QuestionError("the query would write: only reading is allowed here.")
     if kind == "VALUE_PARAMETER":
         raise QuestionError("the query has a parameter, and nothing gives it a value.")
     if kind == "TABLE_FUNCTION":
@@ -415,7 +412,7 @@ def _column_problem(node: Tree, columns: frozenset[str]) -> str | None:
     if len(names) == 1 and names[0].lower() in columns:
         return None
     named = printable(".".join(map(str, names)))
-    return f"names the column {named!r}. Columns: {', '.join(sorted(columns))}."
+    return f"has an unknown column {named!r}. Columns: {', '.join(sorted(columns))}."
 
 
 def _function_problem(node: Tree) -> str | None:
@@ -424,6 +421,6 @@ def _function_problem(node: Tree) -> str | None:
     if name in FUNCTIONS | _SYMBOLS and plain and not node["order_bys"]["orders"]:
         return None
     return (
-        f"calls {printable(name)!r}. A condition must mean the same for ever, so it may call "
-        f"only: {', '.join(sorted(FUNCTIONS))}."
+        f"calls {printable(name)!r}. A condition must always mean the same, so it may call only: "
+        f"{', '.join(sorted(FUNCTIONS))}."
     )

@@ -56,8 +56,8 @@ class Warehouse:
         """Raise `StorageError` if there is no data root: a wrong path is not an empty warehouse."""
         if not self.root.exists():
             raise StorageError(
-                f"{self.root}: there is no data root. Make one with: fleet-slip run, or fleet-slip "
-                "ingest; or choose another with --root."
+                f"{self.root}: no data root. Create one with fleet-slip learn or ingest (own "
+                "logs) or fleet-slip run (simulated), or choose another: --root."
             )
 
     @cached_property

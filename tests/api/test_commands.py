@@ -158,7 +158,7 @@ def test_a_cohort_answers_from_gram_rows(fleet: Fleet) -> None:
         cohort.diagnose("bent", signals="ay")
     with pytest.raises(QuestionError, match="name a published model"):
         cohort.diagnose()
-    with pytest.raises(DataError, match="no drive satisfies"):
+    with pytest.raises(DataError, match="no drive matches"):
         fleet.cohort("mass_kg > 1e6").select()
     with pytest.raises(QuestionError, match="no_such_column"):
         fleet.cohort("no_such_column > 1").select()

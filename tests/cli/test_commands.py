@@ -55,11 +55,12 @@ def test_the_bits_are_those_of_other_machines(smoke_root: Path) -> None:
     manifest = Registry(LocalFolder(smoke_root / "models")).resolve("smoke").manifest
     content = manifest.model_dump(mode="json", exclude={"package_version"})
     del content["cross_validation"]["label_noise_deg"]  # came later
+    del content["selected_by"]["reason"]  # a sentence for people
     digests["models"] = sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
     assert digests == {
         "logs": "b875580a1d17083def2771a1c408763eb3a55e5ba122d59e699d2cce7b2f7c40",
         "grams": "d81339d42929335003f976666893a4ac71b7a9f530338fac71c9c606d61b46d2",
-        "models": "80552fbd244ee65df21f2b7b99d4122a49ab0ea59ba5f1c5e83089600e36388a",
+        "models": "2552afe2bab84030ce37aa9e92191ab7af8193d4e391e7f37877e0ab4cb50156",
     }
 
 
@@ -192,9 +193,9 @@ FORGED = (
         (["run", "--campaign", "nowhere"], 3, "Known: fleet, fleet_course, fleet_realistic"),
         (["run", "--campaign", "missing.toml"], 3, "no such file"),
         (["run", "--campaign", "smoke", "--through", "yesterday"], 2, "write it as 2024-05-01"),
-        (["select", "--cohort", "campaign = 'none'"], 5, "no drive satisfies"),
+        (["select", "--cohort", "campaign = 'none'"], 5, "no drive matches"),
         (["select", "--cohort", "campain = 'x'"], 5, "campain"),
-        (["select", "--cohort", "random() < 0.5"], 5, "must mean the same for ever"),
+        (["select", "--cohort", "random() < 0.5"], 5, "must always mean the same"),
         (["publish", "forged", "--cohort", FORGED], 5, "not valid SQL"),
         (["what-if", "smoke", "--cohort", "EXISTS (FROM log)", "--bias", "ay=1"], 5, "subquery"),
         (["quality", "--cohort", "true) OR (true"], 5, "not valid SQL"),
@@ -242,7 +243,7 @@ def test_commands_on_an_empty_warehouse_say_how_to_begin(
     assert run_command("models", "--json").json == []
     assert run_command("gram", "--json").json["files_read"] == 0
     done = run_command("gram")
-    assert (done.exit_code, "there are no logs yet" in done.stderr) == (0, True)
+    assert (done.exit_code, "no logs yet" in done.stderr) == (0, True)
 
 
 def test_a_long_condition_is_not_printed_whole_unless_all_is(

@@ -60,7 +60,7 @@ def test_the_command_ends_with_130_and_may_be_given_again(
     monkeypatch.setattr(program, "app", interrupted)
     assert program._exit_code_of_app() == 130
     (remark,) = said
-    assert remark.endswith("Give the same command again to go on.")
+    assert remark.endswith("Repeat the command to continue.")
 
 
 INTERRUPTED_AT_IMPORT = """
@@ -107,7 +107,7 @@ def test_a_want_of_memory_is_told_with_an_amount_and_a_bug_is_not_hidden(
     monkeypatch.setattr(program, "app", fail)
     if told:
         assert program._exit_code_of_app() == 6
-        assert re.search(r"out of memory: this process may have [\d,]+ MiB", said[0])
+        assert re.search(r"out of memory: the limit of this process is [\d,]+ MiB", said[0])
     else:
         with pytest.raises(type(error)):
             program._exit_code_of_app()
@@ -178,5 +178,5 @@ def test_a_query_that_cannot_be_stopped_ends_with_the_process(smoke_root: Path, 
         out, err = process.communicate(timeout=PATIENCE_S)
     assert processor_s() - before < 10  # two of them to start
     assert (process.returncode, out) == (130, "")
-    assert "interrupted: what was committed is kept" in err
+    assert "interrupted: committed work is kept" in err
     assert "Traceback" not in err

@@ -90,7 +90,7 @@ def test_a_criterion_chooses_from_a_ranking_and_says_how_sure(
     assert naive["choice"]["effective_rows"] == naive["rows"]
     table = run_command(*arguments, root=every_set).stdout
     assert "order by backward" in table
-    assert "made again inside every training fold" in table
+    assert "selection repeated inside every fold" in table
 
 
 def test_all_subsets_report_the_best_of_every_size(
@@ -376,7 +376,7 @@ def test_a_set_is_not_asked_of_drives_that_no_gram_row_names(
     refused = run_command(*asked, "campaign = 'smoke'", root=root)
     assert refused.exit_code == 5
     assert "log files have no Gram rows yet. Run: fleet-slip gram &&" in refused.stderr
-    assert "no drive satisfies" not in refused.stderr
+    assert "no drive matches" not in refused.stderr
 
 
 def test_of_hundreds_of_inputs_a_message_names_families_and_how_many_more(
@@ -400,7 +400,7 @@ def test_single_drives_have_errors_by_rows_with_a_warning(
     other = ("--against", "drive_id LIKE '%05-01-0001'")
     done = run_command(*asked, *other, root=smoke_root)
     assert done.exit_code == 0
-    assert "there is one drive only" in done.stderr
+    assert "only one drive" in done.stderr
     assert "too few drives to compare" in done.stderr
     assert "Wald" not in done.stdout
     found = run_command(*asked, *other, "--json", root=smoke_root).json

@@ -227,9 +227,9 @@ def test_the_command_imports_and_show_says_from_where(
     assert said["imported_from"]["reference"] == "smoke@1"
     assert ended(*root, "show", "smoke@1") == 0
     assert "from smoke@1 of another data root" in capsys.readouterr().out
-    with pytest.raises(UsageError, match="a file is for import"):
+    with pytest.raises(UsageError, match="unknown action 'smoke'"):
         ended(*root, "models", "smoke", str(exported))
-    with pytest.raises(UsageError, match=r"which file\?"):
+    with pytest.raises(UsageError, match=r"name the file"):
         ended(*root, "models", "import")
 
 

@@ -123,9 +123,9 @@ def test_slow_and_sudden_courses_are_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"antenna_x_m": None}, "say where the antenna is"),
+        ({"antenna_x_m": None}, "set antenna_x_m"),
         ({"antenna_x_m": 1200}, "less than or equal to 15"),
-        ({"clockwise_from_north": None}, "say whether it is clockwise_from_north"),
+        ({"clockwise_from_north": None}, "set clockwise_from_north"),
     ],
 )
 def test_what_a_course_needs_must_be_said(changes: Columns, said: str) -> None:
@@ -137,7 +137,7 @@ def test_what_a_course_needs_must_be_said(changes: Columns, said: str) -> None:
 def test_a_course_comes_with_speed_and_yaw_rate() -> None:
     for needed in ("satellite_speed", "yaw_rate"):
         some = {name: column for name, column in ANGLE.items() if name != needed}
-        with pytest.raises(ValidationError, match=f"it needs {needed} beside it"):
+        with pytest.raises(ValidationError, match=f"needs {needed}, too"):
             a_mapping(signals=some)
     with pytest.raises(ValidationError, match="give the speed too"):
         a_mapping(signals={**VELOCITIES, "satellite_speed": ANGLE["satellite_speed"]})

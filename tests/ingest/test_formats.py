@@ -221,10 +221,10 @@ def test_mdf_errors_name_the_channel_and_the_way_out(tmp_path: Path) -> None:
     assert "no column 'Beta'. Did the mapping mean 'beta'?" in message
     message = failure(file, mdf_mapping(signals={"ax": {"column": "text", "unit": "m/s^2"}}))
     assert "100 not_a_number; first: ax = 'on' in row 1" in message
-    assert "write own_clock = true under [time]" in failure(file, a_mapping())
+    assert "set own_clock = true under [time]" in failure(file, a_mapping())
     empty = write_mdf(tmp_path, [a_x(samples=np.zeros(0, "i2"), timestamps=np.zeros(0))])
     message = failure(empty, mdf_mapping(signals={"ax": {"column": "a_x", "unit": "m/s^2"}}))
-    assert "a header and no rows" in message
+    assert "a header without rows" in message
 
 
 def test_a_signal_that_reaches_no_tick_is_named(tmp_path: Path) -> None:
@@ -347,7 +347,7 @@ def test_a_group_without_samples_is_a_signal_without_values(tmp_path: Path) -> N
     assert (suspicion.kind, suspicion.signals) == ("absent", ("sideslip",))
     file = write_mdf(tmp_path, [a_x()], [beta()], [nothing_but(condition)])
     where = mdf_mapping(where=[{"column": "fix", "at_least": 1}])
-    assert "none of its 200 rows meets the condition" in failure(file, where)
+    assert "none of 200 rows meets the condition" in failure(file, where)
 
 
 def nothing_but(signal: Signal) -> Signal:

@@ -58,7 +58,7 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         ('"deg"', '"km/h"', "steer_fl_deg is in 'km/h', steer_fl needs an angle"),
-        ('"deg"', '"smoot"', "'smoot', which is not a known unit; steer_fl needs an angle"),
+        ('"deg"', '"smoot"', "unknown unit 'smoot'; steer_fl needs an angle"),
         ("steer_fl =", "steer_f =", "unknown signal 'steer_f'. Do you mean steer"),
         (
             "steer_fl =",
@@ -72,7 +72,7 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
         ('unit = "s"', 'format = "%Q nonsense"', "not a strftime format"),
         ('unit = "s"', 'unit = "s", split_gap_s = 0.01', "longest_gap_s cannot be larger"),
         ('unit = "s"', 'unit = "s", longest_gap_s = nan', "time.longest_gap_s"),
-        ("day = 2024-05-31, ", "", "drive.day is needed"),
+        ("day = 2024-05-31, ", "", "drive.day is missing"),
         ("2024-05-31", '"tomorrow"', "drive.day"),
         (
             'vehicle_id = "v"',
@@ -85,7 +85,7 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
         ('"a",', '"a\\n",', "has characters that cannot be printed"),
         ("time =", "csv = { separator = '--' }\ntime =", "one ASCII character"),
         ("[signals]", "[signal]", "signals: is missing"),
-        ('"deg"', '"km/h", radius_m = 0.3', "radius_m is for wheel speeds"),
+        ('"deg"', '"km/h", radius_m = 0.3', "radius_m, which is for wheel speeds"),
         ("steer_fl =", "wheel_fl =", "wheel_fl needs an angular velocity"),
         (STEER, WHEEL.replace("km/h", "rpm"), "wheel_fl needs a velocity, such as 'km/h'"),
         (STEER, WHEEL.replace("0.3", "0"), "signals.wheel_fl.radius_m"),

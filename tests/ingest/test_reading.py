@@ -129,7 +129,7 @@ def test_other_columns_may_have_one_name(tmp_path: Path) -> None:
     [
         (b"", "it is empty"),
         (b"\n\n", "its first line is empty"),
-        (b"t,ax,beta\n", "a header and no rows"),
+        (b"t,ax,beta\n", "a header without rows"),
         (b"t,ax,ax,beta\n0,1,2,3\n", "2 columns are called 'ax' (number 2, 3)"),
         (b"t,AX,beta_deg\n0,1,2\n", "no column 'ax'. Did the mapping mean 'AX'? Its columns are"),
         (b"t,ax,beta\n0,1\xe92,3\n", "not UTF-8, near"),
@@ -139,7 +139,7 @@ def test_other_columns_may_have_one_name(tmp_path: Path) -> None:
         (b"t,ax,beta" + b",x" * 20_000 + b"\n", "20,003 columns, at most 10,000"),
         (b't,ax,"beta\n0,1,2\n', "its header is not CSV"),
         (b't,ax,beta\n0,1,"2\n0.01,3,4\n', "cannot be read"),
-        (b"t,ax,beta\n" + b"x,y,z\n" * 9, "none of its 9 rows is usable (9 not_a_number; first: "),
+        (b"t,ax,beta\n" + b"x,y,z\n" * 9, "none of 9 rows is usable (9 not_a_number; first: "),
     ],
 )
 def test_broken_csv_is_refused_in_one_line(tmp_path: Path, data: bytes, message: str) -> None:

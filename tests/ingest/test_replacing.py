@@ -59,7 +59,9 @@ def test_a_corrected_mapping_replaces_what_came_through_the_old_one(
 ) -> None:
     before = drives(fleet)
     version = fleet.warehouse.logs.snapshot().version
-    with pytest.raises(RepeatedError, match=r"monday.csv: its recording is in the logs.*--replace"):
+    with pytest.raises(
+        RepeatedError, match=r"monday.csv: this recording is in the logs already.*--replace"
+    ):
         fleet.ingest(tmp_path / "monday.csv", corrected())
     assert drives(fleet) == before
     (report,) = fleet.ingest(tmp_path / "monday.csv", corrected(), replace="all")
@@ -96,7 +98,9 @@ def with_more(file: Path) -> Path:
 def test_a_copy_is_told(mapping: Mapping, fleet: Fleet, tmp_path: Path) -> None:
     before = drives(fleet)
     file = with_more(write(tmp_path / "copy.csv", recording()))
-    with pytest.raises(RepeatedError, match=r"copy.csv: its recording is in the logs.*monday.csv"):
+    with pytest.raises(
+        RepeatedError, match=r"copy.csv: this recording is in the logs already.*monday.csv"
+    ):
         fleet.ingest(file, mapping)
     assert drives(fleet) == before
     (report,) = fleet.ingest(file, mapping, replace="all")
@@ -109,7 +113,7 @@ def test_copies_that_come_together_are_told(tmp_path: Path) -> None:
     write(tmp_path / "landing" / "a.csv", recording())
     with_more(write(tmp_path / "landing" / "b.csv", recording()))
     write(tmp_path / "landing" / "c.csv", recording(3))
-    with pytest.raises(RepeatedError, match=r"b.csv: it has the recording of .*a.csv"):
+    with pytest.raises(RepeatedError, match=r"b.csv: same recording as .*a.csv"):
         fleet.ingest(tmp_path / "landing", a_mapping())
     assert drives(fleet).keys() == {"a.csv", "c.csv"}
 
@@ -179,7 +183,7 @@ def test_two_that_land_a_recording_at_once_land_it_once(
         commit(self, change)
 
     monkeypatch.setattr(Snapshot, "commit", commit_later)
-    with pytest.raises(RepeatedError, match=r"first.csv: its recording is in the logs"):
+    with pytest.raises(RepeatedError, match=r"first.csv: this recording is in the logs already"):
         fleet.ingest(first, a_mapping())
     assert drives(fleet).keys() == {"second.csv"}
 

@@ -59,7 +59,7 @@ def test_rows_that_do_not_meet_the_conditions_are_counted(
         ("speed", "is no condition"),
         ("speed > 5 or speed < 2", "is no condition"),
         ("speed > 5 m/s", "'speed' is no signal of this mapping but a column"),
-        ("ax > 5", "of which unit? Say it: m/s"),
+        ("ax > 5", "add the unit: m/s"),
         ("ax > 5 km/h", "ax needs an acceleration"),
         ("ax = 'much'", "compared with a number"),
         ("fix > 'RTK'", "a text can only be ="),
@@ -93,7 +93,7 @@ def test_rows_keep_their_numbers_in_the_quarantine(tmp_path: Path) -> None:
 
 def test_a_condition_that_no_row_meets_is_an_error(tmp_path: Path) -> None:
     where = [{"column": "speed", "at_least": 500}]
-    with pytest.raises(InputError, match=r"none of its 20 rows .* 'speed' is at least 500"):
+    with pytest.raises(InputError, match=r"none of 20 rows .* 'speed' is at least 500"):
         read_columns(tmp_path, columns(), a_mapping(where=where))
 
 

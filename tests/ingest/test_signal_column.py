@@ -74,7 +74,7 @@ def test_placing_keeps_values_and_invents_none(steps: list[float], delay_s: floa
     [
         ("wheel_fl", {"unit": "km/h"}, "add radius_m, the rolling radius of the wheel"),
         ("wheel_fl", {"unit": "rpm", "radius_m": 0.3}, "wheel_fl needs a velocity"),
-        ("vx", {"unit": "km/h", "radius_m": 0.3}, "radius_m is for wheel speeds"),
+        ("vx", {"unit": "km/h", "radius_m": 0.3}, "radius_m, which is for wheel speeds"),
         ("ax", {"unit": "g", "gain": 0}, "gain cannot be 0"),
         ("ax", {"unit": "g", "delay_s": 11}, "less than or equal to 10"),
     ],

@@ -266,7 +266,7 @@ def test_a_rate_that_is_assumed_is_said_at_each_ingest(tmp_path: Path) -> None:
         tmp_path, 'ay = { column = "ay", unit = "m/s^2" }', "rate_hz = 100\nassumed = true"
     )
     assert assumed.time.assumed
-    with pytest.raises(AlarmError, match="100 Hz are assumed"):
+    with pytest.raises(AlarmError, match="100 Hz is assumed"):
         call(
             tmp_path / "root",
             "ingest",

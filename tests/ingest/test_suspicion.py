@@ -190,7 +190,7 @@ def test_ingest_says_what_looks_wrong_and_goes_on(tmp_path: Path) -> None:
     words = ["--root", str(tmp_path / "root"), "ingest", file, "--mapping", mapping, "--json"]
     done = CliRunner().invoke(app, words)
     assert isinstance(done.exception, AlarmError)  # as a dry run, `quality` and a night
-    assert "Rows that were not refused are in." in str(done.exception)
+    assert "Its rows are stored." in str(done.exception)
     (told,) = [line for line in done.stderr.splitlines() if "looks wrong: reversed ay?" in line]
     assert told.startswith(file)
     assert told.endswith("Write negate = true.")
@@ -211,8 +211,8 @@ def test_a_unit_that_lies_so_much_that_rows_are_refused_is_told(tmp_path: Path) 
     (found,) = report["suspicions"]
     assert (found["kind"], found["signals"]) == ("scaled", ["yaw_rate"])
     refused = report["quarantined"]["out_of_range"]
-    assert found["figure"] == f"{refused:,} of 6,000 rows are refused for it, out_of_range"
-    with pytest.raises(AlarmError, match="1 thing to look at"):
+    assert found["figure"] == f"{refused:,} of 6,000 rows were refused: out_of_range"
+    with pytest.raises(AlarmError, match="1 suspicion, see above"):
         call(tmp_path / "other", *command, "--dry-run")
 
 
@@ -223,7 +223,7 @@ def test_few_refused_rows_are_no_suspicion() -> None:
     assert found == [("texts", ("ay",)), ("values", ("vx",))]
     few = {("ax", "out_of_range"): 60, ("ay", "out_of_range"): 60}
     (together,) = find_refusals(few, 1000, {"out_of_range": 120})
-    assert together.figure == "120 of 1,000 rows are refused, 120 as out_of_range"
+    assert together.figure == "120 of 1,000 rows were refused, 120 of them: out_of_range"
     assert not list(find_refusals({("ax", "out_of_range"): 10}, 12, {"out_of_range": 10}))
 
 
@@ -242,7 +242,7 @@ def test_files_that_land_together_say_it_once(tmp_path: Path) -> None:
     reports = json.loads(done.stdout)
     found = {Path(one["file"]).name: len(one["suspicions"]) for one in reports}
     assert found == {"car.csv": 1, "short.csv": 0}
-    with pytest.raises(AlarmError, match="1 thing to look at"):
+    with pytest.raises(AlarmError, match="1 suspicion, see above"):
         call(tmp_path / "root", "ingest", str(logs), "--mapping", mapping, "--dry-run")
 
 
@@ -252,7 +252,7 @@ def test_rows_that_are_refused_for_their_time_call_for_attention(tmp_path: Path)
     (tmp_path / "log.csv").write_text(csv_text(columns))
     (tmp_path / "test.toml").write_text(PLAIN.format(day="2024-05-31"))
     words = ("ingest", str(tmp_path / "log.csv"), "--mapping", str(tmp_path / "test.toml"))
-    with pytest.raises(AlarmError, match="200 of 300 rows are refused"):
+    with pytest.raises(AlarmError, match="200 of 300 rows were refused"):
         call(tmp_path / "root", *words)
     fleet = fleet_slip.open(tmp_path / "root")
     assert fleet.sql("SELECT count(*) FROM log").fetchall() == [(100,)]
@@ -261,5 +261,5 @@ def test_rows_that_are_refused_for_their_time_call_for_attention(tmp_path: Path)
 def test_reasons_together_are_told() -> None:
     found = list(find_refusals({}, 1000, {"time_duplicate": 60, "time_backwards": 50}))
     assert [(one.kind, one.signals) for one in found] == [("values", ("time",))]
-    assert "110 of 1,000 rows are refused, 60 as time_duplicate" in str(found[0])
+    assert "110 of 1,000 rows were refused, 60 of them: time_duplicate" in str(found[0])
     assert not list(find_refusals({}, 1000, {"no_value": 90}))

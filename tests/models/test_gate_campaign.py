@@ -75,7 +75,9 @@ def test_96_drives_again_with_the_label_negated_make_no_champion(champion: Wareh
     land_again(champion, pc.negate)
     with pytest.raises(RefusedError, match=r"its correlation is"):
         publish_from(champion)
-    with pytest.raises(RefusedError, match=r"runs against what beta@1 estimates: is it reversed"):
+    with pytest.raises(
+        RefusedError, match=r"opposite sign of the estimates of beta@1\. Is it reversed"
+    ):
         publish_from(champion, "drive_id LIKE 'again-%'")
     assert Registry(champion.root / "models").versions("beta") == [1]
 

@@ -63,16 +63,16 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
     monkeypatch.undo()
     told = run_command("select", "--models", "table1")
     assert told.exit_code == 0
-    assert "2 drives of 6 left out, not in order: 2 stuck ay" in told.stderr
+    assert "2 drives of 6 left out: faulty sensors (2 stuck ay)" in told.stderr
     assert "4 drives" in told.stdout
     assert "6 drives" in run_command("select", "--models", "table1", "--unexamined").stdout
     assert run_command("publish", "m", "--models", "table1").exit_code == 0
     assert fleet.model("m").manifest.trained_on.drives == 4
     by_hand = fleet.cohort().select(models="table1")
     assert by_hand.as_dict()["examined"] == str(found)
-    assert fleet.publish("m", by_hand).reason == "The champion is this very model."
+    assert fleet.publish("m", by_hand).reason == "The champion is the same model."
     scored = run_command("score", "m")
-    assert "2 drives of 6 left out, not in order: 2 stuck ay" in scored.stderr
+    assert "2 drives of 6 left out: faulty sensors (2 stuck ay)" in scored.stderr
     assert (fleet.score("m").drives, fleet.score("m", unexamined=True).drives_left_out) == (4, 4)
 
 
@@ -87,7 +87,7 @@ def test_a_kept_verdict_of_which_a_bit_flipped_is_found_again(fleet: Fleet, tmp_
 
 
 def test_a_cohort_of_which_no_drive_is_in_order_says_so(fleet: Fleet) -> None:
-    with pytest.raises(DataError, match="none of 2 drives is in order: 2 stuck ay"):
+    with pytest.raises(DataError, match="All 2 drives have faulty sensors \\(2 stuck ay\\)"):
         fleet.cohort("day = DATE '2026-10-06'").select(models="table1")
 
 
@@ -239,12 +239,15 @@ def test_drives_without_gram_rows_are_reduced_and_examined_before_they_train(
     shutil.rmtree(Path(str(fleet.root)) / "grams")
     fleet.gram("calibration")
     told = str(examined.leave_out_faulty(fleet.warehouse, TRAINING_DRIVES))
-    assert told.startswith("6 measured drives not examined: ") and "Run: fleet-slip gram" in told
+    assert (
+        told.startswith("6 measured drives not checked for faulty sensors: ")
+        and "Run: fleet-slip gram" in told
+    )
     with monkeypatch.context() as patch:
         patch.setattr(examined, "READ_ON_THE_WAY", 100)
         with pytest.raises(UnexaminedError, match=r"6 measured drives .* unexamined"):
             fleet.publish("m")
     done = run_command("publish", "m", "--models", "table1")
     assert done.exit_code == 0, done.stderr
-    assert "made the Gram rows of 6 measured drives" in done.stderr
+    assert "computed missing Gram rows of 6 measured drives" in done.stderr
     assert fleet.model("m").manifest.trained_on.drives == 4

@@ -156,7 +156,7 @@ def test_vehicle_models_are_examined_one_after_the_other(warehouse: Warehouse) -
         together = examine(cohort, few(), find_wrong_labels(cohort, few()))
         assert examine_drives(warehouse, condition, few()) == together
         assert together.drives > 0
-    with pytest.raises(DataError, match="no drive satisfies"):
+    with pytest.raises(DataError, match="no drive matches"):
         examine_drives(warehouse, "mass_kg > 1e9")
 
 

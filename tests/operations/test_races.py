@@ -290,7 +290,7 @@ def test_the_command_says_what_may_be_left_and_finishes_when_it_is_repeated(
     with recording(warehouse.root, "ingest", ["ingest"]):
         told = run_command("forget", "--vehicle", "beta", "--now")
         assert told.exit_code == 12
-        assert "2 may still have its rows" in told.stderr
+        assert "2 jobs or files may still hold its rows" in told.stderr
     assert cars_in(warehouse, "log") == {"alfa"}
     os.utime(half, (0, 0))
     done = run_command("forget", "--vehicle", "beta", "--now", "--json")

@@ -39,7 +39,7 @@ def test_freshness_backlog_and_age(warehouse: Warehouse) -> None:
     later = status_of(warehouse, 1, now=datetime.now(UTC) + timedelta(hours=3))
     assert [text.partition(" for ")[0] for text in later.problems] == [
         "no data has been committed",
-        "a log file has been waiting",
+        "a log file has had no Gram rows",
     ]
     assert later.data_age_hours == pytest.approx(3, abs=0.1)
     assert status_of(warehouse, None, now=datetime.now(UTC) + timedelta(hours=3)).problems == ()

@@ -179,7 +179,7 @@ def test_no_name_of_an_object_leads_out_of_the_temporary_folder(
     found = find_object(f"{bucket}/landing/day 0/münchen 0.csv")
     assert found is not None
     with (
-        pytest.raises(InputError, match="no file may have this name"),
+        pytest.raises(InputError, match="invalid file name"),
         local_copy(replace(found, path=path)),
     ):
         pass

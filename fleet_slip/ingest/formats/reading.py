@@ -153,8 +153,8 @@ def _opened(
     for suffixes, kind in _BINARY.items():
         if suffix in suffixes:
             raise InputError(
-                f"{shown(file)}: not {kind}, whatever its name says. Export it again, or name it "
-                "as what it is."
+                f"{shown(file)}: not {kind}, despite its suffix. Export it again, or correct the "
+                "suffix."
             )
     if VBO_BEGINS.match(start) and formats.csv == CsvFormat():
         return nullcontext(VboSource(budget, formats.plain_numbers))

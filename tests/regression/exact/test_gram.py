@@ -100,7 +100,7 @@ def test_products_are_found_by_name() -> None:
 def test_mistakes_are_named() -> None:
     gram = Gram.from_counts(SIGNALS, np.array([[1, 2, 3]]))
     larger = Gram.from_counts(SIGNALS, np.array([[1, 2, 4]]))
-    with pytest.raises(DataError, match="the drives have no yaw_rate"):
+    with pytest.raises(DataError, match="these drives lack yaw_rate"):
         gram.restrict(["ax", "yaw_rate"])
     with pytest.raises(DataError, match="different signals"):
         _ = gram + gram.restrict(["ax"])

@@ -86,7 +86,7 @@ def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
     together = cohort_of(drives, [0, 1, 2] * 4)
     assert both == cross_validate_inputs("two", together, ["x1", "x2"], "y", SCALES)
     assert cross_validate_inputs("three", cohort, ["x3"], "y", SCALES).drives == 6
-    with pytest.raises(DataError, match="the drives have no gyro"):
+    with pytest.raises(DataError, match="these drives lack gyro"):
         cohort.serving(["gyro"], "y")
 
 
@@ -163,8 +163,8 @@ def test_a_gain_that_is_real_and_worth_nothing_buys_no_signal() -> None:
     assert choose([small, best], Worth(0.04, relative=True)).model is small
     assert choose([small, best], Worth(0.03, relative=True)).model is best
     reason = choose([small, best], Worth(0.5)).reason
-    assert "fewest signals (3) of the 2 models whose error is negligibly larger" in reason
-    assert "what an independent error of 24 deg adds, is real, but less than" in reason
+    assert "fewest signals (3) of the 2 models that are about as good" in reason
+    assert "as if an independent error of 24 deg were added), is significant, but less" in reason
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5, 2.0])
@@ -180,7 +180,7 @@ def test_a_gain_that_is_not_real_buys_no_signal_however_large() -> None:
     best = candidate("best", 5, 0.990, 1.05, 2.05)
     chosen = choose([small, best], Worth(0.001))
     assert chosen.model is small
-    assert "is not real" in chosen.reason
+    assert "is not significant" in chosen.reason
 
 
 def test_the_standard_error_of_a_shortfall_is_that_of_a_paired_t_test() -> None:
@@ -205,7 +205,7 @@ def test_models_of_other_rows_are_compared_without_pairs() -> None:
 def test_a_clear_best_wins_and_ties_go_to_the_declared_order() -> None:
     clear = [candidate("first", 1, 0.90, 2.0, 3.0), candidate("best", 5, 0.990, 1.0, 2.0)]
     assert choose(clear).model.name == "best"
-    assert "error of every other model is larger by 0.025 deg or more" in choose(clear).reason
+    assert "gain over every other model is 0.025 deg or more" in choose(clear).reason
     tied = [candidate("b", 2, 0.9, 1.0, 1.0), candidate("a", 2, 0.9, 1.0, 1.0)]
     assert choose(tied).model.name == "b"
     twins = [candidate("twin", 2, 0.91, 1.0, 1.0), candidate("a", 2, 0.9, 1.0, 1.0)]
