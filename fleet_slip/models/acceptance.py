@@ -614,8 +614,8 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
         raise RefusedError(
             f"{manifest.name} was not published: a late course looks like side-slip, and "
             f"{'; '.join(problems)}. The view calibration has receiver_delay of each car. Choose "
-            "other cars, add drives, or set the receiver type (receiver in a mapping or its "
-            f"table of cars). To publish it anyway: fleet-slip publish {manifest.name} --label "
+            "other cars, add drives, or set the receiver type (receiver in the mapping). "
+            f"To publish it anyway: fleet-slip publish {manifest.name} --label "
             "course --force"
         )
     return {car: max(_left(delays[car], corrected), key=abs) for car, corrected in cars.items()}

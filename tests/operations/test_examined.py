@@ -133,7 +133,7 @@ def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
         fleet.gram()
         if name == "a":
             assert fleet.publish("m", fleet.cohort()).new
-    with pytest.raises(RefusedError, match=r"differ from its training set|inspected drives contradict"):
+    with pytest.raises(RefusedError, match="differ from its training set"):
         fleet.publish("m", fleet.cohort())
     assert fleet.publish("m", fleet.cohort(), candidate=True).candidate
 
