@@ -335,9 +335,8 @@ def _read(file: Path, content: bytes) -> pa.Table:
     try:
         if content[:4] == b"PAR1":
             parquet = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
-            groups = map(parquet.metadata.row_group, range(parquet.num_row_groups))
-            unpacked_bytes = sum(group.total_byte_size for group in groups)
-            _require_size(file, parquet.metadata.num_rows, unpacked_bytes)
+            metadata = parquet.metadata
+            _require_size(file, metadata.num_rows, _require_checksums(file, content, metadata))
             table = parquet.read()
         else:
             table = pa.ipc.open_file(pa.BufferReader(content)).read_all()
@@ -368,6 +367,35 @@ def _require_size(file: Path, rows: int, unpacked_bytes: int) -> None:
         raise InputError(f"{file}: has no Gram rows.")
     if rows > MOST_ROWS or unpacked_bytes > MOST_UNPACKED_BYTES:
         raise InputError(f"{file}: more than {MOST_ROWS:,} Gram rows or 1 GiB of them. Divide it.")
+
+
+def _require_checksums(file: Path, content: bytes, metadata: pq.FileMetaData) -> int:
+    """Return the bytes unpacked. Raises `InputError` for pages without a checksum.
+
+    Without it a flipped bit of a product goes unseen. Arrow compares checksums where there are any,
+    and does not say where: they are the field 4 of a page's header, after type and sizes.
+    """
+    unpacked = 0
+    for group in range(metadata.num_row_groups):
+        for column in range(metadata.num_columns):
+            chunk = metadata.row_group(group).column(column)
+            unpacked += chunk.total_uncompressed_size
+            at = chunk.dictionary_page_offset or chunk.data_page_offset
+            for _ in range(3):  # a byte that says field and type, then a number of 7 bits a byte
+                at += 1
+                while content[at] & 0x80:
+                    at += 1
+                at += 1
+            if content[at] != _NEXT_FIELD_I32:
+                raise InputError(
+                    f"{file}: its pages have no checksums. Write it with them, as by "
+                    "pyarrow.parquet.write_table(..., write_page_checksum=True)."
+                )
+    return unpacked
+
+
+_NEXT_FIELD_I32 = 0x15
+"""In Thrift's compact protocol: the next field, an integer of 32 bits."""
 
 
 def _gram_rows(table: pa.Table, schema: pa.Schema, name: str) -> pa.Table:

@@ -147,11 +147,15 @@ def test_a_drive_with_a_log_is_refused(smoke_root: Path, tmp_path: Path) -> None
         fleet.ingest_counted(path)
 
 
-def test_a_flipped_bit_is_found_where_pages_have_checksums(
+def test_pages_need_checksums_and_a_flipped_bit_is_found(
     fleet: fleet_slip.Fleet, tmp_path: Path
 ) -> None:
     table = rows_of_fleet(20, START_S, seed=1)
     path = tmp_path / "rows"
+    for options in ({}, {"use_dictionary": False}, {"compression": "none"}):
+        pq.write_table(table, path, **options)
+        with pytest.raises(InputError, match="no checksums"):
+            fleet.ingest_counted(path)
     pq.write_table(table, path, write_page_checksum=True, compression="none")
     content = bytearray(path.read_bytes())
     at = content.index(np.array(table["products"][7].as_py()[3:5], np.int64).tobytes())
