@@ -8,6 +8,7 @@ import functools
 import json
 import logging
 import os
+import re
 import shutil
 import stat
 from collections.abc import Callable
@@ -28,8 +29,12 @@ PACKAGE = Path(__file__).parent
 CHECKSUMS = "checksums.json"
 LEAST_FREE_BYTES = 2**25
 PREFIX = "fleet-slip-"
-KEPT_VERSIONS = 8
-"""So many folders of other sources stay, those used last first."""
+KEPT = 128
+"""So many folders stay, those used last first. There are some 20 of one state of the sources."""
+
+_IMPORT = re.compile(
+    rb"^\s*(?:from|import) +fleet_slip\b([\w.]*)(?: +import +(\w+) *$)?", re.MULTILINE
+)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -62,23 +67,22 @@ def kernel(function: Function) -> Function:
 
     numba keeps the code in a folder that this user alone can write, if there is one.
     """
-    folder = code_folder(f"{numba.__version__} {llvmlite.__version__}")
-    if folder is None:
+    file = Path(cast(Any, function).__code__.co_filename)
+    folder = code_folder(digest_sources(file)) if file.is_file() else None
+    if folder is None:  # such as of a function that is typed
         return inner_loop(function)
     config: Any = numba.config
     usual = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
     config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = str(folder), "UserProvidedCacheLocator"
     try:
         return _kept_loop(function)
-    except RuntimeError:  # of no source file, as those that are typed
-        return inner_loop(function)
     finally:
         config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = usual
 
 
 @functools.cache
-def code_folder(versions: str) -> Path | None:
-    """Return where code of these sources, compiled by some `versions`, is kept.
+def code_folder(digest: str) -> Path | None:
+    """Return where code of the sources of a digest is kept.
 
     None, and a remark, if there is no such folder or others can write it: what is kept is pickled
     machine code. Files that are not as the process left them that wrote them are deleted.
@@ -86,7 +90,8 @@ def code_folder(versions: str) -> Path | None:
     given = os.environ.get("NUMBA_CACHE_DIR")
     try:
         base = Path(given or cache_folder("compiled")).resolve()
-        folder = base / f"{PREFIX}{digest_sources(versions)}"
+        folder = base / f"{PREFIX}{digest}"
+        new = not folder.is_dir()
         for one in reversed([folder, *folder.parents]):
             if not one.is_dir():
                 one.mkdir(0o700, exist_ok=True)
@@ -101,17 +106,39 @@ def code_folder(versions: str) -> Path | None:
     os.utime(folder)  # in use: others' go first
     sums = _delete_damaged(folder)
     atexit.register(_write_checksums, folder, sums)
-    for old in sorted(base.glob(f"{PREFIX}*"), key=os.path.getmtime)[:-KEPT_VERSIONS]:
+    for old in sorted(base.glob(f"{PREFIX}*"), key=os.path.getmtime)[:-KEPT] if new else ():
         shutil.rmtree(old, ignore_errors=True)
     return folder
 
 
-def digest_sources(versions: str) -> str:
-    """Return a digest of all sources: compiled code has constants and functions of any of them."""
-    digest = sha256(versions.encode())
-    for source in sorted(PACKAGE.rglob("*.py")):
-        digest.update(source.read_bytes())
+def digest_sources(file: Path) -> str:
+    """Return a digest of all that code of a file can have constants and functions of.
+
+    That is its own source, those of the modules that it imports, of those that these import, and so
+    on, and the compiler.
+    """
+    found: set[Path] = set()
+    waiting = [file]
+    while waiting:
+        one = waiting.pop()
+        if one not in found:
+            found.add(one)
+            waiting += _imported(one)
+    digest = sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
+    for source in sorted(found):
+        digest.update(sha256(source.read_bytes()).digest())
     return digest.hexdigest()[:32]
+
+
+@functools.cache
+def _imported(file: Path) -> list[Path]:
+    """Return the modules of this package that a file imports; all of one of which it is a part."""
+    found: list[Path] = []
+    for package, name in _IMPORT.findall(file.read_bytes()):
+        place = PACKAGE.joinpath(*package.decode().split("."))
+        modules = [place.with_suffix(".py"), place / f"{name.decode()}.py"]
+        found += next(([one] for one in modules if one.is_file()), place.rglob("*.py"))
+    return found
 
 
 def _require_own(folder: Path) -> None:

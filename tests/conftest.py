@@ -16,12 +16,15 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.budget import Budget
 from tests.support.commands import Finished, RunCommand, done_on, run_on
-from tests.support.once import made_once, require_unchanged
+from tests.support.once import compile_once, made_once, require_unchanged
 
 os.environ["FLEET_SLIP_LOG"] = "text"  # a test reads what a person would
 
 # A test that has a cache of its own does not compile anew, which takes half a minute.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder("compiled")))
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    compile_once()
 
 # A shell ignores interrupts for what it starts in the background, and so would all that is started.
 signal.signal(signal.SIGINT, signal.default_int_handler)

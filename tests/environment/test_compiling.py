@@ -6,14 +6,10 @@ import shutil
 import sys
 from pathlib import Path
 
-import llvmlite
-import numba
 import pytest
 
 from fleet_slip import compiling
 from tests.support.commands import Finished, run
-
-VERSIONS = f"{numba.__version__} {llvmlite.__version__}"
 
 SOURCE = """
 from fleet_slip.compiling import kernel
@@ -81,7 +77,8 @@ def found_by(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path | None:
     """Return which folder a process is given that asks for it now."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
     monkeypatch.setattr("fleet_slip.compiling.atexit.register", lambda *_: None)
-    return compiling.code_folder.__wrapped__(VERSIONS)
+    (own,) = cache.glob(f"{compiling.PREFIX}*")
+    return compiling.code_folder.__wrapped__(own.name.removeprefix(compiling.PREFIX))
 
 
 def test_without_a_part_code_is_compiled_anew_and_kept(compiled: Path, cache: Path) -> None:
@@ -153,17 +150,33 @@ def test_where_nothing_can_be_kept_a_kernel_compiles_and_says_so_once(
     assert done.stderr.count("there is no folder where compiled code can be kept") == 1
 
 
-def test_a_change_of_any_source_and_of_the_compiler_takes_another_folder(
+def test_a_change_of_what_a_kernel_imports_or_of_the_compiler_takes_another_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A kernel has constants and functions of other modules in it."""
+    """A kernel has constants and functions of other modules in it, and of no others."""
     monkeypatch.setattr(compiling, "PACKAGE", tmp_path)
-    (tmp_path / "vehicle").mkdir()
-    digests = set()
-    for text in ("one", "other"):
-        (tmp_path / "vehicle" / "pose.py").write_text(text)
-        digests |= {compiling.digest_sources(version) for version in ("1", "2")}
-    assert len(digests) == 4
+    sources = {
+        "kernel": "from fleet_slip.vehicle.pose import (\n    angle,\n)\n",
+        "vehicle/pose": "    from fleet_slip.parts import speed\n",
+        "parts/speed": "UNIT = 1\n",
+        "beside": "import fleet_slip.kernel\n",
+    }
+
+    def digest(**changed: str) -> str:
+        compiling._imported.cache_clear()
+        for name, text in {**sources, **changed}.items():
+            file = tmp_path / f"{name}.py"
+            file.parent.mkdir(exist_ok=True)
+            file.write_text(text)
+        return compiling.digest_sources(tmp_path / "kernel.py")
+
+    before = digest()
+    assert digest(beside="changed") == digest() == before
+    others = {digest(**{name: f"{sources[name]}# changed"}) for name in [*sources][:3]}
+    assert len(others | {before}) == 4
+    monkeypatch.setattr("numba.__version__", "another")
+    assert digest() not in others | {before}
+    compiling._imported.cache_clear()
 
 
 LANES = """
