@@ -11,7 +11,7 @@ from datetime import date, timedelta
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
-from typing import Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
@@ -24,7 +24,14 @@ from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import find_config
 from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative, Positive
-from fleet_slip.simulation.plan import DriveDraw, FleetPlan, GridPlan, TrialPlan
+from fleet_slip.simulation.plan import (
+    DriveDraw,
+    FleetPlan,
+    GridPlan,
+    Traffic,
+    TrafficPlan,
+    TrialPlan,
+)
 from fleet_slip.simulation.receivers import Receiver, Receivers
 from fleet_slip.simulation.roads import (
     Manoeuvre,
@@ -38,6 +45,9 @@ from fleet_slip.simulation.roads import (
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Distortion, Sensors
 from fleet_slip.vehicle.batch import Surface
 from fleet_slip.vehicle.parameters import VehicleParameters
+
+if TYPE_CHECKING:
+    from fleet_slip.simulation.traffic import TrafficDrive
 
 ROAD_SPACING_M = 1.0
 """Spacing of the points at which curvature and target speed are tabulated, in m."""
@@ -77,9 +87,26 @@ class DriveSpec:
     pace: Annotated[tuple[PacePoint, ...], Field(exclude=True)] = ()
     """Of a scenario: how its speed varies beside what the track asks for."""
 
+    traffic: Annotated[Traffic | None, Field(exclude_if=lambda one: one is None)] = None
+    """Where highway-env drives; None: the track is known."""
+
+    @cached_property
+    def in_traffic(self) -> "TrafficDrive | None":
+        """What highway-env decides of the drive, computed when it is asked for."""
+        if self.traffic is None:
+            return None
+        from fleet_slip.simulation.traffic import drive_in_traffic  # noqa: PLC0415 - takes a second
+
+        generator = self._drawn("traffic", self.drive_id)
+        return drive_in_traffic(
+            self.traffic, self.limits, self.speed_factor, ROAD_SPACING_M, generator
+        )
+
     @property
     def profile(self) -> SpeedProfile:
-        """The speed profile of the track within the limits, with the pace, before the factor."""
+        """The track and the speed along it within the limits, with the pace, before the factor."""
+        if self.in_traffic:
+            return self.in_traffic.profile
         planned = speed_profile(self.track, self.limits, ROAD_SPACING_M)
         if not self.pace:
             return planned
@@ -92,6 +119,8 @@ class DriveSpec:
     @cached_property
     def expected_rows(self) -> int:
         """Rows of the drive if the car holds its target speed."""
+        if self.traffic:
+            return math.ceil(self.traffic.duration_s * SAMPLE_RATE_HZ)
         time_s = self.profile.time_s(self.laps) / self.speed_factor
         return math.ceil(time_s * SAMPLE_RATE_HZ)
 
@@ -119,7 +148,8 @@ class DriveSpec:
         """Return the road's surface at the stations of the profile."""
         of_track = random_generator(self.seed, "slopes", self.track.name)
         of_drive = self._drawn("weather", self.drive_id)
-        return surface(self.flaws.road, self.track, station_m, of_track, of_drive)
+        track = self.in_traffic.profile.track if self.in_traffic else self.track
+        return surface(self.flaws.road, track, station_m, of_track, of_drive)
 
 
 @dataclass(frozen=True)
@@ -157,7 +187,7 @@ class Campaign(Config):
     drives_per_day: int = Field(gt=0, le=9999)
     laps: float = Field(gt=0, le=1000)
     rows_per_file: int = Field(gt=0, le=2_000_000)
-    plan: Annotated[GridPlan | FleetPlan | TrialPlan, Field(discriminator="kind")]
+    plan: Annotated[GridPlan | FleetPlan | TrafficPlan | TrialPlan, Field(discriminator="kind")]
     sensors: Sensors
     base: Annotated[Identifier | None, Field(exclude_if=lambda one: one is None)] = None
     receivers: Annotated[Receivers | None, Field(exclude_if=lambda one: one is None)] = None

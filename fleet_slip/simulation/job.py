@@ -92,10 +92,10 @@ def lane_drive(spec: DriveSpec) -> LaneDrive:
     profile = spec.profile
     road = Road(
         spacing_m=profile.spacing_m,
-        curvature_1pm=spec.track.curvature(profile.station_m),
+        curvature_1pm=profile.track.curvature(profile.station_m),
         speed_mps=spec.speed_factor * profile.speed_mps,
-        length_m=spec.track.length_m,
-        closed=spec.track.closed,
+        length_m=profile.track.length_m,
+        closed=profile.track.closed,
         surface=spec.surface(profile.station_m),
     )
     felt = spec.distortion() is not None
@@ -103,13 +103,18 @@ def lane_drive(spec: DriveSpec) -> LaneDrive:
     return LaneDrive(spec.vehicle, road, spec.adhesion, spec.laps, spec.flaws.car, felt)
 
 
-def check_against_highway_env(spec: DriveSpec) -> None:
-    """Drive the first seconds of a drive by highway-env too, in a slalom.
+def check_against_highway_env(drives: Sequence[DriveSpec]) -> None:
+    """Drive the first seconds of the first drive by highway-env too, in a slalom.
 
-    Raises `RefusedError` if the kernel, or highway-env itself, is not what it was.
+    Raises `RefusedError` if the kernel, or highway-env or its traffic, is not what it was.
     """
     from fleet_slip.vehicle.highway import require_agreement  # noqa: PLC0415 - takes a second
 
+    for name in sorted({name for one in drives if one.traffic for name in one.traffic.roads}):
+        from fleet_slip.simulation.traffic import require_known_traffic  # noqa: PLC0415 - as above
+
+        require_known_traffic(name)
+    spec = drives[0]
     drive = lane_drive(spec)
     rolling = np.maximum(drive.road.speed_mps, SLOWEST_MPS)
     slalom = Manoeuvre("slalom", 0.0, 2.0, 2.0 * spec.adhesion, 1.0)
@@ -401,7 +406,7 @@ def _write(warehouse: Warehouse, batch: Batch) -> _Written:
     drives = _not_forgotten(warehouse, batch.drives)
     if not drives:
         return _Written(batch, (), None, 0)
-    check_against_highway_env(drives[0])
+    check_against_highway_env(drives)
     rows = simulate_batch(replace(batch, drives=drives))
     action = warehouse.logs.put(file_name(batch), warehouse.logs.encode(rows), batch.day)
     return _Written(batch, drives, action, rows.num_rows)

@@ -5,11 +5,11 @@ Drivers who differ: the line that each takes along a road of a class, and how fa
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
 
 from fleet_slip.config import Config, added
 from fleet_slip.errors import ConfigError
@@ -27,6 +27,7 @@ from fleet_slip.simulation.roads import (
     KINDS,
     WANDER_S,
     Manoeuvre,
+    Segment,
     SpeedLimits,
     Track,
     driven_line,
@@ -58,6 +59,42 @@ NamedVehicle = Annotated[VehicleParameters, load_by_name(load_vehicle)]
 NotEmpty = Field(min_length=1)
 
 
+def _known_to_highway_env(name: str) -> str:
+    from fleet_slip.simulation.traffic import require_road  # noqa: PLC0415 - takes a second
+
+    try:
+        return require_road(name)
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
+
+
+RoadWithTraffic = Annotated[str, AfterValidator(_known_to_highway_env)]
+
+
+class Traffic(Config):
+    """A drive among other cars: on which of highway-env's roads, in turns, and how long."""
+
+    roads: tuple[RoadWithTraffic, ...] = NotEmpty
+    duration_s: FiniteFloat = Field(gt=0, le=600)
+    others: int = Field(ge=0, le=50)
+    """About so many other cars."""
+    decisions_hz: int = Field(default=10, ge=10, le=15)
+
+    @property
+    def track(self) -> Track:
+        """What stands for the way of the drive before highway-env has chosen it."""
+        return Track(
+            name="_".join(dict.fromkeys(self.roads)),
+            description=f"Traffic on {', '.join(self.roads)} in highway-env",
+            closed=False,
+            segments=(Segment(length_m=1000.0, curvature_1pm=(0.0, 0.0)),),
+        )
+
+
+def _way_among_cars(name: Any) -> Any:
+    return Traffic(roads=(name,), duration_s=1.0, others=0).track if isinstance(name, str) else name
+
+
 @dataclass(frozen=True)
 class CarOnRoad:
     """One car on one road at one speed."""
@@ -70,6 +107,7 @@ class CarOnRoad:
     speed_factor: float
     script: tuple[Manoeuvre, ...] = ()
     flaws: Imperfections = NONE
+    traffic: Traffic | None = None
 
 
 @dataclass(frozen=True)
@@ -235,6 +273,32 @@ class FleetPlan(DrawnPlan):
             speed_factor=speed_factor,
             flaws=flaws,
         )
+
+
+class TrafficPlan(FleetPlan):
+    """A fleet in traffic: each drive on one of highway-env's roads among other cars.
+
+    `tracks` are the roads, and `speed_factor` is the wanted speed over what road or plan allow.
+    """
+
+    kind: Literal["traffic"]  # type: ignore[assignment]
+    tracks: tuple[Annotated[Track, BeforeValidator(_way_among_cars)], ...] = NotEmpty
+    duration_s: Uniform
+    others: Uniform
+    """Number of other cars."""
+    decisions_hz: int = Field(default=10, ge=10, le=15)
+    """How often highway-env decides."""
+
+    def assignment(self, drawn: DriveDraw) -> CarOnRoad:
+        """Draw a car and its drive, then how long it takes and among how many cars."""
+        one = super().assignment(drawn)
+        traffic = Traffic(
+            roads=(one.track.name,),
+            duration_s=self.duration_s.draw(drawn.of_drive),
+            others=round(self.others.draw(drawn.of_drive)),
+            decisions_hz=self.decisions_hz,
+        )
+        return replace(one, traffic=traffic)
 
 
 class Drivers(Config):

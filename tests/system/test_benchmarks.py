@@ -37,6 +37,7 @@ TINY = {
     "rivals": "{root} smoke --rows 2000 --rivals regression_8,luenberger --drives nominal",
     "simulator": "--seconds 0.01 --threads 1",
     "simulator_profile": "--campaign smoke",
+    "traffic": "--drives 1",
     "soak": "--minutes 0.1",
     "start": "--rounds 1",
     "statistics_figures": "{root} smoke --output {folder}",

@@ -1,0 +1,188 @@
+"""Drives in traffic: the same decisions everywhere, and such as a real car can drive."""
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from highway_env.vehicle.behavior import IDMVehicle
+
+from fleet_slip.errors import ConfigError, RefusedError
+from fleet_slip.simulation import traffic
+from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
+from fleet_slip.simulation.imperfections import Uniform
+from fleet_slip.simulation.job import simulate_logs
+from fleet_slip.simulation.roads import SLOWEST_MPS
+from fleet_slip.simulation.traffic import SITES, TrafficDrive
+from tests.support.commands import COMMAND, RunCommand, run
+
+SHORT = """
+name = "short"
+description = "A few seconds in traffic"
+base = "traffic"
+number_of_days = 1
+drives_per_day = 2
+
+[plan.duration_s]
+min = 3
+max = 4
+"""
+
+PROGRAM = """
+import hashlib, sys
+from tests.simulation.test_traffic import batch_of
+from fleet_slip.simulation.job import simulate_batch
+table = simulate_batch(batch_of(sys.argv[2:])).combine_chunks()
+for road in sys.argv[1].split(","):
+    rows = table.filter([name.as_py() == road for name in table["track"]]).to_pylist()
+    print(road, len(rows), hashlib.sha256(repr(rows).encode()).hexdigest())
+"""
+
+
+def drives(roads: list[str], duration_s: float = 12.0) -> tuple[DriveSpec, ...]:
+    """Return a drive on each road, whose names and seeds do not depend on their order."""
+    campaign = load_campaign("traffic")
+    length = Uniform(min=duration_s, max=duration_s)
+    specs = []
+    for road in roads:
+        tracks = tuple(one for one in campaign.plan.tracks if one.name == road)
+        plan = campaign.plan.model_copy(update={"tracks": tracks, "duration_s": length})
+        alone = campaign.model_copy(update={"plan": plan})
+        specs.append(alone.drives(campaign.first_day)[sorted(SITES).index(road)])
+    return tuple(specs)
+
+
+def batch_of(roads: list[str]) -> Batch:
+    return Batch("traffic", load_campaign("traffic").first_day, 0, drives(roads))
+
+
+def test_a_drive_has_the_same_bytes_in_every_process_and_order() -> None:
+    roads = sorted(SITES)
+    said = [
+        run(
+            [sys.executable, "-c", PROGRAM, ",".join(roads), *order],
+            env={**os.environ, "PYTHONHASHSEED": seed},
+        ).stdout
+        for order, seed in ((roads, "1"), (roads[::-1], "2024"))
+    ]
+    assert said[0] == said[1]
+    assert all(f"{road} 12" in said[0] for road in roads), said[0]
+
+
+@pytest.fixture(scope="module", params=sorted(SITES))
+def spec(request: pytest.FixtureRequest) -> DriveSpec:
+    (one,) = drives([request.param], 40.0)
+    return one
+
+
+def planned(spec: DriveSpec) -> TrafficDrive:
+    assert spec.in_traffic
+    return spec.in_traffic
+
+
+def test_the_plan_keeps_the_driver_s_limits_and_lasts_as_long_as_asked(spec: DriveSpec) -> None:
+    profile, limits = planned(spec).profile, spec.limits
+    speed = profile.speed_mps * spec.speed_factor
+    lateral = np.abs(profile.track.curvature(profile.station_m)) * speed**2
+    along = np.diff(speed**2 / 2) / profile.spacing_m
+    assert speed.min() >= SLOWEST_MPS
+    assert lateral.max() <= 1.1 * limits.lateral_mps2
+    assert along.max() <= 1.1 * limits.acceleration_mps2
+    assert along.min() >= -1.1 * limits.braking_mps2
+    assert profile.time_s(1) / spec.speed_factor == pytest.approx(40.0, abs=0.5)
+
+
+def test_the_car_follows_it_on_four_tyres(spec: DriveSpec) -> None:
+    (log,) = simulate_logs([spec], ("lateral_offset_m",))
+    assert log.lost_control_s is None
+    assert log.rows == pytest.approx(spec.expected_rows, rel=0.02)
+    assert np.abs(log.motion["lateral_offset_m"]).max() < 1.0
+    assert log.metadata["track"] == spec.track.name
+
+
+def test_there_are_others_and_they_move_between_two_steps(spec: DriveSpec) -> None:
+    plan = planned(spec)
+    assert max(len(cars) for cars in plan.others) >= 2
+    step = next(
+        k
+        for k in range(len(plan.others) - 1)
+        if len(plan.others[k]) == len(plan.others[k + 1]) > 0
+        and plan.station_m[k + 1] > plan.station_m[k]
+    )
+    middle = plan.others_at((plan.station_m[step] + plan.station_m[step + 1]) / 2)
+    np.testing.assert_allclose(middle, (plan.others[step] + plan.others[step + 1]) / 2)
+
+
+def test_lanes_are_changed_on_the_highway_and_turns_taken_at_the_roundabout() -> None:
+    highway, roundabout = (planned(one).profile for one in drives(["highway", "roundabout"], 60.0))
+    bends = np.sign(np.round(highway.track.curvature(highway.station_m), 4))
+    assert {-1.0, 1.0} <= set(bends)
+    assert np.abs(roundabout.track.curvature(roundabout.station_m)).max() > 1 / 25
+
+
+def test_what_highway_env_changes_of_all_cars_changes_no_drive() -> None:
+    """Its intersection sets figures of `IDMVehicle` itself."""
+    traffic.require_known_traffic("intersection")
+    for road in SITES:
+        traffic.require_known_traffic(road)
+
+
+def short(folder: Path, tracks: str = "") -> str:
+    file = folder / "short.toml"
+    file.write_text(SHORT.replace("[plan.duration_s]", f"[plan]\n{tracks}\n[plan.duration_s]"))
+    return str(file)
+
+
+def test_a_campaign_is_simulated_without_a_word_of_pygame(tmp_path: Path) -> None:
+    at = ["--root", str(tmp_path / "data")]
+    done = run([COMMAND, *at, "simulate", short(tmp_path)])
+    assert done.exit_code == 0, done.stderr
+    assert not done.stdout
+    assert "short.toml: 2 drives, " in done.stderr
+    assert len(done.stderr.splitlines()) == 3, done.stderr
+    again = run([COMMAND, *at, "simulate", short(tmp_path)])
+    assert "nothing to do" in again.stderr
+
+
+def test_an_unknown_road_is_named_with_file_and_key(
+    tmp_path: Path, run_command: RunCommand
+) -> None:
+    done = run_command("simulate", short(tmp_path, 'tracks = ["merge", "moon"]'))
+    assert done.exit_code == ConfigError.exit_code
+    assert "short.toml" in done.stderr
+    assert "plan.traffic.tracks.1" in done.stderr
+    assert "'moon' is no road with traffic. Choose from: highway, " in done.stderr
+
+
+def test_a_road_that_highway_env_lacks_is_named_with_file_and_key(
+    tmp_path: Path, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(SITES, "merge", SITES["merge"]._replace(environment="merge-v99"))
+    done = run_command("simulate", short(tmp_path))
+    assert done.exit_code == ConfigError.exit_code
+    assert "short.toml" in done.stderr
+    assert "plan.traffic.tracks.2" in done.stderr
+    assert "has no road 'merge'" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["acceleration", "steering_control"])
+def test_traffic_of_another_kind_is_refused(
+    name: str, tmp_path: Path, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decided: Callable[..., Any] = getattr(IDMVehicle, name)
+    monkeypatch.setattr(IDMVehicle, name, lambda *given, **named: 1.05 * decided(*given, **named))
+    done = run_command("simulate", short(tmp_path, 'tracks = ["roundabout"]'))
+    assert done.exit_code == RefusedError.exit_code
+    assert "do not drive on its road" in done.stderr
+    assert not list((tmp_path / "data").rglob("*.parquet"))
+
+
+def test_every_road_and_car_is_in_the_campaign() -> None:
+    campaign: Campaign = load_campaign("traffic")
+    specs = [spec for day in campaign.days() for spec in campaign.drives(day)]
+    assert {spec.track.name for spec in specs} == set(SITES)
+    assert len({spec.vehicle_id for spec in specs}) == 4
+    assert len({spec.vehicle.name for spec in specs}) == 4
