@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property, partial
+from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
 from fleet_slip.catalogue.signals import catalogue, digest_drive, round_chunks
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
+from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.log_rows import describe_refused, join_refused, no_rows
 from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.resampling import (
@@ -210,8 +212,8 @@ def _latest(
     return latest, np.where(heads, before, shifted)
 
 
-MAX_OPEN_ROWS = 20_000_000
-"""Rows of drives that have not ended: 55 hours at 100 Hz of drives that alternate row by row."""
+MOST_OPEN_ROWS = 2**20
+"""Rows of drives that have not ended, in memory; all others wait in a temporary file."""
 
 
 @dataclass(frozen=True)
@@ -297,18 +299,19 @@ def _base(piece: pl.DataFrame) -> int:
 
 
 class OpenDrives:
-    """Rows by part, as long as the part has not ended."""
+    """Rows by part, as long as the part has not ended, few of them in memory."""
 
     def __init__(self) -> None:
         """Begin without rows."""
         self._rows: dict[int, list[pl.DataFrame]] = {}
-        self.number_of_rows = 0
+        self._in_memory = 0
+        self._spool = Spool()
 
     def add(self, rows: pl.DataFrame) -> None:
         """Keep rows that are sorted by group, and so the rows of each part stand together."""
         if rows.is_empty():
             return
-        self.number_of_rows += rows.height
+        self._in_memory += rows.height
         if rows["part"][0] == rows["part"][-1]:
             runs = [rows]
         else:
@@ -320,11 +323,24 @@ class OpenDrives:
     def take(self, parts: Iterable[int]) -> Iterator[DriveRows]:
         """Yield the rows of parts that have any, and let go of them."""
         for part in parts:
-            found = self._rows.pop(part, None)
-            if found is not None:
-                rows = DriveRows(found)
-                self.number_of_rows -= rows.height
-                yield rows
+            in_memory = self._rows.pop(part, [])
+            self._in_memory -= sum(piece.height for piece in in_memory)
+            spilled = [pl.read_ipc_stream(piece) for piece in self._spool.take(part)]
+            if spilled or in_memory:
+                yield DriveRows([*spilled, *in_memory])
+
+    def spill(self) -> None:
+        """Put the rows aside if they are many. Raises `InputError` if the disk is full."""
+        if self._in_memory <= MOST_OPEN_ROWS:
+            return
+        for part, pieces in self._rows.items():
+            alike = "base" not in pieces[0].columns
+            for piece in [pl.concat(pieces)] if alike else pieces:
+                content = BytesIO()
+                piece.write_ipc_stream(content, compression="lz4")
+                self._spool.add(part, content.getvalue())
+        self._rows.clear()
+        self._in_memory = 0
 
 
 def _by_base(run: pl.DataFrame) -> list[pl.DataFrame]:

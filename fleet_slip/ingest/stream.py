@@ -19,7 +19,6 @@ from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives import (
     LONGEST_DRIVE_S,
-    MAX_OPEN_ROWS,
     DriveCutter,
     DriveRows,
     MeasuredDrive,
@@ -119,9 +118,9 @@ class MeasuredStream:
             longest_s = LONGEST_DRIVE_S * min([1.0, *(s / STEP_S for s in intervals_s.values())])
             cutter = DriveCutter(self.mapping.time, longest_s)
             for block in chain(early, blocks):
-                yield self._piece(cutter, block, intervals_s)
+                yield from self._pieces(cutter, block, intervals_s)
             no_more = CheckedBlock(block.rows.clear(), no_rows(), block.read)
-            yield self._piece(cutter, no_more, intervals_s, last=True)
+            yield from self._pieces(cutter, no_more, intervals_s, last=True)
         self.counts.quarantined = dict(sorted(self.counts.quarantined.items()))
         self._require_usable()
 
@@ -145,33 +144,29 @@ class MeasuredStream:
                 enough += RATE_ROWS
         return early, sample_intervals_s(_trial(self.mapping, early, _reach(early)))
 
-    def _piece(
+    def _pieces(
         self,
         cutter: DriveCutter,
         block: CheckedBlock,
         intervals_s: dict[int, float],
         *,
         last: bool = False,
-    ) -> Piece:
-        counts = self.counts
-        counts.rows_read, counts.rows_left_out = self.checker.rows, self.checker.left_out
+    ) -> Iterator[Piece]:
+        """Yield what was refused of a block, and the drives that ended in it, one by one."""
+        self.counts.rows_read, self.counts.rows_left_out = self.checker.rows, self.checker.left_out
         rows, misplaced = cutter.cut(block.rows, last=last)
-        refused = [block.refused, misplaced]
         self._open.add(rows)
-        drives = []
+        yield self._refusing(join_refused([block.refused, misplaced]))
         for ended in self._open.take([*cutter.ended, *(cutter.open_parts() if last else ())]):
             if ended.end_s - ended.start_s < STEP_S - TIME_EPSILON_S:
-                refused.append(describe_refused(ended.frame(), None, "too_short"))
+                yield self._refusing(describe_refused(ended.frame(), None, "too_short"))
             else:
-                drives.append(self._drive(ended, intervals_s))
-        if self._open.number_of_rows > MAX_OPEN_ROWS:
-            raise InputError(
-                f"{shown(self.file)}: more than {MAX_OPEN_ROWS:,} rows of interleaved drives. "
-                "Sort the file by drive and time."
-            )
-        bad = join_refused(refused)
-        self._count_refused(bad)
-        return Piece(drives, bad)
+                yield Piece([self._drive(ended, intervals_s)], no_rows())
+        self._open.spill()
+
+    def _refusing(self, refused: pl.DataFrame) -> Piece:
+        self._count_refused(refused)
+        return Piece([], refused)
 
     def _count_refused(self, refused: pl.DataFrame) -> None:
         """Count refused rows, by reason and, where that is one of the signals, by what is wrong."""

@@ -177,13 +177,21 @@ def test_nothing_is_left_of_a_file_that_fails_at_its_end(
     assert not list((tmp_path / "data").rglob("*.parquet"))
 
 
-def test_drives_that_alternate_for_ever_are_refused(
+def test_open_drives_that_wait_in_a_file_are_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(open_drives, "MAX_OPEN_ROWS", 19)
-    monkeypatch.setattr(stream, "MAX_OPEN_ROWS", 19)
-    with pytest.raises(InputError, match="Sort the file by drive and time"):
-        read_columns(tmp_path, good_columns(20) | {})
+    """Drives that alternate row by row, and one that stands together."""
+    columns: dict[str, list[Any]] = {**good_columns(60)}
+    columns["run"] = [i % 3 if i < 45 else 9 for i in range(60)]
+    columns["ax"][7] = "x"
+    monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 200)
+    mapping = a_mapping(drive={"column": "run"}, time={"longest_gap_s": 0.1})
+    whole = read_columns(tmp_path, columns, mapping)
+    monkeypatch.setattr(open_drives, "MOST_OPEN_ROWS", 4)
+    spilled = read_columns(tmp_path, columns, mapping)
+    assert spilled.drives.equals(whole.drives)
+    assert spilled.counts == whole.counts
+    assert whole.counts.drives == 4
 
 
 numbers = st.one_of(
