@@ -135,7 +135,7 @@ def _run(one: EvaluatedScenario) -> dict[str, Any]:
         "vehicle_model": scenario.vehicle.name,
         "sprung_mass_kg": scenario.car.body.sprung_mass_kg,
         "adhesion": scenario.adhesion,
-        "track": scenario.track.name,
+        "track": scenario.way.name,
         "failures": [failure.model_dump() for failure in scenario.failures],
         "truth": _truth(drive),
         "sections": [

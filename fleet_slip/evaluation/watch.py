@@ -3,30 +3,36 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 from markupsafe import Markup
+from numpy.typing import NDArray
 
-from fleet_slip.arrays import FloatArray, float_column
+from fleet_slip.arrays import FloatArray, IntArray, float_column
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, as_counts
 from fleet_slip.columns.plan import ColumnPlan
-from fleet_slip.errors import DataError, QuestionError, UsageError
+from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
 from fleet_slip.evaluation.drives import simulate_drives
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import fill_in
 from fleet_slip.resources import config_names
+from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import MOTION
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
+
+if TYPE_CHECKING:
+    from fleet_slip.simulation.traffic import TrafficDrive
 
 # What is to be seen of a drive: where the car is, its angles, its wheels, and its gates.
 
@@ -50,6 +56,7 @@ class DriveFrames:
         steer_rad: mean angle of the front wheels.
         gates: how far each gate of the model is open, from 0 to 1.
         track: x and y of the track's centre line; empty where no track is known.
+        others: of each frame x, y and heading of the other cars in traffic, (3, cars).
     """
 
     title: str
@@ -65,6 +72,7 @@ class DriveFrames:
     steer_rad: FloatArray
     gates: Mapping[str, FloatArray]
     track: tuple[FloatArray, FloatArray]
+    others: NDArray[np.object_]
 
     def part(self, from_s: float, until_s: float | None) -> "DriveFrames":
         """Return the frames of a part of the drive. Raises `UsageError` if it has none."""
@@ -93,7 +101,9 @@ def is_scenario(what: str) -> bool:
 def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> DriveFrames:
     """Return the frames of a drive of the logs. Raises `QuestionError`."""
     names = [one.column for one in catalogue().signals.values()]
-    query = f"SELECT time_s, track, vehicle_model, mass_kg, {', '.join(names)} FROM log"
+    query = (
+        f"SELECT time_s, campaign, day, track, vehicle_model, mass_kg, {', '.join(names)} FROM log"
+    )
     with connect(warehouse.root, query=query, scenarios=True) as database:
         statement = f"{query} WHERE drive_id = $drive ORDER BY time_s"
         rows = database.sql(statement, params={"drive": drive_id}).to_arrow_table()
@@ -102,10 +112,20 @@ def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> 
             f"{drive_id!r} is no drive of the logs, and no scenario. See: "
             'fleet-slip sql "SELECT drive_id FROM drives"'
         )
+    traffic = _traffic_of(drive_id, rows["campaign"][0].as_py(), rows["day"][0].as_py())
     columns = {name: float_column(rows, name) for name in names}
     facts = {name: rows[name][0].as_py() for name in (*FACTS, "track")}
     facts["drive_id"] = drive_id
-    return frames_of(drive_id, columns, facts, float_column(rows, "time_s"), version)
+    return frames_of(drive_id, columns, facts, float_column(rows, "time_s"), version, traffic)
+
+
+def _traffic_of(drive_id: str, campaign: str | None, day: date) -> "TrafficDrive | None":
+    """Return what highway-env decided of a drive of a shipped campaign, computed again."""
+    try:
+        drives = load_campaign(campaign or "").drives(day)
+    except ConfigError:
+        return None
+    return next((one.in_traffic for one in drives if one.drive_id == drive_id), None)
 
 
 def frames_of(
@@ -114,6 +134,7 @@ def frames_of(
     facts: Mapping[str, Any],
     time_s: FloatArray,
     version: ModelVersion,
+    traffic: "TrafficDrive | None" = None,
 ) -> DriveFrames:
     """Return the frames of a drive. Raises `DataError` if nothing of it can be shown.
 
@@ -126,7 +147,7 @@ def frames_of(
     known = {name: pa.array([value] * len(time_s)) for name, value in facts.items()}
     estimate = version.predict(pa.table({**known, "time_s": time_s, **arrays}))
     vx, vy = _velocity(columns)
-    x, y, heading, track = _places(columns, facts, time_s, vx, vy)
+    x, y, heading, track = _places(columns, facts, time_s, vx, vy, traffic)
     gates = gates_on(version.manifest, columns, facts)
     return DriveFrames(
         title=title,
@@ -142,6 +163,7 @@ def frames_of(
         steer_rad=((columns["steer_fl_rad"] + columns["steer_fr_rad"]) / 2)[seen],
         gates={name: values[seen] for name, values in gates.items()},
         track=track,
+        others=_others(traffic, columns["station_m"], seen),
     )
 
 
@@ -173,17 +195,19 @@ def _places(
     time_s: FloatArray,
     vx: FloatArray,
     vy: FloatArray,
+    traffic: "TrafficDrive | None",
 ) -> tuple[FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
     """Return x, y and heading of the car, and the line of the track, if that is known."""
     station, offset = columns["station_m"], columns["lateral_offset_m"]
     empty = np.empty(0)
-    if facts.get("track") and np.isfinite(station).all():
-        track = load_track(str(facts["track"]))
+    if (traffic or facts.get("track")) and np.isfinite(station).all():
+        track = traffic.profile.track if traffic else load_track(str(facts["track"]))
         line = track.centre_line(SPACING_M)
         # The log has stations in steps of 0.25 m, which the car would jump.
         smooth_m, offset = _smooth(np.unwrap(station, period=track.length_m)), _smooth(offset)
+        at_m = smooth_m % track.length_m if track.closed else smooth_m
         x, y, along = (
-            np.interp(smooth_m % track.length_m, line.station_m, values)
+            np.interp(at_m, line.station_m, values)
             for values in (line.x_m, line.y_m, line.heading_rad)
         )
         x, y = x - offset * np.sin(along), y + offset * np.cos(along)
@@ -194,6 +218,28 @@ def _places(
     x = np.cumsum((vx * np.cos(heading) - vy * np.sin(heading)) * step)
     y = np.cumsum((vx * np.sin(heading) + vy * np.cos(heading)) * step)
     return x, y, heading, (empty, empty)
+
+
+def _others(
+    traffic: "TrafficDrive | None", station_m: FloatArray, seen: IntArray
+) -> NDArray[np.object_]:
+    """Return where the other cars are when ours is at its stations: x, y and heading, (3, cars)."""
+    places = np.empty(len(seen), dtype=object)
+    places[:] = [np.empty((3, 0))] * len(seen)
+    if traffic is None or not np.isfinite(station_m).all():
+        return places
+    line = traffic.profile.track.centre_line(SPACING_M)
+    for frame, station in enumerate(_smooth(station_m)[seen].tolist()):
+        x, y, along = (
+            float(np.interp(station, line.station_m, values))
+            for values in (line.x_m, line.y_m, line.heading_rad)
+        )
+        ahead, left, turned = traffic.others_at(station).T
+        cosine, sine = np.cos(along), np.sin(along)
+        places[frame] = np.stack(
+            [x + cosine * ahead - sine * left, y + sine * ahead + cosine * left, along + turned]
+        )
+    return places
 
 
 def gates_of(manifest: Manifest) -> dict[str, tuple[Definition, list[int]]]:
@@ -256,6 +302,9 @@ def _data(frames: DriveFrames) -> dict[str, Any]:
         "wheels": [_listed(one, 2) for one in excess],
         "gates": [_listed(one, 3) for one in frames.gates.values()],
         "track": [_listed(one, 1) for one in frames.track],
+        "others": [
+            [_listed(row, 2) for row in cars] if cars.size else [] for cars in frames.others
+        ],
     }
 
 
@@ -268,7 +317,8 @@ def scenario_frames(name: str, version: ModelVersion) -> DriveFrames:
     """Return the frames of a test drive, which is simulated. Raises `ConfigError`."""
     scenario = load_scenario(name)
     (drive,) = simulate_drives([scenario])
+    traffic = scenario.batch().drives[0].in_traffic
     motion = {column: getattr(drive, column) for column in ("sideslip_rad", *MOTION)}
-    facts = {**drive.facts, "track": scenario.track.name, "drive_id": scenario.drive_id}
+    facts = {**drive.facts, "track": scenario.way.name, "drive_id": scenario.drive_id}
     title = f"{scenario.name}: {scenario.description}"
-    return frames_of(title, {**drive.signals, **motion}, facts, drive.time_s, version)
+    return frames_of(title, {**drive.signals, **motion}, facts, drive.time_s, version, traffic)

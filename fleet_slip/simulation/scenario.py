@@ -6,7 +6,7 @@ Each says in what it differs from its base; its drive has a source of its own, a
 import re
 from collections.abc import Mapping
 from datetime import date
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
@@ -16,8 +16,8 @@ from fleet_slip.config import Config, load_config
 from fleet_slip.resources import config_names, find_config
 from fleet_slip.simulation.campaign import Batch, DriveSpec, PacePoint, load_base, merged
 from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative, Positive
-from fleet_slip.simulation.plan import NamedTrack, NamedVehicle
-from fleet_slip.simulation.roads import SpeedLimits
+from fleet_slip.simulation.plan import NamedTrack, NamedVehicle, Traffic
+from fleet_slip.simulation.roads import SpeedLimits, Track
 from fleet_slip.simulation.sensors import GPS_SIGNALS, Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
 
@@ -78,6 +78,8 @@ class Scenario(Config):
     imperfections: Imperfections = NONE
     """What car, sensors and road have beyond the textbook's."""
     failures: tuple[Failure, ...] = ()
+    traffic: Annotated[Traffic | None, Field(exclude_if=lambda one: one is None)] = None
+    """Where highway-env drives, in the place of the track."""
 
     @model_validator(mode="before")
     @classmethod
@@ -107,6 +109,11 @@ class Scenario(Config):
         return f"{SCENARIO}-{self.drive}"
 
     @property
+    def way(self) -> Track:
+        """The track, or what stands for it where highway-env drives."""
+        return self.traffic.track if self.traffic else self.track
+
+    @property
     def car(self) -> VehicleParameters:
         """The car with the scenario's load and tyres."""
         tyred = self.vehicle.with_tyres(
@@ -125,7 +132,7 @@ class Scenario(Config):
             day=DAY,
             vehicle=self.car,
             sensors=self.sensors,
-            track=self.track,
+            track=self.way,
             adhesion=self.adhesion,
             limits=self.limits,
             speed_factor=1.0,
@@ -134,6 +141,7 @@ class Scenario(Config):
             source=SCENARIO,
             flaws=self.imperfections,
             pace=self.pace,
+            traffic=self.traffic,
         )
         return Batch(self.drive_id, DAY, 0, (drive,))
 

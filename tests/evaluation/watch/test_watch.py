@@ -1,5 +1,6 @@
 """A drive as a page that plays."""
 
+import itertools
 import json
 import math
 import re
@@ -12,7 +13,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.evaluation.watch import DriveFrames, drive_frames, render_watch
+from fleet_slip.evaluation.watch import DriveFrames, drive_frames, render_watch, scenario_frames
 
 DRIVE = "smoke-2024-05-01-0000"
 
@@ -91,3 +92,14 @@ def test_what_cannot_be_shown_is_told(root_to_fail_in: Path, tmp_path: Path) -> 
         fleet.watch(DRIVE, "smoke", tmp_path / "film.mp4")
     with pytest.raises(QuestionError, match="no drive of the logs, and no scenario"):
         fleet.watch("nobody's", "smoke", tmp_path / "page.html")
+
+
+def test_other_cars_of_traffic_are_drawn_and_move_without_jumps(smoke_root: Path) -> None:
+    frames = scenario_frames("traffic", fleet_slip.open(smoke_root).model("smoke")).part(1.0, 12.0)
+    data = data_of(render_watch(frames))
+    assert len(data["others"]) == len(data["t"])
+    assert max(len(cars[0]) for cars in data["others"] if cars) >= 3
+    for before, after in itertools.pairwise(frames.others):
+        if before.shape == after.shape:
+            assert np.abs(after - before)[:2].max() < 2.5  # at most 40 m/s, 25 frames a second
+    assert np.nanstd(frames.estimate_deg - frames.sideslip_deg) < 1.0
