@@ -170,7 +170,7 @@ def test_a_file_that_never_ends_holds_no_night_up(
         fleet.ingest([endless, many, good], own_clock())
     assert f"{endless}: 1 s did not suffice to decode" in str(caught.value)
     assert f"{many}: it" in str(caught.value)
-    assert "2 files cannot be used; all others are in." in str(caught.value)
+    assert "2 files cannot be used; all others are stored." in str(caught.value)
     assert fleet.sql("SELECT count(*) FROM log").fetchall() == [(100,)]
 
 

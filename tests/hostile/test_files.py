@@ -69,7 +69,7 @@ def test_a_link_out_of_a_folder_is_refused_and_holds_nothing_up(
         (folder / name).symlink_to(target)
     (folder / "below").symlink_to(other)
     reports = []
-    with pytest.raises(InputError, match=r"4 files cannot be used; all others are in.*b\.csv"):
+    with pytest.raises(InputError, match=r"4 files cannot be used; all others are stored.*b\.csv"):
         reports += list(ingest_files(warehouse, find_logs([folder]), a_mapping()))
     assert warehouse.logs.snapshot().rows == 20
 

@@ -56,25 +56,6 @@ def write_fleet(file: Path) -> None:
     pl.concat(frames).sort("timestamp", maintain_order=True).write_parquet(file)
 
 
-def write_vbox(file: Path) -> None:
-    """Racelogic's text: sections, blanks, and a time of the day without colons."""
-    car = a_car()
-    speed = car["wheel_rl"] * RADIUS_M
-    lines = ["File created on 12/03/2024", "", "[header]", "satellites", "time", "velocity kmh", ""]
-    lines += [
-        "[column names]",
-        "sats time velocity LatAcc LongAcc YawRate Slip_Angle",
-        "",
-        "[data]",
-    ]
-    for i in range(ROWS):
-        moment = (START + timedelta(milliseconds=10 * i)).strftime("%H%M%S.%f")[:-4]
-        told = [speed[i] * 3.6, car["ay"][i] / 9.80665, car["ax"][i] / 9.80665]
-        told += [car["yaw_rate"][i] * TO_DEG, car["sideslip"][i] * TO_DEG]
-        lines.append(f"008 {moment} " + " ".join(f"{value:+.5f}" for value in told))
-    file.write_text("\n".join(lines))
-
-
 def write_student(file: Path) -> None:
     """No times, no units, single words."""
     car = a_car()
@@ -111,7 +92,6 @@ def read(file: Path, mapping: Any) -> tuple[list[MeasuredDrive], IngestCounts]:
 LOGS: dict[str, tuple[Callable[[Path], None], int, set[str]]] = {
     "bench.csv": (write_bench, 1, {"ax", "ay", "yaw_rate", "steering_wheel", *WHEELS, "sideslip"}),
     "fleet.parquet": (write_fleet, 4, {"ay", "yaw_rate", "steering_wheel", *WHEELS}),
-    "lap.vbo": (write_vbox, 1, {"ax", "ay", "yaw_rate", "sideslip", "vehicle_speed"}),
     "student.csv": (write_student, 1, {"ax", "ay", "yaw_rate", "steering_wheel", "vx", "vy"}),
     "bus.csv": (write_bus, 1, {"ay", "yaw_rate", "steering_wheel", *WHEELS, "sideslip"}),
 }

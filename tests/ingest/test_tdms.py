@@ -17,8 +17,6 @@ from fleet_slip.ingest.formats import matlab, tdms
 from fleet_slip.ingest.formats.reading import FileFormats, open_source
 from fleet_slip.ingest.formats.source import OWN_TIME
 from tests.support.measured import a_mapping, failure, physical, read_measured, ticks
-from tests.support.suggested import ENGLISH, Suggested, suggest, wrong_guesses
-from tests.support.textbook_car import Car
 
 START = datetime(2024, 5, 31, 12, tzinfo=UTC)
 OWN_CLOCK = {"column": None, "unit": None, "own_clock": True}
@@ -193,23 +191,3 @@ def test_counts_of_a_converter_are_refused(tmp_path: Path) -> None:
 def test_a_file_without_values_is_refused(tmp_path: Path) -> None:
     file = write(tmp_path / "log.tdms", [ChannelObject("g", "x", np.zeros(0), wave(0.01))])
     assert "it has no values" in failure(file, own_clock())
-
-
-def test_a_mapping_is_suggested(tmp_path: Path) -> None:
-    degrees = dict.fromkeys(("yaw_rate", "steering_wheel", "sideslip"), 180 / np.pi)
-
-    def log(file: Path, car: Car) -> None:
-        units = {"ax": "m/s²", "ay": "m/s²", "yaw_rate": "deg/s"}
-        units |= dict.fromkeys(("steering_wheel", "sideslip"), "deg")
-        channels = []
-        for name, values in car.items():
-            step = 10 if name == "sideslip" else 1
-            told = wave(step / 100, unit_string=units.get(name, "rad/s"))
-            sampled = values[::step] * degrees.get(name, 1.0)
-            channels.append(ChannelObject(f"every {step}", ENGLISH[name], sampled, told))
-        write(file, channels)
-
-    one = Suggested(".tdms", log, ENGLISH, degrees)
-    draft = suggest(one, tmp_path)
-    assert wrong_guesses(one, draft) == []
-    assert draft.time.keys["own_clock"] is True
