@@ -191,9 +191,7 @@ def within_reach(warehouse: "Warehouse", executor: Executor) -> "Warehouse":
 # What is said of parameters of several methods; with a `Doc` they are options of commands, too.
 
 COHORT = Doc("SQL condition on the view drives, such as \"track = 'waterford_hills'\".")
-UNEXAMINED = Doc(
-    "Take drives whose sensors are not in order, too. As a rule all are examined first."
-)
+UNEXAMINED = Doc("Use drives with faulty sensors, too. By default they are left out.")
 MODEL = Doc(
     "NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. Default: "
     "the only one that there is."
@@ -211,7 +209,7 @@ class NightRequest:
     """What `Fleet.nightly` takes."""
 
     landing: Annotated[
-        Path | str, Doc("The folder where logs land, or s3://…; what is new in it is taken.")
+        Path | str, Doc("Inbox folder of logs, or s3://…; new logs in it are loaded.")
     ]
     mapping: Annotated[
         str,

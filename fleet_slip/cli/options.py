@@ -202,7 +202,7 @@ Unexamined = Annotated[
     bool,
     typer.Option(
         "--unexamined",
-        help="Take drives whose sensors are not in order, too. As a rule all are examined first.",
+        help="Use drives with faulty sensors, too. By default they are left out.",
     ),
 ]
 

@@ -74,7 +74,7 @@ def run_tasks(
         more = f" and {len(lost) - NAMED_MAX} more" if len(lost) > NAMED_MAX else ""
         raise ClusterError(
             f"{', '.join(map(name_of, lost[:NAMED_MAX]))}{more}: every worker that tried it died, "
-            "often for want of memory; the workers' logs tell. All else is done. Give the workers "
+            "often for lack of memory; see the workers' logs. All else is done. Give the workers "
             "more memory, and run the same command again."
         )
 

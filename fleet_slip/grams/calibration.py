@@ -120,13 +120,14 @@ class Calibration(Answer):
     def _remarks_on_roads(self) -> Iterator[Remark]:
         if self.roads.hide_offsets:
             yield Remark(
-                "bends look banked, and roads may always lean to one side, which fewer than "
-                f"{FEWEST_CARS} cars with offsets cannot tell from their own: no car has ay_offset"
+                "bends look banked, and roads may always lean to one side, which cannot be "
+                f"separated from a sensor offset with fewer than {FEWEST_CARS} cars: no car has "
+                "ay_offset"
             )
         elif not self.roads.banked:
             yield Remark(
                 "bends are seen not to be banked: a road that always leans to one side counts as "
-                f"ay_offset. {FEWEST_CARS} cars or more tell the one from the other"
+                f"ay_offset. {FEWEST_CARS} cars or more separate the two"
             )
 
     def as_dict(self) -> dict[str, Any]:

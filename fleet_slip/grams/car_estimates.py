@@ -349,7 +349,7 @@ NO_RECEIVER = (
     "--features calibration_course)"
 )
 FEW_TURNS = "its course by satellite has too few turns"
-NO_CAR = "its course by satellite is none of a car: look at the receiver, and where its antenna is"
+NO_CAR = "its satellite course is implausible: check the receiver and the antenna's position"
 """Why a number is missing."""
 
 SPEED = Relation(instruments=(ONE,), left=((("speed", ONE),),), right=((SATELLITE, ONE),), noise={})

@@ -282,7 +282,7 @@ class TimeBase(Config):
         if self.epoch and self.unit is None:
             raise ValueError("'epoch' is for numbers: give their 'unit'")
         if self.assumed and self.rate_hz is None:
-            raise ValueError("'assumed' is for a rate_hz that nobody knows")
+            raise ValueError("'assumed' is for an unknown rate_hz")
         if self.date is not None:
             if self.format is None or not reads_clock(self.format):
                 raise ValueError("'date' stands beside a column whose format has the time alone")

@@ -640,9 +640,9 @@ def _not_corrected(
     }
     if late:
         yield (
-            f"the Gram rows of some cars are corrected by another delay than they have "
-            f"({_named(late)}): run fleet-slip gram --features course, and tell cars that count "
-            "on board their delay"
+            "the Gram rows of some cars are corrected by another delay than they have "
+            f"({_named(late)}): run fleet-slip gram --features course, and send the new delay to "
+            "cars that count on board"
         )
 
 

@@ -116,7 +116,7 @@ class Diagnosis(Answer):
         yield TextTable(
             f"{number_of(self.drives, 'drive')}, {number_of(self.fitted.gram.n, 'row')}, worth "
             f"{self.evidence.rows:,.0f} independent ones; R squared {self.fitted.r_squared:.4f}, "
-            f"condition number {self.condition_number:.3g} (1: no signal tells what another tells)",
+            f"condition number {self.condition_number:.3g} (1: independent signals)",
             f"signal|unit|coefficient|s.e. by {self.cluster}s|t|s.e. by rows|VIF",
             rows,
             "{robust.name}|{unit}|{robust.value:.6g}|{robust.standard_error:.2g}|{robust.t:.1f}|"

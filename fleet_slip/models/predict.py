@@ -274,7 +274,7 @@ def _numbers(manifest: Manifest, frame: Frame) -> dict[str, tuple[FloatArray, Fr
     used = {one.number.name: one.number for one in manifest.definitions.values() if one.number}
     if missing := [name for name in used if name not in frame.names]:
         raise InputError(
-            f"{manifest.name} needs what a car's own drives tell of it: {', '.join(missing)}. Run: "
+            f"{manifest.name} needs calibrated parameters of the car: {', '.join(missing)}. Run: "
             "fleet-slip calibrate --car NAME. A car that has driven too little has nulls there."
         )
     return {

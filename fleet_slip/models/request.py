@@ -415,8 +415,8 @@ def require_odd(names: Sequence[str], feature_set: str) -> None:
     if other := [name for name in names if not features().is_odd(name)]:
         raise QuestionError(
             f"{', '.join(other)}: does not change sign where left and right are exchanged, as the "
-            "side-slip angle does. Changes of the course would teach it a wrong constant: leave it "
-            "out."
+            "side-slip angle does. Trained on course changes it would get a wrong constant: "
+            "leave it out."
         )
 
 

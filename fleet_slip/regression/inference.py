@@ -200,7 +200,8 @@ def noise_variance(fitted: Fit) -> Fraction:
 def _require_noise(fitted: Fit) -> None:
     if fitted.degrees_of_freedom <= 0:
         raise DataError(
-            f"{fitted.gram.n} rows cannot tell the noise of a model with {fitted.size} signals."
+            f"{fitted.gram.n} rows are too few to estimate the noise of a model with "
+            f"{fitted.size} signals."
         )
 
 

@@ -220,7 +220,7 @@ def test_date_and_time_stand_in_columns_of_their_own(tmp_path: Path, column: str
             "'%H' is not a strftime format of a date",
         ),
         ("rate_hz = 100\nassumed = true\nepoch = true", "give their 'unit'"),
-        ('column = "t"\nunit = "s"\nassumed = true', "a rate_hz that nobody knows"),
+        ('column = "t"\nunit = "s"\nassumed = true', "an unknown rate_hz"),
     ],
 )
 def test_times_that_contradict_themselves(tmp_path: Path, time: str, message: str) -> None:

@@ -201,7 +201,7 @@ def test_the_command_tells_by_its_exit_code(run_command: RunCommand, warehouse: 
     assert "1 of 30 drives are not in order" in bad.stderr
     good = run_command("quality", "--cohort", "drive_id <> 'd29'")
     assert good.exit_code == 0
-    assert "29 drives examined" in good.stdout
+    assert "29 drives checked" in good.stdout
 
 
 def test_a_heading_and_a_reversed_course_are_found(warehouse: Warehouse) -> None:

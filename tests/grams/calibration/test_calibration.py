@@ -343,7 +343,7 @@ def test_a_warehouse_says_what_is_missing_and_forgets(warehouse: Warehouse) -> N
             assert one.uncertainty is not None
             assert abs(one.value - value) < 5 * one.uncertainty
     printed = CliRunner().invoke(app, ["--root", str(warehouse.root), "calibrate"])
-    assert "10 cars or more tell the one from the other" in printed.output
+    assert "10 cars or more separate the two" in printed.output
     with pytest.raises(QuestionError, match="delta"):
         found.car("delta")
     with pytest.raises(DataError, match="no drive of"):

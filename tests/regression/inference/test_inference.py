@@ -103,7 +103,7 @@ def test_questions_without_an_answer_are_errors() -> None:
     with pytest.raises(DataError, match="two drives"):
         infer_by_clusters(fit(gram, ["x1"], "y"), moments_of(drives[:1]), unit_scales(4))
     few = gram_of(drives[0][:2, [0, -1]])
-    with pytest.raises(DataError, match="2 rows cannot tell"):
+    with pytest.raises(DataError, match="2 rows are too few"):
         infer_classically(fit(few, ["x1"], "y"), unit_scales(1))
     with pytest.raises(DataError, match="no drive of the cohort has all"):
         serving_drives([moments_table()], ["x9"])
