@@ -53,6 +53,7 @@ from fleet_slip.models.search import (
     choose_by,
     require_criterion,
     search_models,
+    searching,
     select_inputs,
     try_distances,
 )
@@ -71,10 +72,13 @@ from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.folds import (
     CohortFolds,
     CrossValidation,
+    assemble,
     cross_validate_inputs,
+    held_out_errors,
     least_squares,
 )
 from fleet_slip.regression.gram import GramTable, packed_position
+from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import METHODS
 from fleet_slip.rendering import Answer, Part
 from fleet_slip.resources import find_config
@@ -457,7 +461,8 @@ def answer_request(
     warehouse: Warehouse, request: SelectionRequest, condition: str = TRAINING_DRIVES
 ) -> Selection:
     """Select on a condition's drives. Raises `UsageError` for options that do not go together."""
-    usual = not (request.models or request.model or request.label or request.chosen_by_inputs)
+    named = request.models or request.model or request.chosen_by_inputs
+    usual = not (named or request.label)
     find = _answer_usual if usual else _answer
     answer = replace(find(warehouse, request, condition), request=request, asked=condition)
     if answer.cohort.unlabelled:  # its figures are of the angle
@@ -467,10 +472,16 @@ def answer_request(
     return replace(answer, without_label=told, label_noise_deg=noise_deg)
 
 
+def usual_list(request: SelectionRequest) -> str:
+    """Return the list that a request without one stands for, where its columns are computed."""
+    logged = request.features or request.by in (ROW_FOLDS, PARTS)
+    return LOGGED_MODELS if logged else DEFAULT_MODELS
+
+
 def _answer_usual(warehouse: Warehouse, request: SelectionRequest, condition: str) -> Selection:
     """Select from the usual list, or from that of logged signals where it cannot be had."""
     logged = replace(request, models=LOGGED_MODELS)
-    if request.features or request.by in (ROW_FOLDS, PARTS):
+    if usual_list(request) == LOGGED_MODELS:
         return _answer(warehouse, logged, condition)
     why = "Gram rows sent by cars hold logged signals only."
     if warehouse.logs.snapshot().rows:
@@ -495,9 +506,9 @@ class SelectionPlan:
     def of(cls, request: SelectionRequest) -> "SelectionPlan":
         """Return what a request asks for. Raises `UsageError` and `QuestionError`."""
         request.check()
-        name = request.models or (
-            COURSE if request.label and not request.chosen_by_inputs else None
-        )
+        name = request.models
+        if not (name or request.model or request.chosen_by_inputs):
+            name = COURSE if request.label else usual_list(request)
         model_list = _given(request) or (load_model_list(name) if name else None)
         if model_list and model_list.label and not request.label:
             request = replace(request, label=model_list.label)
@@ -573,34 +584,46 @@ def weigh_prior(cohort: Cohort, prior: Cohort, asked: "SelectionPlan") -> Select
     """Choose the columns on the cohort alone, then the weight of its prior by held-out drives.
 
     A prior does not choose columns: in a car that few drives identified badly its drives would
-    agree on the wrong ones.
+    agree on the wrong ones. A search is made again in every fold.
     """
+    by, count = asked.folds.by, asked.folds.count
     alone = replace(cohort, beside=None)
     first = _compare_listed(alone, asked.request, asked.model_list, asked.folds)
-    chosen = CandidateModel(name="prior", signals=first.winner.model.signals)
+    winner, found = first.winner.model, first.searched_winner
+    label, intercept = catalogue().label, asked.request.intercept
+    choose = least_squares(winner.signals, label, intercept=intercept)
+    if found:
+        choose = searching(found, len(winner.signals), intercept=intercept)
+    inputs = found.inputs if found else winner.signals
+    folds = alone.folds(by, count).serving(inputs, label)
+    chosen = [choose(training).signals for training, _ in folds.splits()]
+    both = cohort.folds(by, count).serving(inputs, label)
     one = Fraction(2) ** round(math.log2(cohort.rows / prior.rows))
-    tried = {
-        weight: validate(
-            chosen,
-            replace(cohort, weight=weight).folds(asked.folds.by, asked.folds.count),
-            intercept=asked.request.intercept,
-        )
-        for weight in (one * share for share in PRIOR_SHARES)
-    }
+
+    def validate_at(weight: Fraction) -> CrossValidation:
+        weighed = replace(both, weight=weight)
+        tests = [
+            held_out_errors(
+                fit(training, signals, label, intercept=intercept).model, training, fold
+            )
+            for signals, (training, fold) in zip(chosen, weighed.splits(), strict=True)
+        ]
+        counts = fit(weighed.total, winner.signals, label, intercept=intercept).model
+        return assemble("prior", weighed, tests, counts, input_scales())
+
+    tried = {one * share: validate_at(one * share) for share in PRIOR_SHARES}
     weight, best = min(tried.items(), key=lambda each: each[1].pooled.rmse)
-    alone_deg = first.winner.model.pooled.rmse_deg
     told = "The prior has no weight: held-out drives are estimated worse with it."
     if weight:
         told = (
             f"With the prior, {weight} of the weight for each row, its RMSE is "
-            f"{best.pooled.rmse_deg:.4f} deg, without it {alone_deg:.4f} deg."
+            f"{best.pooled.rmse_deg:.4f} deg, without it {winner.pooled.rmse_deg:.4f} deg."
         )
-    reason = f"{first.winner.reason} {told}"
     return replace(
         first,
         cohort=replace(cohort, weight=weight),
         models=(*first.models, best),
-        winner=replace(first.winner, model=best, reason=reason),
+        winner=replace(first.winner, model=best, reason=f"{first.winner.reason} {told}"),
     )
 
 

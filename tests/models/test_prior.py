@@ -17,6 +17,8 @@ from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.weights import age_weights
 from fleet_slip.models.prior import simulate_prior
+from fleet_slip.models.request import SelectionRequest, load_model_list
+from fleet_slip.models.select import SelectionPlan
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.simulation.campaign import load_campaign
@@ -194,3 +196,11 @@ def test_old_drives_count_less(tmp_path: Path) -> None:
 def test_weights_halve_with_age() -> None:
     days = [date(2026, 1, 31), date(2026, 1, 21), date(2026, 1, 11), date(2025, 1, 1)]
     assert age_weights(days, 10).tolist() == [16, 8, 4, 0]
+
+
+def test_a_usual_choice_with_other_weights_is_of_the_usual_list() -> None:
+    """An evaluation makes it again by the recipe, which names no list."""
+    usual = SelectionPlan.of(SelectionRequest(half_life=90))
+    assert usual.model_list == load_model_list("estimator")
+    logged = SelectionPlan.of(SelectionRequest(features="signals", robust=True))
+    assert logged.model_list == load_model_list("table1")
