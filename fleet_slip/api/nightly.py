@@ -13,7 +13,6 @@ from fleet_slip.api.session import Training
 from fleet_slip.base import date_of, number_of
 from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError
 from fleet_slip.ingest.log_files import find_logs, is_url
-from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.registry import CANDIDATE, ModelVersion
 from fleet_slip.operations.night import Beginning, NightReport, Nights, NightStep, State
 from fleet_slip.storage.runs import step
@@ -154,6 +153,8 @@ class Night:
         return f"{name}@{pointed}" if waits else None
 
     def _ingest(self) -> Told:
+        from fleet_slip.ingest.mapping import load_mapping
+
         mapping = load_mapping(self.asked.mapping)
         landing = self.asked.landing
         if not is_url(landing) and not Path(landing).is_dir():

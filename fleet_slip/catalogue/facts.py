@@ -90,6 +90,9 @@ CAR_NUMBERS: dict[NumberName, CarNumber] = {
 SCENARIO: Final = "scenario"
 """Source of the drives that models are evaluated on, and must never be trained on."""
 
+MEASURED: Final = "measured"
+"""Source of the drives that logs of real cars hold."""
+
 RECEIVED: Final = "received"
 """Source of the drives whose cars sent Gram rows, and no log."""
 

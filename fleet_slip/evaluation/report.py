@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fleet_slip.base import number_of
+from fleet_slip.catalogue.facts import MEASURED
 from fleet_slip.evaluation.charts import draw_pictures
 from fleet_slip.evaluation.claims import Status, judge_claims
 from fleet_slip.evaluation.judge import LEAST_COVERAGE
 from fleet_slip.evaluation.kept import PAPER_TABLE_TWO, ReportData, gather
-from fleet_slip.ingest.drives import SOURCE as MEASURED
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.drawing import Picture, draw, png_file, svg_file
 from fleet_slip.pages.page import (

@@ -13,7 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
+from fleet_slip.catalogue.facts import LONGEST_PAUSE_S, MEASURED
 from fleet_slip.catalogue.signals import catalogue, digest_drive, round_chunks
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
@@ -352,7 +352,6 @@ def _by_base(run: pl.DataFrame) -> list[pl.DataFrame]:
     ]
 
 
-SOURCE = "measured"
 _SECONDS_PER_DAY = 86_400
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _EARLIEST_S = 10**8
@@ -539,7 +538,7 @@ def _metadata(
         **known,
         "started_at": _EPOCH + timedelta(seconds=start_s) if dated else None,  # to the microsecond
         "drive_id": name,
-        "source": SOURCE,
+        "source": MEASURED,
         "campaign": mapping.name,
         "saturated": 0,  # what is outside its range is quarantined, not clipped
     }

@@ -25,7 +25,7 @@ from pydantic import Field
 from fleet_slip.arrays import BoolArray
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.course import relate
-from fleet_slip.catalogue.facts import ALL_DRIVES, DELAY
+from fleet_slip.catalogue.facts import ALL_DRIVES, DELAY, MEASURED
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
@@ -37,7 +37,6 @@ from fleet_slip.grams.folding import FOLD_KEYS, FoldKey, assign_folds
 from fleet_slip.grams.gram_rows import hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
-from fleet_slip.ingest.drives import SOURCE
 from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
 from fleet_slip.models.manifest import Manifest, TrainedDrives
 from fleet_slip.models.predict import counts_model
@@ -382,7 +381,7 @@ def _look(
     condition = parse_condition(manifest.trained_on.cohort)
     query = _LONGEST.format(condition=condition.sql)
     with connect_tables(warehouse, query + "log_counts") as database, asking(database, condition):
-        drives = database.execute(query, {"source": SOURCE}).fetchall()
+        drives = database.execute(query, {"source": MEASURED}).fetchall()
         measured = len(drives)
         if made is not None:
             numbers = hash_numbers(pa.array([drive for drive, _ in drives], pa.string()))

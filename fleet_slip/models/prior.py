@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.job import update_grams
-from fleet_slip.simulation.campaign import Campaign
+from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.job import simulate_campaign
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
@@ -23,12 +23,14 @@ NOT_LOST = "lost_control_s IS NULL"
 
 
 def simulate_prior(
-    campaign: Campaign, feature_set: str, executor: Executor | None = None
+    campaign: str | Campaign, feature_set: str, executor: Executor | None = None
 ) -> Cohort:
-    """Return the Gram rows of a campaign's drives in which the car was not lost.
+    """Return the Gram rows of a campaign's drives, or of its file's, in which no car was lost.
 
-    Raises `QuestionError` for a set that simulated drives do not have, as `load_cohort`.
+    Raises `ConfigError` for the file, and as `load_cohort`.
     """
+    if isinstance(campaign, str):
+        campaign = load_campaign(campaign)
     workers = nullcontext(executor) if executor else ThreadPoolExecutor(os.cpu_count())
     with TemporaryDirectory(prefix="fleet-slip-prior-") as folder, workers as threads:
         warehouse = Warehouse(LocalFolder(Path(folder)))

@@ -8,15 +8,12 @@ from fractions import Fraction
 from importlib.metadata import version as package_version
 from typing import Any
 
-from fleet_slip.catalogue.facts import TRAINING_DRIVES
+from fleet_slip.catalogue.facts import MEASURED, TRAINING_DRIVES
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
 from fleet_slip.grams.car_evidence import three_digits
 from fleet_slip.grams.reader import open_grams
-from fleet_slip.ingest.assumptions import FOLDER as ASSUMPTIONS
-from fleet_slip.ingest.assumptions import kept_assumptions
-from fleet_slip.ingest.drives import SOURCE as MEASURED
 from fleet_slip.models.acceptance import judge
 from fleet_slip.models.manifest import (
     CrossValidated,
@@ -36,7 +33,6 @@ from fleet_slip.models.select import GIVEN, Selection, checksum_of_list
 from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.regression.folds import CrossValidation
 from fleet_slip.rendering import Answer, Part, Remark
-from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.warehouse.condition import parse_cohort, with_all_drives
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -207,6 +203,8 @@ def _prior_of(selection: Selection) -> Prior | None:
     prior, name = selection.cohort.prior, selection.request.prior
     if prior is None or name is None:
         return None
+    from fleet_slip.simulation.campaign import load_campaign  # noqa: PLC0415 - simulates
+
     campaign = load_campaign(name)
     return Prior(
         campaign=campaign.name,
@@ -252,7 +250,9 @@ def with_straight_intercept(
 
 def with_assumptions(warehouse: Warehouse, manifest: Manifest, selection: Selection) -> Manifest:
     """Return a manifest with what the mappings of its drives leave open."""
-    if not (warehouse.root / ASSUMPTIONS).names():
+    from fleet_slip.ingest.assumptions import FOLDER, kept_assumptions  # noqa: PLC0415 - units
+
+    if not (warehouse.root / FOLDER).names():
         return manifest
     cohort = selection.cohort
     with open_grams(warehouse, cohort.feature_set, cohort.condition) as opened:

@@ -27,7 +27,6 @@ from fleet_slip.grams.folding import PARTS, ROW_FOLDS, Folding, make_folding
 from fleet_slip.grams.gram_rows import by_signals, gram_table
 from fleet_slip.grams.reader import open_grams
 from fleet_slip.grams.weights import FULL, Weighed, age_weights, robust_weights
-from fleet_slip.models.prior import simulate_prior
 from fleet_slip.models.request import (
     BOTH,
     COURSE,
@@ -82,7 +81,6 @@ from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import METHODS
 from fleet_slip.rendering import Answer, Part
 from fleet_slip.resources import find_config
-from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.warehouse.tables import Warehouse
 
 SEED = 1
@@ -559,8 +557,9 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
     else:  # the sum of each fold suffices
         cohort = load_cohort(warehouse, condition, asked.feature_set, folds)
     if request.prior:
-        prior = simulate_prior(load_campaign(request.prior), asked.feature_set)
-        cohort = replace(cohort, beside=prior)
+        from fleet_slip.models.prior import simulate_prior  # noqa: PLC0415 - only here simulated
+
+        cohort = replace(cohort, beside=simulate_prior(request.prior, asked.feature_set))
     answer = asked.choose(cohort)
     cohort = answer.cohort
     if distances:

@@ -17,14 +17,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fleet_slip.base import canonical_json, number_of, sha256_of
-from fleet_slip.catalogue.facts import RECEIVED
+from fleet_slip.catalogue.facts import MEASURED, RECEIVED
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, UnexaminedError
 from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import GramReader
-from fleet_slip.ingest.drives import SOURCE
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.operations.quality import SensorFault, examine_drives
 from fleet_slip.resources import cache_folder, keep_json
@@ -163,7 +162,7 @@ def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
     drives are examined. Raises what `examine_drives` raises; where no drive is measured there is
     nothing to examine.
     """
-    measured = parse_condition(f"source IN ('{SOURCE}', '{RECEIVED}')")
+    measured = parse_condition(f"source IN ('{MEASURED}', '{RECEIVED}')")
     asked = parse_condition(cohort, row_columns())
     condition = measured if asked.columns - set(drive_columns()) else asked & measured
     grams, logs = gram_snapshots(warehouse)

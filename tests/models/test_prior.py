@@ -63,7 +63,7 @@ def test_a_prior_is_weighed_exactly(own: Path, few: str, monkeypatch: pytest.Mon
     monkeypatch.setattr("fleet_slip.models.select.PRIOR_SHARES", (Fraction(1, 16),))
     fleet = fleet_slip.open(own)
     found = fleet.cohort().select(model=INPUTS, prior=few)
-    prior = simulate_prior(load_campaign(few), "signals")
+    prior = simulate_prior(few, "signals")
     weight = found.cohort.weight
     signals = (*INPUTS.split(","), catalogue().label)
     (simulated,) = prior.tables
@@ -119,7 +119,7 @@ def test_a_wrong_prior_gets_next_to_no_weight(
     own: Path, few: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its label is reversed: whatever is taken of it makes held-out drives worse."""
-    prior = simulate_prior(load_campaign(few), "signals")
+    prior = simulate_prior(few, "signals")
     (table,) = prior.tables
     label = table.signals.index(catalogue().label)
     sums, products = table.sums.copy(), table.products.copy()
@@ -128,7 +128,7 @@ def test_a_wrong_prior_gets_next_to_no_weight(
     products[:, rows] *= -1
     wrong = type(table)(table.signals, table.n, sums, products)
     reversed_prior = prior.__class__(**{**vars(prior), "tables": (wrong,)})
-    monkeypatch.setattr("fleet_slip.models.select.simulate_prior", lambda *_: reversed_prior)
+    monkeypatch.setattr("fleet_slip.models.prior.simulate_prior", lambda *_: reversed_prior)
     found = fleet_slip.open(own).cohort().select(model=INPUTS, prior=few)
     assert found.cohort.weight * prior.rows / found.cohort.rows < 1 / 500
 
@@ -159,7 +159,7 @@ def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
     assert identified_prior(campaign) == found.car
     few_drives = campaign.model_copy(update={"number_of_days": 1, "drives_per_day": 2})
     prior = simulate_prior(few_drives, "signals")
-    monkeypatch.setattr("fleet_slip.models.select.simulate_prior", lambda *_: prior)
+    monkeypatch.setattr("fleet_slip.models.prior.simulate_prior", lambda *_: prior)
     done_on(own, "publish", "identified", "--model", INPUTS, "--prior", file, "--force")
     monkeypatch.setattr(module, "identify", identify)
     monkeypatch.setattr(module, "simulate_prior", simulate)
