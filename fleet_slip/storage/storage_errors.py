@@ -50,7 +50,8 @@ _MEANINGS: tuple[tuple[str, str], ...] = (
     ),
     (
         r"InvalidPath",
-        "the name of an object there is no path: a part of it is empty, `.` or `..`. Rename it.",
+        "the name of an object there is no path: a part is empty, `.`, `..` or has a control "
+        "character. Rename it.",
     ),
     (
         r"timed out|TimedOut|kind: Timeout",

@@ -183,8 +183,7 @@ def test_measured_files_are_ingested_and_reported_in_their_order(tmp_path: Path)
     )
     assert [report.file for report in reports] == each == [str(file) for file in files]
     assert all(report.new for report in reports)
-    size = sum(file.stat().st_size for file in files)
-    assert seen[-1] == (size, size)
+    assert seen[-1] == (len(files), len(files))
     (again,) = fleet.ingest(str(files[0]), mapping)
     assert not again.new
     ((arguments,),) = fleet.sql("SELECT arguments FROM runs LIMIT 1").fetchall()

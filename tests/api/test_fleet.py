@@ -106,7 +106,7 @@ def test_a_relation_cannot_write(fleet: Fleet, tmp_path: Path) -> None:
 def test_a_wrong_root_is_not_an_empty_warehouse(tmp_path: Path) -> None:
     nowhere = fleet_slip.open(tmp_path / "nothing")
     for ask in (lambda: nowhere.sql("FROM log"), nowhere.models):
-        with pytest.raises(StorageError, match="there is no data root"):
+        with pytest.raises(StorageError, match="no data root"):
             ask()
 
 

@@ -60,6 +60,6 @@ def test_it_says_in_how_many_drives_the_car_was_lost(
     )
     done = run_command("run", "--campaign", str(campaign), root=tmp_path / "data")
     assert done.exit_code == 0, done.stderr
-    assert " of 12 drives the car was lost" in done.stderr
+    assert " of 12 drives the car lost control" in done.stderr
     line = next(one for one in done.stderr.splitlines() if "lost_control_s IS NULL" in one)
     assert "publish ice --cohort \"campaign = 'ice' AND lost_control_s IS NULL\"" in line

@@ -111,7 +111,7 @@ def test_days_to_learn_from_may_be_chosen_and_must_be_enough(
     warehouse, version = trained
     chart = monitor(warehouse, version, since=DAY + timedelta(days=5))
     assert [day.training for day in chart.days] == [True] * 5 + [False]
-    with pytest.raises(DataError, match="trained on 2 days"):
+    with pytest.raises(DataError, match="has 2 in the cohort"):
         monitor(warehouse, version, since=DAY + timedelta(days=2))
     fleet = fleet_slip.open(warehouse.root)
     assert fleet.monitor("m", since=str(DAY + timedelta(days=5))) == chart

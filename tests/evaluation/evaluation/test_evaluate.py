@@ -88,7 +88,7 @@ def test_a_cohort_that_does_not_ask_for_test_drives_has_none(root: Path, tmp_pat
     asked = ("--cohort", "speed_factor > 0.1")
     assert call(copy, "select", *asked)["drives"] == 8
     assert call(copy, "publish", "fast", *asked)["version"] == 1
-    with pytest.raises(DataError, match="trained on 2 days"):  # and not for its test drives
+    with pytest.raises(DataError, match="has 2 in the cohort"):  # and not for its test drives
         call(copy, "monitor", "fast")
     assert call(copy, "quality", *asked)["drives"] == 8
     every = call(copy, "score", "fast", *asked)["rows"]
