@@ -25,7 +25,7 @@ from fleet_slip.pages.page import fill_in
 from fleet_slip.resources import config_names
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import MOTION
-from fleet_slip.simulation.roads import load_track
+from fleet_slip.simulation.roads import Track, load_track
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
@@ -200,8 +200,8 @@ def _places(
     """Return x, y and heading of the car, and the line of the track, if that is known."""
     station, offset = columns["station_m"], columns["lateral_offset_m"]
     empty = np.empty(0)
-    if (traffic or facts.get("track")) and np.isfinite(station).all():
-        track = traffic.profile.track if traffic else load_track(str(facts["track"]))
+    track = traffic.profile.track if traffic else _known_track(facts.get("track"))
+    if track and np.isfinite(station).all():
         line = track.centre_line(SPACING_M)
         # The log has stations in steps of 0.25 m, which the car would jump.
         smooth_m, offset = _smooth(np.unwrap(station, period=track.length_m)), _smooth(offset)
@@ -218,6 +218,14 @@ def _places(
     x = np.cumsum((vx * np.cos(heading) - vy * np.sin(heading)) * step)
     y = np.cumsum((vx * np.sin(heading) + vy * np.cos(heading)) * step)
     return x, y, heading, (empty, empty)
+
+
+def _known_track(name: str | None) -> Track | None:
+    """Return a track by name; None if its file is not here, as of a campaign by path."""
+    try:
+        return load_track(name) if name else None
+    except ConfigError:
+        return None
 
 
 def _others(

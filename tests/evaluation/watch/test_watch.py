@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.errors import QuestionError, UsageError
+from fleet_slip.errors import ConfigError, QuestionError, UsageError
+from fleet_slip.evaluation import watch
 from fleet_slip.evaluation.watch import DriveFrames, drive_frames, render_watch, scenario_frames
 
 DRIVE = "smoke-2024-05-01-0000"
@@ -51,6 +52,19 @@ def test_the_car_moves_as_fast_as_it_drives_and_where_it_goes(frames: DriveFrame
     off = abs(wrapped - frames.sideslip_deg)[inner]
     assert np.percentile(off, 95) < 1.0
     assert off.max() < 3.0
+
+
+def test_a_drive_on_a_track_whose_file_is_gone_is_drawn_by_its_motion(
+    smoke_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load_track(name: str) -> None:
+        raise ConfigError(f"nothing is called {name!r}")
+
+    monkeypatch.setattr(watch, "load_track", load_track)
+    fleet = fleet_slip.open(smoke_root)
+    drawn = drive_frames(fleet.warehouse, DRIVE, fleet.model("smoke"))
+    assert not drawn.track[0].size
+    assert np.hypot(np.diff(drawn.x_m), np.diff(drawn.y_m)).max() < 3
 
 
 def test_the_page_holds_the_drive_and_asks_for_nothing(frames: DriveFrames) -> None:
