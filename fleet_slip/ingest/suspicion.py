@@ -185,6 +185,8 @@ WHEELBASE_M = (2.0, 4.5)
 LARGEST_ZERO_RAD = math.radians(0.7)
 """Real cars have up to 0.4 deg, from a sensor that is not aligned and roads that lean."""
 SLOW_MPS, SURE_EXPLAINED = 20.0, 0.85
+GENTLE_MPS2, FEWEST_GENTLE_TICKS = 5.0, 500
+"""Beyond, a tyre slips more than in proportion: a race car at its limit shows no lever."""
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 ROAD_WHEELS = ("steer_fl", "steer")
 LEAST_CORRELATION = 0.6
@@ -348,7 +350,8 @@ def _label(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
     with np.errstate(divide="ignore", invalid="ignore"):
         inputs = np.array([signals["ay"], signals["yaw_rate"] / speed])
     many = large.size >= FEWEST_TICKS and np.quantile(large, 0.9) > LARGE_RAD
-    yield from _lever(signals, inputs, rows & (speed < SLOW_MPS), many=bool(many))
+    slow = rows & (speed < SLOW_MPS) & (np.abs(signals["ay"]) < GENTLE_MPS2)
+    yield from _lever(signals, inputs, slow, many=bool(many))
 
 
 def _lever(signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool) -> Iterator[Fault]:
@@ -361,7 +364,7 @@ def _lever(signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool)
     """
     label = catalogue().label
     ay, curvature = inputs[:, slow & np.isfinite(inputs).all(axis=0)]
-    if ay.size < FEWEST_TICKS or abs(np.corrcoef(ay, curvature)[0, 1]) > LARGEST_COLLINEAR:
+    if ay.size < FEWEST_GENTLE_TICKS or abs(np.corrcoef(ay, curvature)[0, 1]) > LARGEST_COLLINEAR:
         return
     (_, lever), zero, explained = fit(signals[label], inputs, slow)
     figure = f"turning slowly it goes with the yaw rate by {lever:+.2f} m, should be +1 to +2"

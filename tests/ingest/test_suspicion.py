@@ -41,6 +41,15 @@ def test_a_sign(name: str) -> None:
     assert kinds({**car, name: -car[name]}) == {("reversed", (name,))}
 
 
+def test_tyres_at_their_limit_tell_nothing_of_the_labels_sign() -> None:
+    """As in the last minutes of a race: below 20 m/s the car only turned as hard as it could."""
+    car = a_car()
+    angle = -1.2 * car["yaw_rate"] / 14.0 - 0.003 * car["ay"]
+    assert ("reversed", ("sideslip",)) in kinds({**car, "sideslip": angle})
+    at_limit = np.where(np.abs(car["ay"]) > 5.0, angle, np.nan)
+    assert ("reversed", ("sideslip",)) not in kinds({**car, "sideslip": at_limit})
+
+
 def test_of_wheels_and_axes_that_contradict_the_fewest_are_at_fault() -> None:
     car, wheels = a_car(), [("wheel_fl", "wheel_fr"), ("wheel_rl", "wheel_rr")]
     exchanged = {a: car[b] for pair in wheels for a, b in (pair, pair[::-1])}
