@@ -131,7 +131,7 @@ def test_the_service_does_its_night_and_keeps_its_compiled_code(
     assert "compiled" not in done.stderr
     assert (folder / "state/models/fleet/versions/1.json").stat().st_uid == NOBODY
     assert list((folder / "cache").rglob("*.nbi"))
-    assert {file.suffix for file in (folder / "logs").iterdir()} == {".txt", ".json", ".html"}
+    assert {file.suffix for file in (folder / "logs").iterdir()} == {".txt", ".json"}
 
 
 def test_without_a_cache_folder_it_does_its_job_and_says_what_that_costs(
