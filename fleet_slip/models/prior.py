@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.simulation.campaign import Campaign, load_campaign
@@ -27,7 +28,7 @@ def simulate_prior(
 ) -> Cohort:
     """Return the Gram rows of a campaign's drives, or of its file's, in which no car was lost.
 
-    Raises `ConfigError` for the file, and as `load_cohort`.
+    Raises `ConfigError` for the file, `DataError` if the car was lost in every drive.
     """
     if isinstance(campaign, str):
         campaign = load_campaign(campaign)
@@ -36,4 +37,10 @@ def simulate_prior(
         warehouse = Warehouse(LocalFolder(Path(folder)))
         simulate_campaign(warehouse, campaign, campaign.days(), threads)
         update_grams(warehouse, feature_set=feature_set)
-        return replace(load_cohort(warehouse, NOT_LOST, feature_set), source=None)
+        try:
+            return replace(load_cohort(warehouse, NOT_LOST, feature_set), source=None)
+        except DataError as error:
+            raise DataError(
+                f"prior {campaign.name}: no drive in which the driver kept the car. Check its "
+                "vehicle: fleet-slip identify names what its drives do not tell."
+            ) from error

@@ -370,6 +370,11 @@ class Selection(Answer):
             "remark": self.remark,
             "examined": self.examined,
         }
+        if self.cohort.prior:
+            found["prior"] = {
+                "campaign": str(self.request.prior),
+                "weight": str(self.cohort.weight),
+            }
         document |= {name: document_of(one) for name, one in found.items() if one}
         return document
 

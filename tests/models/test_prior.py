@@ -71,6 +71,7 @@ def test_a_prior_is_weighed_exactly(own: Path, few: str, monkeypatch: pytest.Mon
     both = times(real.restrict(signals), weight.denominator)
     both += times(simulated.total().restrict(signals), weight.numerator)
     assert 0 < weight < 1
+    assert found.as_dict()["prior"] == {"campaign": few, "weight": str(weight)}
     by_hand = fit(both, INPUTS.split(","), catalogue().label).model
     assert by_hand == found.winner.model.counts
     assert prior.rows > 1000 and found.cohort.drive_count == 6
@@ -191,6 +192,15 @@ def test_old_drives_count_less(tmp_path: Path) -> None:
     assert found.trained_rows == 175
     refused = run_on(tmp_path / "data", "select", "--model", "ay,yaw_rate", "--half-life", "0")
     assert refused.exit_code == 2 and "half_life" in refused.stderr
+
+
+def test_a_prior_in_which_every_car_is_lost_is_refused(
+    own: Path, few: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fleet_slip.models.prior.NOT_LOST", "lost_control_s < 0")
+    done = run_on(own, "select", "--model", INPUTS, "--prior", few)
+    assert done.exit_code == 5
+    assert "prior few: no drive in which the driver kept the car" in done.stderr
 
 
 def test_weights_halve_with_age() -> None:
