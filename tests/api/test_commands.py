@@ -216,8 +216,9 @@ def _measured(folder: Path) -> tuple[list[Path], str]:
 
 def test_two_threads_publish_one_model(tmp_path: Path) -> None:
     fleet = fleet_slip.open(tmp_path / "data")
-    fleet.run("smoke", days=1)
-    selection = fleet.cohort().select()
+    fleet.simulate("smoke", days=1)
+    fleet.gram()
+    selection = fleet.cohort().select(models="table1")
     made: list[object] = []
     threads = [
         threading.Thread(target=lambda: made.append(fleet.publish("slip", selection)))

@@ -1,7 +1,7 @@
 """What a terminal of 80, 100 and 160 columns shows: no word is broken, and nothing is cut off."""
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -11,7 +11,10 @@ from fleet_slip.cli.accuracy import evaluation_parts
 from fleet_slip.cli.app import app
 from fleet_slip.cli.output import print_parts
 from fleet_slip.errors import AlarmError
+from fleet_slip.models import select
+from fleet_slip.models.request import SelectionRequest
 from fleet_slip.rendering import TextTable
+from fleet_slip.warehouse.tables import Warehouse
 
 Shown = Callable[..., list[str]]
 
@@ -28,6 +31,22 @@ COMMANDS = [
     "features --files",
     "diagnose smoke",
 ]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def chosen_once() -> Iterator[None]:
+    """Let what is asked for again be shown again: to choose takes longer than to show."""
+    answer, answers = select.answer_request, dict[str, select.Selection]()
+
+    def once(warehouse: Warehouse, request: SelectionRequest, condition: str) -> select.Selection:
+        asked = f"{request} {condition}"
+        if asked not in answers:
+            answers[asked] = answer(warehouse, request, condition)
+        return answers[asked]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(select, "answer_request", once)
+        yield
 
 
 @pytest.fixture(params=WIDTHS)

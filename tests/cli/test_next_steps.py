@@ -1,6 +1,7 @@
 """What the first run says to type next works as it stands."""
 
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,10 @@ def test_the_last_draws_the_report_of_the_model(told: tuple[Path, list[str]]) ->
     assert report.endswith("report smoke")
 
 
-def test_another_root_stands_in_them(run_command: RunCommand, tmp_path: Path) -> None:
+def test_another_root_stands_in_them(
+    run_command: RunCommand, smoke_root: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(smoke_root, tmp_path / "my data", ignore=shutil.ignore_patterns("models"))
     done = run_command("run", "--campaign", "smoke", root=tmp_path / "my data")
     assert f"--root '{tmp_path / 'my data'}' sql" in done.stderr
 

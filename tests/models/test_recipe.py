@@ -81,7 +81,7 @@ def test_a_version_from_before_that_no_list_chose_needs_to_be_told(tmp_path: Pat
 
 def test_a_dry_run_publishes_nothing(root: Path) -> None:
     before = call(root, "models")
-    assert call(root, "publish", "unborn", "--dry-run")["publishes"]
+    assert call(root, "publish", "unborn", "--models", "table1", "--dry-run")["publishes"]
     told = call(root, "publish", "plain", "--cohort", "day > '2024-05-01'", "--dry-run")
     assert told["model"] == "plain"
     assert call(root, "models") == before

@@ -110,14 +110,14 @@ def test_a_first_champion_of_a_label_that_is_wrong_in_all_drives_is_refused(
     (report,) = fleet.ingest(bad, str(landing.mapping))
     assert told in {f"{one.kind} {one.signals[0]}" for one in report.suspicions}
     fleet.gram()
-    cohort = fleet.cohort()
+    chosen = fleet.cohort().select(models="table1")
     with pytest.raises(RefusedError, match=rf"of 5 inspected drives contradict .*{told}"):
-        fleet.publish("m", cohort)
+        fleet.publish("m", chosen)
     night = fleet.nightly(landing.folder, str(landing.mapping), "m", models="table1")
     assert night.exit_code != 0
     assert night.champion is None
-    assert fleet.publish("m", cohort, candidate=True).candidate
-    assert fleet.publish("m", cohort, force=True).new
+    assert fleet.publish("m", chosen, candidate=True).candidate
+    assert fleet.publish("m", chosen, force=True).new
 
 
 def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
@@ -133,9 +133,10 @@ def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
         fleet.gram()
         if name == "a":
             assert fleet.publish("m", fleet.cohort()).new
+    chosen = fleet.cohort().select()
     with pytest.raises(RefusedError, match="differ from its training set"):
-        fleet.publish("m", fleet.cohort())
-    assert fleet.publish("m", fleet.cohort(), candidate=True).candidate
+        fleet.publish("m", chosen)
+    assert fleet.publish("m", chosen, candidate=True).candidate
 
 
 _FLOOR = champion_rules.floor

@@ -52,7 +52,10 @@ def run(words: Words, *, patience_s: float = PATIENCE_S, **options: Any) -> Fini
 
 
 def run_here(
-    words: Sequence[str], cwd: str | Path | None = None, env: Mapping[str, str] | None = None
+    words: Sequence[str],
+    cwd: str | Path | None = None,
+    env: Mapping[str, str] | None = None,
+    input: str = "",  # noqa: A002 - as `subprocess` calls it
 ) -> Finished:
     """Run `fleet-slip` in this process, which is left as it was: a third of what another costs.
 
@@ -63,16 +66,18 @@ def run_here(
             _left_as_it_was(),
             _configs_read_anew(env is not None or "--config" in words),
             contextlib.chdir(cwd or "."),
-            Path(os.devnull).open() as nothing,
+            tempfile.TemporaryFile("w+") as given,
         ):
+            given.write(input)
+            given.seek(0)
             if env is not None:
                 os.environ.clear()
                 os.environ.update(env)
-            for descriptor, stream in enumerate((nothing, out, err)):
+            for descriptor, stream in enumerate((given, out, err)):
                 os.dup2(stream.fileno(), descriptor)
             sys.argv = list(words)
             assert sys.__stdout__ and sys.__stderr__
-            sys.stdin, sys.stdout, sys.stderr = nothing, sys.__stdout__, sys.__stderr__
+            sys.stdin, sys.stdout, sys.stderr = given, sys.__stdout__, sys.__stderr__
             code = 0
             try:
                 fleet_slip_main()
@@ -147,7 +152,7 @@ def run_on(root: object, *arguments: str | Path, **options: Any) -> Finished:
     """
     words = [COMMAND, "--root", str(root), *map(str, arguments)]
     preloaded = "LD_PRELOAD" in (options.get("env") or {})  # read when a process begins
-    here = options.keys() <= {"cwd", "env"} and not preloaded and _can_run_here()
+    here = options.keys() <= {"cwd", "env", "input"} and not preloaded and _can_run_here()
     done = (run_here if here else run)(words, **options)
     assert "Traceback" not in done.stderr, done.stderr
     require_no_failed_run(root)

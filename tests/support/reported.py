@@ -26,7 +26,7 @@ class Reported:
         return self.root / "report" / "figures"
 
 
-LITTLE_S = 12
+LITTLE_S = 4
 """So much of each drive filters are tuned on: to tune them takes most of an evaluation."""
 
 

@@ -48,10 +48,15 @@ def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, tuned: Path
     return folder
 
 
+@pytest.fixture(scope="module")
+def evaluated(root: Path) -> Any:
+    """What an evaluation says that was done before."""
+    return evaluate(root, *SCENARIOS)
+
+
 def test_evaluating_again_changes_nothing(root: Path) -> None:
     logs_version = Warehouse(LocalFolder(root)).logs.snapshot().version
-    again = evaluate(root, *SCENARIOS)
-    assert again["number"] == 1
+    assert evaluate(root, *SCENARIOS)["number"] == 1
     assert Warehouse(LocalFolder(root)).logs.snapshot().version == logs_version
 
 
@@ -78,7 +83,7 @@ def test_no_model_is_trained_on_scenarios(root: Path) -> None:
         call(root, "select", "--cohort", "source = 'scenario'")
     with pytest.raises(RefusedError, match="scenario"):
         call(root, "publish", "leaking", "--cohort", "source IN ('simulation', 'scenario')")
-    assert call(root, "select")["drives"] == 8
+    assert call(root, "select", "--models", "table1")["drives"] == 8
     assert not call(root, "run", "--campaign", "smoke")["changed"]
 
 
@@ -86,8 +91,9 @@ def test_a_cohort_that_does_not_ask_for_test_drives_has_none(root: Path, tmp_pat
     copy = tmp_path / "data"
     shutil.copytree(root, copy)
     asked = ("--cohort", "speed_factor > 0.1")
-    assert call(copy, "select", *asked)["drives"] == 8
-    assert call(copy, "publish", "fast", *asked)["version"] == 1
+    chosen = (*asked, "--models", "table1")
+    assert call(copy, "select", *chosen)["drives"] == 8
+    assert call(copy, "publish", "fast", *chosen)["version"] == 1
     with pytest.raises(DataError, match="has 2 in the cohort"):  # and not for its test drives
         call(copy, "monitor", "fast")
     assert call(copy, "quality", *asked)["drives"] == 8
@@ -127,11 +133,11 @@ def test_views_show_test_drives_to_those_who_ask(root: Path) -> None:
     assert call(root, "sql", "--scenarios", count) == [{"count_star()": 8 + asked[0][0]}]
 
 
-def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path) -> None:
+def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path, evaluated: Any) -> None:
     """SQL measures against the noisy label, here the truth counts: 0.03 degrees between them."""
     manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
     in_sql = score(Warehouse(LocalFolder(root)), manifest, "drive_id = 'scenario-nominal'")
-    one = evaluate(root, *SCENARIOS)["scenarios"][0]
+    one = evaluated["scenarios"][0]
     here = one["results"]["smoke@1"]
     assert here["rows"] == in_sql.rows == one["truth"]["rows"]
     assert here["error_mean_deg"] == pytest.approx(in_sql.error_mean_deg, abs=0.001)
@@ -150,8 +156,8 @@ def test_the_truth_is_the_simulators_and_not_the_logs(root: Path) -> None:
     assert 0.002 < off.max() <= 0.0025 + 1e-9, "half a count of 0.005 m/s"
 
 
-def test_stability_is_lost_on_the_slippery_road_alone(root: Path) -> None:
-    content = {one["name"]: one for one in evaluate(root, *SCENARIOS)["scenarios"]}
+def test_stability_is_lost_on_the_slippery_road_alone(evaluated: Any) -> None:
+    content = {one["name"]: one for one in evaluated["scenarios"]}
     sections = {
         name: [section["name"] for section in one["sections"]] for name, one in content.items()
     }
@@ -163,10 +169,8 @@ def test_stability_is_lost_on_the_slippery_road_alone(root: Path) -> None:
     assert inside["error_std_deg"] > 3 * outside["error_std_deg"]
 
 
-def test_a_missing_signal_costs_the_models_that_need_it(root: Path) -> None:
-    one = next(
-        one for one in evaluate(root, *SCENARIOS)["scenarios"] if one["name"] == "wheel_missing"
-    )
+def test_a_missing_signal_costs_the_models_that_need_it(evaluated: Any) -> None:
+    one = next(one for one in evaluated["scenarios"] if one["name"] == "wheel_missing")
     assert one["results"]["smoke@1/1"]["coverage"] == 1
     expected = 60 / one["truth"]["duration_s"]
     assert one["results"]["smoke@1/4"]["coverage"] == pytest.approx(expected, abs=0.001)
@@ -194,11 +198,10 @@ def test_the_filters_are_tuned_once(root: Path) -> None:
     assert all(mass_kg is None for _, _, mass_kg in drives), "the model does not know it"
 
 
-def test_a_car_identified_from_the_same_drives_competes(root: Path) -> None:
-    content = evaluate(root, *SCENARIOS)
-    about = content["estimators"]["ekf_identified"]
+def test_a_car_identified_from_the_same_drives_competes(evaluated: Any) -> None:
+    about = evaluated["estimators"]["ekf_identified"]
     assert (about["kind"], about["gps"], about["told"]) == ("filter", False, "labelled drives")
-    results = content["scenarios"][0]["results"]
+    results = evaluated["scenarios"][0]["results"]
     assert results["ekf_identified"]["rmse_deg"] < 1.5 * results["ekf_class_tuned"]["rmse_deg"]
 
 
