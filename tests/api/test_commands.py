@@ -1,8 +1,5 @@
 """What commands do, done in Python: on a folder and on an object store, with the same bits."""
 
-import json
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,18 +14,9 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import DataError, QuestionError, UsageError
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.storage.folder import Folder
-from tests.support.commands import start
-from tests.support.s3_server import forget_clients
+from tests.support.s3_server import ServerApart, forget_clients
 
 DAY = date(2024, 5, 1)
-REPOSITORY = Path(__file__).parents[2]
-SERVER = """
-import json, sys
-from tests.support.s3_server import Server
-server = Server()
-print(json.dumps({"environment": server.environment, "bucket": server.bucket()}), flush=True)
-sys.stdin.read()
-"""
 
 
 @pytest.fixture(scope="module", params=["folder", "object store"])
@@ -40,15 +28,12 @@ def filled(
         if request.param == "folder":
             yield _fill(fleet_slip.open(tmp_path_factory.mktemp("calls") / "data"))
             return
-        # In a process of its own: calls of the Delta library hold the interpreter while they wait.
-        with start([sys.executable, "-c", SERVER], stdin=subprocess.PIPE, cwd=REPOSITORY) as server:
-            assert server.stdout
-            told = json.loads(server.stdout.readline())
-            for name, value in told["environment"].items():
-                patch.setenv(name, value)
-            forget_clients()
-            yield _fill(fleet_slip.open(f"{told['bucket']}/data"))
-            server.kill()
+        server = ServerApart()
+        for name, value in server.environment.items():
+            patch.setenv(name, value)
+        forget_clients()
+        yield _fill(fleet_slip.open(f"{server.bucket()}/data"))
+        server.stop()
         forget_clients()
 
 

@@ -139,15 +139,15 @@ def short(folder: Path, tracks: str = "") -> str:
     return str(file)
 
 
-def test_a_campaign_is_simulated_without_a_word_of_pygame(tmp_path: Path) -> None:
-    at = ["--root", str(tmp_path / "data")]
-    done = run([COMMAND, *at, "simulate", short(tmp_path)])
+def test_a_campaign_is_simulated_without_a_word_of_pygame(
+    tmp_path: Path, run_command: RunCommand
+) -> None:
+    done = run([COMMAND, "--root", str(tmp_path / "data"), "simulate", short(tmp_path)])
     assert done.exit_code == 0, done.stderr
     assert not done.stdout
     assert "short.toml: 2 drives, " in done.stderr
     assert len(done.stderr.splitlines()) == 3, done.stderr
-    again = run([COMMAND, *at, "simulate", short(tmp_path)])
-    assert "nothing to do" in again.stderr
+    assert "nothing to do" in run_command("simulate", short(tmp_path)).stderr
 
 
 def test_an_unknown_road_is_named_with_file_and_key(

@@ -6,7 +6,7 @@ import pytest
 
 from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.folder import Folder
-from tests.support.s3_server import Server, forget_clients
+from tests.support.s3_server import Server, ServerApart, forget_clients
 
 
 @pytest.fixture(scope="session")
@@ -17,7 +17,7 @@ def server() -> Iterator[Server]:
 
 
 @pytest.fixture(autouse=True)
-def environment(server: Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def environment(server: "Server | ServerApart", monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Where the server is, for this process and those that it starts."""
     for name, value in server.environment.items():
         monkeypatch.setenv(name, value)

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -130,6 +131,7 @@ def test_temporary_credentials_are_had_anew_before_they_end(
         with contextlib.suppress(StorageError):
             land(snapshot, "b")
             return True
+        time.sleep(0.25)  # each attempt asks the program for credentials
         return False
 
     until(landed)

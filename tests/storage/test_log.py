@@ -13,7 +13,7 @@ import fleet_slip
 from fleet_slip.errors import HIDDEN, InputError, StorageError
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import current_run_id, publishable, recording, step
-from tests.support.commands import COMMAND, RunCommand, finish, run, start
+from tests.support.commands import RunCommand, finish, run_on, start
 
 
 def runs(root: Path) -> list[dict[str, Any]]:
@@ -140,9 +140,9 @@ def test_commands_are_recorded_and_questions_are_not(run_command: RunCommand) ->
 
 
 def test_the_log_is_json_where_a_machine_reads_it(tmp_path: Path) -> None:
-    command = [COMMAND, "--root", str(tmp_path / "data"), "gram", "--features", "unknown"]
+    command = ["gram", "--features", "unknown"]
     environment = {k: v for k, v in os.environ.items() if k != "FLEET_SLIP_LOG"}
-    done = run([*command, "--json"], env=environment)
+    done = run_on(tmp_path / "data", *command, "--json", env=environment)
     lines = [json.loads(line) for line in done.stderr.splitlines()]
     assert [line["event"] for line in lines] == [
         "run started",
@@ -154,6 +154,6 @@ def test_the_log_is_json_where_a_machine_reads_it(tmp_path: Path) -> None:
     assert lines[2]["exit_code"] == done.exit_code == 5
     assert lines[3]["level"] == "error"
     assert lines[3]["message"].startswith("error: no feature set is called 'unknown'")
-    for words in ([*command[1:], "--json"], ["--log", "text", *command[1:], "--json"]):
-        text = run([COMMAND, *words[: None if "--log" in words else -1]], env=environment)
+    for words in (command, ["--log", "text", *command, "--json"]):
+        text = run_on(tmp_path / "data", *words, env=environment)
         assert text.stderr.startswith("error: no feature set")

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fleet_slip.cli.app import app
+from fleet_slip.evaluation.identify import STARTS
 from tests.support.once import require_no_failed_run
 
 
@@ -27,12 +28,13 @@ class Reported:
 
 
 LITTLE_S = 4
-"""So much of each drive filters are tuned on: to tune them takes most of an evaluation."""
+"""So much of each drive filters are tuned on, and a car identified from: most of an evaluation."""
 
 
 def call(root: Path, *words: str) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fleet_slip.evaluation.filters.TUNING_S", LITTLE_S)
+        patch.setattr("fleet_slip.evaluation.identify.STARTS", STARTS[:1])
         result = CliRunner().invoke(app, ["--root", str(root), *words])
     require_no_failed_run(root)
     if result.exception is not None:

@@ -5,21 +5,25 @@ key, since moto takes any.
 """
 
 import io
+import json
 import random
 import re
+import subprocess
+import sys
 import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
 from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
 
 from fleet_slip.storage.objects import aws_profile, client
-from tests.support.commands import COMMAND, PATIENCE_S, Finished, run
+from tests.support.commands import COMMAND, PATIENCE_S, Finished, run, run_on, start
 
 ACCESS_KEY = "AKIDFORTESTS"
 SECRET_KEY = "s3cr3t/of+tests"  # noqa: S105 - for a server of our own
@@ -142,12 +146,54 @@ class Server:
             return answer
 
 
-def command_on(root: object, *arguments: str) -> Finished:
+PROGRAM = """
+import json, sys
+from tests.support.s3_server import Faults, Server
+server = Server()
+print(json.dumps(server.environment), flush=True)
+for asked in sys.stdin:
+    answer = server.bucket() if asked == "bucket\\n" else server.faults.seen
+    server.faults = Faults()
+    print(json.dumps(answer), flush=True)
+"""
+
+
+class ServerApart:
+    """A server in a process of its own, so that commands can run in the process of the tests.
+
+    deltalake keeps Python's lock while it waits for a server, which that would need to answer.
+    """
+
+    def __init__(self) -> None:
+        words = [sys.executable, "-c", PROGRAM]
+        self._process = start(words, stdin=subprocess.PIPE, cwd=Path(__file__).parents[2])
+        self.environment: dict[str, str] = self._answer()
+
+    def bucket(self) -> str:
+        """Make a bucket and return its URL."""
+        return str(self._answer("bucket\n"))
+
+    def seen(self) -> list[str]:
+        """Return the requests that came since this was asked, or a bucket made."""
+        return list(self._answer("seen\n"))
+
+    def stop(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def _answer(self, asked: str = "") -> Any:
+        assert self._process.stdin and self._process.stdout
+        self._process.stdin.write(asked)
+        self._process.stdin.flush()
+        return json.loads(self._process.stdout.readline())
+
+
+def command_on(root: object, *arguments: str, apart: bool = False) -> Finished:
     """Run a command as a user would, and look for keys in what it prints.
 
-    In a process of its own: deltalake keeps Python's lock while it waits, which the server needs.
+    In a process of its own, unless the server has one: see `ServerApart`.
     """
-    done = run([COMMAND, "--root", str(root), *arguments])
+    done = run_on(root, *arguments) if apart else run([COMMAND, "--root", str(root), *arguments])
     assert "Traceback" not in done.stderr, done.stderr
     for text in (done.stdout, done.stderr):
         assert not [secret for secret in (ACCESS_KEY, SECRET_KEY) if secret in text]

@@ -101,7 +101,7 @@ def test_gram_rows_of_several_times_are_sums_of_the_plain_changes(
     times = (Decimal("3.5"), Decimal(4), Decimal(5))
     three = FeatureSet(description="three", of="fleet", change_s=times)
     monkeypatch.setitem(features().sets, "three", three)
-    drives = {name: hostile_drive(name, 4000, seed) for seed, name in enumerate("ab")}
+    drives = {name: hostile_drive(name, 2000, seed) for seed, name in enumerate("ab")}
     land(warehouse, "one", *drives.values())
     files = warehouse.logs.snapshot().files
     rows = aggregate(warehouse, files, feature_set="three", late={"car-1": late})
