@@ -1,8 +1,7 @@
 """Brings the tables of a data root to this program and to the signal catalogue, step by step.
 
 1. Every table gets the columns that came later. No file is touched: there they are null.
-2. The logs record the scale of every signal, as those of early releases did not.
-3. Files whose dictionaries have names that none of their rows has are written again.
+2. Files whose dictionaries have names that none of their rows has are written again.
 """
 
 from collections.abc import Iterator, Mapping
@@ -39,7 +38,7 @@ class MigrationReport(Answer):
 
     @property
     def changed(self) -> bool:
-        """Whether there was anything to do but to record scales."""
+        """Whether there was anything to do."""
         return bool(self.added or self.files_without_names)
 
     def parts(self) -> Iterator[Part]:
@@ -77,12 +76,11 @@ def migrate(warehouse: Warehouse) -> MigrationReport:
 def _add_columns(table: Table, delta: DeltaTable, found: Evolution) -> None:
     fields = {field.name: field for field in Schema.from_arrow(table.schema).fields}
     scales = scales_of(table.schema)
+    if not found.added:
+        return
     with table.committing():
-        if found.added:
-            delta.alter.set_table_properties(ALL_STATISTICS)
-            delta.alter.add_columns([_with_scale(fields[n], scales) for n in found.added])
-        for name in found.unrecorded:
-            delta.alter.set_column_metadata(name, {SCALE: str(scales[name])})
+        delta.alter.set_table_properties(ALL_STATISTICS)
+        delta.alter.add_columns([_with_scale(fields[n], scales) for n in found.added])
 
 
 def _with_scale(field: Field, scales: Mapping[str, Decimal]) -> Field:

@@ -255,13 +255,11 @@ class Evolution:
     Attributes:
         added, retired: columns of the catalogue alone, and of the table alone.
         rescaled: old and new scale of the signals whose counts mean something else.
-        unrecorded: signals whose scale the table does not record, and which is taken to be ours.
     """
 
     added: tuple[str, ...]
     retired: tuple[str, ...]
     rescaled: Mapping[str, tuple[Decimal, Decimal]]
-    unrecorded: tuple[str, ...]
 
 
 def compare_schemas(schema: pa.Schema, delta: DeltaTable) -> Evolution:
@@ -279,7 +277,6 @@ def compare_schemas(schema: pa.Schema, delta: DeltaTable) -> Evolution:
             for name, scale in scales.items()
             if SCALE in stored[name] and Decimal(stored[name][SCALE]) != scale
         },
-        unrecorded=tuple(name for name in scales if SCALE not in stored[name]),
     )
 
 
