@@ -13,7 +13,7 @@ from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.session import LearnReport, RunReport
 from fleet_slip.base import number_of
-from fleet_slip.cli.options import RESAMPLING, Unexamined, command
+from fleet_slip.cli.options import RESAMPLING, command
 from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.models.manifest import require_model_name
@@ -25,12 +25,19 @@ from fleet_slip.storage.runs import step
 # The command that publishes the model that a selection chose.
 
 
-@command(Fleet.publish, FleetCohort.select, arguments=["name"], without=RESAMPLING)
+@command(
+    Fleet.publish,
+    Fleet.cohort,
+    FleetCohort.select,
+    arguments=["name"],
+    without=[*RESAMPLING, "condition"],
+)
 def publish(
     fleet: Fleet,
     name: str,
     force: bool,
     candidate: bool,
+    unexamined: bool,
     cohort: Annotated[
         str | None,
         typer.Option(
@@ -38,7 +45,6 @@ def publish(
             "drives, of a new model."
         ),
     ] = None,
-    unexamined: Unexamined = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be published, and publish nothing.")
     ] = False,

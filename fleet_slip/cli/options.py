@@ -198,15 +198,6 @@ def _plain(name: str, annotation: Any, default: Any = None) -> inspect.Parameter
     )
 
 
-Unexamined = Annotated[
-    bool,
-    typer.Option(
-        "--unexamined",
-        help="Use drives with faulty sensors, too. By default they are left out.",
-    ),
-]
-
-
 def quantities(values: Sequence[str] | None, option: str) -> dict[str, float]:
     """Return what options like `--noise ay=0.2` say, in SI units. Raises `UsageError`."""
     found = {}
