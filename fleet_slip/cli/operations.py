@@ -41,10 +41,8 @@ def status(
         from fleet_slip.operations.status import as_openmetrics  # noqa: PLC0415 - seldom asked
 
         print_parts([as_openmetrics(found).removesuffix("\n")])
-    elif json:
-        print_json(found)
     else:
-        print_parts(found.parts())
+        print_answer(found, json)
     for problem in found.problems:
         say(f"- {problem}", logging.ERROR)
 
