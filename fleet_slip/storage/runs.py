@@ -5,7 +5,7 @@
 
 A line is one write, never changed, that ends in a checksum of the bytes before: no lock, and a
 killed run lacks its second line. A changed line differs from a torn one, which lacks its end and is
-skipped, and an old one, which has no checksum.
+skipped.
 """
 
 import contextlib
@@ -37,12 +37,6 @@ START = 19
 
 FOLDER = "runs"
 
-_KEYS = frozenset(
-    {"run_id", "command", "arguments", "started_at", "ended_at", "outcome", "exit_code", "error"}
-    | {"seconds", "steps", "host", "process", "process_began", "package_version", "documents"}
-)
-"""What lines of earlier versions, which have no checksum, may say."""
-
 _DIGITS = 32
 _END = b',"sha256":"' + b"0" * _DIGITS + b'"}'
 _WITH_CHECKSUM = re.compile(rb'(.*),"sha256":"([0-9a-f]{%d})"\}' % _DIGITS)
@@ -69,11 +63,9 @@ def read_lines(content: bytes) -> tuple[list[bytes], list[int]]:
     intact, changed = [], []
     for number, line in enumerate(content.split(b"\n"), 1):
         found = _WITH_CHECKSUM.fullmatch(line)
-        record = None if found else _parsed(line)
-        # An earlier version wrote no checksum, but no other keys either.
-        if _checksum(found[1]) == found[2] if found else record and record.keys() <= _KEYS:
+        if found and _checksum(found[1]) == found[2]:
             intact.append(line)
-        elif found or record is not None or _ends(line) or _ends(line[:-1]):
+        elif found or _is_record(line) or _ends(line) or _ends(line[:-1]):
             changed.append(number)
     return intact, changed
 
@@ -108,12 +100,11 @@ def _ends(line: bytes) -> bool:
     return sum(a != b and not (b == 48 and a in hexadecimal) for a, b in pairs) <= 1
 
 
-def _parsed(line: bytes) -> dict[str, Any] | None:
+def _is_record(line: bytes) -> bool:
     try:
-        record = json.loads(line)
+        return isinstance(json.loads(line), dict)
     except (ValueError, RecursionError):
-        return None
-    return record if isinstance(record, dict) else None
+        return False
 
 
 def _checksum(body: bytes) -> bytes:

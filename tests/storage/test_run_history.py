@@ -1,11 +1,10 @@
 """The history of runs where each record is an object."""
 
-import json
 from datetime import UTC, datetime, timedelta
 
 from fleet_slip.operations.status import status_of
 from fleet_slip.storage.folder import Folder
-from fleet_slip.storage.runs import Run
+from fleet_slip.storage.runs import Run, write_line
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.s3_server import Server
@@ -33,4 +32,4 @@ def record_old(root: Folder, days: int) -> None:
     run.started_at -= timedelta(days=days)
     run.run_id = f"{days}"
     for line in (run.beginning(), run.end(None, 1.0)):
-        root.append(f"runs/{run.started_at:%Y-%m}.jsonl", json.dumps(line).encode() + b"\n")
+        root.append(f"runs/{run.started_at:%Y-%m}.jsonl", write_line(line) + b"\n")
