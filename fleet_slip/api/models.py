@@ -216,18 +216,6 @@ class PublishedModels(Rooted):
 
         return compare_versions(self.registry(), self.resolve(one), self.resolve(other))
 
-    @record_call
-    def import_model(self, file: Path) -> ModelVersion:
-        """Bring a version in that another data root exported to JSON; return it.
-
-        It becomes its model's next version, with its origin and no alias; the latest is returned if
-        it is the same estimator. Raises `InputError` for no such export, or a changed one,
-        `RefusedError` if a signal means something else here.
-        """
-        from fleet_slip.export.files import import_version
-
-        return import_version(self.registry(), file)
-
     def estimator(
         self, model: str | ModelVersion, car: Mapping[str, Any] | None = None
     ) -> "Estimator":

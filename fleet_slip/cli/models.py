@@ -10,7 +10,6 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import All, Json, print_json, print_parts, say
-from fleet_slip.errors import UsageError
 from fleet_slip.models.manifest import CrossValidated, LearnedFrom
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.rendering import Part, TextTable
@@ -21,23 +20,14 @@ def models(
     fleet: Fleet,
     name: Annotated[
         str | None,
-        typer.Argument(
-            help="Show one model's versions and history. Or: import, and a FILE that export --to "
-            "json wrote, to bring its version in."
-        ),
+        typer.Argument(help="Show one model's versions and history."),
     ] = None,
-    file: Annotated[Path | None, typer.Argument(help="The file to import.")] = None,
     json: Json = False,
 ) -> None:
-    """List the published model versions, or bring one in from elsewhere: models import FILE.
+    """List the published model versions.
 
     Example: **fleet-slip models**
     """
-    if file is not None:
-        _import_model(fleet, name, file, json)
-        return
-    if name == "import" and name not in fleet.registry().names():
-        raise UsageError("name the file: fleet-slip models import FILE")
     rows = fleet.models(name).to_pylist()
     if json:
         print_json(rows)
@@ -61,21 +51,6 @@ def models(
         header = "at|command|alias|version"
         form = "{at:%Y-%m-%d %H:%M:%S}|{command}|{alias}|{version}"
         print_parts([TextTable("\nhistory of aliases", header, moves, form, left=3)])
-
-
-def _import_model(fleet: Fleet, word: str | None, file: Path, json: bool) -> None:
-    if word != "import":
-        raise UsageError(
-            f"unknown action {word!r}. To import the file: fleet-slip models import {file}"
-        )
-    version = fleet.import_model(file)
-    origin = version.manifest.imported_from
-    if json:
-        told = origin.model_dump() if origin else None
-        print_json({"model": version.reference, "sha256": version.sha256, "imported_from": told})
-        return
-    came = f"imported from {origin.reference}" if origin else "is there already, made here"
-    say(f"{version.reference}: {came}. To use it: fleet-slip promote {version.reference}")
 
 
 @command(Fleet.model, arguments=["model"])

@@ -1,20 +1,17 @@
 """The files that an export of a published version consists of."""
 
 import base64
-import binascii
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, get_args
 
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalogue.definitions import LARGEST_FACT
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.columns.operations import CarFact
-from fleet_slip.config import parse_document, read_named_file
-from fleet_slip.errors import ConfigError, InputError, RefusedError, StorageError, UsageError
+from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.export.c import c_header, c_source
 from fleet_slip.export.c_gram import c_gram_header, c_gram_source, sets_on_board
 from fleet_slip.export.compile import Check, checks_csv, compile_program, make_checks
@@ -23,9 +20,8 @@ from fleet_slip.export.fmu import fmu
 from fleet_slip.export.program import Angle, Input, Program, Target
 from fleet_slip.export.sql import sql_macro, sql_statement
 from fleet_slip.export.templating import c_prefix, different, file_prefix, fill_in_version
-from fleet_slip.models.manifest import ImportedFrom, Manifest, checksum_of_drives
+from fleet_slip.models.manifest import checksum_of_drives
 from fleet_slip.models.registry import ModelVersion, Registry
-from fleet_slip.storage.documents import checksum
 from fleet_slip.warehouse.tables import Warehouse
 
 # A program as a JSON document, from which an implementation can be written: docs/export.md.
@@ -332,77 +328,3 @@ _WRITERS: dict[str, Callable[[Subject], Mapping[str, str | bytes]]] = {
     "onnx": _onnx,
     "fmu": _fmu,
 }
-
-
-# Brings a version into a registry from the JSON document that another data root exported.
-
-LONGEST_FILE_BYTES = 2**28
-
-
-def import_version(registry: Registry, file: Path) -> ModelVersion:
-    """Add the version of a document as the next of its model, to which nothing points yet.
-
-    It says where it comes from. If the model's latest version is the same estimator, that is the
-    result. Raises `InputError` for a file that is no such document or was changed, and
-    `RefusedError` if a signal means something else here.
-    """
-    content = _read(file)
-    model = content["model"]
-    manifest = _manifest(file, model)
-    drives = _drives(file, model, manifest)
-    if program_content(compile_program(manifest)) != content["program"]:
-        raise RefusedError(
-            f"{file}: its signals have other scales or ranges than configs/signals.toml says here, "
-            "so that its counts would mean something else."
-        )
-    origin = manifest.imported_from or ImportedFrom(
-        reference=model["reference"], sha256=model["sha256"]
-    )
-    return registry.add(manifest.model_copy(update={"imported_from": origin}), drives)
-
-
-def _read(file: Path) -> dict[str, Any]:
-    """Return a document whose checksum is right. Raises `InputError` for anything else."""
-    text = read_named_file(file, LONGEST_FILE_BYTES, InputError)
-    try:
-        content = json.loads(text)
-        known = (content["format"], content["schema"])
-        stated = content.pop("sha256")
-        found = sha256_of(canonical_json(content))
-        _ = content["model"]["manifest"], content["program"]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise InputError(f"{file}: is no exported version. {_EXPORT}") from None
-    if known != (FORMAT, SCHEMA):
-        raise InputError(f"{file}: has format {known[0]!r}, schema {known[1]!r}. {_EXPORT}")
-    if stated != found:
-        raise InputError(f"{file}: was changed or damaged: its SHA-256 is another. {_EXPORT}")
-    return dict(content)
-
-
-_EXPORT = "Export it again with: fleet-slip export NAME@VERSION --to json"
-
-
-def _manifest(file: Path, model: Mapping[str, Any]) -> Manifest:
-    try:
-        manifest = parse_document(model["manifest"], Manifest, str(file), "its manifest")
-        reference, stated = str(model["reference"]), model["sha256"]
-    except (StorageError, KeyError) as error:
-        raise InputError(f"{file}: is no version that this program knows: {error}") from None
-    if checksum(model["manifest"]) != stated or reference.partition("@")[0] != manifest.name:
-        raise InputError(f"{file}: its manifest is not that of {reference[:100]!r}. {_EXPORT}")
-    return manifest
-
-
-def _drives(file: Path, model: Mapping[str, Any], manifest: Manifest) -> bytes | None:
-    """Return what tells the version's drives; None if nothing ever did."""
-    trained = manifest.trained_on
-    if trained.drives_sha256 is None:
-        return None
-    expected = trained.drives_sha256
-    try:
-        content = base64.b64decode(model["drives"], validate=True)
-    except (KeyError, TypeError, ValueError, binascii.Error):
-        content = b""
-    if checksum_of_drives(content) != expected:
-        raise InputError(f"{file}: lacks the hashes of the drives that trained it. {_EXPORT}")
-    return content
