@@ -5,16 +5,15 @@ for a pattern, or be anything but a name.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date, datetime
-from decimal import Decimal
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import polars as pl
 
-from fleet_slip.arrays import BoolArray, is_finite
+from fleet_slip.arrays import BoolArray
 from fleet_slip.base import shown
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
@@ -53,8 +52,7 @@ class Field:
     """One thing to take from a row, or a condition on it.
 
     `value` is made of raw columns; `problem`, null where all is well, may also use the value under
-    the field's name, so that a text is parsed once. `is_sound` looks at a whole batch that has the
-    values: where it holds no row has the problem, and looking at each is saved.
+    the field's name, so that a text is parsed once.
     """
 
     name: str
@@ -62,7 +60,6 @@ class Field:
     raw: pl.Expr
     value: pl.Expr
     problem: pl.Expr
-    is_sound: Callable[[pl.DataFrame], bool] = lambda _: False
 
 
 def find_held(column: str, schema: pl.Schema) -> str:
@@ -157,13 +154,7 @@ def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
         (value.is_null(), "missing"),
         (~value.is_finite(), "not_finite"),
     )
-    time_s = number * conversion_factor(unit, "s")
-
-    def is_sound(rows: pl.DataFrame) -> bool:
-        found = rows["time"]
-        return not found.null_count() and is_finite(found.to_numpy())
-
-    return Field("time", "time", raw, time_s, problem, is_sound)
+    return Field("time", "time", raw, number * conversion_factor(unit, "s"), problem)
 
 
 def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
@@ -223,21 +214,18 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
     if mapping.time.key is not None:
         fields.append(time_field(mapping.time.key, schema, mapping))
         if RAW + DISORDER in schema:
-            fields.append(_disorder(pl.col(RAW + mapping.time.key)))
+            # What a file of several time bases says of each time among those of its base.
+            reasons = ("time_backwards", "time_duplicate", "isolated")
+            cases = ((pl.col(RAW + DISORDER) == reason, reason) for reason in reasons)
+            fields.append(_condition(*cases, raw=pl.col(RAW + mapping.time.key), name="time"))
     names = [name for name in catalogue().signals if name in mapping.signals]
     signals = [_signal(name, schema, mapping) for name in names]
     nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
-    no_value = _condition(nothing, "no_value", pl.lit(None, pl.String))
-    somewhere = replace(
-        no_value, is_sound=lambda rows: any(not rows[name].null_count() for name in names)
-    )
-    fields += [*signals, somewhere]
+    fields += [*signals, _condition((nothing, "no_value"), raw=pl.lit(None, pl.String))]
     if RAW + EXTRA_FIELDS in schema:
-        name = RAW + EXTRA_FIELDS
-        extra = pl.col(name)
-        problem = find_problems((extra == CUT, "cut_line"), (extra.is_not_null(), "extra_fields"))
-        field = Field("", "condition", extra, extra, problem)
-        fields.append(replace(field, is_sound=lambda rows: rows[name].null_count() == rows.height))
+        extra = pl.col(RAW + EXTRA_FIELDS)
+        cases = (extra == CUT, "cut_line"), (extra.is_not_null(), "extra_fields")
+        fields.append(_condition(*cases, raw=extra))
     return fields
 
 
@@ -259,15 +247,8 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
     return met
 
 
-def _condition(condition: pl.Expr, reason: str, raw: pl.Expr) -> Field:
-    return Field("", "condition", raw, raw, find_problems((condition, reason)))
-
-
-def _disorder(time: pl.Expr) -> Field:
-    """What a file of several time bases says of each row's time among those of its base."""
-    reasons = ("time_backwards", "time_duplicate", "isolated")
-    problem = find_problems(*((pl.col(RAW + DISORDER) == reason, reason) for reason in reasons))
-    return Field("time", "condition", time, time, problem)
+def _condition(*cases: tuple[pl.Expr, str], raw: pl.Expr, name: str = "") -> Field:
+    return Field(name, "condition", raw, raw, find_problems(*cases))
 
 
 def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
@@ -282,14 +263,7 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
         (~value.is_finite(), "not_finite"),
         (outside, "out_of_range"),
     )
-
-    def is_sound(rows: pl.DataFrame) -> bool:
-        found = rows[name]
-        if found.null_count() and schema[RAW + source.column] == pl.String:
-            return False
-        return _lies_within(found, least - 0.5, most + 0.5, signal.scale)
-
-    return Field(name, "signal", raw, _si_value(name, source, number), problem, is_sound)
+    return Field(name, "signal", raw, _si_value(name, source, number), problem)
 
 
 def _signed(
@@ -309,16 +283,6 @@ def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
     gain, bias = source.linear(catalogue()[name].unit)
     # Otherwise it would change nothing but the sign of zero.
     return number if (gain, bias) == (1.0, 0.0) else number * gain + bias
-
-
-def _lies_within(values: pl.Series, low: float, high: float, scale: Decimal) -> bool:
-    """Whether all values are finite, and their counts between two limits, which are outside."""
-    present = (values.drop_nulls() if values.null_count() else values).to_numpy()
-    if not present.size:
-        return True
-    # Dividing keeps the order of what it rounds; a NaN is the least and the most, and in no range.
-    least, most = float(present.min()) / float(scale), float(present.max()) / float(scale)
-    return low < least and most < high
 
 
 def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
@@ -471,14 +435,10 @@ def _split(batch: pl.DataFrame, fields: list[Field]) -> tuple[pl.DataFrame, pl.D
     """Split a batch into good rows, in SI units, and bad ones, by the first problem of each."""
     values = [field.name for field in fields if field.kind in {"time", "signal"}]
     kept = ["row", "group", *({"base"} & set(batch.columns)), *values]
-    codes = [
-        field.problem + len(REASONS) * i
-        for i, field in enumerate(fields)
-        if not field.is_sound(batch)
-    ]
-    if not codes:
+    codes = pl.coalesce(field.problem + len(REASONS) * i for i, field in enumerate(fields))
+    checked = batch.with_columns(codes.alias(_PROBLEM))
+    if checked[_PROBLEM].null_count() == checked.height:
         return batch.select(kept), no_rows()
-    checked = batch.with_columns(pl.coalesce(codes).alias(_PROBLEM))
     good = checked.filter(pl.col(_PROBLEM).is_null()).select(kept)
     bad = checked.filter(pl.col(_PROBLEM).is_not_null())
     explained = [_explain(rows, fields) for rows in bad.partition_by(_PROBLEM)]
