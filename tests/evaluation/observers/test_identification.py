@@ -1,14 +1,16 @@
 """A car is identified from labelled drives, of mass and geometry alone."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf
+from fleet_slip.evaluation import identify as identifying
 from fleet_slip.evaluation.identify import (
     Fitted,
     Identified,
@@ -16,7 +18,7 @@ from fleet_slip.evaluation.identify import (
     identify,
     identify_held_out,
 )
-from fleet_slip.evaluation.single_track import LabelledDrive
+from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import simulated_drive
 
@@ -108,6 +110,40 @@ def test_what_was_left_out_is_measured_without_it(drive: LabelledDrive, executor
     found = identify_held_out(MEASURED, [drive, wrong], executor)
     assert found.held_out_rad is not None
     assert np.degrees(found.held_out_rad) > 0.8 > np.degrees(found.fit_rad)
+
+
+@dataclass(frozen=True)
+class Recorder(Identified):
+    """A car that records every drive it estimates, beside those it was identified from."""
+
+    training: tuple[float, ...] = ()
+    estimated: tuple[list[tuple[float, tuple[float, ...]]], ...] = ()
+
+    def estimate(self, signals: DriveSignals) -> FloatArray:
+        self.estimated[0].append((float(signals.ax_mps2[0]), self.training))
+        return np.zeros(len(signals))
+
+
+def test_no_car_is_measured_on_a_drive_that_it_was_identified_from(
+    drive: LabelledDrive, executor: Executor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = drive.beginning(1)
+    drives = [
+        replace(row, signals=replace(row.signals, ax_mps2=np.array([number])))
+        for number in np.arange(7.0)
+    ]
+    estimated: list[tuple[float, tuple[float, ...]]] = []
+
+    def record(measured: Measured, drives: Sequence[LabelledDrive], _: Executor) -> Recorder:
+        training = tuple(float(one.signals.ax_mps2[0]) for one in drives)
+        return Recorder(CAR, ekf.EkfNoise(), 0.0, training=training, estimated=(estimated,))
+
+    monkeypatch.setattr(identifying, "identify", record)
+    identify_held_out(MEASURED, drives, executor)
+    assert sorted(number for number, _ in estimated) == list(range(7))
+    for number, training in estimated:
+        assert number not in training
+        assert len(training) >= 5, "a car is identified from all but a fold"
 
 
 def test_drives_without_a_label_are_refused(drive: LabelledDrive, executor: Executor) -> None:
