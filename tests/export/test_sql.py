@@ -29,10 +29,7 @@ def test_the_statement_says_what_it_is_of() -> None:
         assert "ab" * 32 in text
 
 
-@pytest.mark.parametrize(
-    "manifest",
-    [*(model_of(MODELS[name], name=name) for name in MODELS), hostile_version().manifest],
-)
+@pytest.mark.parametrize("manifest", MANIFESTS, ids=lambda one: one.name)
 def test_two_engines_give_the_angles_of_the_checks(tmp_path: Path, manifest: Manifest) -> None:
     """Every kind of column: `car` of the check `extremes` knows all facts and numbers."""
     name = manifest.name

@@ -12,14 +12,12 @@ from hypothesis import strategies as st
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.accuracy import evaluation_parts
 from fleet_slip.cli.output import print_parts
-from fleet_slip.errors import UsageError
 from fleet_slip.evaluation import blind
 from fleet_slip.evaluation.blind import blind_scenarios, judge_blindly
 from fleet_slip.evaluation.drives import simulate_drives
 from fleet_slip.evaluation.judge import Signals
 from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.scenario import load_scenario
-from tests.support.commands import run_on
 from tests.support.reported import call
 
 HASH = "5e" * 32
@@ -104,10 +102,3 @@ def test_the_command_judges_and_writes_nothing(
     assert rows["all"]["smoke@1"]["coverage"] > 0.95
     assert rows["all"]["smoke@1"]["rmse_deg"] > rows["all"]["smoke@1"]["error_std_deg"] > 0
     assert {path for path in root.rglob("*") if "runs" not in path.parts} == before
-
-
-def test_it_has_drives_of_its_own(smoke_root: Path, tmp_path: Path) -> None:
-    root = shutil.copytree(smoke_root, tmp_path / "data")
-    done = run_on(root, "evaluate", "smoke", "--blind", "--scenario", "nominal")
-    assert done.exit_code == UsageError.exit_code
-    assert "leave out --scenario" in done.stderr

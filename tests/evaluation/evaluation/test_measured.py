@@ -183,6 +183,7 @@ def test_gram_rows_of_quarters_add_up_to_those_of_drives(own: Path) -> None:
     "words",
     [
         ("--vehicle", "suv"),
+        ("--blind", "--scenario", "nominal"),
         ("--cohort", "true", "--blind"),
         ("--cohort", "true", "--mass", "1500", "--vehicle", "suv"),
     ],

@@ -1,5 +1,6 @@
 """What may become champion: above the floor, no worse than the champion itself, and by people."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -88,18 +89,39 @@ def registry_of(warehouse: Warehouse) -> Registry:
     return Registry(warehouse.root / "models")
 
 
-@pytest.fixture
-def champion(warehouse: Warehouse) -> Warehouse:
-    """A warehouse of 48 drives, and a champion of all of them."""
-    write(warehouse, "good", 48)
+def copy(root: Path, folder: Path) -> Warehouse:
+    return Warehouse(LocalFolder(Path(shutil.copytree(root, folder / "data"))))
+
+
+@pytest.fixture(scope="module")
+def roots(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A root with 48 drives, and one with a champion of all of them too. Copy them."""
+    folder = tmp_path_factory.mktemp("roots")
+    write(Warehouse(LocalFolder(folder / "data")), "good", 48)
+    warehouse = copy(folder / "data", folder / "champion")
     assert publish_from(warehouse).version.version == 1
-    return warehouse
+    return folder / "data", folder / "champion" / "data"
+
+
+@pytest.fixture
+def drives(roots: tuple[Path, Path], tmp_path: Path) -> Warehouse:
+    """A warehouse of 48 drives."""
+    return copy(roots[0], tmp_path)
+
+
+@pytest.fixture
+def champion(roots: tuple[Path, Path], tmp_path: Path) -> Warehouse:
+    """A warehouse of 48 drives, and a champion of all of them."""
+    return copy(roots[1], tmp_path)
 
 
 def test_a_reversed_label_is_no_champion(champion: Warehouse) -> None:
     write(champion, "reversed", 48, label=-1.0)
     with pytest.raises(RefusedError, match=r"its correlation is .*, below 0\.5"):
         publish_from(champion)
+    alone = "drive_id LIKE 'reversed%'"
+    with pytest.raises(RefusedError, match=r"opposite sign of .* of beta@1\. Is it reversed"):
+        publish_from(champion, alone)
     assert registry_of(champion).versions("beta") == [1]
 
 
@@ -224,31 +246,29 @@ def test_cars_are_held_out_where_there_are_several_else_drives(
     assert (comparison.by, len(comparison.challenger.folds)) == (by, groups)
 
 
-def test_small_steps_do_not_lead_downhill(warehouse: Warehouse) -> None:
-    write(warehouse, "good", 48)
-    strong, registry = "ay,yaw_rate", registry_of(warehouse)
+def test_small_steps_do_not_lead_downhill(drives: Warehouse) -> None:
+    strong, registry = "ay,yaw_rate", registry_of(drives)
     first = ",".join((strong, *WEAK))
-    assert publish_from(warehouse, signals=first).version.version == 1
+    assert publish_from(drives, signals=first).version.version == 1
     second = ",".join((strong, *WEAK[:2]))
-    stays = publish_from(warehouse, signals=second)  # it loses 0.0024 +- 0.0002 deg
+    stays = publish_from(drives, signals=second)  # it loses 0.0024 +- 0.0002 deg
     assert (stays.version.version, stays.new) == (1, False)
     assert stays.reason.startswith("The champion stays: it is significantly better.")
-    assert publish_from(warehouse, signals=second, force=True).version.version == 2
+    assert publish_from(drives, signals=second, force=True).version.version == 2
     assert registry.history("beta").best_of("champion") == 1
     third = ",".join((strong, *WEAK[:1]))
     with pytest.raises(RefusedError, match=r"worse than beta@1, the best champion so far"):
-        publish_from(warehouse, signals=third)
+        publish_from(drives, signals=third)
     registry.promote("beta", 2, "champion")  # a person begins anew
     assert registry.history("beta").best_of("champion") == 2
-    assert publish_from(warehouse, signals=third, force=True).version.version == 3
+    assert publish_from(drives, signals=third, force=True).version.version == 3
     assert registry.rollback("beta", "champion") == 2
 
 
-def test_what_was_forced_is_where_it_begins_anew(warehouse: Warehouse) -> None:
-    write(warehouse, "good", 48)
-    publish_from(warehouse)
-    publish_from(warehouse, signals="ay", force=True)
-    assert registry_of(warehouse).history("beta").best_of("champion") == 2
+def test_what_was_forced_is_where_it_begins_anew(drives: Warehouse) -> None:
+    publish_from(drives)
+    publish_from(drives, signals="ay", force=True)
+    assert registry_of(drives).history("beta").best_of("champion") == 2
 
 
 @pytest.mark.parametrize(
@@ -261,7 +281,7 @@ def test_what_was_forced_is_where_it_begins_anew(warehouse: Warehouse) -> None:
     ],
 )
 def test_a_person_sets_the_floor(
-    warehouse: Warehouse,
+    drives: Warehouse,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     floor: str,
@@ -273,10 +293,9 @@ def test_a_person_sets_the_floor(
     (tmp_path / "publish.toml").write_text(f"{kept}\n{floor}\n")
     monkeypatch.setenv(CONFIG_VARIABLE, str(tmp_path))
     champion_rules.floor.cache_clear()
-    write(warehouse, "good", 48)
     try:
         with pytest.raises(RefusedError, match=problem):
-            publish_from(warehouse)
+            publish_from(drives)
     finally:
         champion_rules.floor.cache_clear()
 
