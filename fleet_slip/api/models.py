@@ -35,9 +35,7 @@ if TYPE_CHECKING:
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.score import Score
     from fleet_slip.models.select import Selection
-    from fleet_slip.operations.examined import Examined
     from fleet_slip.storage.documents import Document
-    from fleet_slip.warehouse.condition import Condition
 
 
 class PublishedModels(Rooted):
@@ -306,13 +304,17 @@ class JudgedModels(PublishedModels):
         row has the model's signals, `QuestionError` for an invalid condition, and what `model`
         raises.
         """
-        from fleet_slip.models.score import find_seen, score
+        from fleet_slip.models.score import cohort_of_rows, find_seen, score
+        from fleet_slip.operations.examined import Examined, leave_out_faulty
 
-        manifest = self.resolve(model).manifest
-        rows, examined = self.scored_rows(cohort, unexamined=unexamined)
+        version = self.resolve(model)
+        asked = ALL_DRIVES if cohort is None else cohort
+        rows = cohort_of_rows(asked)
+        examined = Examined(asked) if unexamined else leave_out_faulty(self.warehouse, asked)
+        rows = replace(rows, sql=cohort_of_rows(examined.cohort).sql)
         with examined.explaining():
-            seen = find_seen(self.warehouse, self.registry(), manifest, rows)
-            found = score(self.warehouse, manifest, rows if cohort else seen.others)
+            seen = find_seen(self.warehouse, self.registry(), version.manifest, rows)
+            found = score(self.warehouse, version.manifest, rows if cohort else seen.others)
         without = 0 if cohort or seen.trained == seen.drives else seen.trained or 0
         return replace(
             found,
@@ -320,21 +322,9 @@ class JudgedModels(PublishedModels):
             drives_trained=seen.trained,
             drives_left_out=without,
             examined=str(examined),
+            model=version.reference,
+            cohort=asked,
         )
-
-    def scored_rows(
-        self, cohort: str | None = None, *, unexamined: bool = False
-    ) -> "tuple[Condition, Examined]":
-        """Return the rows of a cohort without drives that are not in order, and which these are."""
-        from fleet_slip.models.score import cohort_of_rows
-        from fleet_slip.operations.examined import Examined, leave_out_faulty
-
-        asked = ALL_DRIVES if cohort is None else cohort
-        rows = cohort_of_rows(asked)
-        if unexamined:
-            return rows, Examined(asked)
-        examined = leave_out_faulty(self.warehouse, asked)
-        return replace(rows, sql=cohort_of_rows(examined.cohort).sql), examined
 
     @record_call
     def evaluate(

@@ -12,18 +12,13 @@ import typer
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import needed, number_of
-from fleet_slip.catalogue.facts import ALL_DRIVES
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.errors import UsageError
-from fleet_slip.models.registry import ModelVersion
-from fleet_slip.models.score import Score
-from fleet_slip.models.summary import remark_without_information
-from fleet_slip.rendering import Part, Remark, TextTable
+from fleet_slip.rendering import Part, TextTable
 from fleet_slip.resources import folder
 from fleet_slip.storage.storage_errors import storage_errors
-from fleet_slip.warehouse.condition import parse_condition, row_columns
 
 if TYPE_CHECKING:
     from fleet_slip.evaluation.report import Written
@@ -135,96 +130,11 @@ def _measured(content: Mapping[str, Any]) -> Iterator[Part]:
 
 
 @command(Fleet.score, arguments=["model"])
-def score(
-    fleet: Fleet,
-    model: str | None,
-    cohort: str | None,
-    unexamined: bool,
-    against: Annotated[
-        str | None,
-        typer.Option(help="Another version of the model, such as champion, on the same rows."),
-    ] = None,
-    json: Json = False,
-) -> None:
+def score() -> None:
     """Evaluate a model on the rows of a cohort: also the largest error and percentiles.
 
     Example: **fleet-slip score waterford --cohort "speed_factor > 0.9"**
     """
-    version = fleet.model(model)
-    if against is not None:
-        name = against if "@" in against else f"{version.manifest.name}@{against}"
-        _score_against(fleet, version, fleet.model(name), cohort, unexamined=unexamined, json=json)
-        return
-    found: Score = fleet.score(version, cohort, unexamined=unexamined)
-    if found.examined:
-        say(found.examined)
-    if json:
-        return print_json(
-            {"model": version.reference, "cohort": cohort or ALL_DRIVES, **found.as_dict()}
-        )
-    print_parts([_score_table({version.reference: found.as_dict()})])
-    print_parts(remark_without_information(found.rows_without, found.rows + found.rows_without))
-    print_parts(_trained(found, version.reference))
-
-
-def _score_against(
-    fleet: Fleet,
-    one: ModelVersion,
-    other: ModelVersion,
-    cohort: str | None,
-    *,
-    unexamined: bool,
-    json: bool,
-) -> None:
-    """Print the figures of two versions on the rows that have the signals of both."""
-    from fleet_slip.models.score import score as score_rows  # noqa: PLC0415 - compiled code
-
-    rows, examined = fleet.scored_rows(cohort, unexamined=unexamined)
-    if str(examined):
-        say(str(examined))
-    columns = sorted({*one.manifest.columns, *other.manifest.columns})
-    complete = " AND ".join(f"{name} IS NOT NULL" for name in columns)
-    both = rows & parse_condition(complete, row_columns())
-    scores = {
-        version.reference: score_rows(fleet.warehouse, version.manifest, both).as_dict()
-        for version in (one, other)
-    }
-    if json:
-        return print_json({"cohort": rows.text, "models": scores})
-    print_parts([_score_table(scores)])
-
-
-def _score_table(scores: Mapping[str, Mapping[str, Any]]) -> TextTable:
-    """Return a row for each figure that all models have."""
-    first, *_ = scores.values()
-    return TextTable(
-        f"{' and '.join(scores)} on {number_of(first['rows'], 'row')}",
-        "|".join(["figure", *scores]),
-        (
-            [
-                name.replace("_deg", ", deg").replace("_", " "),
-                *(f"{one[name]:.4f}" for one in scores.values()),
-            ]
-            for name in first
-            if name.startswith(("error", "rmse", "correlation"))
-            and None not in [one[name] for one in scores.values()]
-        ),
-    )
-
-
-def _trained(found: Score, reference: str) -> Iterator[Remark]:
-    """Yield which drives made the model: on these its error is that of a fit."""
-    if found.drives_trained is None:
-        yield Remark(f"{reference} does not record its training set: these drives may be in it.")
-    elif found.drives_left_out:
-        left = number_of(found.drives_left_out, "drive")
-        yield Remark(f"left out: {left} of {found.drives:,} that {reference} was trained on.")
-    elif found.drives_trained:
-        yield Remark(
-            f"{reference} was trained on {found.drives_trained:,} of these "
-            f"{number_of(found.drives or 0, 'drive')}: there the error is that of the fit. For "
-            f"new drives: fleet-slip evaluate {reference}"
-        )
 
 
 @command(

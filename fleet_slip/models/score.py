@@ -1,12 +1,13 @@
 """Evaluates a published model on the rows of a cohort."""
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import Record
+from fleet_slip.base import number_of
 from fleet_slip.catalogue.facts import RECEIVED
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
@@ -18,6 +19,8 @@ from fleet_slip.grams.gram_rows import hash_numbers
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor, predict
 from fleet_slip.models.registry import Registry
+from fleet_slip.models.summary import remark_without_information
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.runs import log_event
 from fleet_slip.warehouse.condition import (
@@ -34,8 +37,10 @@ BATCH_ROWS = 2**17
 
 
 @dataclass(frozen=True)
-class Score(Record):
+class Score(Answer):
     """Figures of the error, estimate minus truth, over the rows of a cohort with the signals."""
+
+    DOCUMENT = "model cohort ..."
 
     rows: int
     correlation: float | None
@@ -56,6 +61,40 @@ class Score(Record):
     """Of the cohort, that tell nothing of the model: the label or a signal is missing."""
     examined: str = ""
     """Which drives were left out since they are not in order, as a sentence."""
+    model: str = ""
+    cohort: str = ""
+
+    def parts(self) -> Iterator[Part]:
+        """Return the figures, and which drives and rows they are not of."""
+        if self.examined:
+            yield Remark(self.examined)
+        yield TextTable(
+            f"{self.model} on {number_of(self.rows, 'row')}",
+            f"figure|{self.model}",
+            (
+                [name.replace("_deg", ", deg").replace("_", " "), f"{value:.4f}"]
+                for name, value in vars(self).items()
+                if name.startswith(("error", "rmse", "correlation")) and value is not None
+            ),
+        )
+        yield from remark_without_information(self.rows_without, self.rows + self.rows_without)
+        yield from self._trained()
+
+    def _trained(self) -> Iterator[Remark]:
+        """Yield which drives made the model: on these its error is that of a fit."""
+        if self.drives_trained is None:
+            yield Remark(
+                f"{self.model} does not record its training set: these drives may be in it."
+            )
+        elif self.drives_left_out:
+            left = number_of(self.drives_left_out, "drive")
+            yield Remark(f"left out: {left} of {self.drives:,} that {self.model} was trained on.")
+        elif self.drives_trained:
+            yield Remark(
+                f"{self.model} was trained on {self.drives_trained:,} of these "
+                f"{number_of(self.drives or 0, 'drive')}: there the error is that of the fit. For "
+                f"new drives: fleet-slip evaluate {self.model}"
+            )
 
 
 def _si_rows() -> str:
@@ -80,21 +119,13 @@ def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) 
     is not one expression, and `DataError` if no row has the model's signals.
     """
     condition = cohort_of_rows(condition)
-    estimate_rad, truth_rad = _estimate_rows(warehouse, manifest, condition)
+    estimate_rad, truth_rad, rows = _estimate_rows(warehouse, manifest, condition)
     if not len(truth_rad):
         raise DataError(
             f"no row of the cohort {condition.text!r} has {', '.join(manifest.signals)} and "
             f"{manifest.label.signal}. Choose another cohort, or a model with fewer signals."
         )
-    found = _figures(estimate_rad, truth_rad)
-    return replace(found, rows_without=_count_rows(warehouse, condition) - found.rows)
-
-
-def _count_rows(warehouse: Warehouse, condition: Condition) -> int:
-    statement = f"SELECT count(*) FROM log WHERE {condition.sql}"
-    with connect_tables(warehouse, statement) as database, asking(database, condition):
-        [(rows,)] = database.execute(statement).fetchall()
-    return int(rows)
+    return _figures(estimate_rad, truth_rad, rows)
 
 
 def cohort_of_rows(condition: str | Condition) -> Condition:
@@ -104,8 +135,8 @@ def cohort_of_rows(condition: str | Condition) -> Condition:
 
 def _estimate_rows(
     warehouse: Warehouse, manifest: Manifest, condition: Condition
-) -> tuple[FloatArray, FloatArray]:
-    """Return estimate and label in rad of the rows of a cohort that have both."""
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return estimate and label in rad of the rows of a cohort that have both, and of how many."""
     predictor = Predictor.of(manifest)
     label = manifest.label.signal
     needed = [*predictor.plan.signals, label, *predictor.plan.facts, "vehicle_id"]
@@ -117,6 +148,7 @@ def _estimate_rows(
     )
     estimates: list[FloatArray] = []
     truths: list[FloatArray] = []
+    asked = 0
     unit = float(input_scales()[label])
     with (
         connect_tables(warehouse, text) as database,
@@ -132,10 +164,12 @@ def _estimate_rows(
                 estimate = predict(manifest, rows).to_numpy(zero_copy_only=False)
             truth = rows[label].to_numpy(zero_copy_only=False).astype(np.float64) * unit
             chosen = rows["chosen"].to_numpy(zero_copy_only=False).astype(np.bool_)
+            asked += int(chosen.sum())
             given = chosen & np.isfinite(estimate) & np.isfinite(truth)
             estimates.append(estimate[given])
             truths.append(truth[given])
-    return np.concatenate([*estimates, np.empty(0)]), np.concatenate([*truths, np.empty(0)])
+    estimate_rad, truth_rad = (np.concatenate([*one, np.empty(0)]) for one in (estimates, truths))
+    return estimate_rad, truth_rad, asked
 
 
 def calibrated_cars(warehouse: Warehouse) -> CarCounts:
@@ -145,7 +179,7 @@ def calibrated_cars(warehouse: Warehouse) -> CarCounts:
     return found.counts()
 
 
-def _figures(estimate_rad: FloatArray, truth_rad: FloatArray) -> Score:
+def _figures(estimate_rad: FloatArray, truth_rad: FloatArray, rows: int) -> Score:
     error = np.degrees(estimate_rad - truth_rad)
     size = np.abs(error)
     several = len(error) > 1
@@ -162,6 +196,7 @@ def _figures(estimate_rad: FloatArray, truth_rad: FloatArray) -> Score:
         error_p95_deg=p95,
         error_p99_deg=p99,
         error_max_deg=float(size.max()),
+        rows_without=rows - len(error),
     )
 
 
