@@ -9,7 +9,7 @@ side-slip vanish. The gyroscope's noise is in r and in r/v. Where both are input
 it is taken out of their squares.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
@@ -58,24 +58,12 @@ class CarEstimate:
     noise: Fraction
     value: Fraction
     gradient: tuple[float, ...]
-    also: Mapping[NumberName, float]
+    also: Mapping[NumberName, float] = field(default_factory=dict)
     by_lean: Fraction = Fraction(0)
 
 
-@dataclass(frozen=True)
-class CarEstimates:
-    """The numbers that the sums of a car's drives determine, and why the others are missing."""
-
-    numbers: dict[NumberName, CarEstimate] = field(default_factory=dict)
-    missing: dict[NumberName, str] = field(default_factory=dict)
-
-    def take(self, names: Iterable[NumberName], found: dict[NumberName, CarEstimate] | str) -> None:
-        """Take what was found of some numbers, or why there is none."""
-        if isinstance(found, str):
-            self.missing.update(dict.fromkeys(names, found))
-        else:
-            self.numbers.update(found)
-
+Estimates = dict[NumberName, "CarEstimate | str"]
+"""The numbers that sums determine; in the place of one that they do not determine: why."""
 
 LEAST_TURNING_RAD_S = Fraction(2, 100)
 """Standard deviation of how fast the direction changes, below which a car drove too straight. The
@@ -91,6 +79,7 @@ grow with curvature any more: it looks like speed."""
 
 OF_COURSE: tuple[NumberName, ...] = ("yaw_rate_offset", "ay_offset", "speed_ratio")
 OF_STEERING: tuple[NumberName, ...] = ("steering_offset", "steer_per_curvature", "understeer")
+OF_SLIP: tuple[NumberName, ...] = ("slip_lever", "slip_compliance")
 """The numbers of each relation."""
 
 LEAST_CURVATURE_1PM = Fraction(1, 1000)
@@ -98,16 +87,7 @@ SPEED_RATIOS = {False: (Fraction(4, 5), Fraction(5, 4)), True: (Fraction(3, 4), 
 """What tyres there are; on roads as they are, also what bodies that roll make of ay. A ratio beyond
 it says that noise, not driving, made the fit."""
 
-FLAT = Relation(
-    instruments=(ONE, "course_rate", "slowness"),
-    left=(
-        ((ONE, ONE), ("course_rate", ONE), ("slowness", ONE)),
-        (("course_rate", ONE), ("course_rate", "course_rate"), ("course_rate", "slowness")),
-        (("slowness", ONE), ("course_rate", "slowness"), ("slowness", "slowness")),
-    ),
-    right=(("yaw_rate", ONE), ("yaw_rate", "course_rate"), ("yaw_rate", "slowness")),
-    noise={},
-)
+FLAT = Relation.least_squares("yaw_rate", (ONE, "course_rate", "slowness"))
 """The yaw rate by 1, ay/v and 1/v: the unknowns b, 1/rho and -d/rho. Least squares."""
 
 COURSE = Relation(
@@ -123,15 +103,8 @@ COURSE = Relation(
 )
 """ay by 1, r v, v and r/v: the unknowns d, rho, -rho b and the bank of bends."""
 
-STEERING = Relation(
-    instruments=(ONE, "bend", "ay"),
-    left=(
-        ((ONE, ONE), ("bend", ONE), ("ay", ONE)),
-        (("bend", ONE), ("bend", "bend"), ("bend", "ay")),
-        (("ay", ONE), ("bend", "ay"), ("ay", "ay")),
-    ),
-    right=(("steer", ONE), ("steer", "bend"), ("steer", "ay")),
-    noise={(1, 1): ("slowness", "slowness")},
+STEERING = Relation.least_squares(
+    "steer", (ONE, "bend", "ay"), noise={(1, 1): ("slowness", "slowness")}
 )
 """The steering by 1, curvature without the gyroscope's offset, and ay."""
 
@@ -175,41 +148,41 @@ def steering_terms(yaw_rate_offset: Fraction) -> Terms:
     }
 
 
-def estimate_numbers(sums: Mapping[str, Gram | None], banked: bool) -> CarEstimates:
+def estimate_numbers(sums: Mapping[str, Gram], banked: bool) -> Estimates:
     """Return the numbers that the sums of a car's drives determine, by kind; exactly.
 
     `banked`: whether bends are, on the fleet's roads (`road_lean`). A number is missing where its
     columns are, where the sums do not determine it, or where the car drove too straight or too
-    evenly to separate it from noise.
+    evenly to separate it from noise. What satellites determine replaces what its own sensors do,
+    and the bias at standstill both.
     """
-    estimates = CarEstimates()
+    found = _by_own_sensors(sums, banked)
+    return found | _speed_ratio(sums) | _slip(sums) | _standstill(sums)
+
+
+def _by_own_sensors(sums: Mapping[str, Gram], banked: bool) -> Estimates:
     course, steering = sums.get("course"), sums.get("steering")
+    every = (*OF_COURSE, *OF_STEERING)
     if course is None or course.n == 0:
-        estimates.take((*OF_COURSE, *OF_STEERING), NO_COURSE)
-        return estimates
+        return dict.fromkeys(every, NO_COURSE)
     of_course = ExactSums(course, course_terms())
     noise = gyroscope_noise(course, steering)
     if of_course.variance("course_rate") < LEAST_TURNING_RAD_S**2 or noise is None:
-        estimates.take((*OF_COURSE, *OF_STEERING), STRAIGHT)
-        return estimates
+        return dict.fromkeys(every, STRAIGHT)
     change = LEAST_CHANGE_OF_SPEED[banked] * of_course.mean("slowness")
     if of_course.variance("slowness") < change**2:
-        estimates.take((*OF_COURSE, *OF_STEERING), EVEN)
-        return estimates
-    found = _estimate_course(of_course, noise if banked else None)
-    estimates.take(OF_COURSE, found)
-    if isinstance(found, str):
-        estimates.take(OF_STEERING, found)
-    elif steering is None or steering.n == 0:
-        estimates.take(OF_STEERING, NO_STEERING)
+        return dict.fromkeys(every, EVEN)
+    of_plane = _estimate_course(of_course, noise if banked else None)
+    if isinstance(of_plane, str):
+        return dict.fromkeys(every, of_plane)
+    found: Estimates = {**of_plane}
+    if steering is None or steering.n == 0:
+        found |= dict.fromkeys(OF_STEERING, NO_STEERING)
     else:
-        estimates.take(
-            OF_STEERING, _estimate_steering(found, steering, noise if banked else Fraction(0))
-        )
-    if of_course.variance("curvature") > TIGHT_1PM**2 and "speed_ratio" in estimates.numbers:
-        del estimates.numbers["speed_ratio"]
-        estimates.take(("speed_ratio",), TIGHT_BENDS)
-    return estimates
+        found |= _estimate_steering(of_plane, steering, noise if banked else Fraction(0))
+    if of_course.variance("curvature") > TIGHT_1PM**2:
+        found["speed_ratio"] = TIGHT_BENDS
+    return found
 
 
 def bank_of_bends(sums: Mapping[str, Gram]) -> Fraction | None:
@@ -258,23 +231,23 @@ def _estimate_course(
     least, most = SPEED_RATIOS[relation is COURSE]
     if not least <= ratio <= most:
         return NO_TYRE
-    found: dict[NumberName, CarEstimate] = {}
     values = (yaw_rate_offset, ay_offset, ratio)
-    for (name, gradient), value in zip(gradients.items(), values, strict=True):
-        lean, terms = Fraction(name == "ay_offset"), course_terms()
-        found[name] = CarEstimate("course", relation, terms, noise, value, gradient, {}, lean)
-    return found
+    of = ("course", relation, course_terms(), noise)
+    return {
+        name: CarEstimate(*of, value, gradient, by_lean=Fraction(name == "ay_offset"))
+        for (name, gradient), value in zip(gradients.items(), values, strict=True)
+    }
 
 
 def _estimate_steering(
     found: Mapping[NumberName, CarEstimate], gram: Gram, noise: Fraction
-) -> dict[NumberName, CarEstimate] | str:
+) -> Estimates:
     yaw_rate_offset, ay_offset = found["yaw_rate_offset"].value, found["ay_offset"].value
     terms = steering_terms(yaw_rate_offset)
     sums = ExactSums(gram, terms)
     solution = solve(STEERING.system(sums, noise))
     if solution is None or sums.variance("bend") < LEAST_CURVATURE_1PM**2:
-        return STRAIGHT
+        return dict.fromkeys(OF_STEERING, STRAIGHT)
     straight, by_bend, understeer = solution
 
     also: dict[NumberName, float] = {
@@ -286,8 +259,8 @@ def _estimate_steering(
     gradient = (1.0, 0.0, float(ay_offset))
     return {
         "steering_offset": CarEstimate(*of_plane, value, gradient, also, by_lean=understeer),
-        "steer_per_curvature": CarEstimate(*of_plane, by_bend, (0.0, 1.0, 0.0), {}),
-        "understeer": CarEstimate(*of_plane, understeer, (0.0, 0.0, 1.0), {}),
+        "steer_per_curvature": CarEstimate(*of_plane, by_bend, (0.0, 1.0, 0.0)),
+        "understeer": CarEstimate(*of_plane, understeer, (0.0, 0.0, 1.0)),
     }
 
 
@@ -298,29 +271,25 @@ def _estimate_steering(
 
 LONGEST_ROLL_MPS, FEWEST_STILL = Fraction(1, 2), 1000
 """Mean speed of slow rows that are mostly at standstill, and how many they are at least."""
-STILL = Relation(
-    instruments=(ONE, "wheels"),
-    left=(((ONE, ONE), ("wheels", ONE)), (("wheels", ONE), ("wheels", "wheels"))),
-    right=(("yaw_rate", ONE), ("yaw_rate", "wheels")),
-    noise={},
-)
+STILL = Relation.least_squares("yaw_rate", (ONE, "wheels"))
 """The yaw rate by 1 and the wheels' differences: b, and one over the tracks. Least squares."""
 
 
-def add_standstill(sums: Mapping[str, Gram], estimates: CarEstimates) -> None:
-    """Add the bias of the gyroscope of a car that stood still, in place of what driving tells.
+def _standstill(sums: Mapping[str, Gram]) -> Estimates:
+    """Return the bias of the gyroscope of a car that stood still, in place of what driving tells.
 
     Also in place of the course: of a car that turns to one side alone that has a part of its scale.
     """
     gram = sums.get(STANDSTILL)
     if gram is None or gram.n < FEWEST_STILL:
-        return
+        return {}
     terms = {name: course_terms()[name] for name in ("yaw_rate", "speed", "wheels")}
     still = ExactSums(gram, terms)
     solution = solve(STILL.system(still, 0))
-    if solution is not None and still.mean("speed") < LONGEST_ROLL_MPS:
-        of = (STANDSTILL, STILL, terms, Fraction(0))
-        estimates.numbers["yaw_rate_offset"] = CarEstimate(*of, solution[0], (1.0, 0.0), {})
+    if solution is None or still.mean("speed") >= LONGEST_ROLL_MPS:
+        return {}
+    one = CarEstimate(STANDSTILL, STILL, terms, Fraction(0), solution[0], (1.0, 0.0))
+    return {"yaw_rate_offset": one}
 
 
 # What a satellite receiver determines of a car beyond its own sensors: its speed, and how it slips.
@@ -352,16 +321,10 @@ FEW_TURNS = "its course by satellite has too few turns"
 NO_CAR = "its satellite course is implausible: check the receiver and the antenna's position"
 """Why a number is missing."""
 
-SPEED = Relation(instruments=(ONE,), left=((("speed", ONE),),), right=((SATELLITE, ONE),), noise={})
+SPEED = Relation(instruments=(ONE,), left=((("speed", ONE),),), right=((SATELLITE, ONE),))
 """The satellite's speed by that of the wheels. Neither delay nor noise changes a mean."""
 
-_BY = (ONE, "curvature", "ay", TURNED)
-CHANGE = Relation(
-    instruments=_BY,
-    left=tuple(tuple((a, b) for b in _BY) for a in _BY),
-    right=tuple((SLIP, a) for a in _BY),
-    noise={},
-)
+CHANGE = Relation.least_squares(SLIP, (ONE, "curvature", "ay", TURNED))
 """The label's change by 1, r/v, ay and the angle turned: the gyroscope's bias, l, K and its scale.
 Least squares."""
 
@@ -374,58 +337,40 @@ def kinds_by_set() -> dict[str, dict[str, tuple[str, ...]]]:
     }
 
 
-def add_satellite_estimates(sums: Mapping[str, Gram], estimates: CarEstimates) -> None:
-    """Add the numbers that satellites determine of a car, from the sums of its drives; exactly.
-
-    They replace what its own sensors determine.
-    """
-    estimates.numbers.update(_speed_ratio(sums.get(SATELLITE)))
-    estimates.take(("slip_lever", "slip_compliance"), _slip(sums.get(SLIP)))
-
-
-def _speed_ratio(gram: Gram | None) -> dict[NumberName, CarEstimate]:
+def _speed_ratio(sums: Mapping[str, Gram]) -> Estimates:
+    gram = sums.get(SATELLITE)
     if gram is None or gram.n == 0:
         return {}
-    scales = input_scales()
-    terms = {
-        "speed": dict.fromkeys(WHEEL_SPEEDS, scales["speed"] / 4),
-        SATELLITE: {SATELLITE: catalogue()[SATELLITE].exact_scale},
-    }
+    terms = {"speed": course_terms()["speed"], SATELLITE: _si(**{SATELLITE: 1})}
     solution = solve(SPEED.system(ExactSums(gram, terms), 0))
     least, most = SPEED_RATIOS[True]
     if solution is None or not least <= solution[0] <= most:
         return {}
-    one = CarEstimate(SATELLITE, SPEED, terms, Fraction(0), solution[0], (1.0,), {})
+    one = CarEstimate(SATELLITE, SPEED, terms, Fraction(0), solution[0], (1.0,))
     return {"speed_ratio": one}
 
 
-def _slip(gram: Gram | None) -> dict[NumberName, CarEstimate] | str:
+def _slip(sums: Mapping[str, Gram]) -> Estimates:
+    gram = sums.get(SLIP)
     if gram is None or gram.n == 0:
-        return NO_RECEIVER
-    terms = slip_terms()
-    sums = ExactSums(gram, terms)
-    if gram.n < FEWEST_CHANGES or sums.variance(TURNED) < Fraction(LEAST_TURNED_RAD) ** 2:
-        return FEW_TURNS
-    solution = solve(CHANGE.system(sums, 0))
+        return dict.fromkeys(OF_SLIP, NO_RECEIVER)
+    terms = {
+        **{name: _si(**{name: 1}) for name in ("curvature", "ay")},
+        TURNED: {TURNED: Fraction(turned_scale())},
+        SLIP: _si(**{catalogue().label: 1}),
+    }
+    exact = ExactSums(gram, terms)
+    if gram.n < FEWEST_CHANGES or exact.variance(TURNED) < Fraction(LEAST_TURNED_RAD) ** 2:
+        return dict.fromkeys(OF_SLIP, FEW_TURNS)
+    solution = solve(CHANGE.system(exact, 0))
     if solution is None or not LEVERS_M[0] <= solution[1] <= LEVERS_M[1]:
-        return NO_CAR
-    of_plane = (SLIP, CHANGE, terms, Fraction(0))
+        return dict.fromkeys(OF_SLIP, NO_CAR)
+    of = (SLIP, CHANGE, terms, Fraction(0))
     # Over so much time the heading changes by the bias too much, and the label by as little.
     by_bias = -1 / Fraction(features().feature_set(BY_COURSE).change_s[0])
-    bias, of_bias = by_bias * solution[0], (float(by_bias), 0.0, 0.0, 0.0)
+    of_bias = (float(by_bias), 0.0, 0.0, 0.0)
     return {
-        "yaw_rate_offset": CarEstimate(*of_plane, bias, of_bias, {}),
-        "slip_lever": CarEstimate(*of_plane, solution[1], (0.0, 1.0, 0.0, 0.0), {}),
-        "slip_compliance": CarEstimate(*of_plane, solution[2], (0.0, 0.0, 1.0, 0.0), {}),
-    }
-
-
-def slip_terms() -> Terms:
-    """Return the terms of the relation of the course's changes."""
-    scales = input_scales()
-    return {
-        "curvature": {"curvature": scales["curvature"]},
-        "ay": {"ay": scales["ay"]},
-        TURNED: {TURNED: Fraction(turned_scale())},
-        SLIP: {catalogue().label: catalogue()[catalogue().label].exact_scale},
+        "yaw_rate_offset": CarEstimate(*of, by_bias * solution[0], of_bias),
+        "slip_lever": CarEstimate(*of, solution[1], (0.0, 1.0, 0.0, 0.0)),
+        "slip_compliance": CarEstimate(*of, solution[2], (0.0, 0.0, 1.0, 0.0)),
     }

@@ -12,7 +12,7 @@ from fleet_slip.catalogue.facts import MEASURED, TRAINING_DRIVES
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
-from fleet_slip.grams.car_evidence import three_digits
+from fleet_slip.grams.calibration import three_digits
 from fleet_slip.grams.reader import open_grams
 from fleet_slip.models.acceptance import judge
 from fleet_slip.models.manifest import (

@@ -150,8 +150,8 @@ def _of_car(
     """Return what a car asks for; None if it drove alike all the time."""
     numbers = calibration.cars.get(car, {})
     weights = _of_columns(coefficients, {name: one.count for name, one in numbers.items()})
-    rows = np.arange(*sums.cars[car].indices(len(sums.drives)))
-    gram = sums.table.take(rows).total()
+    table = sums.table.take(sums.cars[car])
+    gram = table.total()
     bias = numbers.get("yaw_rate_offset")
     value, unsure = (Fraction(bias.value), bias.uncertainty or 0.0) if bias else (Fraction(0), 0.0)
     means = calibration.evidence.means(car, ("slowness", "speed"))
@@ -177,8 +177,8 @@ def _of_car(
     intercept, by_bias = read(point), read(moved)
     if intercept is None or by_bias is None:
         return None
-    each = sums.table.take(rows).moments()
-    label = np.array([float(weights.get(name, 0)) for name in sums.table.signals])
+    each = table.moments()
+    label = np.array([float(weights.get(name, 0)) for name in table.signals])
     scatter = _scatter(
         each[:, : len(plane), : len(plane)],
         each[:, : len(plane), 1:] @ label,

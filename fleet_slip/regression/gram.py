@@ -239,8 +239,8 @@ class GramTable:
         sums, products = self.sums[index].tolist(), self.products[index].tolist()
         return Gram(self.signals, int(self.n[index]), tuple(sums), tuple(products))
 
-    def take(self, rows: NDArray[Any]) -> "GramTable":
-        """Return the drives at an index array or a boolean mask."""
+    def take(self, rows: NDArray[Any] | slice) -> "GramTable":
+        """Return the drives at a slice, an index array or a boolean mask."""
         return GramTable(self.signals, self.n[rows], self.sums[rows], self.products[rows])
 
     def total(self, rows: NDArray[Any] | None = None) -> Gram:

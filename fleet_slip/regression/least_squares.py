@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from math import lcm
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -235,7 +236,18 @@ class Relation:
     instruments: tuple[str, ...]
     left: tuple[tuple[Product, ...], ...]
     right: tuple[Product, ...]
-    noise: Mapping[tuple[int, int], Product]
+    noise: Mapping[tuple[int, int], Product] = field(default_factory=dict)
+
+    @classmethod
+    def least_squares(
+        cls,
+        of: str,
+        by: tuple[str, ...],
+        noise: Mapping[tuple[int, int], Product] = MappingProxyType({}),
+    ) -> "Relation":
+        """Return that of a term by others, which are the instruments themselves."""
+        left = tuple(tuple((a, b) for b in by) for a in by)
+        return cls(by, left, tuple((of, a) for a in by), noise)
 
     def system(
         self, sums: Callable[[str, str], Any], variance: Fraction | float

@@ -11,13 +11,8 @@ from fleet_slip.catalogue.course import TURNED, turned_scale
 from fleet_slip.catalogue.facts import BY_COURSE, BY_SATELLITE
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.grams.car_estimates import (
-    NO_CAR,
-    CarEstimates,
-    add_satellite_estimates,
-    kinds_by_set,
-)
-from fleet_slip.grams.car_evidence import CarEvidence
+from fleet_slip.grams.calibration import CalibratedNumber, CarEvidence
+from fleet_slip.grams.car_estimates import NO_CAR, NO_COURSE, estimate_numbers, kinds_by_set
 from fleet_slip.grams.reader import DriveSums, collect_sums
 from fleet_slip.regression.gram import Gram
 
@@ -65,13 +60,14 @@ def row(columns: tuple[str, ...], drive: int, counts: dict[str, Any]) -> dict[st
 
 
 @pytest.fixture(scope="module")
-def told() -> CarEvidence:
+def told() -> dict[str, CalibratedNumber]:
     rng = np.random.default_rng(5)
     sums: dict[str, DriveSums] = {}
     for name, make in ((BY_SATELLITE, levels), (BY_COURSE, changes)):
         rows = [row(COLUMNS[name], drive, make(rng)) for drive in range(4)]
         sums |= collect_sums([pa.RecordBatch.from_pylist(rows)], kinds_by_set()[name])
-    return CarEvidence(sums)
+    stated = CarEvidence(sums).stated("car")
+    return {name: one for name, one in stated.items() if isinstance(one, CalibratedNumber)}
 
 
 def test_the_sets_have_the_columns() -> None:
@@ -79,18 +75,17 @@ def test_the_sets_have_the_columns() -> None:
         assert set(columns) <= set(features().feature_set(name).columns)
 
 
-def test_a_late_receiver_tells_the_speed_ratio(told: CarEvidence) -> None:
-    one = told.calibrated("car")["speed_ratio"]
+def test_a_late_receiver_tells_the_speed_ratio(told: dict[str, CalibratedNumber]) -> None:
+    one = told["speed_ratio"]
     assert one.value == pytest.approx(RATIO, abs=1e-3)
     assert one.uncertainty is not None
     assert 0.0012 <= one.uncertainty < 0.003
 
 
-def test_the_course_tells_how_a_car_slips(told: CarEvidence) -> None:
-    found = told.calibrated("car")
-    assert found["slip_lever"].value == pytest.approx(LEVER_M, abs=0.01)
-    assert found["slip_compliance"].value == pytest.approx(COMPLIANCE, abs=1e-4)
-    bias = found["yaw_rate_offset"]  # over 4 s the heading gains that much, and the label lacks it
+def test_the_course_tells_how_a_car_slips(told: dict[str, CalibratedNumber]) -> None:
+    assert told["slip_lever"].value == pytest.approx(LEVER_M, abs=0.01)
+    assert told["slip_compliance"].value == pytest.approx(COMPLIANCE, abs=1e-4)
+    bias = told["yaw_rate_offset"]  # over 4 s the heading gains that much, and the label lacks it
     assert bias.value == pytest.approx(-BIAS_RAD / 4, abs=3e-5)
     assert bias.uncertainty is not None and 1e-4 <= bias.uncertainty < 2e-4
 
@@ -102,7 +97,6 @@ def test_what_is_no_course_of_a_car_tells_nothing(times: int) -> None:
     counts[catalogue().label] = times * counts[catalogue().label]
     columns = COLUMNS[BY_COURSE]
     table = np.stack([counts[name].astype(np.int64) for name in columns], axis=1)
-    told = CarEstimates()
-    add_satellite_estimates({"slip": Gram.from_counts(columns, table)}, told)
-    assert not told.numbers
-    assert told.missing["slip_lever"] == NO_CAR
+    told = estimate_numbers({"slip": Gram.from_counts(columns, table)}, banked=False)
+    assert {*told.values()} == {NO_COURSE, NO_CAR}
+    assert told["slip_lever"] == told["slip_compliance"] == NO_CAR
