@@ -102,8 +102,8 @@ class LogsAndGrams(Rooted):
         `InputError`, when all others are in, for files that cannot be used, or `RepeatedError`
         where these are all in already; `StorageError` and `ClusterError`.
         """
-        from fleet_slip.ingest.assumptions import keep_assumptions
         from fleet_slip.ingest.load import ingest_files, joined
+        from fleet_slip.ingest.mapping import keep_assumptions
         from fleet_slip.ingest.recordings import KnownFiles
         from fleet_slip.operations.rewriting import take_out
 

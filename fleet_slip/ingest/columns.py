@@ -71,6 +71,8 @@ FiniteFloat = Annotated[float, Field(allow_inf_nan=False)]
 OffsetM = Annotated[FiniteFloat, Field(ge=-15, le=15)]
 WHEELS = "wheel_"
 """How the names of wheel speeds begin."""
+RADIUS_M = 0.31
+"""Of a wheel whose mapping names none; a tenth more moves the label's correction by a tenth."""
 VELOCITY = "m/s"
 CHOOSE = "choose"
 """What a draft has for a unit that the file does not say, where several are possible."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue, round_chunks
-from fleet_slip.ingest.columns import SignalColumn
+from fleet_slip.ingest.columns import RADIUS_M, SignalColumn
 from fleet_slip.ingest.mapping import SPEEDS, LabelSensor, Mapping
 
 # Which fixes of a satellite receiver show where the car goes, and at which ticks.
@@ -369,9 +369,6 @@ def _in_one_turn(angle: FloatArray) -> FloatArray:
 
 # The label is brought to the centre of gravity: with the yaw rate r, a sensor x before it and y to
 # its left has the velocities (vx - r y, vy + r x). Of an angle alone the speed is needed beside it.
-
-RADIUS_M = 0.31
-"""Of a wheel whose mapping names none; a tenth more moves the correction by a tenth."""
 
 
 def physical(counts: Named[str, pa.Array], name: str) -> FloatArray:

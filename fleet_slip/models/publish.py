@@ -250,9 +250,9 @@ def with_straight_intercept(
 
 def with_assumptions(warehouse: Warehouse, manifest: Manifest, selection: Selection) -> Manifest:
     """Return a manifest with what the mappings of its drives leave open."""
-    from fleet_slip.ingest.assumptions import FOLDER, kept_assumptions  # noqa: PLC0415 - units
+    from fleet_slip.ingest.mapping import ASSUMPTIONS, kept_assumptions  # noqa: PLC0415 - units
 
-    if not (warehouse.root / FOLDER).names():
+    if not (warehouse.root / ASSUMPTIONS).names():
         return manifest
     cohort = selection.cohort
     with open_grams(warehouse, cohort.feature_set, cohort.condition) as opened:

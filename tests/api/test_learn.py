@@ -9,8 +9,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import ConfigError, RefusedError
-from fleet_slip.ingest.assumptions import assumptions_of
-from fleet_slip.ingest.mapping import Mapping, load_mapping
+from fleet_slip.ingest.mapping import Mapping, assumptions_of, load_mapping
 from tests.support.commands import Finished, run_on
 from tests.support.measured import DRIVE, SIGNALS, TIME, csv_text
 
