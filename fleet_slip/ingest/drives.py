@@ -18,7 +18,7 @@ from fleet_slip.catalogue.signals import catalogue, digest_drive, round_chunks
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
 from fleet_slip.ingest.formats.source import Spool
-from fleet_slip.ingest.log_rows import describe_refused, join_refused, no_rows
+from fleet_slip.ingest.log_rows import describe_refused, no_rows
 from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.resampling import (
     SNAP_TOLERANCE_S,
@@ -102,7 +102,7 @@ class DriveCutter:
             ]
             if (disordered := twice | backwards).any():
                 rows = rows.filter(pl.Series(~disordered))
-        return rows, join_refused(refused)
+        return rows, pl.concat(refused)
 
     def _grow(self, rows: pl.DataFrame) -> None:
         """Make room for groups that were not there before."""

@@ -25,7 +25,6 @@ from fleet_slip.catalogue.signals import as_arrow, catalogue
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConflictError, InputError, RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive, drive_id
-from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.log_files import Log, local_copies, local_copy
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.recordings import (
@@ -51,7 +50,7 @@ from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.storage.folder import StoredFile
 from fleet_slip.storage.table import Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.warehouse.forgotten import Audit
-from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
+from fleet_slip.warehouse.tables import Warehouse
 
 BATCH_BYTES = 2**24
 """Files are read, written and committed together up to this size."""
@@ -387,9 +386,8 @@ class _Writer:
         for name, data in self.data.items():
             data.begin_log(digest, wanted=is_new and self._lacks(name, digest))
         fingerprints = {f"{PREFIX}{stream.content[:16]}": Origin.of(digest).number}
-        refused = _RefusedRows(stream)
         left_out, ticks = set[str](), 0
-        for drives in _groups(refused.collect()):
+        for drives in _groups(stream.drives()):
             kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), self.audit)
             left_out |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in kept}
             ticks += _rows_of(kept)
@@ -402,7 +400,7 @@ class _Writer:
                     for drive, origin in of_drives
                     if origin
                 }
-        for table, following in pairwise(chain(refused.tables(), [None])):
+        for table, following in pairwise(chain(stream.quarantine(), [None])):
             allowed = keep_refused(table, self.audit, left_out)
             self.data["quarantine"].add(allowed, full=following is not None)
         report = IngestReport(str(asked.file), stream.counts, new=is_new)
@@ -443,34 +441,6 @@ def _rows_of(drives: Iterable[MeasuredDrive]) -> int:
     return sum(drive.ticks.size for drive in drives)
 
 
-class _RefusedRows:
-    """Rows for the quarantine, spooled until it is known whether their drive was forgotten."""
-
-    def __init__(self, stream: MeasuredStream) -> None:
-        self._stream, self._spool = stream, Spool()
-        self._rows: list[pl.DataFrame] = []
-
-    def collect(self) -> Iterator[MeasuredDrive]:
-        """Yield the drives of the file, and keep its refused rows."""
-        for piece in self._stream.pieces():
-            if piece.refused.height:
-                self._rows.append(piece.refused)
-            if sum(one.height for one in self._rows) >= FILE_ROWS:
-                sink = pa.BufferOutputStream()
-                with pa.ipc.new_stream(sink, QUARANTINE_SCHEMA) as writer:
-                    writer.write_table(self._stream.quarantine_table(self._rows))
-                self._spool.add("", sink.getvalue().to_pybytes())
-                self._rows = []
-            yield from piece.drives
-
-    def tables(self) -> Iterator[pa.Table]:
-        """Yield the refused rows."""
-        for piece in self._spool.read(""):
-            yield pa.ipc.open_stream(piece).read_all()
-        if self._rows:
-            yield self._stream.quarantine_table(self._rows)
-
-
 # What would become of files: they are read as above, and nothing is written.
 
 
@@ -495,7 +465,7 @@ def preview_log(log: Log, mapping: Mapping) -> tuple[Preview, MeasuredDrive | No
     ends: dict[str, list[int]] = {name: [] for name in mapping.signal_names}
     values: Counter[str] = Counter()
     with local_copy(log) as file, open_measured(file, mapping) as stream:
-        for drive in (drive for piece in stream.pieces() for drive in piece.drives):
+        for drive in stream.drives():
             for name, counts in drive.counts.items():
                 values[name] += len(counts) - counts.null_count
                 found = pc.min_max(counts).as_py()

@@ -4,7 +4,7 @@ A batch's columns carry the prefix `RAW`, so that no name in a file can meet one
 for a pattern, or be anything but a name.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import date, datetime
 from functools import cache, lru_cache
@@ -224,8 +224,8 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
     fields += [*signals, _condition((nothing, "no_value"), raw=pl.lit(None, pl.String))]
     if RAW + EXTRA_FIELDS in schema:
         extra = pl.col(RAW + EXTRA_FIELDS)
-        cases = (extra == CUT, "cut_line"), (extra.is_not_null(), "extra_fields")
-        fields.append(_condition(*cases, raw=extra))
+        cut, more = (extra == CUT, "cut_line"), (extra.is_not_null(), "extra_fields")
+        fields.append(_condition(cut, more, raw=extra))
     return fields
 
 
@@ -457,12 +457,6 @@ def describe_refused(rows: pl.DataFrame, which: BoolArray | None, reason: str) -
         pl.lit("time").alias("signal"),
         pl.col("time").cast(pl.String).alias("value"),
     )
-
-
-def join_refused(frames: Sequence[pl.DataFrame]) -> pl.DataFrame:
-    """Return the bad rows of all frames; most have none, and joining takes a while."""
-    some = [frame for frame in frames if frame.height]
-    return pl.concat(some) if len(some) > 1 else next(iter(some), frames[0])
 
 
 @cache

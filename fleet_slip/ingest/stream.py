@@ -2,12 +2,13 @@
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from io import BytesIO
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -29,6 +30,7 @@ from fleet_slip.ingest.drives import (
     to_ticks,
 )
 from fleet_slip.ingest.formats.reading import log_digest, require_unchanged_log
+from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.formats.tables import partition_keys
 from fleet_slip.ingest.log_faults import LogFaults
 from fleet_slip.ingest.log_files import parts_of
@@ -36,7 +38,6 @@ from fleet_slip.ingest.log_rows import (
     CheckedBlock,
     RowChecker,
     describe_refused,
-    join_refused,
     no_rows,
 )
 from fleet_slip.ingest.mapping import Mapping
@@ -75,15 +76,8 @@ RATE_ROWS, MOST_RATE_ROWS = 2**17, 2**21
 FEWEST_STEPS = 1000
 
 
-class Piece(NamedTuple):
-    """Drives of a file that have ended, and rows that were refused meanwhile.
-
-    The order of drives depends on the file and the mapping only. `refused` has `row`, `group`,
-    `reason`, `signal` and `value`.
-    """
-
-    drives: list[MeasuredDrive]
-    refused: pl.DataFrame
+REFUSED_ROWS = 2**18
+"""Refused rows that are in memory at most; all others wait in a temporary file."""
 
 
 class MeasuredStream:
@@ -102,6 +96,8 @@ class MeasuredStream:
         self.counts = IngestCounts()
         self.longest: MeasuredDrive | None = None
         self._refused = Counter[tuple[str, str]]()
+        self._refused_rows: list[pl.DataFrame] = []
+        self._spool = Spool()
         self._first_refused: dict[str, Any] | None = None
         self._samples, self._values = Counter[str](), Counter[str]()
         self._open = OpenDrives()
@@ -111,16 +107,19 @@ class MeasuredStream:
         self.name = os.fsencode(file.name).decode("utf-8", "replace")
         self._stem = self.name.split(".", 1)[0] or self.name
 
-    def pieces(self) -> Iterator[Piece]:
-        """Yield what the file becomes, in order, once. Raises `InputError`, at its end too."""
+    def drives(self) -> Iterator[MeasuredDrive]:
+        """Yield the drives of the file as they end, once. Raises `InputError`, at its end too.
+
+        Their order depends on the file and the mapping only.
+        """
         with closing(read_ahead(self.checker.blocks())) as blocks:
             early, intervals_s = self._usual_intervals(blocks)
             longest_s = LONGEST_DRIVE_S * min([1.0, *(s / STEP_S for s in intervals_s.values())])
             cutter = DriveCutter(self.mapping.time, longest_s)
             for block in chain(early, blocks):
-                yield from self._pieces(cutter, block, intervals_s)
+                yield from self._ended(cutter, block, intervals_s)
             no_more = CheckedBlock(block.rows.clear(), no_rows(), block.read)
-            yield from self._pieces(cutter, no_more, intervals_s, last=True)
+            yield from self._ended(cutter, no_more, intervals_s, last=True)
         self.counts.quarantined = dict(sorted(self.counts.quarantined.items()))
         self._require_usable()
 
@@ -144,32 +143,28 @@ class MeasuredStream:
                 enough += RATE_ROWS
         return early, sample_intervals_s(_trial(self.mapping, early, _reach(early)))
 
-    def _pieces(
+    def _ended(
         self,
         cutter: DriveCutter,
         block: CheckedBlock,
         intervals_s: dict[int, float],
         *,
         last: bool = False,
-    ) -> Iterator[Piece]:
-        """Yield what was refused of a block, and the drives that ended in it, one by one."""
+    ) -> Iterator[MeasuredDrive]:
+        """Yield the drives that ended in a block, and keep what was refused of it."""
         self.counts.rows_read, self.counts.rows_left_out = self.checker.rows, self.checker.left_out
         rows, misplaced = cutter.cut(block.rows, last=last)
         self._open.add(rows)
-        yield self._refusing(join_refused([block.refused, misplaced]))
+        self._refuse(pl.concat([block.refused, misplaced]))
         for ended in self._open.take([*cutter.ended, *(cutter.open_parts() if last else ())]):
             if ended.end_s - ended.start_s < STEP_S - TIME_EPSILON_S:
-                yield self._refusing(describe_refused(ended.frame(), None, "too_short"))
+                self._refuse(describe_refused(ended.frame(), None, "too_short"))
             else:
-                yield Piece([self._drive(ended, intervals_s)], no_rows())
+                yield self._drive(ended, intervals_s)
         self._open.spill()
 
-    def _refusing(self, refused: pl.DataFrame) -> Piece:
-        self._count_refused(refused)
-        return Piece([], refused)
-
-    def _count_refused(self, refused: pl.DataFrame) -> None:
-        """Count refused rows, by reason and, where that is one of the signals, by what is wrong."""
+    def _refuse(self, refused: pl.DataFrame) -> None:
+        """Keep refused rows; count them by reason, and by signal where it is that of one."""
         if not refused.height:
             return
         for reason, number in refused["reason"].value_counts().iter_rows():
@@ -178,6 +173,12 @@ class MeasuredStream:
         self._refused.update(zip(of_signals["signal"], of_signals["reason"], strict=True))
         first = refused.row(refused["row"].arg_min() or 0, named=True)
         self._first_refused = min(self._first_refused or first, first, key=lambda row: row["row"])
+        self._refused_rows.append(refused)
+        if sum(rows.height for rows in self._refused_rows) >= REFUSED_ROWS:
+            content = BytesIO()
+            pl.concat(self._refused_rows).write_ipc_stream(content)
+            self._spool.add("", content.getvalue())
+            self._refused_rows = []
 
     def _drive(self, rows: DriveRows, intervals_s: dict[int, float]) -> MeasuredDrive:
         group = rows.group
@@ -251,9 +252,16 @@ class MeasuredStream:
                     "of its own, or interpolate = false."
                 )
 
-    def quarantine_table(self, refused: Sequence[pl.DataFrame]) -> pa.Table:
-        """Return refused rows as those of the table `quarantine`, in the file's order."""
-        bad = join_refused(refused).sort("row", maintain_order=True)
+    def quarantine(self) -> Iterator[pa.Table]:
+        """Yield refused rows as those of the table `quarantine`, once all drives were taken."""
+        for piece in self._spool.read(""):
+            yield self._quarantine_table(pl.read_ipc_stream(piece))
+        if self._refused_rows:
+            yield self._quarantine_table(pl.concat(self._refused_rows))
+
+    def _quarantine_table(self, refused: pl.DataFrame) -> pa.Table:
+        """Return refused rows in the file's order."""
+        bad = refused.sort("row", maintain_order=True)
         groups = bad["group"].unique().drop_nulls()
         ids = {group: drive_id(self.prefix, group) for group in groups}
         stated = self.mapping.drive.vehicle_id
@@ -276,7 +284,7 @@ class MeasuredStream:
         return frame.to_arrow().cast(QUARANTINE_SCHEMA)
 
     def suspicions(self) -> tuple[Fault, ...]:
-        """Return what looks wrong in the file as a whole, once all pieces were taken."""
+        """Return what looks wrong in the file as a whole, once all drives were taken."""
         counts = self.counts
         return tuple(self._faults.find(self._refused, counts.rows_read, counts.quarantined))
 

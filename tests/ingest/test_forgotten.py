@@ -24,9 +24,7 @@ def two_cars(folder: Path) -> tuple[list[MeasuredDrive], pa.Table]:
     file = folder / "log.csv"
     file.write_text(csv_text(columns))
     with open_measured(file, mapping) as stream:
-        pieces = list(stream.pieces())
-    drives = [drive for piece in pieces for drive in piece.drives]
-    return drives, stream.quarantine_table([piece.refused for piece in pieces])
+        return list(stream.drives()), next(stream.quarantine())
 
 
 def cars(rows: pa.Table) -> set[str]:

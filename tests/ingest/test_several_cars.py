@@ -42,7 +42,7 @@ def cars(number: int) -> list[pl.DataFrame]:
 def said_of(rows: pl.DataFrame, folder: Path, mapping: Any) -> list[Fault]:
     rows.write_parquet(folder / "log.parquet")
     with open_measured(folder / "log.parquet", mapping) as stream:
-        list(stream.pieces())
+        list(stream.drives())
         return list(stream.suspicions())
 
 

@@ -85,8 +85,7 @@ def write_bus(file: Path) -> None:
 def read(file: Path, mapping: Any) -> tuple[list[MeasuredDrive], IngestCounts]:
     """Return the drives of a file, and what became of its rows."""
     with open_measured(file, mapping) as stream:
-        drives = [drive for piece in stream.pieces() for drive in piece.drives]
-        return drives, stream.counts
+        return list(stream.drives()), stream.counts
 
 
 LOGS: dict[str, tuple[Callable[[Path], None], int, set[str]]] = {

@@ -13,7 +13,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.load import IngestReport, ingest_files, log_table
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
 
 TIME = {"column": "t", "unit": "s"}
 DRIVE = {"day": date(2024, 5, 31), "vehicle_id": "car", "vehicle_model": "sedan"}
@@ -46,11 +46,10 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
     row.
     """
     with open_measured(file, mapping) as stream:
-        pieces = list(stream.pieces())
-    drives = sorted((d for piece in pieces for d in piece.drives), key=lambda d: d.drive_id)
+        drives = sorted(stream.drives(), key=lambda drive: drive.drive_id)
     return MeasuredLog(
         log_table(drives, mapping),
-        stream.quarantine_table([piece.refused for piece in pieces]),
+        pa.concat_tables([QUARANTINE_SCHEMA.empty_table(), *stream.quarantine()]),
         stream.counts,
         stream.digest,
     )
