@@ -99,6 +99,9 @@ RECEIVED: Final = "received"
 RECEIVED_FILES: Final = "received/"
 """What stands before a digest in the column `file` of Gram rows without a log file."""
 
+RECEIVER: Final = "receiver"
+"""The drive column that says of which type a satellite receiver is."""
+
 LONGEST_PAUSE_S: Final = 600
 """A pause that is longer begins another trip: road, load and warmth of the tyres may be others."""
 

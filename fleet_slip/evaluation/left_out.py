@@ -25,7 +25,7 @@ from fleet_slip.grams.cohort import Cohort, with_gram_rows
 from fleet_slip.grams.compute import Parts, counts_of, drive_sums
 from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
-from fleet_slip.grams.gram_rows import hash_numbers
+from fleet_slip.grams.gram_files import hash_numbers
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import manifest_of, with_straight_intercept
 from fleet_slip.models.request import BOTH, SelectionRequest

@@ -12,8 +12,7 @@ from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
-from fleet_slip.grams.gram_files import find_backlog, is_of_received
-from fleet_slip.grams.gram_rows import is_received
+from fleet_slip.grams.gram_files import find_backlog, is_of_received, is_received
 from fleet_slip.grams.job import unit_name
 from fleet_slip.grams.receiver_delay import recorded_cars
 from fleet_slip.regression.gram import Gram

@@ -33,7 +33,7 @@ from fleet_slip.grams.folding import (
     assign_folds,
     require_divided,
 )
-from fleet_slip.grams.gram_rows import Hashes
+from fleet_slip.grams.gram_files import Hashes
 from fleet_slip.grams.reader import HASHES, GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.weights import FULL, weighted
 from fleet_slip.regression.choice import TrainingFolds

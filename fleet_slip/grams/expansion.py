@@ -18,7 +18,7 @@ from fleet_slip.catalogue.definitions import Number
 from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION
 from fleet_slip.catalogue.features import features
 from fleet_slip.grams.calibration import calibration_of
-from fleet_slip.grams.gram_rows import by_signals, gram_table
+from fleet_slip.grams.gram_files import by_signals, gram_table
 from fleet_slip.grams.reader import OpenedGrams
 from fleet_slip.regression.gram import GramTable, packed_position, packed_positions
 from fleet_slip.warehouse.condition import parse_condition

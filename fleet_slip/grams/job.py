@@ -25,13 +25,13 @@ from fleet_slip.grams.gram_files import (
     find_backlog,
     find_superseded,
     is_of_received,
+    is_received,
     named_files,
     require_active,
     rows_of_set,
     rows_to_keep,
     write_rows,
 )
-from fleet_slip.grams.gram_rows import is_received
 from fleet_slip.grams.receiver_delay import course_delays, files_of_other_delay
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.table import Change, Snapshot, TableFile, Unit, retrying

@@ -40,8 +40,13 @@ from fleet_slip.catalogue.time_columns import Feature
 from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.grams.compute import Parts
-from fleet_slip.grams.gram_files import files_to_rewrite, rows_to_keep, write_rows
-from fleet_slip.grams.gram_rows import by_signals, gram_table
+from fleet_slip.grams.gram_files import (
+    by_signals,
+    files_to_rewrite,
+    gram_table,
+    rows_to_keep,
+    write_rows,
+)
 from fleet_slip.grams.reader import BATCH_ROWS
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, Remark

@@ -15,13 +15,17 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.catalogue.course import TURNED
-from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, LONGEST_PAUSE_S, TRAINING_DRIVES
+from fleet_slip.catalogue.facts import (
+    ALL_DRIVES,
+    CALIBRATION,
+    LONGEST_PAUSE_S,
+    RECEIVER,
+    TRAINING_DRIVES,
+)
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, NotComputedError
-from fleet_slip.grams.gram_files import find_backlog
-from fleet_slip.grams.gram_rows import by_signals, gram_table
-from fleet_slip.grams.receiver_delay import RECEIVER
+from fleet_slip.grams.gram_files import by_signals, find_backlog, gram_table
 from fleet_slip.regression.gram import GramTable, packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot

@@ -10,8 +10,9 @@ more so the fewer drives they have (`regression/shrinkage/partial_pooling.py`).
 
 import math
 import statistics
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
@@ -19,11 +20,10 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.course import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOST_LATE
-from fleet_slip.catalogue.facts import DELAY, RECEIVED_FILES
+from fleet_slip.catalogue.facts import DELAY, RECEIVED_FILES, RECEIVER
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
-from fleet_slip.grams.gram_files import rows_of_set
-from fleet_slip.grams.gram_rows import by_signals, gram_table
+from fleet_slip.grams.gram_files import by_signals, gram_table, is_received, rows_of_set
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.shrinkage import Pooled, pool
 from fleet_slip.storage.table import Snapshot
@@ -31,9 +31,6 @@ from fleet_slip.storage.table import Snapshot
 RECEIVER_DELAY = "receiver_delay"
 SPREAD = f"{RECEIVER_DELAY}_spread"
 """What the view `calibration` calls it, and by how much cars of one type of receiver differ."""
-RECEIVER = "receiver"
-"""The drive column that says of which type a receiver is."""
-
 SPAN, STEP, STEPS = 40, 5, 12
 """Ticks of the integral, between two lags, and how many lags there are beside the first. Receivers
 of 5 Hz have fixes that are so far apart."""
@@ -97,27 +94,10 @@ def _weights() -> FloatArray:
 
 def receiver_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> ReceiverDelays:
     """Return the delays of cars and of types that Gram rows of the feature set `delay` tell."""
-    found = {}
-    for car, own in _by_car(rows_of_delay).items():
-        one = _delay(np.array(list(own.products.values())), own.rows)
-        if one is not None:
-            receiver = own.receivers.pop() if len(own.receivers) == 1 else None
-            found[car] = replace(one, receiver=receiver)
-    return with_types(with_pooled(found))
-
-
-@dataclass
-class _CarProducts:
-    """What one car's drives tell: products about their means, by day and name, and its rows."""
-
-    products: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
-    receivers: set[str] = field(default_factory=set)
-    rows: int = 0
-
-
-def _by_car(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, _CarProducts]:
     columns = delay_columns()
-    found: dict[str, _CarProducts] = {}
+    products: dict[str, dict[tuple[str, str], FloatArray]] = defaultdict(dict)
+    receivers = defaultdict[str, set[str]](set)
+    counts = Counter[str]()
     for batch in rows_of_delay:
         for names, some, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
             if not set(columns) <= set(names.split(",")):
@@ -128,13 +108,17 @@ def _by_car(rows_of_delay: Iterable[pa.RecordBatch]) -> dict[str, _CarProducts]:
             for (car, day, drive, receiver), about, n in zip(
                 zip(*keys, strict=True), _about_means(table), table.n.tolist(), strict=True
             ):
-                own = found.setdefault(car, _CarProducts())
-                own.products[str(day), drive] = own.products.get((str(day), drive), 0.0) + about
-                own.receivers |= {receiver} - {None}
-                own.rows += n
-    for own in found.values():
-        own.products = dict(sorted(own.products.items()))
-    return dict(sorted(found.items()))
+                own = products[car]
+                own[str(day), drive] = own.get((str(day), drive), 0.0) + about
+                receivers[car] |= {receiver} - {None}
+                counts[car] += n
+    found = {}
+    for car, own in sorted(products.items()):
+        one = _delay(np.array([own[drive] for drive in sorted(own)]), counts[car])
+        if one is not None:
+            kind = receivers[car].pop() if len(receivers[car]) == 1 else None
+            found[car] = replace(one, receiver=kind)
+    return with_types(with_pooled(found))
 
 
 def _about_means(table: GramTable) -> FloatArray:
@@ -151,18 +135,12 @@ def _about_means(table: GramTable) -> FloatArray:
 
 def with_pooled(delays: dict[str, ReceiverDelay]) -> dict[str, ReceiverDelay]:
     """Add the spread of other cars' drives to cars with few; None if all have too few."""
-    noise = _noise(delays.values())
-    return {
-        car: one
-        if one.drives >= FEWEST_DRIVES and one.uncertainty is not None
-        else replace(
-            one,
-            uncertainty=None
-            if noise is None
-            else math.sqrt(noise / one.information + LASTING_S**2),
-        )
-        for car, one in delays.items()
-    }
+    noise, found = _noise(delays.values()), dict(delays)
+    for car, one in delays.items():
+        if one.drives < FEWEST_DRIVES or one.uncertainty is None:
+            usual = noise and math.sqrt(noise / one.information + LASTING_S**2)
+            found[car] = replace(one, uncertainty=usual)
+    return found
 
 
 def with_types(delays: dict[str, ReceiverDelay]) -> ReceiverDelays:
@@ -263,28 +241,26 @@ def _best_lag(products: FloatArray) -> float | None:
 
 GRAIN_S = float(SAMPLE_TIME_S) / LATE_PARTS
 """What a delay is a whole number of, s."""
-_OF_DELAY = ("file", "day", "vehicle_id", "drive_id", "signals", "n", "sums", "products")
 
 
 def course_delays(grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
     """Return each car's course delay in parts of a tick, of Gram rows of the `active` log files."""
-    delays = receiver_delays(_of_delay(grams, active)).cars
-    return {car: in_parts(one) for car, one in delays.items()}
+    counted = pa.array(sorted(active), pa.string())
+    columns = ("file", "day", "vehicle_id", "drive_id", RECEIVER)
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        identity = features().identity(DELAY)
+        for rows in rows_of_set(grams, identity, *columns, "signals", "n", "sums", "products"):
+            counts = pc.or_(pc.is_in(rows["file"].cast(pa.string()), counted), is_received(rows))
+            yield from rows.filter(counts).to_batches()
+
+    return {car: in_parts(one) for car, one in receiver_delays(batches()).cars.items()}
 
 
 def in_parts(one: ReceiverDelay) -> int:
     """Return a delay as Gram rows are corrected by it."""
     least, most = LATE_PARTS * MOST_EARLY, LATE_PARTS * MOST_LATE
     return min(max(round(one.value / GRAIN_S), least), most)
-
-
-def _of_delay(grams: Snapshot, active: frozenset[str]) -> Iterator[pa.RecordBatch]:
-    identity = features().identity(DELAY)
-    for rows in rows_of_set(grams, identity, *_OF_DELAY, RECEIVER):
-        files = rows["file"].cast(pa.string())
-        counts = pc.is_in(files, pa.array(sorted(active), pa.string()))
-        counts = pc.or_(counts, pc.starts_with(files, RECEIVED_FILES))
-        yield from rows.filter(counts).to_batches()
 
 
 def files_of_other_delay(grams: Snapshot, identity: str, late: Mapping[str, int]) -> set[str]:

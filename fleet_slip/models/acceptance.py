@@ -34,7 +34,7 @@ from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageErr
 from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.folding import FOLD_KEYS, FoldKey, assign_folds
-from fleet_slip.grams.gram_rows import hash_numbers
+from fleet_slip.grams.gram_files import hash_numbers
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
 from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick

@@ -26,7 +26,7 @@ from fleet_slip.catalogue.definitions import Definition, integer_arithmetic, pla
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
-from fleet_slip.grams.gram_rows import Hashes
+from fleet_slip.grams.gram_files import Hashes
 
 MOST_DIGITS = 4000
 """Most decimal digits of a number that stands in decimal; Python refuses longer ones as text."""

@@ -15,7 +15,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.compute import counts_of, drives_of_stream
 from fleet_slip.grams.expansion import CarCounts
-from fleet_slip.grams.gram_rows import hash_numbers
+from fleet_slip.grams.gram_files import hash_numbers
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor, predict
 from fleet_slip.models.registry import Registry

@@ -24,7 +24,7 @@ from fleet_slip.grams.cohort import (
     load_mixed_labels,
 )
 from fleet_slip.grams.folding import PARTS, ROW_FOLDS, Folding, make_folding
-from fleet_slip.grams.gram_rows import by_signals, gram_table
+from fleet_slip.grams.gram_files import by_signals, gram_table
 from fleet_slip.grams.reader import open_grams
 from fleet_slip.grams.weights import FULL, Weighed, age_weights, robust_weights
 from fleet_slip.models.request import (

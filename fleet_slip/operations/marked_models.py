@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.grams.gram_rows import Hashes, hash_numbers
+from fleet_slip.grams.gram_files import Hashes, hash_numbers
 from fleet_slip.models.manifest import TrainedDrives
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder

@@ -20,8 +20,7 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.errors import ConflictError, FleetSlipError
-from fleet_slip.grams.gram_files import read_rows, rows_of_set, write_rows
-from fleet_slip.grams.gram_rows import is_received
+from fleet_slip.grams.gram_files import is_received, read_rows, rows_of_set, write_rows
 from fleet_slip.grams.job import land_ahead, reconcile
 from fleet_slip.ingest.recordings import MEASURED, Fingerprints, Origin, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of

@@ -29,8 +29,7 @@ from fleet_slip.grams.check import (
     stored_grams,
 )
 from fleet_slip.grams.compute import by_sql, wide_grams
-from fleet_slip.grams.gram_files import named_files
-from fleet_slip.grams.gram_rows import is_received
+from fleet_slip.grams.gram_files import is_received, named_files
 from fleet_slip.grams.on_board import counted_sets, impossible_rows
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import find_temporary_files, find_unreferenced

@@ -10,7 +10,7 @@ import pyarrow as pa
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.grams.gram_rows import hash_numbers
+from fleet_slip.grams.gram_files import hash_numbers
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.condition import parse_condition
 from tests.support.counts import Matrix, table_of

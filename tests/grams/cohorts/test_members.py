@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.grams.cohort import Cohort, load_cohort
-from fleet_slip.grams.gram_rows import hash_numbers
+from fleet_slip.grams.gram_files import hash_numbers
 from fleet_slip.grams.job import update_grams
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse

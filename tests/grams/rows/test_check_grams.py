@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.grams.check import check_grams, differing_drives
-from fleet_slip.grams.gram_rows import gram_table
+from fleet_slip.grams.gram_files import gram_table
 from fleet_slip.grams.job import update_grams
 from fleet_slip.regression.gram import Gram, packed_size
 from fleet_slip.warehouse.tables import Warehouse
