@@ -15,6 +15,7 @@ from typing import (
     Any,
     Concatenate,
     ParamSpec,
+    TypedDict,
     TypeVar,
     get_args,
     get_origin,
@@ -202,6 +203,18 @@ CAMPAIGN = Doc("A campaign of configs/campaigns, or the path of a TOML file.")
 DAYS = Doc("Simulate the first N days only. Default: all.")
 THROUGH = Doc("Last day to simulate, YYYY-MM-DD or today. Default: all days.")
 MODELS = Doc("A model list of configs/models, or a TOML file.")
+
+
+class CarMeasures(TypedDict, total=False):
+    """What scales and a tape measure say of a car."""
+
+    mass_kg: Annotated[float | None, Doc("Of the whole car with its driver, kg.")]
+    front_axle_m: Annotated[float | None, Doc("From the centre of gravity to the front axle, m.")]
+    rear_axle_m: Annotated[float | None, Doc("To the rear axle, m.")]
+    track_m: Annotated[float | None, Doc("m. Default: 1.55.")]
+    height_m: Annotated[float | None, Doc("Of the centre of gravity, m. Default: 0.55.")]
+    rolling_radius_m: Annotated[float | None, Doc("Of the wheels, m. Default: 0.315.")]
+    front_drive_share: Annotated[float | None, Doc("Part of the drive torque. Default: 1.")]
 
 
 @dataclass(frozen=True)

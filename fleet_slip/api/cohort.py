@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Unpack
 
 from typing_extensions import Doc
 
-from fleet_slip.api.calls import Rooted, open_workers, takes
+from fleet_slip.api.calls import CarMeasures, Rooted, open_workers, takes
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.features import features as known_features
 from fleet_slip.errors import NotComputedError, UsageError
@@ -170,14 +170,19 @@ class FleetCohort(Rooted):
             cohort, one, bias=bias or {}, noise=noise or {}, intercept=examined.intercept
         )
 
-    def identify(self, name: str, *, threads: int | None = None, **measured: float) -> "Identified":
+    def identify(
+        self,
+        name: Annotated[str, Doc("What the car is to be called.")],
+        *,
+        threads: int | None = None,
+        **measured: Unpack[CarMeasures],
+    ) -> "Identified":
         """Identify the tyres and the yaw inertia of the car that made the cohort's drives.
 
-        `measured` is what scales and a tape measure say, in the words of
-        `fleet_slip.evaluation.identify.Measured`. The extended Kalman filter in the
-        car is fitted to the labels of up to 24 drives; its error on drives that were left out
-        stands beside. Raises `DataError` if the drives lack the label or what the filter needs, and
-        `UsageError` for a name or number that no car can have.
+        Mass and axles must be known. The extended Kalman filter in the car is fitted to the labels
+        of up to 24 drives; its error on drives that were left out stands beside. Raises `DataError`
+        if the drives lack the label or what the filter needs, and `UsageError` for a name or number
+        that no car can have.
         """
         from fleet_slip.evaluation.filters import TuningDrives
         from fleet_slip.evaluation.identify import identify_held_out, measured_car

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 from typing_extensions import Doc
 
@@ -12,6 +12,7 @@ from fleet_slip.api.calls import (
     MODEL,
     UNEXAMINED,
     VERSION,
+    CarMeasures,
     Rooted,
     ShowProgress,
     count_from_start,
@@ -369,22 +370,19 @@ class JudgedModels(PublishedModels):
         others: Sequence[str | ModelVersion] = (),
         *,
         vehicle: Annotated[
-            str | Mapping[str, float] | None,
-            Doc(
-                "With `cohort`: the car's file, for filters; or what scales and a tape measure say "
-                "of it, in the words of `fleet_slip.evaluation.identify.Measured`."
-            ),
+            str | None, Doc("With `cohort`: the car's file, for filters; or its mass and axles.")
         ] = None,
         threads: int | None = None,
+        **measured: Unpack[CarMeasures],
     ) -> "Document":
         """Evaluate models on measured drives with a label, beside Table I and filters.
 
         What is chosen, fitted, tuned or identified never saw what it is judged by: each drive is
         left out in turn, or each quarter of the time of one or two, and each kind of driving.
-        Without a `vehicle` no filter competes, unless a file ships for the drives' class. Returns
-        the document kept below `evaluations/measured/`. Raises `DataError` without a label,
-        `ConfigError` for an unknown car, `UsageError` for one that no car can be, and what `model`
-        raises.
+        Without a `vehicle` or what was `measured` of it no filter competes, unless a file ships for
+        the drives' class. Returns the document kept below `evaluations/measured/`. Raises
+        `DataError` without a label, `ConfigError` for an unknown car, `UsageError` for one that no
+        car can be, and what `model` raises.
         """
         from fleet_slip.evaluation.evaluate import evaluations_of, keep
         from fleet_slip.evaluation.identify import Measured, measured_car
@@ -392,10 +390,11 @@ class JudgedModels(PublishedModels):
         from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 
         versions = [self.resolve(one) for one in (model, *others)]
-        if isinstance(vehicle, Mapping):
-            car: VehicleParameters | Measured | None = measured_car("measured", vehicle)
-        else:
-            car = load_vehicle(vehicle) if vehicle else None
+        car: VehicleParameters | Measured | None = load_vehicle(vehicle) if vehicle else None
+        if any(measured.values()):
+            if car is not None:
+                raise UsageError("leave out the vehicle file, or what was measured of the car.")
+            car = measured_car("measured", measured)
         with open_workers(self.root, threads) as executor:
             content = evaluate_measured(self.warehouse, versions, cohort, car, executor)
         return keep(evaluations_of(self.warehouse, "measured"), content)

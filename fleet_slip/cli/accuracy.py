@@ -13,7 +13,7 @@ from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import needed, number_of
 from fleet_slip.cli.options import command
-from fleet_slip.cli.output import Json, print_json, print_parts, say
+from fleet_slip.cli.output import Json, print_answer, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.errors import UsageError
 from fleet_slip.rendering import Part, TextTable
@@ -21,18 +21,8 @@ from fleet_slip.resources import folder
 from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
+    from fleet_slip.evaluation.identify import Identified
     from fleet_slip.evaluation.report import Written
-
-
-# What scales and a tape measure say of a car.
-
-MASS = typer.Option(help="Of the whole car, kg.", min=1)
-FRONT_AXLE = typer.Option(help="From the centre of gravity to the front axle, m.", min=0.01)
-REAR_AXLE = typer.Option(help="To the rear axle, m.", min=0.01)
-TRACK = typer.Option(help="m.", min=0.01)
-HEIGHT = typer.Option(help="Of the centre of gravity above the road, m.", min=0.01)
-RADIUS = typer.Option(help="Rolling radius, m.", min=0.01)
-FRONT_DRIVE = typer.Option(help="Share of the drive torque in front.", min=0, max=1)
 
 
 # What `evaluate` prints for people: a screen, and with --all the errors of all on every drive.
@@ -169,17 +159,11 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
-    mass: Annotated[float | None, MASS] = None,
-    front_axle: Annotated[float | None, FRONT_AXLE] = None,
-    rear_axle: Annotated[float | None, REAR_AXLE] = None,
-    track: Annotated[float, TRACK] = 1.55,
-    height: Annotated[float, HEIGHT] = 0.55,
-    radius: Annotated[float, RADIUS] = 0.315,
-    front_drive: Annotated[float, FRONT_DRIVE] = 1.0,
     everything: Annotated[
         bool, typer.Option("--all", help="Print the errors of all estimators on every drive.")
     ] = False,
     json: Json = False,
+    **measured: float | None,
 ) -> None:
     """Evaluate models on the paper's test drives and on others; simulates those that are missing.
 
@@ -190,32 +174,21 @@ def evaluate(
 
     Example: **fleet-slip evaluate waterford --scenario nominal**
     """
-    car = vehicle or mass
+    car = vehicle or any(measured.values())
     if (cohort is None and car) or (cohort is not None and (scenarios or blind)):
         raise UsageError(
             "--cohort judges measured drives, for filters in the car of --vehicle or --mass: leave "
             "out --scenario and --blind, and name a cohort."
         )
-    if mass and (vehicle or front_axle is None or rear_axle is None):
-        raise UsageError("--mass is for --front-axle and --rear-axle too: leave out --vehicle.")
     if blind and scenarios:
         raise UsageError("--blind has drives of its own: leave out --scenario.")
     if blind:
         content = fleet.evaluate_blind(model, others, threads=threads)
         return print_json(content) if json else print_parts(evaluation_parts(content, everything))
     if cohort is not None:
-        known: str | dict[str, float] | None = vehicle
-        if mass and front_axle and rear_axle:
-            known = {
-                "mass_kg": mass,
-                "front_axle_m": front_axle,
-                "rear_axle_m": rear_axle,
-                "track_m": track,
-                "height_m": height,
-                "rolling_radius_m": radius,
-                "front_drive_share": front_drive,
-            }
-        kept = fleet.evaluate_measured(model, cohort, others, vehicle=known, threads=threads)
+        kept = fleet.evaluate_measured(
+            model, cohort, others, vehicle=vehicle, threads=threads, **measured
+        )
     else:
         with progress("simulate scenarios", "rows") as show:
             kept = fleet.evaluate(
@@ -230,19 +203,9 @@ def evaluate(
 # The command that identifies a car from labelled drives: identify.
 
 
-@command(Fleet.cohort, FleetCohort.identify, without=["unexamined"])
+@command(Fleet.cohort, FleetCohort.identify, arguments=["name"], without=["unexamined"])
 def identify(
-    fleet: Fleet,
-    condition: str,
-    threads: int | None,
-    name: Annotated[str, typer.Argument(help="What the car is to be called.")],
-    mass: Annotated[float, MASS],
-    front_axle: Annotated[float, FRONT_AXLE],
-    rear_axle: Annotated[float, REAR_AXLE],
-    track: Annotated[float, TRACK] = 1.55,
-    height: Annotated[float, HEIGHT] = 0.55,
-    radius: Annotated[float, RADIUS] = 0.315,
-    front_drive: Annotated[float, FRONT_DRIVE] = 1.0,
+    found: "Identified",
     output: Annotated[
         Path | None, typer.Option(help="Write the vehicle file here.", show_default=False)
     ] = None,
@@ -256,49 +219,23 @@ def identify(
 ) -> None:
     """Identify a car's tyres and inertia from labelled drives, as a vehicle file for filters.
 
-    Given what scales and a tape measure say, an extended Kalman filter in the car is fitted to the
-    label. Its error on drives that were left out stands beside it. A steering wheel suffices where
-    no angle of the road wheels is logged.
+    Given what scales and a tape measure say (mass and axles at least), an extended Kalman filter in
+    the car is fitted to the label. Its error on drives that were left out stands beside it. A
+    steering wheel suffices where no angle of the road wheels is logged.
 
     Example: **fleet-slip identify hatchback --mass 1776 --front-axle 1.19 --rear-axle 1.44**
     """
-    found = fleet.cohort(condition).identify(
-        name,
-        mass_kg=mass,
-        front_axle_m=front_axle,
-        rear_axle_m=rear_axle,
-        track_m=track,
-        height_m=height,
-        rolling_radius_m=radius,
-        front_drive_share=front_drive,
-        threads=threads,
-    )
-    for file, text in ((output, found.as_toml()), (campaign, found.as_campaign())):
+    print_answer(found, json)
+    train = f". Train with it: fleet-slip publish NAME --prior {campaign}"
+    for file, text, then in (
+        (output, found.as_toml(), ": a vehicle file, as in configs/vehicles."),
+        (campaign, found.as_campaign(), train),
+    ):
         if file is not None:
             with storage_errors(file):
                 file.write_text(text, encoding="utf-8")
-    shown = found.as_dict()
-    if json:
-        return print_json(shown)
-    title = f"{name}, identified from {number_of(found.drives, 'drive')}"
-    values = ((what.replace("_", " "), value) for what, value in shown["found"].items())
-    print_parts([TextTable(title, "what|value", values, "{0}|{1:.4g}")])
-    held_out = shown["held_out_deg"]
-    say(
-        f"the extended Kalman filter in it errs by {shown['fit_deg']:.4f} deg on these drives"
-        + ("." if held_out is None else f", and by {held_out:.4f} deg on those left out.")
-    )
-    if found.at_bounds:
-        say(
-            f"at the bound of plausible values: {', '.join(shown['at_bounds'])}. Drives or label "
-            "contradict the model there: do not use it as the car's value."
-        )
-    if found.not_identifiable:
-        say(f"not identifiable from these drives: {', '.join(shown['not_identifiable'])}.")
-    if output is not None:
-        say(f"written to {output}: a vehicle file, as in configs/vehicles.")
-    if campaign is not None:
-        say(f"written to {campaign}. Train with it: fleet-slip publish NAME --prior {campaign}")
+            if not json:
+                say(f"written to {file}{then}")
 
 
 # Commands that show: report, watch, explore.
@@ -318,13 +255,7 @@ def report(written: "Written") -> None:
     )
 
 
-@command(
-    Fleet.watch,
-    arguments=["what", "model"],
-    without=["json"],
-    from_s="--from",
-    until_s="--until",
-)
+@command(Fleet.watch, arguments=["what", "model"], without=["json"])
 def watch(file: Path) -> None:
     """Show a drive: the car on its track, its true and its estimated angle, wheels and gates.
 

@@ -29,8 +29,14 @@ DETAILS: dict[str, dict[str, Any]] = {
 }
 """What options need on the command line beside what is said of them in the API."""
 
-NAMES = {"condition": "--cohort", "everything": "--all"}
-"""Parameters that every command calls otherwise than the API."""
+NAMES = {
+    "condition": "--cohort",
+    "everything": "--all",
+    "front_drive_share": "--front-drive",
+    "rolling_radius_m": "--radius",
+}
+"""Parameters that every command calls otherwise than the API; units are in the help of an option,
+not in its name."""
 
 READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "bias": (list[str] | None, lambda values: quantities(values, "--bias")),
@@ -57,6 +63,7 @@ RESAMPLING = ("repeat", "bootstrap")
 """Options that tell more of a winner and choose none."""
 
 _NAMED = re.compile("`([a-z_]+)`")
+_UNIT = re.compile("_(kg|m|s)$")
 
 
 def command(
@@ -85,7 +92,7 @@ def command(
     asked = {
         name: one
         for call in calls
-        for name, one in inspect.signature(call).parameters.items()
+        for name, one in _parameters_of(call).items()
         if name not in without
     }
     given = {
@@ -132,7 +139,7 @@ def command(
                 with _doing(fleet, asked, typed, *progress) as working:
                     answer = fleet
                     for call in calls:
-                        taken = inspect.signature(call).parameters.keys()
+                        taken = _parameters_of(call)
                         options = {**values, **working}
                         answer = getattr(answer, call.__name__)(
                             **{name: one for name, one in options.items() if name in taken}
@@ -173,6 +180,17 @@ def _doing(
         yield found
 
 
+def _parameters_of(call: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """Return what a call takes by name; instead of `**` the keys of its `TypedDict`."""
+    found = dict(inspect.signature(call).parameters)
+    for name, one in [*found.items()]:
+        if one.kind is inspect.Parameter.VAR_KEYWORD:
+            del found[name]
+            [keys] = get_args(one.annotation)  # of `Unpack`
+            found |= {key: _plain(key, kind) for key, kind in keys.__annotations__.items()}
+    return found
+
+
 def _parameter(one: inspect.Parameter, argument: bool, name: str | None) -> inspect.Parameter:
     """Return a parameter of the API as the command line has it."""
     text = _NAMED.sub(lambda found: "--" + found[1].replace("_", "-"), doc_of(one.annotation) or "")
@@ -184,8 +202,7 @@ def _parameter(one: inspect.Parameter, argument: bool, name: str | None) -> insp
             details["metavar"] = "MODEL"
         said: Any = typer.Argument(**details)
     else:
-        alone = (f"--{one.name.replace('_', '-')}",) if one.default is False else ()
-        said = typer.Option(*((name,) if name else alone), **details)
+        said = typer.Option(name or f"--{_UNIT.sub('', one.name).replace('_', '-')}", **details)
     kind = READ[one.name][0] if one.name in READ else type_of(one.annotation)
     left_out = one.default is inspect.Parameter.empty and type(None) in get_args(kind)
     default = None if left_out or one.default == () else one.default

@@ -8,7 +8,7 @@ filter, which errs least then on the drives' labels. As a vehicle file the car s
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial, reduce
@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat, ValidationError
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.base import sha256_of
+from fleet_slip.base import number_of, sha256_of
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, faults_of
 from fleet_slip.errors import DataError, UsageError
@@ -30,6 +30,7 @@ from fleet_slip.evaluation.single_track import (
     LabelledDrive,
     measured_speed_mps,
 )
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters
 
 # Finds the parameters of an estimator that suit training drives best, so that rivals are fair.
@@ -402,16 +403,17 @@ class Measured(Config):
         return VehicleParameters.model_validate(content)
 
 
-def measured_car(name: str, measured: Mapping[str, float]) -> Measured:
+def measured_car(name: str, measured: Mapping[str, object]) -> Measured:
     """Return what was measured of a car. Raises `UsageError` for what no car can have."""
+    known = {what: value for what, value in measured.items() if value is not None}
     try:
-        return Measured.model_validate({"name": name, **measured})
+        return Measured.model_validate({"name": name, **known})
     except ValidationError as error:
         raise UsageError(f"what was measured of the car: {faults_of(error)}.") from None
 
 
 @dataclass(frozen=True)
-class Identified:
+class Identified(Answer):
     """A car, the noise of the filter in it, and how far it errs, in rad.
 
     Attributes:
@@ -430,6 +432,26 @@ class Identified:
     drives: int = 0
     at_bounds: tuple[str, ...] = ()
     not_identifiable: tuple[str, ...] = ()
+
+    def parts(self) -> Iterator[Part]:
+        """Return what was found, how far the filter errs, and what the drives do not tell."""
+        said = self.as_dict()
+        title = f"{self.car.name}, identified from {number_of(self.drives, 'drive')}"
+        values = ((what.replace("_", " "), value) for what, value in said["found"].items())
+        yield TextTable(title, "what|value", values, "{0}|{1:.4g}")
+        left_out = said["held_out_deg"]
+        yield Remark(
+            f"the extended Kalman filter in it errs by {said['fit_deg']:.4f} deg on these drives"
+            + ("." if left_out is None else f", and by {left_out:.4f} deg on those left out.")
+        )
+        if self.at_bounds:
+            yield Remark(
+                f"at the bound of plausible values: {', '.join(said['at_bounds'])}. Drives or "
+                "label contradict the model there: do not use it as the car's value."
+            )
+        if self.not_identifiable:
+            names = ", ".join(said["not_identifiable"])
+            yield Remark(f"not identifiable from these drives: {names}.")
 
     def estimate(self, signals: DriveSignals) -> FloatArray:
         """Return what the filter in the car estimates of a drive."""
