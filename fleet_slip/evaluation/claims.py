@@ -76,7 +76,7 @@ class Facts:
             raise NotEvaluatedError("nominal drive")
         rows = [
             row
-            for row in self._evaluated.comparisons
+            for row in self._evaluated.document.content["comparisons"]
             if scenarios[row["scenario"]]["vehicle_model"] != scenarios["nominal"]["vehicle_model"]
         ]
         if not rows:

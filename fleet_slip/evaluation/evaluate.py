@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib.metadata import version as package_version
 from itertools import pairwise
 from typing import Any
@@ -18,6 +18,7 @@ from fleet_slip.evaluation.drives import (
     simulate_drives,
 )
 from fleet_slip.evaluation.filters import (
+    Bank,
     FilterEstimate,
     TrainedModels,
     TuningDrives,
@@ -40,37 +41,21 @@ from fleet_slip.storage.documents import Document, DocumentFolder, checksum
 from fleet_slip.warehouse.tables import Warehouse
 
 
-@dataclass(frozen=True)
-class Competitors:
-    """All estimators that compete, by name, and what a document says of each."""
-
-    one_car: TrainedModels
-    fleets: tuple[TrainedModels, ...]
-    estimators: Mapping[str, Estimate]
-    descriptions: Mapping[str, Mapping[str, Any]]
-
-
 def train_competitors(
     warehouse: Warehouse,
     one_car: ModelVersion,
     fleets: Sequence[ModelVersion],
     executor: Executor,
-) -> Competitors:
+) -> tuple[list[TrainedModels], Bank]:
     """Fit and tune all that compete; filters get the one-car model's drives."""
-    first, *others = (train_models(warehouse, version) for version in (one_car, *fleets))
-    estimators: dict[str, Estimate] = {}
-    descriptions: dict[str, Mapping[str, Any]] = {}
-    for trained in (first, *others):
-        estimators |= trained.estimators()
-        descriptions |= trained.descriptions()
+    trained = [train_models(warehouse, version) for version in (one_car, *fleets)]
+    bank: Bank = {}
+    for one in trained:
+        bank |= one.bank()
     weighed = "mass_kg" in Predictor.of(one_car.manifest).plan.facts
-    drives = TuningDrives.of(warehouse, first.selection.cohort, weighed=weighed)
-    bank = filter_bank(drives, load_scenario("nominal").car, executor, weighed=weighed)
-    return Competitors(
-        first,
-        tuple(others),
-        estimators | {name: one for name, (one, _) in bank.items()},
-        descriptions | {name: about for name, (_, about) in bank.items()},
+    drives = TuningDrives.of(warehouse, trained[0].selection.cohort, weighed=weighed)
+    return trained, bank | filter_bank(
+        drives, load_scenario("nominal").car, executor, weighed=weighed
     )
 
 
@@ -85,26 +70,26 @@ def evaluate(
 
     Returns the evaluation's document: of logs, models and program alone.
     """
-    trained = train_competitors(warehouse, one_car, fleets, executor)
-    about, first = trained.descriptions, trained.one_car
-    runs = [evaluate_drive(one, trained.estimators) for one in simulate_drives(scenarios)]
-    gps = {name for name, one in about.items() if one.get("gps")}
-    filters = {name: trained.estimators[name] for name in about if name in gps}
-    cohort = first.selection.cohort
+    (first, *others), bank = train_competitors(warehouse, one_car, fleets, executor)
+    estimators = {name: one for name, (one, _) in bank.items()}
+    runs = [evaluate_drive(one, estimators) for one in simulate_drives(scenarios)]
+    gps = {name for name, (_, about) in bank.items() if about.get("gps")}
+    filters = {name: estimators[name] for name in bank if name in gps}
+    own = [*first.table_one.values(), first.version.reference]
     return {
         "format": 1,
         "package_version": package_version("fleet-slip"),
-        "estimators": {name: dict(one) for name, one in about.items()},
+        "estimators": {name: about for name, (_, about) in bank.items()},
         "scenarios": [_run(one) for one in runs],
-        "logs_version": cohort.logs_version,
-        "grams_version": cohort.grams_version,
+        "logs_version": first.selection.cohort.logs_version,
+        "grams_version": first.selection.cohort.grams_version,
         "comparisons": [
             row
-            for fleet in trained.fleets
+            for fleet in others
             for row in compare_models(runs, first.table_one, fleet.table_one)
         ],
         "ranking": rank(runs, first.version.reference, gps),
-        "gps_noise": sweep_gps_noise(runs, filters, list(first.estimators())),
+        "gps_noise": sweep_gps_noise(runs, filters, own),
     }
 
 
@@ -115,13 +100,13 @@ def evaluate_blindly(
     executor: Executor,
 ) -> dict[str, Any]:
     """Evaluate the same on drives that follow from the model's hash; nothing is written."""
-    trained = train_competitors(warehouse, model, others, executor)
+    _, bank = train_competitors(warehouse, model, others, executor)
     return {
         "format": 1,
         "package_version": package_version("fleet-slip"),
         "model": model.reference,
-        "estimators": {name: dict(one) for name, one in trained.descriptions.items()},
-        "drives": judge_blindly(model.sha256, trained.estimators),
+        "estimators": {name: about for name, (_, about) in bank.items()},
+        "drives": judge_blindly(model.sha256, {name: one for name, (one, _) in bank.items()}),
     }
 
 

@@ -8,7 +8,6 @@ The tuned ones have the parameters that suit drives which the regression was tra
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -48,6 +47,9 @@ from fleet_slip.warehouse.tables import Warehouse
 TABLE_ONE = "table1"
 """The model list with the paper's five sets of signals."""
 
+Bank = dict[str, tuple[Estimate, dict[str, Any]]]
+"""Estimators by name, and what a document says of each."""
+
 
 @dataclass(frozen=True)
 class LinearEstimate:
@@ -68,10 +70,6 @@ class LinearEstimate:
         total: FloatArray = np.sum(terms, axis=0) + self.intercept
         return total
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs to compute the same estimates."""
-        return {"intercept": self.intercept, "coefficients": dict(self.coefficients)}
-
 
 @dataclass(frozen=True)
 class PublishedEstimate:
@@ -81,14 +79,13 @@ class PublishedEstimate:
     `facts` are what the car knows of itself.
     """
 
-    manifest: Manifest
     predictor: Predictor
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(cls, manifest: Manifest) -> "PublishedEstimate":
         """Return the estimator that a manifest publishes. Raises `RefusedError` as `Predictor`."""
-        return cls(manifest, Predictor.of(manifest))
+        return cls(Predictor.of(manifest))
 
     def in_drive(self, drive: EvaluatedDrive) -> "PublishedEstimate":
         """Return the estimator in the car of a drive, which knows its facts."""
@@ -97,20 +94,6 @@ class PublishedEstimate:
     def __call__(self, signals: Signals) -> FloatArray:
         """Return the estimate at each tick; there is one row for every tick."""
         return self.predictor(as_counts(signals, self.predictor.plan.signals, self.facts))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs to compute the same estimates."""
-        return {
-            "intercept": self.manifest.intercept,
-            "coefficients": {term.column: term.coefficient for term in self.manifest.terms},
-            "columns": {
-                term.signal: term.definition.model_dump(mode="json")
-                if term.definition
-                else term.sql
-                for term in self.manifest.terms
-                if not term.logged
-            },
-        }
 
 
 @dataclass(frozen=True)
@@ -125,42 +108,46 @@ class TrainedModels:
         """Return the estimator's name of each model of Table I that the cohort can serve."""
         return {one.name: f"{self.version.reference}/{one.name}" for one in self.selection.models}
 
-    def estimators(self) -> dict[str, LinearEstimate | PublishedEstimate]:
-        """Return the models of Table I, then the published one, by name."""
-        models = zip(self.table_one.values(), self.selection.models, strict=True)
-        fitted = {name: LinearEstimate.of(one.model) for name, one in models}
-        return {**fitted, self.version.reference: PublishedEstimate.of(self.version.manifest)}
-
-    def descriptions(self) -> dict[str, dict[str, Any]]:
-        """Return what a JSON document says of each estimator."""
-        estimators = self.estimators()
+    def bank(self) -> Bank:
+        """Return the models of Table I, then the published one."""
+        version, manifest = self.version, self.version.manifest
         trained = {
             "kind": "regression",
-            "group": self.version.reference,
+            "group": version.reference,
             "cohort": self.selection.cohort.condition.text,
             "drives": self.selection.cohort.drives.num_rows,
             "rows": self.selection.cohort.rows,
         }
-        fitted = {
-            self.table_one[model.name]: {
+        bank: Bank = {}
+        for name, model in zip(self.table_one.values(), self.selection.models, strict=True):
+            fitted = LinearEstimate.of(model.model)
+            about = {
                 **trained,
                 "table_one": model.name,
                 "signals": list(model.signals),
                 "cross_validated": model.pooled.as_dict(),
-                **estimators[self.table_one[model.name]].as_dict(),
+                "intercept": fitted.intercept,
+                "coefficients": dict(fitted.coefficients),
             }
-            for model in self.selection.models
-        }
-        manifest, reference = self.version.manifest, self.version.reference
-        published = {
+            bank[name] = fitted, about
+        about = {
             **trained,
-            "published": reference,
-            "sha256": self.version.sha256,
+            "published": version.reference,
+            "sha256": version.sha256,
             "signals": list(manifest.signals),
             "cross_validated": manifest.cross_validation.model_dump(mode="json"),
-            **estimators[reference].as_dict(),
+            "intercept": manifest.intercept,
+            "coefficients": {term.column: term.coefficient for term in manifest.terms},
+            "columns": {
+                term.signal: term.definition.model_dump(mode="json")
+                if term.definition
+                else term.sql
+                for term in manifest.terms
+                if not term.logged
+            },
         }
-        return {**fitted, reference: published}
+        bank[version.reference] = PublishedEstimate.of(manifest), about
+        return bank
 
 
 def train_models(warehouse: Warehouse, version: ModelVersion) -> TrainedModels:
@@ -273,10 +260,6 @@ def rebuild(name: str, about: Mapping[str, Any], car: VehicleParameters) -> Filt
     return FilterEstimate(one, parameters, car, about.get("weighed", False))
 
 
-Bank = dict[str, tuple[Estimate, dict[str, Any]]]
-"""Estimators by name, and what a document says of each."""
-
-
 def filter_bank(
     drives: "TuningDrives", car: VehicleParameters, executor: Executor, *, weighed: bool = False
 ) -> Bank:
@@ -291,12 +274,7 @@ def filter_bank(
         bank[IDENTIFIED_NAME] = identified, identified.description()
     before: dict[str, Config] = {}
     for one in FILTERS:
-        found = drives.kept_or_found(
-            one.module,
-            _key(one, drives, car),
-            partial(_tuned, one, drives, car, executor),
-            f"{one.name} left untuned",
-        )
+        found = _kept_or_tuned(one, drives, car, executor)
         if found:
             before[one.module] = type(one.parameters).model_validate(found["parameters"])
         plain = FilterEstimate(one, one.parameters, car, weighed)
@@ -307,9 +285,10 @@ def filter_bank(
     return bank
 
 
-def _key(one: Filter, drives: "TuningDrives", car: VehicleParameters) -> dict[str, Any]:
-    """Return what tuned parameters depend on."""
-    return {
+def _kept_or_tuned(
+    one: Filter, drives: "TuningDrives", car: VehicleParameters, executor: Executor
+) -> Mapping[str, Any] | None:
+    key = {
         "for_lowest": "rmse_deg",
         "starts": [start.model_dump(mode="json") for start in (one.parameters, *one.other_starts)],
         "tunable": list(one.tunable),
@@ -318,17 +297,16 @@ def _key(one: Filter, drives: "TuningDrives", car: VehicleParameters) -> dict[st
         "program": checksum_of_sources(),
     }
 
+    def find() -> dict[str, Any]:
+        LOGGER.info("tuning %s on %s, once", one.name, number_of(len(drives.names), "drive"))
+        best = one.tune(drives.read(), car, executor)
+        return {
+            "parameters": best.parameters.model_dump(mode="json"),
+            "rmse_deg": float(np.degrees(best.rmse_rad)),
+            "evaluations": best.evaluations,
+        }
 
-def _tuned(
-    one: Filter, drives: "TuningDrives", car: VehicleParameters, executor: Executor
-) -> dict[str, Any]:
-    LOGGER.info("tuning %s on %s, once", one.name, number_of(len(drives.names), "drive"))
-    best = one.tune(drives.read(), car, executor)
-    return {
-        "parameters": best.parameters.model_dump(mode="json"),
-        "rmse_deg": float(np.degrees(best.rmse_rad)),
-        "evaluations": best.evaluations,
-    }
+    return drives.kept_or_found(one.module, key, find, f"{one.name} left untuned")
 
 
 # The extended Kalman filter in a car that was identified from the drives a model learned from, as a

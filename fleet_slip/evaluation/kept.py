@@ -70,12 +70,6 @@ class Evaluated:
         """What the document says of each scenario, by name, in its order."""
         return {one["name"]: one for one in self.document.content["scenarios"]}
 
-    @property
-    def comparisons(self) -> Sequence[Mapping[str, Any]]:
-        """How the models of other cohorts compare with those of its own."""
-        rows: Sequence[Mapping[str, Any]] = self.document.content["comparisons"]
-        return rows
-
     @cached_property
     def models(self) -> Mapping[str, str]:
         """The estimator's name of each model of Table I that the cohort could serve."""
@@ -106,10 +100,10 @@ class Evaluated:
 
     def require_models(self, trained: TrainedModels) -> None:
         """Raise `DataError` if today's data make others of the models of Table I."""
-        now = {name: model.as_dict() for name, model in trained.estimators().items()}
+        now = {name: about for name, (_, about) in trained.bank().items()}
         for name in self.models.values():
-            kept = self.estimators[name]
-            if name not in now or now[name] != {key: kept.get(key) for key in now[name]}:
+            kept, made = self.estimators[name], now.get(name, {})
+            if any(kept.get(key) != made.get(key) for key in ("intercept", "coefficients")):
                 raise self._changed(f"the cohort of {self.group}")
 
     def require_figures(self, runs: Mapping[str, EvaluatedScenario]) -> None:

@@ -131,14 +131,12 @@ class Learner:
     """A model that is learned anew from what is left in, by its own recipe.
 
     Attributes:
-        name: of the model.
         asked: its recipe.
         cohort: the Gram rows of all drives.
         drives: their rows as logged, with the label.
         warehouse: what tells the intercept of a model that changes taught.
     """
 
-    name: str
     asked: SelectionPlan
     cohort: Cohort
     drives: Sequence[HeldOutDrive]
@@ -148,7 +146,6 @@ class Learner:
     def of(
         cls,
         warehouse: Warehouse,
-        name: str,
         request: SelectionRequest,
         condition: str,
         trained_on: str,
@@ -162,7 +159,7 @@ class Learner:
         asked = SelectionPlan.of(replace(request, bootstrap=None))
         mixed = asked.request.label == BOTH
         cohort = asked.load(warehouse, trained_on if mixed else condition)
-        return cls(name, asked, cohort, drives, warehouse)
+        return cls(asked, cohort, drives, warehouse)
 
     @cached_property
     def divided(self) -> Cohort:

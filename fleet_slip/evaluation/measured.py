@@ -196,7 +196,7 @@ class Competition:
             else:
                 recipes[name], told[name] = recipe_of(version), CHOSEN
         learners = {
-            name: Learner.of(warehouse, name, request, condition, own, drives)
+            name: Learner.of(warehouse, request, condition, own, drives)
             for name, (request, own) in recipes.items()
         }
         numbered = any(one.plan.numbers for one in published.values()) or any(

@@ -215,7 +215,7 @@ def _provenance(data: ReportData) -> list[tuple[str, str]]:
 def _commands(data: ReportData) -> list[str]:
     reference, drives = data.version.reference, data.trained.selection.cohort.drives
     pairs = zip(drives["source"].to_pylist(), drives["campaign"].to_pylist(), strict=True)
-    rows = data.evaluated.comparisons
+    rows = data.evaluated.document.content["comparisons"]
     fleets = dict.fromkeys(row["fleet"].rpartition("/")[0] for row in rows)
     measured = f"fleet-slip learn {data.version.manifest.name} LOGS --mapping"
     return [

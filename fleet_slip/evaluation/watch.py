@@ -250,32 +250,29 @@ def _others(
     return places
 
 
-def gates_of(manifest: Manifest) -> dict[str, tuple[Definition, list[int]]]:
-    """Return what opens each gate of a model, and its knots in counts, by what it looks back on."""
-    knots: dict[str, tuple[Definition, set[int]]] = {}
-    for term in manifest.terms:
-        gate = term.definition.gate if term.definition else None
-        if gate is not None:
-            name = f"{gate.by.of} over {gate.by.ticks} ticks"
-            known = knots.setdefault(name, (gate.by, set()))[1]
-            known.update(count for count in (gate.low, gate.peak, gate.high) if count is not None)
-    return {name: (by, sorted(counts)) for name, (by, counts) in knots.items()}
-
-
 def gates_on(
     manifest: Manifest, signals: Mapping[str, FloatArray], facts: Mapping[str, Any]
 ) -> Mapping[str, FloatArray]:
     """Return by gate how far it is open at each tick, shape (ticks,): 0 at the first knot, 1 at
     the last, and equally far from knot to knot."""
-    gates = gates_of(manifest)
+    gates: dict[str, tuple[Definition, set[int]]] = {}
+    for term in manifest.terms:
+        gate = term.definition.gate if term.definition else None
+        if gate is not None:
+            _, knots = gates.setdefault(
+                f"{gate.by.of} over {gate.by.ticks} ticks", (gate.by, set())
+            )
+            knots.update(count for count in (gate.low, gate.peak, gate.high) if count is not None)
     if not gates:
         return {}
-    names = tuple(f"gate_{number}" for number in range(len(gates)))
-    bys = [by for by, _ in gates.values()]
-    plan = ColumnPlan.of(names, {}, dict(zip(names, bys, strict=True)))
+    plan = ColumnPlan.of(
+        tuple(f"gate_{number}" for number in range(len(gates))),
+        {},
+        {f"gate_{number}": by for number, (by, _) in enumerate(gates.values())},
+    )
     columns = DriveColumns(plan, as_counts(signals, plan.signals, facts)).compute()
     return {
-        name: np.interp(column, knots, np.linspace(0, 1, len(knots)))
+        name: np.interp(column, sorted(knots), np.linspace(0, 1, len(knots)))
         for (name, (_, knots)), column in zip(gates.items(), columns, strict=True)
     }
 
