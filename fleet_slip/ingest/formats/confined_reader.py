@@ -2,7 +2,7 @@
 
 A server, started once, imports what formats need and forks one reader for each file. A reader
 confines itself, opens the file, and answers what it is asked: lines of JSON on a socket. An answer
-is two sizes and JSON; rows are an Arrow stream in memory of both processes.
+is two sizes, JSON, and rows as an Arrow stream.
 
 A reader keeps that file, a folder for its temporary files, and the installed code, of which
 libraries import parts late. It cannot connect, start programs or processes, or signal others. Where
@@ -13,6 +13,7 @@ import contextlib
 import ctypes
 import errno
 import importlib
+import io
 import json
 import os
 import pickle
@@ -29,7 +30,7 @@ from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import polars as pl
 
@@ -88,7 +89,7 @@ def serve(control: int) -> None:
     own = os.getpid()
     with socket.socket(fileno=control) as asking:
         while True:
-            name, given, *_ = socket.recv_fds(asking, 100, 2)
+            name, given, *_ = socket.recv_fds(asking, 100, 1)
             if not given:
                 return
             _, module, packages = FORMATS[name.decode()]
@@ -100,15 +101,11 @@ def serve(control: int) -> None:
             if not reader:
                 asking.close()
                 try:
-                    with (
-                        socket.socket(fileno=given[0]) as channel,
-                        os.fdopen(given[1], "wb") as rows,
-                    ):
-                        _Reader(channel, rows).serve(own)
+                    with socket.socket(fileno=given[0]) as channel:
+                        _Reader(channel).serve(own)
                 finally:
                     os._exit(0)
-            for one in given:
-                os.close(one)
+            os.close(given[0])
             handle = os.pidfd_open(reader)
             socket.send_fds(asking, [b"."], [handle])
             os.close(handle)
@@ -117,8 +114,8 @@ def serve(control: int) -> None:
 class _Reader:
     """An open file, who asks for what is in it, and what of it is being read."""
 
-    def __init__(self, channel: socket.socket, rows: BinaryIO) -> None:
-        self._channel, self._rows = channel, rows
+    def __init__(self, channel: socket.socket) -> None:
+        self._channel = channel
         self._source: Source
         self._bases: list[Base] = []
         self._batches: list[Iterator[pl.DataFrame]] = []
@@ -165,12 +162,11 @@ class _Reader:
         return True
 
     def _send(self, answer: Any, frame: pl.DataFrame | None = None) -> None:
-        self._rows.seek(0)
+        line, rows = json.dumps(answer).encode(), io.BytesIO()
         if frame is not None:
-            frame.write_ipc_stream(self._rows, compat_level=pl.CompatLevel.oldest())
-            self._rows.flush()
-        line = json.dumps(answer).encode()
-        self._channel.sendall(SIZES.pack(len(line), self._rows.tell()) + line)
+            frame.write_ipc_stream(rows, compat_level=pl.CompatLevel.oldest())
+        self._channel.sendall(SIZES.pack(len(line), rows.tell()) + line)
+        self._channel.sendall(rows.getbuffer())
 
     def channels(self) -> list[tuple[str, ...]]:
         """Return all that can be read."""

@@ -223,7 +223,7 @@ def _end(process: "subprocess.Popen[bytes]", control: socket.socket) -> None:
     process.wait()
 
 
-def _fork_reader(name: str, rows: int, budget: Budget) -> tuple[socket.socket, int]:
+def _fork_reader(name: str, budget: Budget) -> tuple[socket.socket, int]:
     """Return what a reader is asked through, and a handle by which it is ended."""
     ours, theirs = socket.socketpair()
     handles: list[int] = []
@@ -231,7 +231,7 @@ def _fork_reader(name: str, rows: int, budget: Budget) -> tuple[socket.socket, i
         for _ in range(2):  # the server may have ended since the last file: then another forks
             process, control = _server(os.getpid())
             with suppress(OSError):
-                socket.send_fds(control, [name.encode()], [theirs.fileno(), rows])
+                socket.send_fds(control, [name.encode()], [theirs.fileno()])
                 _, handles, *_ = socket.recv_fds(control, 1, 1)
             if handles:
                 break
@@ -246,9 +246,9 @@ def _fork_reader(name: str, rows: int, budget: Budget) -> tuple[socket.socket, i
 class ConfinedSource(Source):
     """A file that another process reads. It is trusted with nothing: its answers are checked."""
 
-    def __init__(self, channel: socket.socket, rows: int, budget: Budget) -> None:
-        """Take what a reader is asked through, where it puts rows, and what these may become."""
-        self._channel, self._rows, self._budget = channel, rows, budget
+    def __init__(self, channel: socket.socket, budget: Budget) -> None:
+        """Take what a reader is asked through, and what its answers may become."""
+        self._channel, self._budget = channel, budget
         self.has_clock = bool(self._receive()[0])
 
     def channels(self) -> list[Channel]:
@@ -280,13 +280,13 @@ class ConfinedSource(Source):
                 raise self._budget.crashed() from None
             yield frame
 
-    def _ask(self, *question: Any) -> tuple[Any, pa.Buffer]:
+    def _ask(self, *question: Any) -> tuple[Any, bytearray]:
         """Return what the reader answers, and rows. Raises `InputError`."""
         with suppress(OSError):  # then nothing comes back
             self._channel.sendall(json.dumps(question).encode() + b"\n")
         return self._receive()
 
-    def _receive(self) -> tuple[Any, pa.Buffer]:
+    def _receive(self) -> tuple[Any, bytearray]:
         """Return what the reader says, and rows."""
         until_s = time.monotonic() + self._budget.seconds
         text, size = SIZES.unpack(self._take(SIZES.size, until_s))
@@ -296,11 +296,7 @@ class ConfinedSource(Source):
             said = json.loads(self._take(text, until_s))
         except (ValueError, RecursionError):
             raise self._budget.crashed() from None
-        # Not the memory itself, which the reader could still change.
-        rows = pa.allocate_buffer(size)
-        if size and os.preadv(self._rows, [memoryview(rows)], 0) != size:
-            raise self._budget.crashed()
-        return self._found(said), rows
+        return self._found(said), self._take(size, until_s)
 
     def _found(self, said: Any) -> Any:
         if not isinstance(said, dict) or not {"found", "error"} & said.keys():
@@ -313,7 +309,7 @@ class ConfinedSource(Source):
         is_ours = isinstance(kind, type) and issubclass(kind, FleetSlipError)
         raise (kind if is_ours else InputError)(str(said.get("text")))
 
-    def _take(self, size: int, until_s: float) -> bytes:
+    def _take(self, size: int, until_s: float) -> bytearray:
         """Receive so many bytes. Raises `InputError` if they do not come in time."""
         taken = bytearray(size)
         left = memoryview(taken)
@@ -328,26 +324,24 @@ class ConfinedSource(Source):
             if not came:
                 raise self._budget.crashed()
             left = left[came:]
-        return bytes(taken)
+        return taken
 
 
 @contextmanager
 def open_confined(name: str, bus: CanBus | None, budget: Budget) -> Iterator[Source]:
     """Open a file of a format for reading by another process. Raises `InputError`."""
     with TemporaryDirectory(prefix="fleet-slip-", ignore_cleanup_errors=True) as folder:
-        rows = os.memfd_create("rows")
-        with os.fdopen(rows, "rb"):
-            channel, handle = _fork_reader(name, rows, budget)
-            try:
-                job = Job(
-                    *(name, os.fspath(budget.file), budget.size, bus, str(Path.cwd()), folder),
-                    limits=(budget.memory, budget.unfolded, int(10 * budget.seconds) + 1),
-                )
-                channel.sendall(pickle.dumps(job))
-                yield ConfinedSource(channel, rows, budget)
-            finally:
-                with suppress(ProcessLookupError):
-                    signal.pidfd_send_signal(handle, signal.SIGKILL)
-                select.select([handle], [], [])  # until it is gone, and its locks
-                os.close(handle)
-                channel.close()
+        channel, handle = _fork_reader(name, budget)
+        try:
+            job = Job(
+                *(name, os.fspath(budget.file), budget.size, bus, str(Path.cwd()), folder),
+                limits=(budget.memory, budget.unfolded, int(10 * budget.seconds) + 1),
+            )
+            channel.sendall(pickle.dumps(job))
+            yield ConfinedSource(channel, budget)
+        finally:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(handle, signal.SIGKILL)
+            select.select([handle], [], [])  # until it is gone, and its locks
+            os.close(handle)
+            channel.close()
