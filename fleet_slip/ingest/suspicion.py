@@ -39,15 +39,12 @@ def moving(speed: FloatArray | None) -> BoolArray:
 
 
 def slope_of(values: FloatArray, expected: FloatArray, rows: BoolArray) -> tuple[float, float]:
-    """Return values over expected, by least squares about their means, and their correlation."""
-    rows = rows & np.isfinite(values) & np.isfinite(expected)
-    if rows.sum() < FEWEST_TICKS:
-        return 1.0, 0.0
-    y, x = values[rows] - values[rows].mean(), expected[rows] - expected[rows].mean()
-    xx, yy, xy = x @ x, y @ y, x @ y
-    if not xx > 0 or not yy > 0:
-        return 1.0, 0.0
-    return float(xy / xx), float(xy / np.sqrt(xx * yy))
+    """Return values over expected, by least squares about their means, and their correlation.
+
+    Both are 0 where there is too little to judge.
+    """
+    (slope,), _, explained = fit(values, expected[None], rows)
+    return float(slope), math.copysign(math.sqrt(max(explained, 0.0)), slope)
 
 
 def fit(y: FloatArray, inputs: FloatArray, rows: BoolArray) -> tuple[FloatArray, float, float]:
@@ -85,7 +82,7 @@ def _course(signals: "Signals") -> Iterator[Fault]:
     course, turned = signals["course"], np.cumsum(signals["yaw_rate"]) * float(SAMPLE_TIME_S)
     change, heading = _wrapped(course[SECOND:] - course[:-SECOND]), turned[SECOND:]
     slope, correlation = slope_of(change, heading - turned[:-SECOND], np.isfinite(change))
-    if (slope, correlation) != (1.0, 0.0):  # else it is too little to judge
+    if correlation:
         figure = f"over a second it changes by {slope:+.2f} times what the yaw rate adds up to"
         if correlation < -LEAST_CORRELATION:
             remedy = "Turn clockwise_from_north, or swap north and east."

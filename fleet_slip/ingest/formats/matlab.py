@@ -6,7 +6,7 @@ A column is the path of a vector, `Data.Vehicle.yawRate`, or one column of a mat
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -38,17 +38,29 @@ WINDOW_ROWS = 2**15
 Array = np.ndarray[Any, Any]
 
 
-class Matrix(Protocol):
-    """A matrix in a file."""
+class Matrix:
+    """An array of HDF5, which has the axes of MATLAB in reverse; those of length 1 are left out."""
+
+    unit = ""
+    """Neither MATLAB nor HDF5 knows one."""
+
+    def __init__(self, values: Any) -> None:
+        """Take what numpy or h5py give for it."""
+        self._values = values
+        self.shape = tuple(size for size in reversed(values.shape) if size != 1)
 
     @property
-    def shape(self) -> tuple[int, ...]:
-        """Length of its axes."""
-        ...
+    def size(self) -> tuple[int, int]:
+        """Rows and columns; what has more axes has no rows of one value."""
+        if len(self.shape) == 1:
+            return self.shape[0], 1
+        return (self.shape[0], self.shape[1]) if len(self.shape) == 2 else (0, 0)
 
     def read(self, column: int, start: int, end: int) -> Array:
         """Return some rows of a column."""
-        ...
+        wanted = iter([column, slice(start, end)][-len(self.shape) :])
+        places = tuple(0 if size == 1 else next(wanted) for size in self._values.shape)
+        return np.asarray(self._values[places])
 
 
 class Vectors(FormatSource):
@@ -66,18 +78,17 @@ class Vectors(FormatSource):
         """Return all vectors, and the columns of matrices."""
         found = []
         for path, matrix in self._matrices.items():
-            rows, columns = _rows_columns(matrix)
+            rows, columns = matrix.size
             names = [path] if columns == 1 else [f"{path}(:,{i + 1})" for i in range(columns)]
             if rows > 1 and columns <= _MOST_COLUMNS:
-                unit = getattr(matrix, "unit", "")  # MATLAB knows none
-                found += [Channel(name, unit, f"{rows} rows") for name in names]
+                found += [Channel(name, matrix.unit, f"{rows} rows") for name in names]
         return found
 
     def find(self, column: str) -> tuple[str, tuple[Matrix, int]]:
         """Return a matrix, and which of its columns is meant. Raises `InputError`."""
         whole = self._matrices.get(column)
         if whole is not None:
-            if _rows_columns(whole)[1] != 1:
+            if whole.size[1] != 1:
                 axes = " x ".join(map(str, whole.shape)) or "1"
                 raise InputError(
                     f"{shown(self._file)}: channel {column!r} has {axes} values, not one a row. "
@@ -86,7 +97,7 @@ class Vectors(FormatSource):
             return "", (whole, 0)
         found = _COLUMN.fullmatch(column)
         matrix = self._matrices.get(found[1]) if found else None
-        if found and matrix and 1 <= int(found[2]) <= _rows_columns(matrix)[1]:
+        if found and matrix and 1 <= int(found[2]) <= matrix.size[1]:
             return "", (matrix, int(found[2]) - 1)
         for path, why in self._refused.items():
             if f"{column}.".startswith(f"{path}."):
@@ -95,13 +106,13 @@ class Vectors(FormatSource):
 
     def count(self, _base: str, found: dict[str, tuple[Matrix, int]]) -> int:
         """Return how many rows the first of some columns has."""
-        return next(_rows_columns(matrix)[0] for matrix, _ in found.values())
+        return next(matrix.size[0] for matrix, _ in found.values())
 
     def read(self, base: str, found: dict[str, tuple[Matrix, int]]) -> Iterator[pl.DataFrame]:
         """Yield all rows, some at once. Raises `InputError` if columns differ in length."""
         rows, first = self.count(base, found), next(iter(found))
         for name, (matrix, _) in found.items():
-            if (length := _rows_columns(matrix)[0]) != rows:
+            if (length := matrix.size[0]) != rows:
                 raise InputError(
                     f"{shown(self._file)}: {name!r} has {length:,} values and {first!r} has "
                     f'{rows:,}. Give the signal the time that goes with it: time = "…".'
@@ -114,28 +125,6 @@ class Vectors(FormatSource):
             )
 
 
-class _Stored:
-    """An array of HDF5, which has the axes of MATLAB in reverse; those of length 1 are left out."""
-
-    def __init__(self, values: Any) -> None:
-        self._values = values
-        self.shape = tuple(size for size in reversed(values.shape) if size != 1)
-
-    def read(self, column: int, start: int, end: int) -> Array:
-        """Return some rows of a column."""
-        wanted = iter([column, slice(start, end)][-len(self.shape) :])
-        places = tuple(0 if size == 1 else next(wanted) for size in self._values.shape)
-        return np.asarray(self._values[places])
-
-
-def _rows_columns(matrix: Matrix) -> tuple[int, int]:
-    """Return rows and columns; what has more axes has no rows of one value."""
-    shape = matrix.shape
-    if len(shape) == 1:
-        return shape[0], 1
-    return (shape[0], shape[1]) if len(shape) == 2 else (0, 0)
-
-
 @contextmanager
 def open_mat(budget: Budget) -> Iterator[Vectors]:
     """Open a MATLAB file of version 5 to 7, which is then in memory. Raises `InputError`."""
@@ -145,13 +134,13 @@ def open_mat(budget: Budget) -> Iterator[Vectors]:
     yield Vectors(dict(_arrays_in(own)), budget, {})
 
 
-def _arrays_in(of: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, _Stored]]:
+def _arrays_in(of: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Matrix]]:
     """Yield the matrices of numbers or text in a struct, by path."""
     for name, value in of.items():
         if isinstance(value, dict):
             yield from _arrays_in(value, f"{above}{name}.")
         elif isinstance(value, np.ndarray) and value.ndim and value.dtype.kind in "iufbU":
-            yield f"{above}{name}", _Stored(value.T)
+            yield f"{above}{name}", Matrix(value.T)
 
 
 @contextmanager
@@ -165,7 +154,7 @@ def open_mat73(budget: Budget) -> Iterator[Vectors]:
     file = budget.file
     h5py = load_library(file, "h5py")
     with h5py.File(file, "r") as root:
-        matrices: dict[str, _Stored] = {}
+        matrices: dict[str, Matrix] = {}
         refused: dict[str, str] = {}
 
         def visit(path: str, item: Any) -> None:
@@ -180,7 +169,7 @@ def open_mat73(budget: Budget) -> Iterator[Vectors]:
             if _PACKED & set(item.attrs):
                 refused[path.replace("/", ".")] = _COUNTS
             elif item.shape and item.dtype.kind in "iufb" and _is_plain(item.attrs):
-                matrices[path.replace("/", ".")] = _Stored(item)
+                matrices[path.replace("/", ".")] = Matrix(item)
 
         def note(path: str, link: Any) -> None:
             if not isinstance(link, h5py.HardLink):

@@ -30,7 +30,7 @@ _EARLIEST_S = 10**8
 """A waveform that was given no start begins in 1904: before 1973 it is not a date."""
 
 
-class _Vector:
+class _Vector(Matrix):
     """The values of a channel; `base` says their times, and is empty where nothing says them."""
 
     def __init__(self, channel: Any) -> None:
