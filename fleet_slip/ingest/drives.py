@@ -1,10 +1,12 @@
 """Checks the order of time and cuts rows, block by block, into drives: uninterrupted stretches."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property, partial
 from io import BytesIO
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -218,84 +220,45 @@ MOST_OPEN_ROWS = 2**20
 
 @dataclass(frozen=True)
 class DriveRows:
-    """The rows of one drive, in the pieces that they came in: they are not joined without need.
+    """The rows of one drive, by number of their time base, in chunks that are not copied together.
 
-    Of several time bases, each piece is of one, and has the signals of that base only.
+    Of several bases, each has the signals that have a value there.
     """
 
-    pieces: Sequence[pl.DataFrame]
+    bases: dict[int, pl.DataFrame]
 
     @cached_property
     def height(self) -> int:
         """Number of rows."""
-        return sum(piece.height for piece in self.pieces)
-
-    @cached_property
-    def group(self) -> int:
-        """Number of what the rows say of the drive."""
-        return int(self.pieces[0]["group"][0])
+        return sum(rows.height for rows in self.bases.values())
 
     @cached_property
     def start_s(self) -> float:
         """The first time."""
-        return min(float(piece["time"][0]) for piece in self.pieces)
+        return min(float(rows["time"][0]) for rows in self.bases.values())
 
     @cached_property
     def end_s(self) -> float:
         """The last time."""
-        return max(float(piece["time"][-1]) for piece in self.pieces)
+        return max(float(rows["time"][-1]) for rows in self.bases.values())
 
     @cached_property
-    def bases(self) -> tuple[int, ...]:
-        """Numbers of the time bases; none if the file has but one."""
-        return tuple(sorted({_base(piece) for piece in self.pieces if "base" in piece.columns}))
+    def frame(self) -> pl.DataFrame:
+        """All rows in one frame."""
+        return pl.concat(self.bases.values(), how="diagonal")
 
-    @cached_property
-    def time_s(self) -> FloatArray:
-        """Times of all rows, which are of one base."""
-        return self.column("time")
-
-    def times_of(self, base: int) -> FloatArray:
-        """Return the times of one of several bases."""
-        return np.concatenate([p["time"].to_numpy() for p in self.pieces if _base(p) == base])
-
-    def chunks(self, name: str) -> list[FloatArray]:
-        """Return a column piece by piece, NaN where it has no value."""
-        found: list[FloatArray] = []
-        for piece in self.pieces:
-            some = name in piece.columns
-            chunks = (
-                piece[name].get_chunks() if some else [pl.repeat(np.nan, piece.height, eager=True)]
-            )
-            found += [chunk.to_numpy() for chunk in chunks]
-        return found
-
-    def column(self, name: str) -> FloatArray:
-        """Return a column, NaN where it has no value."""
-        chunks = self.chunks(name)
-        return chunks[0] if len(chunks) == 1 else np.concatenate(chunks)
+    def column(self, name: str) -> pl.Series:
+        """Return a column of the only base."""
+        (rows,) = self.bases.values()
+        return rows.get_column(name, default=pl.repeat(np.nan, rows.height, eager=True))
 
     def samples(self, name: str) -> pl.DataFrame:
-        """Return `time`, `base` and a signal where it has a value, by time, of several bases."""
-        columns = ["time", "base", name]
-        some = [piece.select(columns) for piece in self.pieces if name in piece.columns]
+        """Return `time` and a signal where it has a value, by time."""
+        some = [rows.select("time", name) for rows in self.bases.values() if name in rows.columns]
         if not some:
-            return pl.DataFrame(schema=dict.fromkeys(columns, pl.Float64))
-        found = pl.concat(some).filter(pl.col(name).is_not_null())
+            return pl.DataFrame(schema={"time": pl.Float64, name: pl.Float64})
+        found = pl.concat(some).drop_nulls(name)
         return found if found["time"].is_sorted() else found.sort("time", maintain_order=True)
-
-    def number_of(self, name: str) -> int:
-        """Return how many rows have a value in a column."""
-        columns = [piece[name] for piece in self.pieces if name in piece.columns]
-        return sum(len(column) - column.null_count() for column in columns)
-
-    def frame(self) -> pl.DataFrame:
-        """Return all rows in one frame."""
-        return pl.concat(self.pieces, how="diagonal")
-
-
-def _base(piece: pl.DataFrame) -> int:
-    return int(piece["base"][0])
 
 
 class OpenDrives:
@@ -312,11 +275,8 @@ class OpenDrives:
         if rows.is_empty():
             return
         self._in_memory += rows.height
-        if rows["part"][0] == rows["part"][-1]:
-            runs = [rows]
-        else:
-            runs = rows.partition_by("part", maintain_order=True)
-        for run in runs:
+        one = rows["part"][0] == rows["part"][-1]
+        for run in [rows] if one else rows.partition_by("part", maintain_order=True):
             pieces = _by_base(run) if "base" in run.columns else [run]
             self._rows.setdefault(int(run["part"][0]), []).extend(pieces)
 
@@ -325,9 +285,12 @@ class OpenDrives:
         for part in parts:
             in_memory = self._rows.pop(part, [])
             self._in_memory -= sum(piece.height for piece in in_memory)
-            spilled = [pl.read_ipc_stream(piece) for piece in self._spool.take(part)]
-            if spilled or in_memory:
-                yield DriveRows([*spilled, *in_memory])
+            bases = defaultdict[int, list[pl.DataFrame]](list)
+            for piece in chain(map(pl.read_ipc_stream, self._spool.take(part)), in_memory):
+                bases[piece["base"][0] if "base" in piece.columns else 0].append(piece)
+            if bases:
+                joined = {one: pl.concat(bases[one], how="diagonal") for one in sorted(bases)}
+                yield DriveRows(joined)
 
     def spill(self) -> None:
         """Put the rows aside if they are many. Raises `InputError` if the disk is full."""
@@ -416,12 +379,12 @@ def to_ticks(
         if signal in {COURSE, SPEED} and COURSE in mapping.signals:
             continue
         if method == "snap" and source.interpolate and not source.delay_s:
-            values = rows.chunks(signal)
+            values = [chunk.to_numpy() for chunk in rows.column(signal).get_chunks()]
         elif len(intervals_s) == 1:
-            values = [_resample(rows.column(signal), resampler, signal, mapping)]
+            values = [_resample(rows.column(signal).to_numpy(), resampler, signal, mapping)]
         else:
             samples = rows.samples(signal)
-            own = _on_own_times(samples, start_s, resampler, intervals_s)
+            own = _on_own_times(rows, signal, samples, resampler, intervals_s)
             values = [_resample(samples[signal].to_numpy(), own, signal, mapping)]
         # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
         counts[signal] = round_chunks(values, catalogue()[signal])
@@ -457,13 +420,12 @@ def _fixes(
     """Return the counts of course and speed over ground, null between fixes."""
     source = mapping.signals[COURSE]
     if len(intervals_s) == 1:
-        first, second = rows.column(COURSE), rows.column(SPEED)
+        samples = pl.DataFrame([rows.column(name).alias(name) for name in (COURSE, SPEED)])
     else:
         samples = rows.samples(COURSE).join(rows.samples(SPEED), on="time", how="inner")
-        resampler = _on_own_times(samples, rows.start_s, resampler, intervals_s)
-        first, second = samples[COURSE].to_numpy(), samples[SPEED].to_numpy()
+        resampler = _on_own_times(rows, COURSE, samples, resampler, intervals_s)
     fixes = fixes_on_ticks(
-        *course_and_speed(source, first, second),
+        *course_and_speed(source, samples[COURSE].to_numpy(), samples[SPEED].to_numpy()),
         resampler,
         source.delay_s,
         Antenna(source.antenna_x_m or 0.0, source.antenna_y_m or 0.0),
@@ -495,7 +457,7 @@ def _build_resampler(rows: DriveRows, intervals_s: dict[int, float], *, whole: b
     """
     if len(intervals_s) == 1:
         (interval_s,) = intervals_s.values()
-        time_s = rows.time_s - rows.start_s
+        time_s = rows.column("time").to_numpy() - rows.start_s
         resampler = build_resampler(time_s, choose_method(time_s, interval_s))
         if whole and resampler.method == "snap" and (np.diff(resampler.ticks) > 1).any():
             return build_resampler(time_s, "interpolate")
@@ -504,12 +466,16 @@ def _build_resampler(rows: DriveRows, intervals_s: dict[int, float], *, whole: b
 
 
 def _on_own_times(
-    samples: pl.DataFrame, start_s: float, ticks: Resampler, intervals_s: dict[int, float]
+    rows: DriveRows,
+    signal: str,
+    samples: pl.DataFrame,
+    ticks: Resampler,
+    intervals_s: dict[int, float],
 ) -> Resampler:
-    """Return what brings the samples of one time base of several onto a drive's ticks."""
-    interval_s = intervals_s[samples["base"][0]] if len(samples) else STEP_S
-    fast = interval_s < STEP_S - SNAP_TOLERANCE_S
-    time_s = samples["time"].to_numpy() - start_s
+    """Return what brings the samples of a signal, of one of several bases, onto a drive's ticks."""
+    of_base = (intervals_s[base] for base, some in rows.bases.items() if signal in some.columns)
+    fast = next(of_base, STEP_S) < STEP_S - SNAP_TOLERANCE_S
+    time_s = samples["time"].to_numpy() - rows.start_s
     return replace(ticks, time_s=time_s, method="average" if fast else "interpolate")
 
 

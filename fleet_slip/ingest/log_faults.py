@@ -65,8 +65,9 @@ class LogFaults:
         """Look at the rows of a drive."""
         self._drives += 1
         for name in _LIMITS:
-            if any(name in piece.columns for piece in rows.pieces):
-                self._jumps[name] += _count_jumps(name, *_samples(rows, name))
+            samples = rows.samples(name)
+            values = (samples[column].to_numpy() for column in ("time", name))
+            self._jumps[name] += _count_jumps(name, *values)
         if drive.metadata["started_at"] is not None:
             car = str(drive.metadata["vehicle_id"])
             self._under_way[car].append((rows.start_s, rows.end_s))
@@ -160,16 +161,6 @@ def _values_and_runs(column: pl.Series) -> tuple[int, int]:
     if values > min(MOST_NAMES, len(present) // LEAST_ROWS_A_NAME):
         return 0, 0
     return values, 1 + int((present != present.shift()).sum())
-
-
-def _samples(rows: DriveRows, name: str) -> tuple[FloatArray, FloatArray]:
-    """Return the times and values of a signal of a drive, where it has some."""
-    if rows.bases:
-        samples = rows.samples(name)
-        return samples["time"].to_numpy(), samples[name].to_numpy()
-    values = rows.column(name)
-    present = np.isfinite(values)
-    return (rows.time_s, values) if present.all() else (rows.time_s[present], values[present])
 
 
 def _count_jumps(name: str, time_s: FloatArray, values: FloatArray) -> int:

@@ -158,7 +158,7 @@ class MeasuredStream:
         self._refuse(pl.concat([block.refused, misplaced]))
         for ended in self._open.take([*cutter.ended, *(cutter.open_parts() if last else ())]):
             if ended.end_s - ended.start_s < STEP_S - TIME_EPSILON_S:
-                self._refuse(describe_refused(ended.frame(), None, "too_short"))
+                self._refuse(describe_refused(ended.frame, None, "too_short"))
             else:
                 yield self._drive(ended, intervals_s)
         self._open.spill()
@@ -181,7 +181,7 @@ class MeasuredStream:
             self._refused_rows = []
 
     def _drive(self, rows: DriveRows, intervals_s: dict[int, float]) -> MeasuredDrive:
-        group = rows.group
+        group = int(next(iter(rows.bases.values()))["group"][0])
         self._stretches[group] += 1
         name = drive_id(self.prefix, group, self._stretches[group])
         in_file = self.checker.keys.metadata[group]
@@ -191,8 +191,8 @@ class MeasuredStream:
             "source_file": self.name,
             "trip_id": self._trips.name(name, group, rows.start_s, rows.end_s),
         }
-        for base in set(rows.bases) - intervals_s.keys():
-            steps_s = np.diff(rows.times_of(base)[:RATE_ROWS])
+        for base in rows.bases.keys() - intervals_s.keys():
+            steps_s = np.diff(rows.bases[base]["time"].head(RATE_ROWS).to_numpy())
             intervals_s[base] = float(np.median(steps_s)) if steps_s.size else STEP_S
         try:
             drive = to_ticks(rows, self.mapping, intervals_s, name, known)
@@ -203,7 +203,8 @@ class MeasuredStream:
         self.counts.drives_resampled += drive.method != "snap"
         self.counts.ticks += drive.ticks.size
         for signal, values in drive.counts.items():
-            self._samples[signal] += rows.number_of(signal)
+            some = (of[signal] for of in rows.bases.values() if signal in of.columns)
+            self._samples[signal] += sum(column.count() for column in some)
             self._values[signal] += len(values) - values.null_count
         if self.longest is None or drive.ticks.size > self.longest.ticks.size:
             self.longest = drive
