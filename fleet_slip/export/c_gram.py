@@ -99,7 +99,7 @@ class OnBoard:
     @property
     def ranges(self) -> list[Range]:
         """The ranges of the columns."""
-        return self.of.ranges_of(self.columns)
+        return [self.of.ranges[name] for name in self.columns]
 
     @property
     def places(self) -> list[int]:

@@ -34,7 +34,7 @@ from fleet_slip.catalogue.course import (
 )
 from fleet_slip.catalogue.definitions import limit_of
 from fleet_slip.catalogue.facts import RECEIVED_FILES
-from fleet_slip.catalogue.features import PLAIN, FeatureSet, features
+from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, Signal, catalogue
 from fleet_slip.catalogue.time_columns import Feature
 from fleet_slip.config import read_named_file
@@ -79,8 +79,7 @@ class CountedSet:
 
     Attributes:
         name, identity: of the set.
-        columns: of its Gram rows, in order.
-        ranges: the smallest and the largest count of each.
+        ranges: the smallest and the largest count of each column of its Gram rows, in order.
         signals: what a car must know to count it, in catalogue order.
         times: over how many ticks columns change; none where they stand for themselves.
         parts: what those parts of a drive are called; None alone where it is not divided.
@@ -90,8 +89,7 @@ class CountedSet:
 
     name: str
     identity: str
-    columns: tuple[str, ...]
-    ranges: tuple[Range, ...]
+    ranges: Mapping[str, Range]
     signals: tuple[str, ...]
     times: tuple[int, ...]
     parts: tuple[str | None, ...]
@@ -103,76 +101,67 @@ class CountedSet:
         """What a table of Gram rows calls it: its name, and what its columns mean."""
         return f"{self.name}:{self.definition:016x}"
 
-    def ranges_of(self, columns: Sequence[str]) -> list[Range]:
-        """Return the ranges of some columns."""
-        known = dict(zip(self.columns, self.ranges, strict=True))
-        return [known[name] for name in columns]
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of its Gram rows, in order."""
+        return tuple(self.ranges)
 
 
 @cache
 def counted_sets() -> dict[str, CountedSet]:
     """Return the sets by their identities, which Gram rows carry, the logged signals first."""
     known = features()
-    found = [_counted(name) for name in (PLAIN, *known.sets) if _can_be(known.feature_set(name))]
-    return {one.identity: one for one in found}
+    found = {}
+    for name in (PLAIN, *known.sets):
+        one = known.feature_set(name)
+        divided = one.regimes or one.block_ticks or one.row_folds
+        if not divided and len(one.columns) <= MOST_COLUMNS:
+            found[known.identity(name)] = _counted(name, known.identity(name))
+    return found
 
 
-def _can_be(one: FeatureSet) -> bool:
-    divided = one.regimes or one.block_ticks or one.row_folds
-    return not divided and len(one.columns) <= MOST_COLUMNS
-
-
-def _counted(name: str) -> CountedSet:
-    one, known = features().feature_set(name), catalogue()
-    used = {*one.signals, known.label}
-    if one.change_ticks:
-        used = {*one.signals, COURSE, YAW_RATE}
-    used |= {signal for f in one.features for signal in features().features[f].inputs}
-    used |= {signal for d in features().definitions(name).values() for signal in d.signals}
-    signals = tuple(signal for signal in known.signals if signal in used)
+def _counted(name: str, identity: str) -> CountedSet:
+    known, signals = features(), catalogue()
+    one = known.feature_set(name)
+    used = {*one.signals, *([COURSE, YAW_RATE] if one.change_ticks else [signals.label])}
+    used |= {signal for f in one.features for signal in known.features[f].inputs}
+    used |= {signal for d in known.definitions(name).values() for signal in d.signals}
+    made_of = {signal: about for signal, about in signals.signals.items() if signal in used}
+    defined: list[Any] = [
+        [signal, f"{about.scale:f}", about.min_count, about.max_count]
+        for signal, about in made_of.items()
+    ]
+    content = defined if name == PLAIN else [identity, defined]
+    digest = sha256_of(canonical_json(content))
     return CountedSet(
         name,
-        features().identity(name),
-        one.columns,
-        tuple(_range(column, one.change_ticks) for column in one.columns),
-        signals,
+        identity,
+        {column: _range(column, one.change_ticks) for column in one.columns},
+        tuple(made_of),
         one.change_ticks,
-        Parts.of_set(features(), one).times or (None,),
+        Parts.of_set(known, one).times or (None,),
         one.in_time,
-        _definition_of(signals, None if name == PLAIN else features().identity(name)),
+        int.from_bytes(bytes.fromhex(digest[:16]), "little"),
     )
 
 
-def _definition_of(signals: Sequence[str], identity: str | None) -> int:
-    known = [
-        [name, f"{s.scale:f}", s.min_count, s.max_count]
-        for name in signals
-        for s in [catalogue()[name]]
-    ]
-    content = canonical_json(known if identity is None else [identity, known])
-    return int.from_bytes(bytes.fromhex(sha256_of(content)[:16]), "little")
-
-
 def _range(column: str, times: Sequence[int]) -> Range:
-    if times and column in (*BESIDE, catalogue().label):
-        return _range_beside(column, max(times))
-    of = catalogue()[column] if column == catalogue().label else features().of(column)
+    label = catalogue().label
+    if times and column in (*BESIDE, label):
+        if column == STRAIGHT:
+            return 0, 1
+        units = course_units()
+        most = units.largest // units.divisor + 1
+        if column == TURNED:
+            most = 2 * max(times) * COUNT_MAX // COARSER + 1
+        return -most, most
+    of = catalogue()[column] if column == label else features().of(column)
     if isinstance(of, Signal):
         least, most = of.min_count, of.max_count
     else:
         most = limit_of(of.bits if isinstance(of, Feature) else of.definition.bits)
         least = -most
     return (least - most, most - least) if times else (least, most)
-
-
-def _range_beside(column: str, ticks: int) -> Range:
-    if column == STRAIGHT:
-        return 0, 1
-    units = course_units()
-    most = units.largest // units.divisor + 1
-    if column == TURNED:
-        most = 2 * ticks * COUNT_MAX // COARSER + 1
-    return -most, most
 
 
 # Which Gram rows no drive of integer counts can have.
@@ -224,19 +213,19 @@ def impossible_rows(
     Rows of other sets, which were defined otherwise, are passed over.
     """
     for name in rows["feature_set"].unique().to_pylist():
-        one = sets.get(name)
-        if one is None:
+        if name not in sets:
             continue
+        ranges = sets[name].ranges
         mine = rows.filter(pc.equal(rows["feature_set"], name)).combine_chunks()
         for batch in mine.to_batches(BATCH_ROWS):
             for signals, alike, _ in by_signals(batch):
                 names = signals.split(",") if signals else []
-                if not set(names) <= set(one.columns):
+                found: dict[str, IntArray] = {}
+                if not set(names) <= ranges.keys():
                     found = {"has signals that there are not": np.arange(len(alike))}
                 elif names:
-                    found = find_impossible(gram_table(signals, alike), one.ranges_of(names))
-                else:
-                    found = {}
+                    known = [ranges[name] for name in names]
+                    found = find_impossible(gram_table(signals, alike), known)
                 for reason, at in found.items():
                     yield from ((alike.slice(i, 1).to_pylist()[0], reason) for i in at.tolist())
 
