@@ -19,23 +19,18 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from fleet_slip.arrays import BoolArray, FloatArray, IntArray
+from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.base import Progress, no_progress, number_of
-from fleet_slip.catalogue.course import (
-    COARSER,
-    COURSE,
-    COURSE_LATE,
-    course_units,
-    split_late,
-)
+from fleet_slip.catalogue.course import COURSE_LATE
 from fleet_slip.catalogue.definitions import COUNT_BITS
 from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, FeatureSet, features
-from fleet_slip.catalogue.signals import HALF_TURN, SignalCatalogue
+from fleet_slip.catalogue.signals import SignalCatalogue
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
-from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
+from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.columns.sql import with_absent, with_columns
 from fleet_slip.compute.tasks import LocalThreads, in_flight, run_tasks
 from fleet_slip.errors import DataError, QuestionError, StorageError
+from fleet_slip.grams.changes import Fixes
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import TableFile, absent_columns
 from fleet_slip.warehouse.database import open_database, reading_files
@@ -445,148 +440,6 @@ def _query(
     )
 
 
-# Sums of the changes from fix to fix of one drive, as `catalogue/course.py` defines them.
-#
-# Only rows with a fix are kept, at most one in ten: they fit into memory.
-
-
-@dataclass(frozen=True)
-class Fixes:
-    """The rows of a drive that have a fix.
-
-    Attributes:
-        ticks, yaw_rate: of all rows, shape (rows,); NaN where the rate is missing.
-        at, course: the rows with a fix and their courses in counts, shape (fixes,).
-        gain: what the label gains per count of r, see `split_late`.
-        counts, clipped: the columns of those rows, (columns, fixes), and how many were clipped.
-        first_clipped: how many columns of the first row were clipped.
-    """
-
-    ticks: IntArray
-    yaw_rate: FloatArray
-    at: IntArray
-    course: IntArray
-    gain: int
-    counts: FloatArray
-    clipped: FloatArray
-    first_clipped: FloatArray
-
-
-@dataclass(frozen=True)
-class Changes:
-    """The changes of a drive's columns between fixes that are so many ticks apart.
-
-    `rows` are those with a change; `columns` end in `BESIDE` and the label, NaN where missing.
-    """
-
-    rows: IntArray
-    columns: FloatArray
-    clipped: FloatArray
-
-
-def find_fixes(workspace: Workspace, drive: DriveCounts, late: int = 0) -> Fixes:
-    """Return the fixes of the loaded drive, its course and yaw rate last, `late` by so much."""
-    ticks = drive.ticks.astype(np.int64)
-    whole, gain = split_late(late)
-    at, course = _fixes(drive, ticks, whole)
-    yaw_rate = np.empty(workspace.rows)
-    values: list[FloatArray] = []
-    clipped: list[FloatArray] = []
-    first_clipped = np.zeros(0)
-    for first in range(0, workspace.rows, BLOCK_ROWS):
-        workspace.compute_block(first)
-        block, here = workspace.block(first)
-        yaw_rate[first : first + block.shape[1]] = block[-1]
-        begin, end = np.searchsorted(at, (first, first + block.shape[1]))
-        fixed = at[begin:end] - first
-        values.append(block[:-2].take(fixed, axis=1))
-        clipped.append(here[fixed])
-        first_clipped = here[:1].copy() if first == 0 else first_clipped
-    return Fixes(
-        ticks,
-        yaw_rate,
-        at,
-        course,
-        gain,
-        np.concatenate(values, axis=1),
-        np.concatenate(clipped),
-        first_clipped,
-    )
-
-
-def course_changes(fixes: Fixes, apart: int) -> Changes:
-    """Return the changes of a drive's columns between fixes that are so many ticks apart."""
-    at, yaw_rate = fixes.at, fixes.yaw_rate
-    before, now = _pairs(fixes.ticks[at], apart)
-    turned, known = _twice_turned(fixes.ticks, yaw_rate, at[before], at[now])
-    before, now, turned = before[known], now[known], turned[known]
-    rest = fixes.gain * (yaw_rate[at[now]] - yaw_rate[at[before]]).astype(np.int64)
-    change, sound = _change(fixes.course[now] - fixes.course[before], turned, rest)
-    before, now, turned, change = before[sound], now[sound], turned[sound], change[sound]
-    straight = _straight(yaw_rate[at[before]], yaw_rate[at[now]], turned)
-    beside = [_rounded(turned, COARSER), straight, straight * change]  # `BESIDE`
-    began = fixes.ticks[:1] == 0  # no change: so a drive without a course is remembered
-    first, size = int(began.sum()), len(fixes.counts)
-    columns = np.full((size + len(beside) + 1, first + len(now)), np.nan)
-    columns[:size, first:] = fixes.counts.take(now, axis=1)
-    columns[:size, first:] -= fixes.counts.take(before, axis=1)
-    columns[size:, first:] = [*beside, change]
-    return Changes(
-        np.concatenate([np.flatnonzero(began), at[now]]),
-        columns,
-        np.concatenate([fixes.first_clipped[began], fixes.clipped[now]]),
-    )
-
-
-def _fixes(drive: DriveCounts, ticks: IntArray, whole: int) -> tuple[IntArray, IntArray]:
-    fixed = np.flatnonzero(drive.present.get(COURSE, np.ones(len(ticks), dtype=np.bool_)))
-    place = np.searchsorted(ticks, ticks[fixed] - whole)
-    there = ticks[np.minimum(place, len(ticks) - 1)] == ticks[fixed] - whole
-    return place[there], drive.counts[COURSE][fixed[there]].astype(np.int64)
-
-
-def _straight(before: FloatArray, now: FloatArray, turned: IntArray) -> IntArray:
-    """Return 1 where the car went straight on, by the yaw rate at both fixes and in between."""
-    units = course_units()
-    slow = np.maximum(np.abs(before), np.abs(now)) <= units.slow
-    straight: IntArray = (slow & (np.abs(turned) <= units.unturned)).astype(np.int64)
-    return straight
-
-
-def _pairs(ticks: IntArray, apart: int) -> tuple[IntArray, IntArray]:
-    if not ticks.size:
-        return ticks, ticks
-    place = np.minimum(np.searchsorted(ticks, ticks - apart), ticks.size - 1)
-    later = np.flatnonzero(ticks[place] == ticks - apart)
-    return place[later], later
-
-
-def _twice_turned(
-    ticks: IntArray, yaw_rate: FloatArray, before: IntArray, now: IntArray
-) -> tuple[IntArray, BoolArray]:
-    """Return J between pairs of rows, and where no tick's yaw rate is missing in between."""
-    missing = np.isnan(yaw_rate)
-    counts = np.where(missing, 0.0, yaw_rate).astype(np.int64)
-    total, gaps = np.cumsum(counts), np.cumsum(missing)
-    turned = 2 * (total[now] - total[before]) - counts[now] + counts[before]
-    whole = ticks[now] - ticks[before] == now - before
-    return turned, whole & (gaps[now] == gaps[before]) & ~missing[before]
-
-
-def _change(course: IntArray, turned: IntArray, rest: IntArray) -> tuple[IntArray, BoolArray]:
-    """Return the change of the side-slip angle in counts of the label, and where it is one."""
-    units = course_units()
-    left = units.turn * course - 2 * HALF_TURN * turned + rest
-    whole = 2 * HALF_TURN * units.turn
-    left -= whole * _rounded(left, whole)
-    return _rounded(left, units.divisor), np.abs(left) <= units.largest
-
-
-def _rounded(number: IntArray, divisor: int) -> IntArray:
-    half: IntArray = (2 * np.abs(number) + divisor) // (2 * divisor)
-    return np.sign(number) * half
-
-
 # Gram rows of any feature set, from the columns of log files: what SQL says, faster.
 #
 # Drives are gone through once, in time. Columns are integers below 2^19 in binary64, whose products
@@ -721,10 +574,10 @@ def change_sums(
     """Return the sums of a drive's changes, by columns missing and time; the course is `late`."""
     exact_rows = _exact_rows(len(counts.ticks), 2 * max(workspace.plan.limits))
     workspace.load(counts)
-    fixes = find_fixes(workspace, counts, late)
+    fixes = Fixes(workspace, counts, late)
     found: dict[Kind, PartSums] = {}
     for part, apart in enumerate(times):
-        changes = course_changes(fixes, apart)
+        changes = fixes.changes(apart)
         numbers = np.full(len(changes.rows), part)
         _add_by_kind(found, changes.columns, changes.clipped, numbers, exact_rows)
     return found

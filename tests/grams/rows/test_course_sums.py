@@ -16,13 +16,8 @@ from fleet_slip.catalogue.features import FeatureSet, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.columns.plan import ColumnPlan
-from fleet_slip.grams.compute import (
-    aggregate,
-    counts_of,
-    course_changes,
-    find_fixes,
-    wide_grams,
-)
+from fleet_slip.grams.changes import Fixes
+from fleet_slip.grams.compute import aggregate, counts_of, wide_grams
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
@@ -84,7 +79,7 @@ def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers(late: int) -
     plan = ColumnPlan.of_set(features(), "course")
     workspace, counts = Workspace(plan), counts_of(table, plan, {})
     workspace.load(counts)
-    found = course_changes(find_fixes(workspace, counts, late), APART)
+    found = Fixes(workspace, counts, late).changes(APART)
     expected = plain_changes(table, late)
     assert len(expected) > 40
     assert counts.ticks[found.rows].tolist() == [0, *expected]
@@ -140,7 +135,7 @@ def test_the_label_is_the_change_of_the_side_slip_angle() -> None:
     plan = ColumnPlan.of_set(features(), "course")
     workspace, loaded = Workspace(plan), counts_of(log_rows("a", counts), plan, {})
     workspace.load(loaded)
-    found = course_changes(find_fixes(workspace, loaded), APART)
+    found = Fixes(workspace, loaded).changes(APART)
     rows, columns = found.rows[1:], found.columns[:, 1:]
     assert len(rows) == 460
     changed = slip[rows] - slip[rows - APART]
