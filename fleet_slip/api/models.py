@@ -29,6 +29,7 @@ from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from fleet_slip.evaluation.evaluate import Evaluation
     from fleet_slip.evaluation.report import Written
     from fleet_slip.export.stepping import Estimator
     from fleet_slip.models.diff import Difference
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.score import Score
     from fleet_slip.models.select import Selection
-    from fleet_slip.storage.documents import Document
 
 
 class PublishedModels(Rooted):
@@ -342,11 +342,11 @@ class JudgedModels(PublishedModels):
         ] = (),
         threads: int | None = None,
         progress: ShowProgress | None = None,
-    ) -> "Document":
+    ) -> "Evaluation":
         """Evaluate models on the paper's test drives and on others; simulate those missing.
 
         Models of Table I are fitted on the cohort of each and evaluated beside it. Progress is in
-        simulated rows. Returns the document kept below `evaluations/`. Raises `ConfigError` for an
+        simulated rows. The document is kept below `evaluations/`. Raises `ConfigError` for an
         invalid scenario, `RefusedError` for one that changed since it was simulated, `DataError`,
         and what `model` raises.
         """
@@ -374,13 +374,13 @@ class JudgedModels(PublishedModels):
         ] = None,
         threads: int | None = None,
         **measured: Unpack[CarMeasures],
-    ) -> "Document":
+    ) -> "Evaluation":
         """Evaluate models on measured drives with a label, beside Table I and filters.
 
         What is chosen, fitted, tuned or identified never saw what it is judged by: each drive is
         left out in turn, or each quarter of the time of one or two, and each kind of driving.
         Without a `vehicle` or what was `measured` of it no filter competes, unless a file ships for
-        the drives' class. Returns the document kept below `evaluations/measured/`. Raises
+        the drives' class. Returns the document, kept below `evaluations/measured/`. Raises
         `DataError` without a label, `ConfigError` for an unknown car, `UsageError` for one that no
         car can be, and what `model` raises.
         """
@@ -405,7 +405,7 @@ class JudgedModels(PublishedModels):
         others: Sequence[str | ModelVersion] = (),
         *,
         threads: int | None = None,
-    ) -> dict[str, Any]:
+    ) -> "Evaluation":
         """Evaluate models, and all that `evaluate` trains beside them, on drives of the first.
 
         Roads, cars, weather and noise are drawn from its version's hash, unknown before it was

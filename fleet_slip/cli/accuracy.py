@@ -1,122 +1,25 @@
 """Commands that evaluate: score on the rows of a cohort, evaluate on test drives."""
 
 import os
-import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.base import needed, number_of
+from fleet_slip.base import needed
 from fleet_slip.cli.options import command
-from fleet_slip.cli.output import Json, print_answer, print_json, print_parts, say
+from fleet_slip.cli.output import Json, print_answer, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.errors import UsageError
-from fleet_slip.rendering import Part, TextTable
 from fleet_slip.resources import folder
 from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
     from fleet_slip.evaluation.identify import Identified
     from fleet_slip.evaluation.report import Written
-
-
-# What `evaluate` prints for people: a screen, and with --all the errors of all on every drive.
-
-BLIND_NAMES = 5
-"""Estimators of the table that is printed first: published models, then the best of the others."""
-
-
-def evaluation_parts(content: Mapping[str, Any], everything: bool) -> Iterator[Part]:
-    """Return the summary of an evaluation's document, with `everything` its one table besides."""
-    names = list(content["estimators"])
-    if "scenarios" in content:
-        drives, title = content["scenarios"], "Test drives: RMSE in deg"
-        yield ranking_table(content["ranking"])
-        yield f"Pictures: fleet-slip report {shlex.quote(content['ranking']['estimator'])}"
-    elif "cohort" in content:
-        drives, title = content["drives"], "RMSE in deg by drive"
-        yield from _measured(content)
-    else:
-        drives, title = content["drives"], "Blind drives: RMSE in deg against the exact angle"
-        errors = {name: one["rmse_deg"] for name, one in drives[0]["results"].items()}
-        names.sort(key=lambda name: ("@" not in name, errors[name] is None, errors[name]))
-        if not everything:
-            groups = [one for one in drives if one["drives"] > 1]
-            shown = [name for name in names if "/" not in name]
-            yield error_table(title, groups, shown[:BLIND_NAMES])
-    if everything:
-        yield error_table(f"\n{title}", drives, names)
-    else:
-        yield "Every drive, and all estimators: --all; for machines --json."
-
-
-def error_table(title: str, drives: Sequence[Mapping[str, Any]], names: Sequence[str]) -> TextTable:
-    """Return RMSE by drive and estimator, and of how much of the drive unless of all."""
-    words = [name.replace("_", " ") for name in names]  # which a heading can wrap
-
-    def error(found: Mapping[str, Any]) -> str:
-        if found["rmse_deg"] is None:
-            return "none"
-        covered = found["coverage"]
-        return f"{found['rmse_deg']:.3f}" + ("" if covered == 1 else f" ({covered:.0%})")
-
-    rows = (
-        [
-            one["name"],
-            f"{one.get('truth', one)['sideslip_std_deg']:.2f}",
-            *(error(one["results"][name]) for name in names),
-        ]
-        for one in drives
-    )
-    return TextTable(title, "|".join(["drive", "side-slip std", *words]), rows)
-
-
-def ranking_table(ranking: Mapping[str, Any]) -> TextTable:
-    """Return who wins each test drive."""
-    least, ours = ranking["least_coverage"], ranking["estimator"]
-    return TextTable(
-        f"\n{ours} wins {ranking['won']} of {ranking['drives']} test drives by RMSE, and is within "
-        f"{ranking['close_ratio']:g} of the winner on {ranking['close']} others.\nAll compete that "
-        f"need no GPS and estimate {least:.0%} of the rows. Drives that differ in GPS alone are "
-        f"one. {ours}/3 is model 3 of Table I, trained on what {ours} was trained on.",
-        f"scenario|won by|RMSE deg|{ours} deg|ratio",
-        (one for one in ranking["standings"] if one["same_as"] is None),
-        "{scenario}|{winner}|{winner_rmse_deg:.3f}|{rmse_deg:.3f}|{ratio:.2f}",
-        left=2,
-    )
-
-
-def _measured(content: Mapping[str, Any]) -> Iterator[Part]:
-    """Return figures on measured drives, the best estimator first."""
-    drives = number_of(len(content["drives"]), "drive")
-    left_out = "quarters of their time" if content["parts_of"] == "time" else "whole"
-    kinds = ", ".join(f"{one['name']} ({len(one['drives'])})" for one in content["kinds"])
-    yield TextTable(
-        f"{content['cohort']}: {drives}, left out {left_out} in turn, in {content['parts']} parts",
-        "estimator|knows|RMSE deg|±|mean|std|correlation|rows|worst|kinds left out",
-        (
-            {**one, "name": name, "kinds": (one["kinds_left_out"] or {}).get("rmse_deg")}
-            for name, one in content["estimators"].items()
-        ),
-        "{name}|{told}|{rmse_deg:.3f}|{rmse_standard_error_deg:.3f}|{error_mean_deg:+.3f}|"
-        "{error_std_deg:.3f}|{correlation:.3f}|{coverage:.0%}|{worst_drive_rmse_deg:.3f}|"
-        "{kinds:.3f}",
-        left=2,
-    )
-    yield (
-        "±: standard error over drives; worst: RMSE of the drive that is estimated worst.\n"
-        + (f"Kinds of driving: {kinds}." if kinds else "All drives are of one kind of driving.")
-    )
-    if content["vehicle"] is None:
-        yield (
-            "No filter was evaluated: the car is unknown. Give --mass, --front-axle and "
-            "--rear-axle, or a vehicle file with --vehicle."
-        )
 
 
 @command(Fleet.score, arguments=["model"])
@@ -183,21 +86,17 @@ def evaluate(
     if blind and scenarios:
         raise UsageError("--blind has drives of its own: leave out --scenario.")
     if blind:
-        content = fleet.evaluate_blind(model, others, threads=threads)
-        return print_json(content) if json else print_parts(evaluation_parts(content, everything))
-    if cohort is not None:
-        kept = fleet.evaluate_measured(
+        found = fleet.evaluate_blind(model, others, threads=threads)
+    elif cohort is not None:
+        found = fleet.evaluate_measured(
             model, cohort, others, vehicle=vehicle, threads=threads, **measured
         )
     else:
         with progress("simulate scenarios", "rows") as show:
-            kept = fleet.evaluate(
+            found = fleet.evaluate(
                 model, others, scenarios=scenarios, threads=threads, progress=show
             )
-    if json:
-        return print_json({"number": kept.number, "sha256": kept.sha256, **kept.content})
-    print_parts(evaluation_parts(kept.content, everything))
-    say(f"kept as evaluations/{'' if cohort is None else 'measured/'}{kept.number}.json")
+    print_answer(found, json, everything=everything)
 
 
 # The command that identifies a car from labelled drives: identify.

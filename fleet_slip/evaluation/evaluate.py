@@ -1,8 +1,9 @@
 """An evaluation from end to end: who competes, on which drives, and the document of the result."""
 
-from collections.abc import Mapping, Sequence
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version as package_version
 from itertools import pairwise
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.base import number_of
 from fleet_slip.evaluation.blind import judge_blindly
 from fleet_slip.evaluation.drives import (
     EvaluatedDrive,
@@ -35,6 +37,7 @@ from fleet_slip.evaluation.judge import (
 )
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import Document, DocumentFolder, checksum
@@ -98,16 +101,17 @@ def evaluate_blindly(
     model: ModelVersion,
     others: Sequence[ModelVersion],
     executor: Executor,
-) -> dict[str, Any]:
+) -> "Evaluation":
     """Evaluate the same on drives that follow from the model's hash; nothing is written."""
     _, bank = train_competitors(warehouse, model, others, executor)
-    return {
+    content = {
         "format": 1,
         "package_version": package_version("fleet-slip"),
         "model": model.reference,
         "estimators": {name: about for name, (_, about) in bank.items()},
         "drives": judge_blindly(model.sha256, {name: one for name, (one, _) in bank.items()}),
     }
+    return Evaluation(content)
 
 
 def _run(one: EvaluatedScenario) -> dict[str, Any]:
@@ -160,21 +164,128 @@ def _truth(drive: EvaluatedDrive) -> dict[str, Any]:
     }
 
 
+BLIND_NAMES = 5
+"""Estimators of the table that is printed first: published models, then the best of the others."""
+
+
+@dataclass(frozen=True)
+class Evaluation(Answer):
+    """The document of an evaluation, and the number under which it is kept; a blind one is not."""
+
+    DOCUMENT = "number? sha256? *content"
+
+    content: Mapping[str, Any]
+    number: int | None = None
+    sha256: str = ""
+
+    def parts(self, everything: bool = False) -> Iterator[Part]:
+        """Return the summary, or the errors of all on every drive besides."""
+        content, measured = self.content, "cohort" in self.content
+        names = list(content["estimators"])
+        if "scenarios" in content:
+            drives, title = content["scenarios"], "Test drives: RMSE in deg"
+            yield _ranking_table(content["ranking"])
+            yield f"Pictures: fleet-slip report {shlex.quote(content['ranking']['estimator'])}"
+        elif measured:
+            drives, title = content["drives"], "RMSE in deg by drive"
+            yield from _measured(content)
+        else:
+            drives, title = content["drives"], "Blind drives: RMSE in deg against the exact angle"
+            errors = {name: one["rmse_deg"] for name, one in drives[0]["results"].items()}
+            names.sort(key=lambda name: ("@" not in name, errors[name] is None, errors[name]))
+            if not everything:
+                groups = [one for one in drives if one["drives"] > 1]
+                shown = [name for name in names if "/" not in name]
+                yield _error_table(title, groups, shown[:BLIND_NAMES])
+        if everything:
+            yield _error_table(f"\n{title}", drives, names)
+        else:
+            yield "Every drive, and all estimators: --all; for machines --json."
+        if self.number:
+            yield Remark(f"kept as evaluations/{'measured/' if measured else ''}{self.number}.json")
+
+
+def _error_table(
+    title: str, drives: Sequence[Mapping[str, Any]], names: Sequence[str]
+) -> TextTable:
+    """Return RMSE by drive and estimator, and of how much of the drive unless of all."""
+    words = [name.replace("_", " ") for name in names]  # which a heading can wrap
+
+    def error(found: Mapping[str, Any]) -> str:
+        if found["rmse_deg"] is None:
+            return "none"
+        covered = found["coverage"]
+        return f"{found['rmse_deg']:.3f}" + ("" if covered == 1 else f" ({covered:.0%})")
+
+    rows = (
+        [
+            one["name"],
+            f"{one.get('truth', one)['sideslip_std_deg']:.2f}",
+            *(error(one["results"][name]) for name in names),
+        ]
+        for one in drives
+    )
+    return TextTable(title, "|".join(["drive", "side-slip std", *words]), rows)
+
+
+def _ranking_table(ranking: Mapping[str, Any]) -> TextTable:
+    """Return who wins each test drive."""
+    least, ours = ranking["least_coverage"], ranking["estimator"]
+    return TextTable(
+        f"\n{ours} wins {ranking['won']} of {ranking['drives']} test drives by RMSE, and is within "
+        f"{ranking['close_ratio']:g} of the winner on {ranking['close']} others.\nAll compete that "
+        f"need no GPS and estimate {least:.0%} of the rows. Drives that differ in GPS alone are "
+        f"one. {ours}/3 is model 3 of Table I, trained on what {ours} was trained on.",
+        f"scenario|won by|RMSE deg|{ours} deg|ratio",
+        (one for one in ranking["standings"] if one["same_as"] is None),
+        "{scenario}|{winner}|{winner_rmse_deg:.3f}|{rmse_deg:.3f}|{ratio:.2f}",
+        left=2,
+    )
+
+
+def _measured(content: Mapping[str, Any]) -> Iterator[Part]:
+    """Return figures on measured drives, the best estimator first."""
+    drives = number_of(len(content["drives"]), "drive")
+    left_out = "quarters of their time" if content["parts_of"] == "time" else "whole"
+    kinds = ", ".join(f"{one['name']} ({len(one['drives'])})" for one in content["kinds"])
+    yield TextTable(
+        f"{content['cohort']}: {drives}, left out {left_out} in turn, in {content['parts']} parts",
+        "estimator|knows|RMSE deg|±|mean|std|correlation|rows|worst|kinds left out",
+        (
+            {**one, "name": name, "kinds": (one["kinds_left_out"] or {}).get("rmse_deg")}
+            for name, one in content["estimators"].items()
+        ),
+        "{name}|{told}|{rmse_deg:.3f}|{rmse_standard_error_deg:.3f}|{error_mean_deg:+.3f}|"
+        "{error_std_deg:.3f}|{correlation:.3f}|{coverage:.0%}|{worst_drive_rmse_deg:.3f}|"
+        "{kinds:.3f}",
+        left=2,
+    )
+    yield (
+        "±: standard error over drives; worst: RMSE of the drive that is estimated worst.\n"
+        + (f"Kinds of driving: {kinds}." if kinds else "All drives are of one kind of driving.")
+    )
+    if content["vehicle"] is None:
+        yield (
+            "No filter was evaluated: the car is unknown. Give --mass, --front-axle and "
+            "--rear-axle, or a vehicle file with --vehicle."
+        )
+
+
 def evaluations_of(warehouse: Warehouse, kind: str = "") -> DocumentFolder:
     """Return where a data root keeps its evaluations; `measured` are those on measured drives."""
     folder = warehouse.root / "evaluations"
     return DocumentFolder(folder / kind if kind else folder)
 
 
-def keep(documents: DocumentFolder, content: Mapping[str, Any]) -> Document:
-    """Add an evaluation, unless the latest one is the same; return its document."""
+def keep(documents: DocumentFolder, content: Mapping[str, Any]) -> Evaluation:
+    """Add an evaluation, unless the latest one is the same; return it as it is kept."""
 
     def attempt(newest: int) -> Document | None:
         if newest and (before := documents.read(newest)).sha256 == checksum(content):
             return before
         return documents.create(newest + 1, content)
 
-    return documents.after_newest(attempt)
+    return Evaluation(**vars(documents.after_newest(attempt)))
 
 
 # Below which noise of satellite navigation the paper's filter is better than a regression.

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from rich.text import Text
 
-from fleet_slip.cli.accuracy import evaluation_parts
 from fleet_slip.cli.app import app
 from fleet_slip.cli.output import print_parts
 from fleet_slip.errors import AlarmError
+from fleet_slip.evaluation.evaluate import Evaluation
 from fleet_slip.models import select
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.rendering import TextTable
@@ -145,10 +145,11 @@ def test_an_evaluation_is_a_screen(shown: Shown) -> None:
         "results": {"ours@1": result},
     }
     content = {"estimators": {"ours@1": {}}, "ranking": ranking, "scenarios": [scenario]}
-    text = " ".join(" ".join(shown(lambda: print_parts(evaluation_parts(content, False)))).split())
+    evaluation = Evaluation(content)
+    text = " ".join(" ".join(shown(lambda: print_parts(evaluation.parts()))).split())
     assert "nominal ekf 0.100 0.200 2.00" in text
     assert "Every drive, and all estimators: --all" in text
-    whole = " ".join(" ".join(shown(lambda: print_parts(evaluation_parts(content, True)))).split())
+    whole = " ".join(" ".join(shown(lambda: print_parts(evaluation.parts(True)))).split())
     assert "nominal 0.70 0.200 (35%)" in whole
 
 

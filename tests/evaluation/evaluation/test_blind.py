@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.cli.accuracy import evaluation_parts
 from fleet_slip.cli.output import print_parts
 from fleet_slip.evaluation import blind
 from fleet_slip.evaluation.blind import blind_scenarios, judge_blindly
 from fleet_slip.evaluation.drives import simulate_drives
+from fleet_slip.evaluation.evaluate import Evaluation
 from fleet_slip.evaluation.judge import Signals
 from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.scenario import load_scenario
@@ -83,7 +83,7 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
     assert all(row["results"]["right"]["rmse_deg"] == 0 for row in rows.values())
     whole = rows["all"]["results"]["zero"]
     assert whole["error_std_deg"] == pytest.approx(rows["all"]["sideslip_std_deg"], rel=1e-4)
-    print_parts(evaluation_parts({"estimators": estimators, "drives": judged}, everything=False))
+    print_parts(Evaluation({"estimators": estimators, "drives": judged}).parts())
     told = capsys.readouterr().out
     assert "switchback" in told
     assert "0.000" in told

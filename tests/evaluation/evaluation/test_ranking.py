@@ -9,9 +9,9 @@ from rich.text import Text
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.cli.accuracy import ranking_table
 from fleet_slip.cli.output import print_parts
 from fleet_slip.evaluation.drives import EvaluatedDrive, visible_signals
+from fleet_slip.evaluation.evaluate import _ranking_table
 from fleet_slip.evaluation.judge import EvaluatedScenario, Signals, evaluate_drive, rank
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 
@@ -94,7 +94,7 @@ def test_the_table_keeps_its_numbers_whole(
 ) -> None:
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     monkeypatch.setenv("COLUMNS", str(columns))
-    print_parts([ranking_table(rank([run(ours=0.3, ekf_class_tuned=0.2)], "ours", gps=()))])
+    print_parts([_ranking_table(rank([run(ours=0.3, ekf_class_tuned=0.2)], "ours", gps=()))])
     printed = Text.from_ansi(capsys.readouterr().out).plain
     assert "ours/3 is model 3 of Table I" in " ".join(printed.split())
     table = printed[printed.index("scenario") :]
