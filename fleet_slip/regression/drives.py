@@ -27,18 +27,13 @@ def missing_signals_error(signals: Sequence[str]) -> DataError:
     )
 
 
-def require_serving_drives(tables: Sequence[GramTable], signals: Sequence[str]) -> None:
-    """Raise `DataError` if no drive has all the signals."""
-    if not any(set(signals) <= set(table.signals) for table in tables):
-        raise missing_signals_error(signals)
-
-
 def serving_drives(
     tables: Sequence[GramTable], signals: Sequence[str]
 ) -> tuple[GramTable, BoolArray]:
     """Return one table of drives with all signals, and their mask. Raises `DataError` for none."""
-    require_serving_drives(tables, signals)
     served = [set(signals) <= set(table.signals) for table in tables]
+    if not any(served):
+        raise missing_signals_error(signals)
     parts = [table.restrict(signals) for table, yes in zip(tables, served, strict=True) if yes]
     mask = np.repeat(served, [len(table) for table in tables])
     if len(parts) == 1:

@@ -33,15 +33,7 @@ class ErrorSums:
     null: Fraction
 
     def __add__(self, other: "ErrorSums") -> "ErrorSums":
-        return ErrorSums(
-            self.n + other.n,
-            self.p + other.p,
-            self.y + other.y,
-            self.pp + other.pp,
-            self.py + other.py,
-            self.yy + other.yy,
-            self.null + other.null,
-        )
+        return ErrorSums(*map(operator.add, vars(self).values(), vars(other).values()))
 
     @property
     def squared_error(self) -> Fraction:

@@ -7,7 +7,7 @@ the folds out cannot. Sizes vary by chance; an empty fold is an error.
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Record, number_of
 from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.regression.drives import missing_signals_error
 from fleet_slip.regression.figures import ErrorSums, Figures, error_sums
 from fleet_slip.regression.gram import Gram, GramTable, require_signals
 from fleet_slip.regression.least_squares import LinearModel, Scales, condition_number, fit
@@ -118,13 +119,9 @@ class Folds:
 
     def without(self, number: int, drives: int) -> "Folds":
         """Return the other folds, which hold so many drives."""
-        return Folds(
-            self.grams[:number] + self.grams[number + 1 :],
-            self.names[:number] + self.names[number + 1 :],
-            drives,
-            self.beside,
-            self.weight,
-        )
+        grams = self.grams[:number] + self.grams[number + 1 :]
+        names = self.names[:number] + self.names[number + 1 :]
+        return replace(self, grams=grams, names=names, drives=drives)
 
 
 @dataclass(frozen=True)
@@ -174,10 +171,7 @@ class CohortFolds:
         if not served:
             known = sorted({name for grams in self.tables for name in grams[0].signals})
             require_signals(known, signals)
-            raise DataError(
-                f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or "
-                "another cohort."
-            )
+            raise missing_signals_error(signals)
         folds = tuple(
             sum((self.tables[i][f].restrict(signals) for i in served), Gram.zero(signals))
             for f in range(len(self.names))

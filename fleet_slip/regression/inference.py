@@ -376,7 +376,7 @@ class Evidence:
         2. Raises `DataError`.
         """
         full, variance = fits[-1], _variance(fits[-1])
-        at = [0, *(drives.signals.index(name) + 1 for name in full.model.signals)]
+        at = _columns(full, drives)
         total = drives.matrix(drives.packed.sum(axis=0))[np.ix_(at, at)]
         scores = cluster_scores(full, drives)
         rotated = np.linalg.solve(np.linalg.cholesky(total), scores.T)[1:]

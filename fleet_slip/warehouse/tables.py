@@ -37,9 +37,6 @@ QUARANTINE_SCHEMA = pa.schema(
 that it belongs to and `vehicle_id` its car, null if that is what is wrong; `signal` is the signal
 or metadata concerned, or `time`; `value` is what stood there, as text."""
 
-SIGNED = "signed"
-"""Column of `grams` that releases up to 0.3 kept signatures of cars in; no view has it."""
-
 
 @dataclass(frozen=True)
 class Warehouse:
@@ -81,13 +78,7 @@ class Warehouse:
         """Gram rows of drives, by feature set: n, sums and sums of products of counts."""
         return Table(
             folder=self.root / "grams",
-            schema=pa.schema(
-                [
-                    *gram_schema(self.catalogue),
-                    (SIGNED, pa.binary()),
-                    (COURSE_LATE, pa.int64()),
-                ]
-            ),
+            schema=pa.schema([*gram_schema(self.catalogue), (COURSE_LATE, pa.int64())]),
             encoding=Encoding(
                 dictionary=("feature_set", "file", "part", "signals", *self.catalogue.drive),
                 # A seventh smaller, and twice as fast to write and read, as zstd alone.
@@ -95,7 +86,7 @@ class Warehouse:
                 compression="zstd",
             ),
             description="Gram rows: exact sums and sums of products of counts, one a drive",
-            optional=(SIGNED, COURSE_LATE),
+            optional=(COURSE_LATE,),
         )
 
     def computed_schema(self, *, in_time: bool) -> pa.Schema:
