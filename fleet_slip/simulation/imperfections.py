@@ -158,7 +158,10 @@ class ImperfectionRanges(Config):
                 (SensorImperfections, self.sensors),
                 (RoadImperfections, self.road),
             ):
-                kind.model_validate({name: _end(kind, name, r, end) for name, r in ranges.items()})
+                if strange := [name for name in ranges if name not in kind.model_fields]:
+                    known = ", ".join(kind.model_fields)
+                    raise ValueError(f"{strange[0]!r} is no imperfection. There are: {known}")
+                kind.model_validate({name: getattr(one, end) for name, one in ranges.items()})
         return self
 
     @model_validator(mode="after")
@@ -188,12 +191,6 @@ class ImperfectionRanges(Config):
             sensors=_draw(SensorImperfections, self.sensors, of_car),
             road=_draw(RoadImperfections, self.road, of_drive),
         )
-
-
-def _end(kind: type[Config], name: str, bounds: Range, end: str) -> float:
-    if name not in kind.model_fields:
-        raise ValueError(f"{name!r} is no imperfection. There are: {', '.join(kind.model_fields)}")
-    return float(getattr(bounds, end))
 
 
 def _draw(kind: type[ConfigT], ranges: dict[str, Range], generator: np.random.Generator) -> ConfigT:

@@ -438,8 +438,17 @@ class TrialPlan(DrawnPlan):
         adhesion = self.adhesion.draw(of_drive)
         friction = self.friction_use.draw(of_drive) * adhesion * GRAVITY_MPS2
         lateral_mps2 = min(self.lateral_mps2.draw(of_drive), friction)
-        limits = self._tempered(lateral_mps2, of_drive)
-        vehicle = self._loaded(vehicle, of_drive)
+        limits = SpeedLimits(
+            lateral_mps2=lateral_mps2,
+            acceleration_mps2=self.acceleration_mps2 * self.acceleration.draw(of_drive),
+            braking_mps2=self.braking_mps2 * self.braking.draw(of_drive),
+            top_speed_mps=self.top_speed_mps,
+        )
+        loaded_kg = vehicle.body.sprung_mass_kg * self.load.draw(of_drive)
+        vehicle = vehicle.with_sprung_mass(loaded_kg).with_tyres(
+            stiffness_factor=self.tyre_stiffness.draw(of_drive),
+            rolling_radius_factor=self.tyre_radius.draw(of_drive),
+        )
         sensors = _noisier(sensors, self.noise.draw(of_drive))
         script = self.manoeuvres.draw(track, adhesion, of_drive)
         kind = road_class(track)
@@ -459,15 +468,6 @@ class TrialPlan(DrawnPlan):
             flaws=ranges.draw(of_car, of_drive),
         )
 
-    def _tempered(self, lateral_mps2: float, generator: np.random.Generator) -> SpeedLimits:
-        limits = self.limits(lateral_mps2)
-        return limits.model_copy(
-            update={
-                "acceleration_mps2": limits.acceleration_mps2 * self.acceleration.draw(generator),
-                "braking_mps2": limits.braking_mps2 * self.braking.draw(generator),
-            }
-        )
-
     def _as_today(
         self, vehicle: VehicleParameters, ranges: ImperfectionRanges, generator: np.random.Generator
     ) -> VehicleParameters:
@@ -480,15 +480,6 @@ class TrialPlan(DrawnPlan):
         days = round(generator.uniform(0, self.tyre_wear_days))
         stiffer, smaller = ranges.wear(generator, days)
         return vehicle.with_tyres(stiffness_factor=stiffer, rolling_radius_factor=smaller)
-
-    def _loaded(
-        self, vehicle: VehicleParameters, generator: np.random.Generator
-    ) -> VehicleParameters:
-        vehicle = vehicle.with_sprung_mass(vehicle.body.sprung_mass_kg * self.load.draw(generator))
-        return vehicle.with_tyres(
-            stiffness_factor=self.tyre_stiffness.draw(generator),
-            rolling_radius_factor=self.tyre_radius.draw(generator),
-        )
 
 
 def _noisier(sensors: Sensors, factor: float) -> Sensors:

@@ -146,6 +146,14 @@ class Track(Config):
         at = np.searchsorted(nodes, station)
         return CentreLine(station, x[at], y[at], heading[at])
 
+    def through(self, curvature_1pm: FloatArray, step_m: float) -> Self:
+        """Return a track in the place of this one, through curvatures so far apart."""
+        pairs = zip(curvature_1pm[:-1].tolist(), curvature_1pm[1:].tolist(), strict=True)
+        segments = tuple(Segment(length_m=step_m, curvature_1pm=pair) for pair in pairs)
+        return type(self)(
+            name=self.name, description=self.description, closed=self.closed, segments=segments
+        )
+
     def closure(self) -> tuple[float, float]:
         """Return how far apart the ends are: in m, and in rad beside whole turns."""
         line = self.centre_line(self.length_m)
@@ -484,14 +492,7 @@ def driven_line(
     bends = np.zeros(knots)
     bends[1:-1] = (offsets_m[:-2] - 2 * offsets_m[1:-1] + offsets_m[2:]) / wander_every_m**2
     curvature = curvature + np.interp(station_m, np.linspace(0.0, road.length_m, knots), bends)
-    ends = zip(curvature[:-1].tolist(), curvature[1:].tolist(), strict=True)
-    step_m = road.length_m / (points - 1)
-    return Track(
-        name=road.name,
-        description=road.description,
-        closed=road.closed,
-        segments=tuple(Segment(length_m=step_m, curvature_1pm=pair) for pair in ends),
-    )
+    return road.through(curvature, road.length_m / (points - 1))
 
 
 def _mean_around(road: Track, station_m: FloatArray, reach_m: float) -> FloatArray:

@@ -593,10 +593,11 @@ class Recorder:
             seen = truth.get(catalogue()[name].column)
             fixed = (truth[column] if seen is None else seen)[fix]
             noise = self._generator.standard_normal(len(fixed), dtype=np.float32)
-            self._add(name, fixed, noise, (0.0, self._sensors.gps.velocity_std_mps))
+            std = self._sensors.gps.velocity_std_mps
             counts = np.zeros(ticks, dtype=np.int16)
-            counts[fix] = self._counts[name].pop()
-            self._counts[name].append(counts)
+            counts[fix], clipped = noisy_counts(fixed, noise, (0.0, std), catalogue()[name])
+            self._counts.setdefault(name, []).append(counts)
+            self._saturated += clipped
 
     def _add(
         self,

@@ -23,10 +23,8 @@ from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.simulation.roads import (
     LINE_STEP_M,
     SLOWEST_MPS,
-    Segment,
     SpeedLimits,
     SpeedProfile,
-    Track,
 )
 
 if TYPE_CHECKING:
@@ -283,13 +281,7 @@ def _planned(
     points = max(2, round(float(ends[-1]) / LINE_STEP_M)) + 1
     line_m = np.linspace(0.0, float(ends[-1]), points)
     curvature = np.interp(line_m, (station_m + ends) / 2, [step.curvature_1pm for step in steps])
-    pairs = zip(curvature[:-1].tolist(), curvature[1:].tolist(), strict=True)
-    track = Track(
-        name=traffic.track.name,
-        description=traffic.track.description,
-        closed=False,
-        segments=tuple(Segment(length_m=float(line_m[1]), curvature_1pm=pair) for pair in pairs),
-    )
+    track = traffic.track.through(curvature, float(line_m[1]))
     grid_m, even_m = track.grid(spacing_m)
     speed = np.interp(grid_m, station_m, [max(step.speed_mps, SLOWEST_MPS) for step in steps])
     profile = SpeedProfile(track, even_m, grid_m, speed / speed_factor)

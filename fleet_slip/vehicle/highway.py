@@ -193,7 +193,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
     @property
     def specific_force(self) -> tuple[float, float]:
         """What an accelerometer at the centre of gravity reads: ax, ay in m/s²."""
-        rates = _rates(self.motion, self.controls, self.constants)
+        rates = self._rates_of(self.motion)
         return rates.ax, rates.ay
 
     @property
@@ -215,11 +215,13 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         """Return the rates of highway-env's state (x, y, heading, vx, vy, yaw rate), (6, 1)."""
         del time
         heading, vx, vy, yaw_rate = (float(value) for value in state[2:, 0])
-        x = self._hidden._replace(vx=vx, vy=vy, yaw_rate=yaw_rate)
-        rates = _rates(x, self.controls, self.constants)
+        rates = self._rates_of(self._hidden._replace(vx=vx, vy=vy, yaw_rate=yaw_rate))
         cosine, sine = math.cos(heading), math.sin(heading)
         place = (vx * cosine - vy * sine, vx * sine + vy * cosine, yaw_rate)
         return np.array([*place, rates.vx, rates.vy, rates.yaw_rate])[:, np.newaxis]
+
+    def _rates_of(self, x: State) -> Derivative | Acceleration:
+        return _rates(x, self.controls, self.constants)
 
     def step(self, dt: float) -> None:
         """Move on by `dt` s in steps of at most `STEP_S`."""
@@ -262,20 +264,14 @@ class PlainVehicle(FourWheelVehicle):
         self.position = np.array([x, y])
         self.heading, self.speed, self.lateral_speed, self.yaw_rate = motion
 
-    def derivative_func(self, time: float, state: FloatArray, **_: Any) -> Any:
-        """Return the rates of highway-env's state under the forces of linear axles, (6, 1)."""
-        del time
-        heading, vx, vy, yaw_rate = (float(value) for value in state[2:, 0])
+    def _rates_of(self, x: State) -> Acceleration:
+        """Return how the body moves under the forces of linear axles."""
         c = self.constants._replace(drag_per_mass=0.0)
-        slip_front = self.action["steering"] - math.atan2(vy + c.front * yaw_rate, vx)
-        slip_rear = -math.atan2(vy - c.rear * yaw_rate, vx)
-        along = c.mass * (self.action["acceleration"] - yaw_rate * vy)
+        slip_front = self.action["steering"] - math.atan2(x.vy + c.front * x.yaw_rate, x.vx)
+        slip_rear = -math.atan2(x.vy - c.rear * x.yaw_rate, x.vx)
+        along = c.mass * (self.action["acceleration"] - x.yaw_rate * x.vy)
         front, rear = 2 * self.FRICTION_FRONT * slip_front, 2 * self.FRICTION_REAR * slip_rear
-        x = self._hidden._replace(vx=vx, vy=vy, yaw_rate=yaw_rate)
-        rates = _rates_on_axles(x, along, front, rear, c)
-        cosine, sine = math.cos(heading), math.sin(heading)
-        place = (vx * cosine - vy * sine, vx * sine + vy * cosine, yaw_rate)
-        return np.array([*place, rates.vx, rates.vy, rates.yaw_rate])[:, np.newaxis]
+        return _rates_on_axles(x, along, front, rear, c)
 
 
 def bicycle_of(car: FourWheelVehicle) -> BicycleVehicle:
