@@ -152,7 +152,6 @@ class FleetCohort(Rooted):
         """
         from fleet_slip.catalogue.signals import catalogue
         from fleet_slip.models.diagnose import what_if
-        from fleet_slip.models.predict import counts_model
         from fleet_slip.regression.least_squares import fit
 
         if not noise and not bias:
@@ -162,7 +161,7 @@ class FleetCohort(Rooted):
         examined = self._examined(model, signals, features)
         cohort = self._load(examined.feature_set)
         if examined.version is not None:
-            one = counts_model(examined.version.manifest)
+            one = examined.version.manifest.counts_model()
         else:
             inputs = examined.inputs(cohort)
             one = fit(cohort.serving(inputs).table.total(), inputs, catalogue().label).model

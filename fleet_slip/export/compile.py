@@ -1,4 +1,4 @@
-"""Makes the integer program of a published manifest."""
+"""Makes the integer program of a published manifest, and checks that travel with it."""
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,29 +10,13 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.definitions import plain_column
-from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
+from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
-from fleet_slip.columns.operations import (
-    CarFact,
-    Lowering,
-    size_of,
-)
-from fleet_slip.errors import DataError
-from fleet_slip.export.program import (
-    LARGEST_ANGLE,
-    OUTPUT_COUNTS,
-    UNKNOWN_CAR,
-    Angle,
-    Car,
-    Input,
-    Program,
-    fixed_point,
-)
+from fleet_slip.columns.operations import CarFact
+from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program, write_program
 from fleet_slip.grams.compute import counts_of
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.predict import Predictor, counts_model
+from fleet_slip.models.predict import Predictor
 
 
 def compile_program(manifest: Manifest) -> Program:
@@ -41,55 +25,8 @@ def compile_program(manifest: Manifest) -> Program:
     Raises what `write_program` raises, and `QuestionError` or `DataError` for definitions that
     contradict each other.
     """
-    from fleet_slip.models.predict import Predictor  # noqa: PLC0415 - numba, not for show
-
     _ = Predictor.of(manifest).plan.program  # raises for what the kernel could not compute
     return write_program(manifest)
-
-
-def write_program(manifest: Manifest) -> Program:
-    """Return the program of definitions that are known to agree.
-
-    Raises `RefusedError` if counts mean something else now, or no bound of the error can be stated,
-    and `DataError` for a feature of no signal.
-    """
-    signals = _inputs(manifest)
-    columns = [term.definition or plain_column(term.signal, term.sql) for term in manifest.terms]
-    lowered, places = Lowering.of([one.name for one in signals], columns)
-    steps, facts, numbers = tuple(lowered.steps), tuple(lowered.facts), tuple(lowered.numbers)
-    ranges = lowered.ranges([(one.min_count, one.max_count) for one in signals])
-    exact = counts_model(manifest)
-    fixed = fixed_point(
-        exact.intercept * OUTPUT_COUNTS,
-        [one * OUTPUT_COUNTS for one in exact.coefficients],
-        [size_of(ranges[place]) for place in places],
-    )
-    label = catalogue()[manifest.label.signal]
-    angle = Angle(
-        name=manifest.label.signal,
-        column=label.column,
-        unit=label.unit,
-        scale=label.scale / Decimal(OUTPUT_COUNTS),
-        places=tuple(places),
-        limit=LARGEST_ANGLE,
-        **vars(fixed),
-    )
-    return Program(signals, facts, numbers, steps, angle)
-
-
-def _inputs(manifest: Manifest) -> tuple[Input, ...]:
-    used: set[str] = set()
-    for term in manifest.terms:
-        parts = term.definition.parts if term.definition else (term,)
-        if any(part.sql and not parse(part.sql).inputs for part in parts):
-            raise DataError(f"the feature {term.signal} is of no signal. Publish the model again.")
-        used |= {*term.inputs}
-    return tuple(
-        # -32768 is a missing count on board, so that a cyclic signal lacks its half turn there.
-        Input(name, s.column, s.unit, s.scale, max(s.min_count, -COUNT_MAX), s.max_count)
-        for name, s in catalogue().signals.items()
-        if name in used
-    )
 
 
 # Checks of a program that travel with it: ticks of made-up drives, and the angles.

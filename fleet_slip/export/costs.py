@@ -13,8 +13,7 @@ from typing import Any
 from fleet_slip.base import Record, number_of
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.export.c import StepWriter, state_bytes, step_lines
-from fleet_slip.export.compile import write_program
-from fleet_slip.export.program import Program
+from fleet_slip.export.program import Program, write_program
 from fleet_slip.models.manifest import Manifest
 
 COEFFICIENT_BYTES = 8

@@ -22,7 +22,6 @@ from onnx import TensorProto, helper, numpy_helper
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.operations import GIVEN, operands_of, operation_of, plain_of, size_of
 from fleet_slip.export.program import Program
-from fleet_slip.models.predict import counts_model
 from fleet_slip.models.registry import ModelVersion
 
 # Nodes of an ONNX graph: how they are written, and what several of them compute together.
@@ -132,7 +131,7 @@ def error_bound(version: ModelVersion, program: Program, kind: FloatName) -> flo
 
 def _radians(version: ModelVersion) -> list[Fraction]:
     """Return the intercept, and the coefficients of counts, in the unit of the angle."""
-    exact = counts_model(version.manifest)
+    exact = version.manifest.counts_model()
     unit = Fraction(catalogue()[version.manifest.label.signal].scale)
     return [one * unit for one in (exact.intercept, *exact.coefficients)]
 

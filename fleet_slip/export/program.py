@@ -13,9 +13,13 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Literal
 
+from fleet_slip.catalogue.arithmetic import parse
+from fleet_slip.catalogue.definitions import plain_column
+from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.columns.operations import (
     CarCount,
     CarFact,
+    Lowering,
     Range,
     Step,
     given_ranges,
@@ -23,8 +27,10 @@ from fleet_slip.columns.operations import (
     ranges_of,
     rings_of,
     roots_of,
+    size_of,
 )
-from fleet_slip.errors import RefusedError
+from fleet_slip.errors import DataError, RefusedError
+from fleet_slip.models.manifest import Manifest
 
 # Exact coefficients as integers, and a proof of how far the angle can be from the exact model.
 #
@@ -231,3 +237,48 @@ class Car:
 
 UNKNOWN_CAR = Car({}, {})
 """A car of which nothing is known."""
+
+
+def write_program(manifest: Manifest) -> Program:
+    """Return the program of definitions that are known to agree.
+
+    Raises `RefusedError` if counts mean something else now, or no bound of the error can be stated,
+    and `DataError` for a feature of no signal.
+    """
+    signals = _inputs(manifest)
+    columns = [term.definition or plain_column(term.signal, term.sql) for term in manifest.terms]
+    lowered, places = Lowering.of([one.name for one in signals], columns)
+    steps, facts, numbers = tuple(lowered.steps), tuple(lowered.facts), tuple(lowered.numbers)
+    ranges = lowered.ranges([(one.min_count, one.max_count) for one in signals])
+    exact = manifest.counts_model()
+    fixed = fixed_point(
+        exact.intercept * OUTPUT_COUNTS,
+        [one * OUTPUT_COUNTS for one in exact.coefficients],
+        [size_of(ranges[place]) for place in places],
+    )
+    label = catalogue()[manifest.label.signal]
+    angle = Angle(
+        name=manifest.label.signal,
+        column=label.column,
+        unit=label.unit,
+        scale=label.scale / Decimal(OUTPUT_COUNTS),
+        places=tuple(places),
+        limit=LARGEST_ANGLE,
+        **vars(fixed),
+    )
+    return Program(signals, facts, numbers, steps, angle)
+
+
+def _inputs(manifest: Manifest) -> tuple[Input, ...]:
+    used: set[str] = set()
+    for term in manifest.terms:
+        parts = term.definition.parts if term.definition else (term,)
+        if any(part.sql and not parse(part.sql).inputs for part in parts):
+            raise DataError(f"the feature {term.signal} is of no signal. Publish the model again.")
+        used |= {*term.inputs}
+    return tuple(
+        # -32768 is a missing count on board, so that a cyclic signal lacks its half turn there.
+        Input(name, s.column, s.unit, s.scale, max(s.min_count, -COUNT_MAX), s.max_count)
+        for name, s in catalogue().signals.items()
+        if name in used
+    )

@@ -39,7 +39,6 @@ from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
 from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
 from fleet_slip.models.manifest import Manifest, TrainedDrives
-from fleet_slip.models.predict import counts_model
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 from fleet_slip.models.search import searching
 from fleet_slip.models.select import Selection
@@ -192,7 +191,7 @@ def contest(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest
     label, winner, found = catalogue().label, selection.winner.model, selection.searched_winner
     inputs = found.inputs if found is not None else winner.signals
     feature_set = selection.cohort.feature_set
-    models = tuple(counts_model(version.manifest, feature_set) for version in incumbents)
+    models = tuple(version.manifest.counts_model(feature_set) for version in incumbents)
     every = (name for model in models for name in model.signals)
     signals = tuple(dict.fromkeys((*inputs, *every)))
     cars = selection.cohort.count_vehicles_with((*signals, label))

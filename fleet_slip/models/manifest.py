@@ -23,10 +23,12 @@ from pydantic import (
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.catalogue.definitions import Definition, integer_arithmetic, plain_column
+from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.grams.gram_files import Hashes
+from fleet_slip.regression.least_squares import LinearModel
 
 MOST_DIGITS = 4000
 """Most decimal digits of a number that stands in decimal; Python refuses longer ones as text."""
@@ -284,6 +286,30 @@ class Manifest(Config):
     def signals(self) -> tuple[str, ...]:
         """Names of the model's inputs."""
         return tuple(term.signal for term in self.terms)
+
+    def counts_model(self, feature_set: str | None = None) -> LinearModel:
+        """Return the model as one of counts, exactly.
+
+        For the Gram rows of a feature set of changes it has no intercept, and no column that is a
+        number of the car alone: a change has none.
+        """
+        changes = feature_set is not None and features().feature_set(feature_set).change_ticks
+        # Of the counts as they are now: a signal's scale may have changed since it was published.
+        self.require_same_counts()
+        scales = input_scales()
+        unit = scales[self.label.signal]
+        terms = [term for term in self.terms if not (changes and term.alone)]
+        return LinearModel(
+            tuple(term.signal for term in terms),
+            self.label.signal,
+            tuple(
+                term.coefficient_exact
+                * (scales[term.signal] if term.logged else term.scale_exact)
+                / unit
+                for term in terms
+            ),
+            Fraction(0) if changes else self.intercept_exact / unit,
+        )
 
     @property
     def columns(self) -> tuple[str, ...]:

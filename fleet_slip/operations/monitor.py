@@ -25,7 +25,6 @@ from fleet_slip.catalogue.features import PLAIN, features, input_scales
 from fleet_slip.errors import AlarmError, ConfigError, DataError, StorageError
 from fleet_slip.grams.cohort import remark_left_out, sum_days
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.predict import counts_model
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.operations.peers import MonitorThresholds, thresholds
 from fleet_slip.pages.drawing import DESK, STYLE, Size, colour
@@ -181,7 +180,7 @@ def _models(
     """Return the model that predicts each day: of a training day, the one made without it."""
     own = [gram for gram, known in zip(grams, training, strict=True) if known]
     total = sum(own[1:], own[0])
-    champion = counts_model(manifest, feature_set)
+    champion = manifest.counts_model(feature_set)
     refit = least_squares(champion.signals, champion.label, intercept=not manifest.through_origin)
     return [
         refit(total - gram) if known else champion

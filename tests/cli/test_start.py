@@ -41,7 +41,7 @@ def imported_by(root: Path, *arguments: str) -> set[str]:
         (["--help"], TABLES | ENGINES | {"rich", "pydantic", "email"}),
         (["select", "--help"], {"highway_env", "matplotlib"}),
         (["models"], ENGINES - {"duckdb"} | {"rich.table"}),
-        (["show", "smoke"], ENGINES - {"duckdb", "numba"}),
+        (["show", "smoke"], ENGINES - {"duckdb"}),
         (["status"], ENGINES - {"duckdb"}),
         (["sql", "--csv", "FROM models"], ENGINES - {"duckdb"} | {"rich.table"}),
     ],

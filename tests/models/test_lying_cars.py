@@ -11,7 +11,6 @@ import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import RefusedError
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.predict import counts_model
 from fleet_slip.models.select import Selection
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram, packed_position
@@ -74,7 +73,7 @@ def lie(gram: Gram, gain: int = 1, offset: int = 0, times: int = 1) -> Gram:
 
 def error_deg(manifest: Manifest, grams: Sequence[Gram]) -> float:
     """RMSE of a version on the honest drives."""
-    model = counts_model(manifest)
+    model = manifest.counts_model()
     total = sum(grams[1:], grams[0]).restrict((*model.signals, model.label))
     return error_sums(model, total).figures(catalogue()[model.label].exact_scale).rmse_deg
 

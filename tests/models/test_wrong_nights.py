@@ -19,7 +19,6 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.predict import counts_model
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
 from tests.support.cars import Signals, counts, drive
@@ -133,7 +132,7 @@ def truth() -> Gram:
 
 
 def error_deg(manifest: Manifest, truth: Gram) -> float:
-    model = counts_model(manifest)
+    model = manifest.counts_model()
     sums = error_sums(model, truth.restrict((*model.signals, model.label)))
     return sums.figures(catalogue()[model.label].exact_scale).rmse_deg
 

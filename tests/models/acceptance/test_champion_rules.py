@@ -15,7 +15,6 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, RefusedError, StorageError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models import acceptance as champion_rules
-from fleet_slip.models.predict import counts_model
 from fleet_slip.models.publish import Publication, manifest_of, publish, would_publish
 from fleet_slip.models.registry import CANDIDATE, Registry
 from fleet_slip.models.request import SelectionRequest
@@ -185,7 +184,7 @@ def test_the_champion_is_compared_as_it_is_not_fitted_anew(champion: Warehouse) 
     answer = answer_request(champion, request, "drive_id LIKE 'more%'")
     comparison = champion_rules.compare(answer, [version])
     (as_it_is,) = comparison.incumbents
-    assert as_it_is.counts.coefficients == counts_model(version.manifest).coefficients
+    assert as_it_is.counts.coefficients == version.manifest.counts_model().coefficients
     assert as_it_is.pooled.rows == comparison.challenger.pooled.rows == 48 * ROWS
 
 
