@@ -23,7 +23,6 @@ from fleet_slip.api.calls import (
 )
 from fleet_slip.base import last_day
 from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.errors import InputError
 from fleet_slip.storage.runs import step
 
 if TYPE_CHECKING:
@@ -102,14 +101,13 @@ class LogsAndGrams(Rooted):
         `InputError`, when all others are in, for files that cannot be used, or `RepeatedError`
         where these are all in already; `StorageError` and `ClusterError`.
         """
-        from fleet_slip.ingest.load import ingest_files, joined
+        from fleet_slip.ingest.load import ingest_files
         from fleet_slip.ingest.mapping import keep_assumptions
         from fleet_slip.ingest.recordings import KnownFiles
         from fleet_slip.operations.rewriting import take_out
 
         plan, logs, folders = _chosen_logs(files, mapping, as_one=as_one)
         count = count_from_start(progress)
-        failures: list[InputError] = []
         reports: list[IngestReport] = []
         with open_workers(self.root, workers) as executor, step("ingest") as figures:
             elsewhere = unless_local(executor)
@@ -127,9 +125,7 @@ class LogsAndGrams(Rooted):
             if landed := len(logs) - len(wanted):
                 count(landed, len(logs))
             try:
-                for report in ingest_files(
-                    warehouse, wanted, plan, threads, known, replace, out, failures
-                ):
+                for report in ingest_files(warehouse, wanted, plan, threads, known, replace, out):
                     reports.append(report)
                     figures.rows += report.counts.ticks if report.new else 0
                     if each is not None:
@@ -140,8 +136,6 @@ class LogsAndGrams(Rooted):
                     known.save()
                 if any(report.new for report in reports):
                     keep_assumptions(self.root, plan)
-            if failures:
-                raise joined(failures)
         order = {str(log): number for number, log in enumerate(logs)}
         return sorted(reports, key=lambda report: order[report.file])
 

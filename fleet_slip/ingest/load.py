@@ -187,7 +187,6 @@ def ingest_files(
     known: KnownFiles | None = None,
     replace: Replace = "no",
     take_out: TakeOut | None = None,
-    failures: list[InputError] | None = None,
 ) -> Iterator[IngestReport]:
     """Ingest files, and yield a report of each as it is committed; small files land together.
 
@@ -195,30 +194,27 @@ def ingest_files(
     which keeps all cores busy. `known` remembers what is in. A recording that is there is refused,
     unless it is to be replaced: then `take_out` takes it out in the same commit.
 
-    Errors of files come at the end: `failures` takes them, or `InputError` names all, or
-    `RepeatedError` where all are there already. Raises `ClusterError` for files that workers died
-    of.
+    At the end raises `InputError`, which names all files that cannot be used, or `RepeatedError`
+    where all of these are there already; and `ClusterError` for files that workers died of.
     """
     write = partial(write_batch, warehouse, mapping, replace=replace)
     warehouse.logs.require_writable(mapping.signal_names)
-    failed: list[InputError] = []
+    failures: list[InputError] = []
     asked = (AskedFile(file, known.digest_of(file) if known else None) for file in files)
     for batch, written in _written(executor, write, _batches(asked)):
         # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
         digest = digest_of([one.digest for one in written.files])
         note = {"job": "ingest", "mapping": mapping.name, "digest": digest}
         committed, new = commit_batch(warehouse, written, partial(write, batch), note, take_out)
-        failed += committed.failures
+        failures += committed.failures
         for one in committed.files:
             unit = unit_of(one.digest).name
             yield _finished(warehouse, one, is_new=unit in new)
             new -= {unit}  # the same content in another file is not new
             if known is not None:
                 known.remember(one.log, one.digest)
-    if failures is not None:
-        failures += failed
-    elif failed:
-        raise joined(failed)
+    if failures:
+        raise _joined(failures)
 
 
 def _written(
@@ -271,7 +267,7 @@ def _finished(warehouse: Warehouse, one: WrittenFile, *, is_new: bool) -> Ingest
     return report
 
 
-def joined(failures: list[InputError]) -> InputError:
+def _joined(failures: list[InputError]) -> InputError:
     """Return one error that names all."""
     if len(failures) == 1:
         return failures[0]
@@ -319,30 +315,20 @@ def write_batch(
                 failures.append(error)
             else:
                 batch.end(one, stream.longest)
-        batch.longest.judge()
+        _judge_longest(batch.longest)
         new = {name: data.finish() for name, data in batch.data.items()}
     return WrittenBatch(tuple(batch.written), tuple(failures), batch.forgotten, new)
 
 
-class _Longest:
-    """The longest drive of files that are read together, which is looked at for what looks wrong.
+def _judge_longest(found: Iterable[tuple[_Judged, MeasuredDrive | None]]) -> None:
+    """Add what looks wrong in the longest drive of files to the report of its file.
 
     It stands for all, since to look at a drive takes longer than to load a small file.
     """
-
-    def __init__(self) -> None:
-        self._report: _Judged | None = None
-        self._drive: MeasuredDrive | None = None
-
-    def add(self, report: _Judged, drive: MeasuredDrive | None) -> None:
-        """Keep the longest drive of a file if it is longer than all before."""
-        if drive and (self._drive is None or drive.ticks.size > self._drive.ticks.size):
-            self._report, self._drive = report, drive
-
-    def judge(self) -> None:
-        """Add what looks wrong in it to the report of its file."""
-        if self._report is not None and self._drive is not None:
-            self._report.suspicions += tuple(find_suspicions(signals_of(self._drive)))
+    drives = [(report, drive) for report, drive in found if drive is not None]
+    if drives:
+        report, drive = max(drives, key=lambda one: one[1].ticks.size)
+        report.suspicions += tuple(find_suspicions(signals_of(drive)))
 
 
 class _Writer:
@@ -362,7 +348,7 @@ class _Writer:
         self.data = {name: DataFiles(t, writers) for name, t in tables_of(warehouse).items()}
         self._same = SameRecordings(warehouse, logs, mapping.name, replace)
         self.written: list[WrittenFile] = []
-        self.longest = _Longest()
+        self.longest: list[tuple[_Judged, MeasuredDrive | None]] = []
 
     def _look(self) -> Snapshot:
         """Look at the tables as they are now; return a snapshot of the logs."""
@@ -422,7 +408,7 @@ class _Writer:
             data.end_log()
         self.written.append(one)
         if one.report.new:
-            self.longest.add(one.report, longest)
+            self.longest.append((one.report, longest))
 
 
 def _groups(drives: Iterable[MeasuredDrive]) -> Iterator[list[MeasuredDrive]]:
@@ -451,12 +437,9 @@ def preview_logs(logs: Iterable[Log], mapping: Mapping) -> list[Preview]:
     """
     previews: list[Preview] = []
     for batch in _batches(map(AskedFile, logs)):
-        longest = _Longest()
-        for asked in batch:
-            preview, drive = preview_log(asked.file, mapping)
-            longest.add(preview, drive)
-            previews.append(preview)
-        longest.judge()
+        found = [preview_log(asked.file, mapping) for asked in batch]
+        _judge_longest(found)
+        previews += [preview for preview, _ in found]
     return previews
 
 
