@@ -5,10 +5,7 @@ floats, dates or timestamps. CSV fields stay text, so that what is not a number 
 as it was written.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
-from functools import partial
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -18,7 +15,7 @@ import polars as pl
 from fleet_slip.base import shown
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.reading import file_errors, open_source
-from fleet_slip.ingest.formats.source import BASE, Base, Budget, Source
+from fleet_slip.ingest.formats.source import BASE, Budget
 from fleet_slip.ingest.formats.tables import BATCH_ROWS
 from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.mapping import Mapping
@@ -31,76 +28,43 @@ def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
     """Yield the columns of a log that a mapping uses, in its order, in bounded batches.
 
     Rows of several time bases come as `merge_bases` says; files of one log, in the order of their
-    names, have one. Raises `InputError` if a file cannot be
-    read, or a column is missing or ambiguous.
+    names, have one. Raises `InputError` if a file cannot be read, has a clock and the mapping none
+    or the other way round, or if a column is missing or ambiguous.
     """
-    wanted, parts = mapping.time_bases(), parts_of(log)
+    wanted, parts, time = mapping.time_bases(), parts_of(log), str(mapping.time.key)
     for part in parts:
-        with _open_part(part, mapping) as source:
-            if len(wanted) == 1 and not mapping.time.own_clock:
-                yield from Budget.of(part).metered(source.batches(next(iter(wanted.values()))))
+        with file_errors(part), open_source(part, mapping.formats) as source:
+            if source.has_clock != mapping.time.own_clock:
+                raise InputError(
+                    f"{shown(part)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
+                    f"{mapping.name!r}."
+                )
+            metered = Budget.of(part).metered
+            if len(wanted) == 1 and not source.has_clock:
+                yield from metered(source.batches(next(iter(wanted.values()))))
                 continue
-            bases = _bases_of(source, part, mapping, wanted)
+            if source.has_clock:
+                bases = [base for columns in wanted.values() for base in source.bases(columns)]
+            else:
+                bases = [
+                    _with_times(source.batches(columns), part, str(own), time)
+                    for own, columns in wanted.items()
+                ]
             if len(parts) > 1 and len(bases) > 1:
                 raise InputError(
                     f"{shown(part)}: its signals have {len(bases)} time bases, and files of one "
                     "log have one. Ingest each file as a log of its own: one trip joins them."
                 )
-            yield from _merged(bases, mapping)
+            held, split_gap_s = mapping.common_columns(), mapping.time.split_gap_s
+            for rows in merge_bases([*map(metered, bases)], time, held, split_gap_s):
+                yield from rows.iter_slices(BATCH_ROWS)
 
 
-def _merged(bases: list[Base], mapping: Mapping) -> Iterator[pl.DataFrame]:
-    """Yield the rows of time bases as those of one table."""
-    time, held = str(mapping.time.key), mapping.common_columns()
-    for rows in merge_bases(bases, time, held, mapping.time.split_gap_s):
-        yield from rows.iter_slices(BATCH_ROWS)
-
-
-@contextmanager
-def _open_part(part: Path, mapping: Mapping) -> Iterator[Source]:
-    """Open a file that says times as the mapping does. Raises `InputError`."""
-    with file_errors(part), open_source(part, mapping.formats) as source:
-        if source.has_clock != mapping.time.own_clock:
-            raise InputError(
-                f"{shown(part)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
-                f"{mapping.name!r}."
-            )
-        yield source
-
-
-def _bases_of(
-    source: Source, part: Path, mapping: Mapping, wanted: dict[str | None, list[str]]
-) -> list[Base]:
-    """Return the time bases of a file that have one of the wanted columns."""
-    if source.has_clock:
-        bases = [base for columns in wanted.values() for base in source.bases(columns)]
-    else:
-        time = str(mapping.time.key)
-        bases = [
-            Base(
-                partial(_count_rows, source, str(own), own == time),
-                partial(_read_with_times, source, part, columns, str(own), time),
-            )
-            for own, columns in wanted.items()
-        ]
-
-    def metered(read: Callable[[], Iterator[pl.DataFrame]]) -> Iterator[pl.DataFrame]:
-        return Budget.of(part).metered(read())
-
-    return [replace(base, read=partial(metered, base.read)) for base in bases]
-
-
-def _count_rows(source: Source, own: str, is_main: bool) -> int:
-    """Return how many rows a base has: those with a time, where it has times of its own."""
-    batches = source.batches([own])
-    return sum(batch.height - (0 if is_main else batch[own].null_count()) for batch in batches)
-
-
-def _read_with_times(
-    source: Source, part: Path, columns: list[str], own: str, time: str
+def _with_times(
+    batches: Iterator[pl.DataFrame], part: Path, own: str, time: str
 ) -> Iterator[pl.DataFrame]:
-    """Yield the rows of a base, its times under the name that all times have."""
-    for batch in source.batches(columns):
+    """Yield the rows that have a time of their own, under the name that all times have."""
+    for batch in batches:
         if not batch[own].dtype.is_numeric():
             raise InputError(
                 f"{shown(part)}: the time {own!r} is not of numbers; signals with times of their "
@@ -120,7 +84,7 @@ DISORDER = "\0disorder"
 HELD = "\0held "
 """Before the name of a column: its last value at the time, whatever base the row is of."""
 ROW = "\0row"
-"""Column with the row's number, from 1: those of the first base come first, then the next."""
+"""Column with the row's number among those of its base, from 1."""
 _RIGHT = "\0right"
 """Column with the last right time of the base up to each row: where the row stands among others."""
 WINDOW_ROWS = 2**16
@@ -128,7 +92,7 @@ WINDOW_ROWS = 2**16
 
 
 def merge_bases(
-    bases: Sequence[Base], time: str, held: Sequence[str], split_gap_s: float
+    bases: Sequence[Iterator[pl.DataFrame]], time: str, held: Sequence[str], split_gap_s: float
 ) -> Iterator[pl.DataFrame]:
     """Yield the rows of all bases, window by window in the order of time, with `BASE` as a number.
 
@@ -143,11 +107,9 @@ def merge_bases(
     if len(some) == 1:
         yield from (_completed(batch, columns) for batch in some[0].batches)
         return
-    coming, offset = some, 0
+    coming = some
     for number, one in enumerate(some):
-        one.begin(number, offset, max(WINDOW_ROWS // len(some), 1))
-        if number + 1 < len(some):
-            offset += one.base.count_rows()
+        one.begin(number, max(WINDOW_ROWS // len(some), 1))
     columns |= {BASE: pl.Int32(), DISORDER: pl.String(), ROW: pl.Int64(), _RIGHT: pl.Float64()}
     of = {name: number for number, one in reversed([*enumerate(some)]) for name in one.columns}
     lasting = [_Lasting(name, of.get(name, -1), time, split_gap_s) for name in held]
@@ -167,20 +129,19 @@ def _completed(rows: pl.DataFrame, columns: dict[str, pl.DataType]) -> pl.DataFr
 class _Coming:
     """The rows of a base that are in no window yet; of the first ones its columns are known."""
 
-    def __init__(self, base: Base, time: str, split_gap_s: float) -> None:
-        self.base, self._time, self._gap_s = base, time, split_gap_s
-        batches = base.read()
+    def __init__(self, batches: Iterator[pl.DataFrame], time: str, split_gap_s: float) -> None:
+        self._time, self._gap_s = time, split_gap_s
         first = next(batches)
         while not first.height and (following := next(batches, None)) is not None:
             first = following
         self.columns, self.has_rows = dict(first.schema), first.height > 0
         self.batches = chain([first], batches)
-        self._before_s, self._right_s = np.nan, -np.inf
+        self._before_s, self._right_s, self._judged_rows = np.nan, -np.inf, 0
         self._rows = pl.DataFrame()
 
-    def begin(self, number: int, offset: int, most: int) -> None:
-        """Take the base's number, that of its first row, and how many rows to read at once."""
-        self._number, self._offset = pl.lit(number, pl.Int32).alias(BASE), offset
+    def begin(self, number: int, most: int) -> None:
+        """Take the base's number, and how many rows to read at once."""
+        self._number = pl.lit(number, pl.Int32).alias(BASE)
         self._slices = _resized(self._judged(), most)
 
     def _judged(self) -> Iterator[pl.DataFrame]:
@@ -211,11 +172,10 @@ class _Coming:
             )
             reasons = pl.Series(names.tolist()).replace("", None)
         self._before_s, self._right_s = time_s[-1], right_s[-1]
-        self._offset += rows.height
-        first = self._offset - rows.height + 1
+        first, self._judged_rows = self._judged_rows + 1, self._judged_rows + rows.height
         return rows.with_columns(
             reasons.alias(DISORDER),
-            pl.int_range(first, self._offset + 1, dtype=pl.Int64).alias(ROW),
+            pl.int_range(first, self._judged_rows + 1, dtype=pl.Int64).alias(ROW),
             pl.Series(_RIGHT, right_s[1:]),
         )
 

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from functools import partial
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from hypothesis import strategies as st
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import stream, time_bases
-from fleet_slip.ingest.formats.source import OWN_TIME, Base, Channel, Source
+from fleet_slip.ingest.formats.source import BASE, OWN_TIME, Channel, Source
 from fleet_slip.ingest.time_bases import DISORDER, HELD, ROW, merge_bases
 from tests.support.measured import MeasuredLog, a_mapping, read_measured
 
@@ -33,12 +32,9 @@ class FakeSource(Source):
     def channels(self) -> list[Channel]:
         return [Channel(name) for frame in self._frames for name in frame.columns[1:]]
 
-    def bases(self, columns: Sequence[str]) -> list[Base]:
-        return [
-            Base(lambda f=frame: f.height, partial(self._read, frame, columns))  # type: ignore[misc]
-            for i, frame in enumerate(self._frames)
-            if {*columns} & {*frame.columns}
-        ]
+    def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
+        wanted = (frame for frame in self._frames if {*columns} & {*frame.columns})
+        return [self._read(frame, columns) for frame in wanted]
 
     def _read(self, frame: pl.DataFrame, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         some = frame.select(OWN_TIME, *(name for name in columns if name in frame.columns))
@@ -65,11 +61,10 @@ def reason_and_place(times: Sequence[float]) -> list[tuple[str | None, float]]:
 def merged(bases: Sequence[Sequence[tuple[float, float | None]]]) -> list[tuple[Any, ...]]:
     """All rows as (place, base, row, time, value, reason, held): the value of base 0 is held."""
     rows, said = [], []
-    number = 0
     for of, samples in enumerate(bases):
         judged = reason_and_place([time for time, _ in samples])
-        for (time, value), (reason, place) in zip(samples, judged, strict=True):
-            number += 1
+        pairs = zip(samples, judged, strict=True)
+        for number, ((time, value), (reason, place)) in enumerate(pairs, 1):
             rows.append((place, of, number, time, value, reason))
             if of == 0 and reason is None and value is not None and math.isfinite(time):
                 said.append((time, value))
@@ -120,16 +115,16 @@ def test_windows_say_what_the_whole_says(
     if not bases[0]:
         return  # the held column is of a base without rows
     value = pl.coalesce(columns).alias("value")
-    told_by = [rows.select(ROW, OWN_TIME, value, DISORDER, HELD + "v0") for rows in windows]
+    told_by = [rows.select(BASE, ROW, OWN_TIME, value, DISORDER, HELD + "v0") for rows in windows]
     found = [row for rows in told_by for row in rows.rows()]
-    expected = [row[2:] for row in merged(some)]
-    assert repr(sorted(found, key=itemgetter(0))) == repr(sorted(expected, key=itemgetter(0)))
+    expected = [row[1:] for row in merged(some)]
+    assert repr(sorted(found, key=itemgetter(0, 1))) == repr(sorted(expected, key=itemgetter(0, 1)))
     assert usable(found) == usable(expected)
 
 
-def usable(rows: list[tuple[Any, ...]]) -> list[int]:
-    """Numbers of the rows at right times, in their order; where the others are does not matter."""
-    return [number for number, time, _, reason, _ in rows if not reason and math.isfinite(time)]
+def usable(rows: list[tuple[Any, ...]]) -> list[tuple[int, int]]:
+    """Base and number of the rows at right times, in their order; where others are is all one."""
+    return [(of, row) for of, row, time, _, reason, _ in rows if not reason and math.isfinite(time)]
 
 
 def read_in(
@@ -137,14 +132,13 @@ def read_in(
 ) -> MeasuredLog | str:
     """Read bases as one file, so many rows at once."""
 
-    @contextmanager
-    def opened(*_: object) -> Iterator[FakeSource]:
-        yield FakeSource(frames, batch)
+    def opened(*_: object) -> AbstractContextManager[FakeSource]:
+        return nullcontext(FakeSource(frames, batch))
 
     file = folder / "log.mf4"
     file.write_bytes(b"in memory")
     with ExitStack() as patched:
-        patched.enter_context(mock.patch.object(time_bases, "_open_part", opened))
+        patched.enter_context(mock.patch.object(time_bases, "open_source", opened))
         patched.enter_context(mock.patch.object(time_bases, "BATCH_ROWS", max(batch // 2, 1)))
         patched.enter_context(mock.patch.object(time_bases, "WINDOW_ROWS", window))
         patched.enter_context(mock.patch.object(stream, "RATE_ROWS", 60))

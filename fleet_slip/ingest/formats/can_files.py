@@ -332,12 +332,6 @@ class CanSource(FormatSource):
                     f"{shown(self._file)}: there is no CAN frame in it. Record it again."
                 )
 
-    def count(self, name: str, signals: dict[str, Any]) -> int:
-        """Return how many frames of a message have one of the signals."""
-        if any(signal.multiplexer_ids is None for signal in signals.values()):
-            return self._frames[_key(self._messages[name])].sizes_on(self._bus.channel).total()
-        return super().count(name, signals)
-
     def read(self, name: str, signals: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield the signals of one message; rows are frames that have one of them."""
         message, needed = self._messages[name], max(map(needed_bytes, signals.values()))

@@ -36,7 +36,7 @@ import polars as pl
 
 from fleet_slip.errors import FleetSlipError, is_lack_of_memory
 from fleet_slip.ingest.formats.can import CanBus
-from fleet_slip.ingest.formats.source import Base, Budget, Source, unreadable
+from fleet_slip.ingest.formats.source import Budget, Source, unreadable
 
 
 class Format(NamedTuple):
@@ -117,7 +117,6 @@ class _Reader:
     def __init__(self, channel: socket.socket) -> None:
         self._channel = channel
         self._source: Source
-        self._bases: list[Base] = []
         self._batches: list[Iterator[pl.DataFrame]] = []
         self._ahead: dict[int, Future[pl.DataFrame | None] | None] = {}
 
@@ -173,22 +172,13 @@ class _Reader:
         return [astuple(one) for one in self._source.channels()]
 
     def bases(self, columns: Sequence[str]) -> list[int]:
-        """Return the numbers of time bases."""
-        first = len(self._bases)
-        self._bases += self._source.bases(columns)
-        return list(range(first, len(self._bases)))
-
-    def count(self, number: int) -> int:
-        """Return the rows of a time base."""
-        return self._bases[number].count_rows()
-
-    def read(self, number: int) -> int:
-        """Begin to read a time base; return the number by which rows are asked for."""
-        self._batches.append(self._bases[number].read())
-        return len(self._batches) - 1
+        """Return the numbers of time bases, by which their rows are asked for."""
+        first = len(self._batches)
+        self._batches += self._source.bases(columns)
+        return list(range(first, len(self._batches)))
 
     def rows(self, number: int) -> pl.DataFrame | None:
-        """Return the next rows, None if there are no more."""
+        """Return the next rows of a time base, None if there are no more."""
         ahead = self._ahead.get(number)
         return next(self._batches[number], None) if ahead is None else ahead.result()
 

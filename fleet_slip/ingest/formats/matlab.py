@@ -104,13 +104,10 @@ class Vectors(FormatSource):
                 raise InputError(f"{shown(self._file)}: {column!r} {why}")
         raise missing_column(self._file, column, [channel.name for channel in self.channels()])
 
-    def count(self, _base: str, found: dict[str, tuple[Matrix, int]]) -> int:
-        """Return how many rows the first of some columns has."""
-        return next(matrix.size[0] for matrix, _ in found.values())
-
-    def read(self, base: str, found: dict[str, tuple[Matrix, int]]) -> Iterator[pl.DataFrame]:
+    def read(self, _base: str, found: dict[str, tuple[Matrix, int]]) -> Iterator[pl.DataFrame]:
         """Yield all rows, some at once. Raises `InputError` if columns differ in length."""
-        rows, first = self.count(base, found), next(iter(found))
+        first, (matrix, _) = next(iter(found.items()))
+        rows, _ = matrix.size
         for name, (matrix, _) in found.items():
             if (length := matrix.size[0]) != rows:
                 raise InputError(

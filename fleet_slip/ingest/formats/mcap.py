@@ -126,7 +126,6 @@ class McapSource(FormatSource):
         """Take the file and what it may become, and where decoded messages are kept."""
         self._file, self._budget, self._spool = budget.file, budget, spool
         self._kept: dict[str, _Fields] = {}
-        self._rows: dict[str, int] = {}
         self._numbers: set[str] = set()
         self._texts: set[str] = set()
 
@@ -154,10 +153,6 @@ class McapSource(FormatSource):
             for column in of.keys() - self._numbers - self._texts:
                 names = [f"{topic}.{name}" for name in self._topics[topic]]
                 raise missing_column(self._file, column, names)
-
-    def count(self, topic: str, _found: _Fields) -> int:
-        """Return how many messages a topic has."""
-        return self._rows[topic]
 
     def read(self, topic: str, found: _Fields) -> Iterator[pl.DataFrame]:
         """Yield fields of a topic."""
@@ -202,7 +197,6 @@ class McapSource(FormatSource):
         """Put columns of some topics aside."""
         self._spool.clear()
         self._kept, self._numbers, self._texts = {}, set(), set()
-        self._rows = dict.fromkeys(wanted, 0)
         waiting: dict[str, list[list[Any]]] = {topic: [] for topic in wanted}
         paths = {topic: [parse_path(name) for name in of.values()] for topic, of in wanted.items()}
         for channel, message in self._messages():
@@ -222,8 +216,7 @@ class McapSource(FormatSource):
                 self._put_aside(topic, wanted[topic], waiting[topic])
                 waiting[topic] = []
         for topic, rows in waiting.items():
-            if rows or not self._rows[topic]:
-                self._put_aside(topic, wanted[topic], rows)
+            self._put_aside(topic, wanted[topic], rows)
         self._kept = wanted
 
     def _put_aside(self, topic: str, fields: _Fields, rows: list[list[Any]]) -> None:
@@ -233,7 +226,6 @@ class McapSource(FormatSource):
         content = io.BytesIO()
         pl.DataFrame(columns).write_ipc_stream(content)
         self._spool.add(topic, content.getvalue())
-        self._rows[topic] += len(rows)
 
     def _column(self, column: str, values: Sequence[Any]) -> pl.Series:
         """Return some values of a column: all of it are numbers, or texts."""

@@ -19,7 +19,6 @@ from fleet_slip.ingest.formats.can import Bytes, CanBus, FrameBlock
 from fleet_slip.ingest.formats.can_files import CanSource
 from fleet_slip.ingest.formats.source import (
     OWN_TIME,
-    Base,
     Budget,
     Channel,
     FormatSource,
@@ -154,8 +153,8 @@ class MdfSource(FormatSource):
             if index != self._mdf.masters_db.get(number)
         ]
 
-    def bases(self, columns: Sequence[str]) -> list[Base]:
-        """Return the channel groups that have one of the columns, in the file's order."""
+    def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
+        """Return the rows of each channel group that has one of the columns, in file order."""
         return super().bases(sorted(columns, key=lambda name: self.find(name)[1][0]))
 
     def find(self, column: str) -> tuple[str, tuple[int, int]]:
@@ -179,14 +178,6 @@ class MdfSource(FormatSource):
             )
         return f"group {places[0][0]}", places[0]
 
-    def count(self, _base: str, found: dict[str, tuple[int, int]]) -> int:
-        """Return how many samples a group says that it has."""
-        return self.count_records(next(iter(found.values()))[0])
-
-    def count_records(self, number: int) -> int:
-        """Return how many samples a group says that it has."""
-        return int(self._mdf.groups[number].channel_group.cycles_nr)
-
     def read(self, _base: str, found: dict[str, tuple[int, int]]) -> Iterator[pl.DataFrame]:
         """Read channels of a group, some records at a time; what is marked as invalid is null."""
         [number] = {number for number, _ in found.values()}
@@ -208,7 +199,7 @@ class MdfSource(FormatSource):
         for index in (self._mdf.masters_db[number], *indices.values()):
             self._require_inside(number, index)
         self._require_data(number, name)
-        records = self.count_records(number)
+        records = int(self._mdf.groups[number].channel_group.cycles_nr)
         for start in range(0, max(records, 1), WINDOW_RECORDS):
             yield self._signals(number, indices, start, min(WINDOW_RECORDS, records - start))
 

@@ -18,7 +18,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
@@ -33,7 +33,7 @@ from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.confined_reader import FORMATS, SIZES, Job
 from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
-from fleet_slip.ingest.formats.source import Base, Budget, Channel, Source, unreadable
+from fleet_slip.ingest.formats.source import Budget, Channel, Source, unreadable
 from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, open_parquet
 from fleet_slip.ingest.formats.vbo import BEGINS as VBO_BEGINS
 from fleet_slip.ingest.formats.vbo import VboSource
@@ -255,20 +255,13 @@ class ConfinedSource(Source):
         """Return all that can be read, in the file's order."""
         return [Channel(*map(str, one)) for one in self._ask("channels")[0]]
 
-    def bases(self, columns: Sequence[str]) -> list[Base]:
-        """Return the time bases that have one of the columns. Raises `InputError`."""
-        return [
-            Base(partial(self._count, number), partial(self._read, number))
-            for number in self._ask("bases", list(columns))[0]
-        ]
-
-    def _count(self, base: int) -> int:
-        return int(self._ask("count", base)[0])
+    def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
+        """Return the rows of each time base that has one of the columns. Raises `InputError`."""
+        return [self._read(number) for number in self._ask("bases", list(columns))[0]]
 
     def _read(self, base: int) -> Iterator[pl.DataFrame]:
-        number = self._ask("read", base)[0]
         while True:
-            names, content = self._ask("rows", number)
+            names, content = self._ask("rows", base)
             if names is None:
                 return
             try:

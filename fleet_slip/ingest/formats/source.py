@@ -12,9 +12,8 @@ import tempfile
 import time
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -52,19 +51,6 @@ class Channel:
     title: str = ""
 
 
-@dataclass(frozen=True)
-class Base:
-    """The rows of a log that share their times.
-
-    Attributes:
-        count_rows: returns how many rows there are.
-        read: yields them in the file's order, in bounded batches of the same columns, at least one.
-    """
-
-    count_rows: Callable[[], int]
-    read: Callable[[], Iterator[pl.DataFrame]]
-
-
 class Source(ABC):
     """A file that is open for reading."""
 
@@ -76,17 +62,18 @@ class Source(ABC):
         """Return all that can be read, in the file's order."""
 
     @abstractmethod
-    def bases(self, columns: Sequence[str]) -> list[Base]:
-        """Return the time bases that have one of the columns; without a clock there is one.
+    def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
+        """Return the rows of each time base that has one of the columns; without a clock of one.
 
-        Their rows have the columns of their base as text, 64-bit floats, dates or timestamps, and
-        `OWN_TIME` with a clock. Raises `InputError`, for a missing or ambiguous column too.
+        They come in the file's order, in bounded batches, at least one, with the columns of their
+        base as text, 64-bit floats, dates or timestamps, and `OWN_TIME` with a clock. Raises
+        `InputError`, for a missing or ambiguous column too.
         """
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield the rows of each time base that has one of the columns, base by base."""
         for base in self.bases(columns):
-            yield from base.read()
+            yield from base
 
 
 class FormatSource(Source):
@@ -96,10 +83,6 @@ class FormatSource(Source):
     def find(self, column: str) -> tuple[str, Any]:
         """Return the name of a column's time base, and its place there. Raises `InputError`."""
 
-    def count(self, base: str, found: dict[str, Any]) -> int:
-        """Return how many rows some columns of a base have, by their places."""
-        return sum(rows.height for rows in self.read(base, found))
-
     @abstractmethod
     def read(self, base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield the rows of some columns of a base, in bounded batches, at least one."""
@@ -107,17 +90,14 @@ class FormatSource(Source):
     def prepare(self, wanted: dict[str, dict[str, Any]]) -> None:
         """Get ready to read some columns of some bases, where a file is read as a whole first."""
 
-    def bases(self, columns: Sequence[str]) -> list[Base]:
-        """Return the time bases that have one of the columns. Raises `InputError`."""
+    def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
+        """Return the rows of each time base that has one of the columns. Raises `InputError`."""
         wanted: dict[str, dict[str, Any]] = {}
         for column in columns:
             base, place = self.find(column)
             wanted.setdefault(base, {})[column] = place
         self.prepare(wanted)
-        return [
-            Base(partial(self.count, base, found), partial(self.read, base, found))
-            for base, found in wanted.items()
-        ]
+        return [self.read(base, found) for base, found in wanted.items()]
 
 
 def load_library(file: Path, package: str) -> Any:
