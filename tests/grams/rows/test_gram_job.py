@@ -93,18 +93,6 @@ def test_rows_do_not_depend_on_files_order_or_threads(
         assert grams == expected
 
 
-def test_a_second_run_does_nothing_and_a_new_file_reads_only_itself(warehouse: Warehouse) -> None:
-    rng = np.random.default_rng(2)
-    land(warehouse, "one", log_rows("a", random_counts(rng, 50)))
-    first = update_grams(warehouse)
-    again = update_grams(warehouse)
-    assert (first.files_read, first.rows_read, again.changed) == (1, 50, False)
-    assert again.grams_version == first.grams_version
-    land(warehouse, "two", log_rows("b", random_counts(rng, 70)))
-    second = update_grams(warehouse)
-    assert (second.files_read, second.rows_read, second.gram_rows) == (1, 70, 2)
-
-
 def test_gram_rows_of_a_file_that_is_gone_are_dropped(warehouse: Warehouse) -> None:
     rng = np.random.default_rng(3)
     for name in "abc":

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.gram import Gram, GramTable, exact_sum, packed_position
+from fleet_slip.regression.gram import Gram, GramTable, exact_sum
 from tests.support.counts import table_of
 
 SIGNALS = ("ax", "ay", "sideslip")
@@ -82,19 +82,6 @@ def test_linear_combinations_equal_those_of_the_counts(counts: np.ndarray) -> No
         {"mix": {"ax": 1, "sideslip": -3}, "twice": {"ay": 2}}
     )
     assert combined == Gram.from_counts(("mix", "twice"), expected)
-
-
-def test_centring_is_exact() -> None:
-    counts = np.array([[30_000, 1], [30_001, 1], [30_002, 1]])
-    gram = Gram.from_counts(("a", "constant"), counts)
-    assert gram.centred() == [[6, 0], [0, 0]]
-
-
-def test_products_are_found_by_name() -> None:
-    gram = Gram.from_counts(SIGNALS, np.array([[1, 2, 3], [4, 5, 6]]))
-    assert gram.product("ax", "sideslip") == gram.product("sideslip", "ax") == 1 * 3 + 4 * 6
-    assert gram.sum("ay") == 7
-    assert packed_position(2, 0) == packed_position(0, 2) == 3
 
 
 def test_mistakes_are_named() -> None:

@@ -58,6 +58,8 @@ def test_coefficients_and_both_kinds_of_errors_agree(
     errors = [estimate.standard_error for estimate in mine.estimates]
     np.testing.assert_allclose(errors, theirs.bse, rtol=AGREEMENT)
     assert abs(mine.residual_std / np.sqrt(theirs.scale) - 1) < AGREEMENT
+    p = [estimate.p for estimate in mine.estimates]
+    np.testing.assert_allclose(p, theirs.pvalues, rtol=1e-7, atol=1e-14)
     clustered = model.fit(cov_type="cluster", cov_kwds={"groups": groups})
     fits = nested_fits(gram_of(counts), names(inputs)[:-1], "y")
     last = Evidence.clustered(fits, moments).contributions[-1]

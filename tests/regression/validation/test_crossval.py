@@ -65,14 +65,6 @@ def test_equals_cross_validation_on_rows(seed: int, count: int) -> None:
     assert result.standard_error == pytest.approx(spread)
 
 
-def test_training_without_a_fold_is_training_on_the_other_drives_bit_for_bit() -> None:
-    drives = random_drives(3)
-    grams = [gram_of(counts) for counts in drives]
-    total = sum(grams[1:], grams[0])
-    rest = gram_of(np.concatenate([*reversed(drives[4:]), *drives[:3]]))
-    assert total - grams[3] == rest
-
-
 def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
     drives = random_drives(7, drives=12)
     full = table_of([gram_of(counts) for counts in drives[:6]])
@@ -106,13 +98,6 @@ def test_the_hash_of_a_drive_decides_its_fold_for_ever() -> None:
     sizes = np.bincount(by_hash([f"d{i}" for i in range(10_000)], 5).fold)
     assert sizes.min() > 1800
     assert sizes.max() < 2200
-
-
-def test_drives_of_one_vehicle_share_a_fold() -> None:
-    vehicles = [f"car{i // 3}" for i in range(60)]
-    fold = by_hash(vehicles, 4).fold.reshape(20, 3)
-    assert (fold == fold[:, :1]).all()
-    assert by_value(vehicles).names == tuple(sorted(set(vehicles)))
 
 
 def test_folds_that_no_drive_falls_into_are_left_out() -> None:
