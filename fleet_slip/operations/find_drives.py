@@ -222,7 +222,7 @@ def quarantined_of(
 ) -> pa.ChunkedArray:
     """Return which rows of the quarantine are of a subject, or of drives that are known to be.
 
-    Rows refused before a cut at a gap name the whole drive; older rows name no vehicle.
+    Rows refused before a cut at a gap name the whole drive.
     """
     if subject.kind == "drive":
         drives = {*drives, subject.value}
@@ -233,7 +233,7 @@ def quarantined_of(
         if name and any(drive == name or drive.startswith(f"{name}-") for drive in drives)
     }
     of_drives = pc.is_in(ids, pa.array(sorted(concerned), pa.string()))
-    if subject.kind != "vehicle" or "vehicle_id" not in rows.schema.names:
+    if subject.kind != "vehicle":
         return of_drives
     return pc.or_(of_drives, pc.fill_null(rows_of(rows, subject), False))
 

@@ -167,8 +167,7 @@ def read_whole(table: Table, file: TableFile) -> ReadFile:
         if len(content) != file.size_bytes:
             problem = f"has {len(content):,} bytes instead of {file.size_bytes:,}"
             return ReadFile(file, problem)
-        expected = checksum_in(file.path)
-        if expected and checksum_of(content) != expected:
+        if checksum_of(content) != checksum_in(file.path):
             return ReadFile(file, "its bytes do not match the checksum in its name")
         with storage_errors(path):
             metadata = pq.read_metadata(pa.BufferReader(content))

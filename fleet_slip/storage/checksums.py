@@ -3,7 +3,7 @@
     NAME-x0123456789abcdef-0123456789abcdef0123456789abcdef.parquet
 
 The last is of its SHA-256, which `verify` computes; that with an x of its XXH3, so fast that every
-job looks at every byte. Earlier names have the last only, or none.
+job looks at every byte.
 """
 
 import functools
@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import xxhash
 
@@ -38,11 +38,6 @@ _CHECKSUM = re.compile(rf"-([0-9a-f]{{{CHECKSUM_DIGITS}}})\.parquet$")
 _FAST = re.compile(rf"-x([0-9a-f]{{{FAST_DIGITS}}})-[0-9a-f]{{{CHECKSUM_DIGITS}}}\.parquet$")
 
 
-class _Hash(Protocol):
-    def update(self, data: Any, /) -> None: ...
-    def hexdigest(self) -> str: ...
-
-
 def checksum_of(content: "pa.Buffer | bytes") -> str:
     """Return the checksum of a file's bytes as it stands at the end of the file's name."""
     return hashlib.sha256(content).hexdigest()[:CHECKSUM_DIGITS]
@@ -54,7 +49,7 @@ def fast_checksum_of(content: "pa.Buffer | bytes") -> str:
 
 
 def checksum_in(path: str) -> str | None:
-    """Return the checksum in a file's name; None for a file of a version that wrote none."""
+    """Return the checksum in a data file's name; None in other names."""
     found = _CHECKSUM.search(path)
     return found[1] if found else None
 
@@ -65,8 +60,8 @@ def require_content(path: str, content: "pa.Buffer | bytes", where: object) -> N
 
 
 def check_local_files(paths: Iterable[str]) -> None:
-    """Raise `StorageError` for a file that is not what its name says; each is read once."""
-    named = [path for path in paths if checksum_in(path)]
+    """Raise `StorageError` for a data file that is not what its name says; each is read once."""
+    named = [path for path in paths if _FAST.search(path)]
     if len(named) == 1:
         _check_local(named[0])
     elif named:
@@ -88,14 +83,12 @@ def _check_once(path: str, _size: int, _modified_ns: int, _inode: int) -> None:
 
 
 def _require(path: str, chunks: "Iterable[Any]", where: object) -> None:
-    fast = _FAST.search(path)
-    expected = fast[1] if fast else checksum_in(path)
-    if expected is None:
+    hashed, named = xxhash.xxh3_64(), _FAST.search(path)
+    if named is None:  # a file of a person's own
         return
-    hashed: _Hash = xxhash.xxh3_64() if fast else hashlib.sha256()
     for chunk in chunks:
         hashed.update(chunk)
-    if hashed.hexdigest()[: len(expected)] != expected:
+    if hashed.hexdigest() != named[1]:
         raise StorageError(
             f"{where}: its bytes do not match the checksum in its name: it was damaged. See what "
             "can be repaired with: fleet-slip verify --repair; or restore it from a backup."

@@ -100,7 +100,7 @@ class Commit:
         found = self.info.get("operationParameters")
         return found if isinstance(found, Mapping) else {}
 
-    def problem(self, must_state_checksum: bool) -> str | None:
+    def problem(self) -> str | None:
         """Return what is wrong with it, or None."""
         # Overwriting, Delta removes files by itself.
         unchecked = {"remove"} if self.parameters.get("mode") == "Overwrite" else set()
@@ -108,8 +108,8 @@ class Commit:
         stated = self.note.get(CHECKSUM_KEY)
         if stated is not None and not _has_checksum(self.note, checked, stated):
             return "its content does not match the checksum that it states"
-        if stated is None and must_state_checksum and checked:
-            return "states no checksum, although earlier commits do: damage, or another program's"
+        if stated is None and checked:
+            return "states no checksum: damage, or another program's"
         made = {kind: content for action in self.actions for kind, content in action.items()}
         for kind, key in (("metaData", "metadata"), ("protocol", "protocol")):
             if self.version == 0 and made.get(kind) != _object(self.parameters.get(key)):
@@ -159,7 +159,6 @@ def check_commits(log: Folder, last: int | None = None) -> tuple[list[Commit], d
     newest = max(there, default=-1) if last is None else last
     commits: list[Commit] = []
     faults: dict[str, str] = {}
-    must_state_checksum = False
     for version in range(min(there, default=newest), newest + 1):
         name = f"{version:020}.json"
         try:
@@ -167,8 +166,7 @@ def check_commits(log: Folder, last: int | None = None) -> tuple[list[Commit], d
         except ValueError as error:
             faults[name] = str(error) if version in there else "is missing"
             continue
-        must_state_checksum |= CHECKSUM_KEY in commit.note
-        if problem := commit.problem(must_state_checksum):
+        if problem := commit.problem():
             faults[name] = problem
         commits.append(commit)
     return commits, faults

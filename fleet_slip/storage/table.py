@@ -34,8 +34,9 @@ from fleet_slip.storage.encoding import Encoded, Encoding, Names, read_names
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.storage_errors import first_line, storage_errors
 
-_DATA_FILE = re.compile(r"[\w.=-][\w.=/-]*\.parquet", re.ASCII)
-"""Path of a data file below its table: relative, and without characters that could be a pattern."""
+_DATA_FILE = re.compile(r"[\w.=-][\w.=/-]*-x[0-9a-f]{16}-[0-9a-f]{32}\.parquet", re.ASCII)
+"""Path of a data file below its table: relative, without characters that could be a pattern, and
+with its checksums."""
 
 _NULLS = "null_count."
 """Before a column's name: how many nulls a file has in it. Null, if it has no such column."""

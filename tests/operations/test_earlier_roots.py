@@ -1,4 +1,4 @@
-"""Data roots that earlier versions of the program made are migrated, read, and worked on.
+"""Data roots that earlier releases made are migrated, read, and worked on.
 
 `tests/evidence/roots/` has one of each; its README says how they were made.
 """
@@ -17,10 +17,7 @@ LARGEST_BYTES = 100_000
 DRIVES, ROWS = 4, 1739
 
 
-@pytest.fixture(
-    params=[*ROOTS[:2], *(pytest.param(file, marks=pytest.mark.long) for file in ROOTS[2:])],
-    ids=lambda file: file.name.removesuffix(".tar.gz"),
-)
+@pytest.fixture(params=ROOTS, ids=lambda file: file.name.removesuffix(".tar.gz"))
 def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Fleet:
     with tarfile.open(request.param) as archive:
         archive.extractall(tmp_path, filter="data")
@@ -28,7 +25,7 @@ def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Fleet:
 
 
 def test_there_are_some_and_they_are_small() -> None:
-    assert len(ROOTS) >= 2
+    assert ROOTS
     assert all(file.stat().st_size < LARGEST_BYTES for file in ROOTS)
 
 

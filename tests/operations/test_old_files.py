@@ -81,8 +81,3 @@ def test_refused_rows_are_of_a_drive_or_of_the_whole_that_it_was_cut_from() -> N
     assert quarantined_of(rows, drive, set()).to_pylist() == [True, True, False, False, False]
     by_car = quarantined_of(rows, vehicle("a"), {"log-10"}).to_pylist()
     assert by_car == [True, False, True, True, True]
-    older = rows.drop_columns(["vehicle_id"])
-    assert quarantined_of(older, vehicle("a"), {"log-1"}).to_pylist() == [
-        *(True, True, False, False),
-        False,
-    ]

@@ -106,18 +106,6 @@ def test_damage_that_no_other_check_sees_is_told(
     assert problem in problems(root)[f"logs/_delta_log/{file.name}"]
 
 
-def test_tables_of_versions_that_wrote_no_checksums_are_sound(root: Warehouse) -> None:
-    for file in commits(root):
-        for line in (lines := file.read_text().splitlines()):
-            action = json.loads(line)
-            if "commitInfo" in action:
-                del action["commitInfo"]["fleet_slip"]
-                file.write_text("\n".join([json.dumps(action), *lines[1:]]))
-    assert not problems(root)
-    land(root, "three", log_rows("three", COUNTS))
-    assert not problems(root)
-
-
 def test_a_commit_that_is_gone_is_told(root: Warehouse) -> None:
     DeltaTable(str(logs_of(root))).create_checkpoint()
     commits(root)[2].unlink()

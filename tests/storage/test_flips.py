@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.errors import FleetSlipError, StorageError
+from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
 from fleet_slip.storage import checksums
-from fleet_slip.storage.checksums import check_local_files, checksum_in, checksum_of
+from fleet_slip.storage.checksums import check_local_files, checksum_in
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse
@@ -105,15 +105,6 @@ def test_a_flipped_bit_is_told_or_makes_no_difference(
                 told += 1
     assert answer(filled) == usual
     assert told
-
-
-def test_a_file_of_an_earlier_name_is_compared_with_its_sha256(tmp_path: Path) -> None:
-    file = tmp_path / f"signals-6d052870401c74f0-{checksum_of(b'sound')}.parquet"
-    file.write_bytes(b"sound")
-    check_local_files([str(file)])
-    file.write_bytes(b"Sound")
-    with pytest.raises(StorageError, match="do not match the checksum in its name"):
-        check_local_files([str(file)])
 
 
 def test_a_file_is_read_once_while_it_stays_the_same(
