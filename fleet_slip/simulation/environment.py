@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium
-import numba
 import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
-from fleet_slip.compiling import equation
+from fleet_slip.compiling import equation, kernel
 from fleet_slip.errors import UsageError
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.vehicle.dynamics import (
@@ -56,7 +55,7 @@ def braked_derivative(x: State, u: Controls, brakes: Brakes, c: Constants) -> De
     return rates_of(x, u, motion, braked_spins(x, force, load, each, c), c)
 
 
-@numba.njit(error_model="numpy", nogil=True, cache=False)
+@kernel
 def move(
     x: State,
     slopes: Slopes,

@@ -2,11 +2,12 @@
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.compiling import kernel
 from fleet_slip.vehicle.driver import SAMPLE_S, SPEED_GAIN_1PS
+from fleet_slip.vehicle.dynamics import Derivative
 from fleet_slip.vehicle.imperfections import (
     Around,
     CarImperfections,
@@ -40,7 +41,14 @@ class Response(NamedTuple):
     vx_mps: FloatArray
 
 
-@numba.njit(error_model="numpy")
+@kernel
+def imperfect_rates(
+    x: State, u: Controls, give: Give, around: Around, c: Any, t: Any
+) -> tuple[Derivative, GiveRates]:
+    return imperfect_derivative(x, u, give, around, c, t)
+
+
+@kernel
 def _run(
     x: State,
     slopes: Slopes,

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_slip.compiling import kernel
 from fleet_slip.vehicle.dynamics import Derivative, derivative
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
 from fleet_slip.vehicle.parameters import (
@@ -22,12 +22,12 @@ CAR = constants(SEDAN, adhesion=1.0)
 NO_SLOPES = Slopes(*(0.0 for _ in Slopes._fields))
 
 
-@numba.njit(error_model="numpy")
+@kernel
 def rates(x: State, u: Controls, c: Constants) -> Derivative:
     return derivative(x, u, c)
 
 
-@numba.njit(error_model="numpy")
+@kernel
 def _run(x: State, u: Controls, c: Constants, slopes: Slopes, step: float, count: int) -> Any:
     states = np.empty((count + 1, len(x)))
     forces = np.empty((count, 2))

@@ -5,12 +5,12 @@
 
 import math
 
-import numba
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from fleet_slip.compiling import kernel
 from fleet_slip.vehicle.driver import LARGEST_GRIP_USE, Handling, slip_growth
 from fleet_slip.vehicle.integration import STEP_S, Pose, PoseSlopes, advance_pose, followed
 from fleet_slip.vehicle.parameters import constants, load_vehicle
@@ -20,7 +20,7 @@ CARS = ("compact_hatchback", "d_class_sedan", "rear_drive_sedan", "suv")
 SIZES = st.floats(1e-6, 1e6)
 
 
-@numba.njit(error_model="numpy")
+@kernel
 def arctangents(y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
     angles = np.empty_like(y)
     for i in range(len(y)):

@@ -5,7 +5,6 @@ import pytest
 
 from fleet_slip.vehicle.batch import LaneDrive, Road, Surface, simulate_blocks
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
-from fleet_slip.vehicle.dynamics import derivative
 from fleet_slip.vehicle.imperfections import (
     CAMBER_PER_SLIP,
     PERFECT,
@@ -15,14 +14,14 @@ from fleet_slip.vehicle.imperfections import (
     Give,
     GiveRates,
     advance_give,
-    imperfect_derivative,
     traits,
 )
 from fleet_slip.vehicle.integration import SECOND_ORDER
-from fleet_slip.vehicle.parameters import GRAVITY_MPS2, Controls, State, constants, load_vehicle
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2, Controls, State, constants
+from tests.support.open_loop import imperfect_rates
+from tests.support.rolling import SEDAN, rates
 from tests.support.whole_drives import Truth, simulate_drives
 
-SEDAN = load_vehicle("d_class_sedan")
 FINE = Around(0.0, 0.0, 1.0, 1.0, 0.0, 1.0)
 RIGID = Give(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -68,8 +67,8 @@ def test_without_imperfections_the_equations_are_those_of_the_textbook() -> None
         draw = np.random.default_rng(seed).standard_normal(11)
         x = State(20.0 + draw[0], draw[1], 0.3 * draw[2], draw[3], *draw[4:7], *(62.0 + draw[7:]))
         give = RIGID._replace(rack=x.steering_wheel, side_fl=99.0)
-        plain = np.hstack([np.ravel(v) for v in derivative(x, u, c)])
-        found, _ = imperfect_derivative(x, u, give, FINE, c, t)
+        plain = np.hstack([np.ravel(v) for v in rates(x, u, c)])
+        found, _ = imperfect_rates(x, u, give, FINE, c, t)
         np.testing.assert_allclose(np.hstack([np.ravel(v) for v in found]), plain, rtol=1e-9)
 
 

@@ -2,11 +2,12 @@
 
 import dataclasses
 import re
+from typing import Any
 
-import numba
 import numpy as np
 import pytest
 
+from fleet_slip.compiling import inner_loop
 from fleet_slip.errors import ConfigError
 from fleet_slip.simulation.roads import SpeedLimits, load_track, speed_profile
 from fleet_slip.vehicle import batch_kernel
@@ -244,14 +245,14 @@ def test_impossible_adhesion_is_refused() -> None:
 
 def test_the_inner_loop_is_vector_instructions_without_fused_operations() -> None:
     """On x86-64 with AVX: the physics divides in whole vectors, and no operation is fused."""
-    fresh = numba.njit(nogil=True, error_model="numpy")(batch_kernel.build_kernel())
-    on = circle(50.0, 15.0)
-    usual, batch_kernel.simulate = batch_kernel.simulate, fresh
-    try:
-        drive(SEDAN, on, laps=0.01)
-    finally:
-        batch_kernel.simulate = usual
-    (assembly,) = fresh.inspect_asm().values()
+
+    def loops(memory: Any) -> None:  # those of the kernel over all lanes
+        batch_kernel._decide(memory)
+        batch_kernel.integrate(memory, 0.002, True)
+
+    fresh = inner_loop(loops)
+    fresh(batch_kernel.empty_lanes()[0])
+    (assembly,) = fresh.inspect_asm().values()  # type: ignore[attr-defined]
     if "ymm" not in assembly:
         pytest.skip("this processor has no AVX")
     assert len(re.findall(r"vdivpd.*[yz]mm", assembly)) >= 15

@@ -2,12 +2,12 @@
 
 import math
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet_slip.compiling import kernel
 from fleet_slip.vehicle.parameters import Constants
 from fleet_slip.vehicle.tyre import TyreForce, brush_force, cornering_stiffness
 from tests.support.rolling import CAR
@@ -16,7 +16,7 @@ PEAK = CAR.stiffness_rear
 SPEED = 20.0
 
 
-@numba.njit(error_model="numpy")
+@kernel
 def force(
     along: float, across: float, rolling: float, load: float, peak: float, c: Constants
 ) -> TyreForce:

@@ -1,15 +1,16 @@
 """The paper's filter against textbook algebra, the joint Gaussian, and what its model must give."""
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import kalman
 from fleet_slip.evaluation.belief import Belief, belief_of
@@ -137,7 +138,7 @@ def last_belief(drive: DriveSignals, yaw_rate: FloatArray, noise: FilterNoise) -
     return belief
 
 
-@numba.njit
+@kernel
 def normalised_innovations(
     ax: Any, ay: Any, yaw_rate: Any, vx: Any, vy: Any, c: Any
 ) -> NDArray[np.float64]:
@@ -157,8 +158,13 @@ def normalised_innovations(
     return found
 
 
+@cache
+def generated() -> tuple[DriveSignals, FloatArray]:
+    return generate(50_000, NOISE, seed=3)[:2]
+
+
 def innovations(assumed: FilterNoise) -> FloatArray:
-    drive, yaw_rate, _ = generate(100_000, NOISE, seed=3)
+    drive, yaw_rate = generated()
     found = normalised_innovations(
         drive.ax_mps2,
         drive.ay_mps2,
@@ -196,7 +202,7 @@ def test_innovations_of_a_wrong_noise_are_not_white() -> None:
     assert all(ljung_box(series) < 1e-6 for series in innovations(wrong))
 
 
-@numba.njit
+@kernel
 def covariances_over(steps: int, every: int, turn: float, c: Any) -> NDArray[np.float64]:
     belief = kalman.first_belief(20.0, 0.0, c)
     kept = np.empty((steps // every, 4, 4))
