@@ -270,15 +270,13 @@ def _draft(file: str, can: Path | None) -> "tuple[Draft, str]":
     """Return what a log suggests, and that as a mapping."""
     from fleet_slip.ingest.draft import draft_mapping, name_of, write_draft  # noqa: PLC0415 - takes a while
     from fleet_slip.ingest.formats.can import CanBus, read_can_database  # noqa: PLC0415
-    from fleet_slip.ingest.formats.reading import FileFormats  # noqa: PLC0415
     from fleet_slip.ingest.log_files import find_logs, local_copy  # noqa: PLC0415
     from fleet_slip.ingest.profile import profile_file  # noqa: PLC0415
 
     bus = read_can_database(CanBus(database=str(can.absolute())), can.parent) if can else None
-    formats = FileFormats(can=bus)
     logs = find_logs([file])
     if len(logs) > 1:
         raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
     with local_copy(logs[0]) as copy:
-        draft = draft_mapping(copy, profile_file(copy, formats))
+        draft = draft_mapping(copy, profile_file(copy, bus))
         return draft, write_draft(draft, name_of(copy.stem), file)

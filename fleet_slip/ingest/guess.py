@@ -78,18 +78,12 @@ class Guess:
         return any(reason.startswith(NO_UNIT) for reason in self.reasons)
 
     def because(self, reason: str, **keys: Any) -> "Guess":
-        """Return the guess with other keys, None for those to leave out, and one more reason."""
-        changed = {k: value for k, value in {**self.keys, **keys}.items() if value is not None}
-        return replace(self, keys=changed, reasons=(*self.reasons, reason))
+        """Return the guess with more keys, and one more reason."""
+        return replace(self, keys={**self.keys, **keys}, reasons=(*self.reasons, reason))
 
     def doubted(self, doubt: str) -> "Guess":
         """Return the guess as one that has something against it."""
         return replace(self, doubts=(*self.doubts, doubt))
-
-    def largest(self, **keys: Any) -> float:
-        """Return its largest value, but for outliers, in SI units; with other keys for the unit."""
-        value = float(np.nanquantile(np.abs(self.profile.values), 0.999))
-        return value * si_factor(self.signal, **{**self.keys, **keys})
 
 
 def guess_signals(profiles: tuple[Profile, ...]) -> dict[str, Guess]:
@@ -193,10 +187,10 @@ def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
     """Return a guess with a unit that the signal can have, or None."""
     name, in_brackets = split_unit(profile.channel.name)
     several: tuple[Keys, ...] = ()
+    largest = float(np.nanquantile(np.abs(profile.values), 0.999))  # but for outliers
     text = profile.channel.unit.strip() or in_brackets
     unit = unit_called(text) or unit_behind(name)
     if unit is None:
-        largest = float(np.nanquantile(np.abs(profile.values), 0.999))
         several = unit_readings(signal, largest)
         keys = dict(several[0])
         unknown = f" that is known: {text!r}" if text else ""
@@ -214,7 +208,7 @@ def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
     guess = Guess(signal, profile, keys, (named, reason), readings=readings)
     if signal not in catalogue().signals or catalogue()[signal].cyclic:
         return guess
-    known, in_si = catalogue()[signal], guess.largest()
+    known, in_si = catalogue()[signal], largest * si_factor(signal, **keys)
     most = float(max(-known.min, known.max))
     if in_si <= most:
         return guess

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.csv import CsvFormat, Encoding, decompressed, first_lines
 from fleet_slip.ingest.formats.reading import (
     FileFormats,
@@ -224,14 +225,11 @@ class FileProfile:
     """What is wrong with channels that cannot be read."""
 
 
-def profile_file(file: Path, formats: FileFormats) -> FileProfile:
+def profile_file(file: Path, bus: CanBus | None = None) -> FileProfile:
     """Look at the first `MOST_ROWS` rows of every channel. Raises `InputError`."""
     with require_unchanged_log(file), file_errors(file), ExitStack() as opened:
-        if formats.can is None:
-            layout, units = guess_layout(file)
-            formats = FileFormats(csv=layout)
-        else:
-            units = {}
+        layout, units = guess_layout(file) if bus is None else (CsvFormat(), {})
+        formats = FileFormats(csv=layout, can=bus)
         source = opened.enter_context(open_source(file, formats))
         channels = source.channels()
         with suppress(InputError):  # of a column; some files are read once for all of them

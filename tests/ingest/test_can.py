@@ -1,7 +1,6 @@
 """CAN traces: written by python-can, with databases and payloads by cantools."""
 
 from collections import Counter
-from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -280,8 +279,8 @@ def test_bus_logging_says_what_is_not_in_it(tmp_path: Path) -> None:
 def test_frames_that_are_kept_are_those_that_came(
     came: list[tuple[float, str, bytes]], piece: int
 ) -> None:
-    with closing(Spool()) as spool, mock.patch.object(can_frames, "PIECE_FRAMES", piece):
-        frames = CanFrames(spool)
+    with mock.patch.object(can_frames, "PIECE_FRAMES", piece):
+        frames = CanFrames(Spool())
         for time, on, data in came:
             payload = np.frombuffer(data, dtype=np.uint8)[np.newaxis]
             one, size = np.zeros(1, dtype=np.int64), np.array([len(data)])

@@ -3,7 +3,6 @@
 import errno
 import os
 import tempfile
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -19,15 +18,15 @@ def test_pieces_come_back_by_key_and_no_file_has_a_name(
 ) -> None:
     monkeypatch.setattr(source, "IN_MEMORY_BYTES", in_memory)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with closing(Spool()) as kept:
-        for number in range(10):
-            kept.add(number % 3, b"%d" % number * number)
-        assert list(kept.read(1)) == [b"1", b"4444", b"7777777"]
-        assert list(tmp_path.iterdir()) == []
-        kept.clear()
-        assert list(kept.read(1)) == []
-        kept.add(1, b"again")
-        assert list(kept.read(1)) == [b"again"]
+    kept = Spool()
+    for number in range(10):
+        kept.add(number % 3, b"%d" % number * number)
+    assert list(kept.read(1)) == [b"1", b"4444", b"7777777"]
+    assert list(tmp_path.iterdir()) == []
+    kept.clear()
+    assert list(kept.read(1)) == []
+    kept.add(1, b"again")
+    assert list(kept.read(1)) == [b"again"]
     assert list(tmp_path.iterdir()) == []
 
 
@@ -35,12 +34,12 @@ def test_a_full_disk_is_an_error_that_names_the_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with closing(Spool()) as kept:
-        kept._file.close()
-        kept._file = _Full()  # type: ignore[assignment]
-        with pytest.raises(InputError, match=r"no room for a temporary copy .*TMPDIR") as caught:
-            kept.add(1, b"much")
-        assert str(caught.value).startswith(str(tmp_path))
+    kept = Spool()
+    kept._file.close()
+    kept._file = _Full()  # type: ignore[assignment]
+    with pytest.raises(InputError, match=r"no room for a temporary copy .*TMPDIR") as caught:
+        kept.add(1, b"much")
+    assert str(caught.value).startswith(str(tmp_path))
 
 
 class _Full:
@@ -51,6 +50,3 @@ class _Full:
 
     def write(self, _: bytes) -> int:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    def close(self) -> None:
-        """Close nothing."""

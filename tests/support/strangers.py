@@ -21,7 +21,6 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import SignalColumn, conversion_factor
 from fleet_slip.ingest.draft import draft_mapping, write_draft
-from fleet_slip.ingest.formats.reading import FileFormats
 from fleet_slip.ingest.profile import profile_file
 from fleet_slip.ingest.suspicion import RADIUS_M
 from tests.support.textbook_car import a_car
@@ -58,7 +57,7 @@ def score(columns: list[Named], folder: Path) -> Counter[str]:
     file = folder / f"{columns[0].log}.{'mf4' if columns[0].layout == 'mdf' else 'csv'}"
     _write(file, columns)
     try:
-        text = write_draft(draft_mapping(file, profile_file(file, FileFormats())), "draft")
+        text = write_draft(draft_mapping(file, profile_file(file)), "draft")
     except InputError:
         return Counter(missing=sum(bool(column.signal) for column in columns))
     return _judge(columns, text)

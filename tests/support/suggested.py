@@ -1,7 +1,7 @@
 """Logs of a car by the textbook, as other programs write them, and the mapping that is right."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from asammdf import MDF, Signal
 from fleet_slip.ingest.columns import SignalColumn
 from fleet_slip.ingest.draft import Draft, draft_mapping, signal_keys
 from fleet_slip.ingest.formats.can import CanBus
-from fleet_slip.ingest.formats.reading import FileFormats
 from fleet_slip.ingest.profile import profile_file
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
 from tests.support.textbook_car import Car, a_car
@@ -64,7 +63,7 @@ ON_BUS = {
     "sideslip": "Correvit.SlipAngle",
 }  # fmt: skip
 _BUS_FACTORS = {"ax": 1 / G_MPS2, "ay": 1 / G_MPS2, **DEGREES, **KMH}
-ON_BUS_ONLY = FileFormats(can=CanBus(database="car.dbc", text=DBC))
+BUS = CanBus(database="car.dbc", text=DBC)
 
 
 def _columns(car: Car, names: Mapping[str, str], factors: Mapping[str, float]) -> pl.DataFrame:
@@ -161,7 +160,7 @@ class Suggested:
         names: column of each signal.
         factors: value in the file of one SI unit;.
         least_mps: the car's least speed.
-        formats: what is known of the file beside it.
+        bus: the database of a CAN trace.
     """
 
     suffix: str
@@ -169,7 +168,7 @@ class Suggested:
     names: Mapping[str, str]
     factors: Mapping[str, float]
     least_mps: float = 8.0
-    formats: FileFormats = field(default_factory=FileFormats)
+    bus: CanBus | None = None
 
 
 LOGS: dict[str, Suggested] = {
@@ -184,12 +183,8 @@ LOGS: dict[str, Suggested] = {
     "MATLAB, a struct with the catalogue's names": Suggested(
         ".mat", _matlab, {name: f"Data.{name}" for name in ENGLISH}, DEGREES
     ),
-    "CAN trace (BLF) with a DBC": Suggested(
-        ".blf", _blf, ON_BUS, _BUS_FACTORS, formats=ON_BUS_ONLY
-    ),
-    "MDF 4 with bus logging and a DBC": Suggested(
-        ".mf4", _mf4_bus, ON_BUS, _BUS_FACTORS, formats=ON_BUS_ONLY
-    ),
+    "CAN trace (BLF) with a DBC": Suggested(".blf", _blf, ON_BUS, _BUS_FACTORS, bus=BUS),
+    "MDF 4 with bus logging and a DBC": Suggested(".mf4", _mf4_bus, ON_BUS, _BUS_FACTORS, bus=BUS),
     "MCAP, sensor_msgs/Imu and a message of the car": Suggested(".mcap", _mcap, ROS, {}),
 }
 
@@ -198,7 +193,7 @@ def suggest(one: Suggested, folder: Path) -> Draft:
     """Write a log, and return the draft of its mapping."""
     file = folder / f"log{one.suffix}"
     one.write(file, a_car(one.least_mps))
-    return draft_mapping(file, profile_file(file, one.formats))
+    return draft_mapping(file, profile_file(file, one.bus))
 
 
 def wrong_guesses(one: Suggested, draft: Draft) -> list[str]:

@@ -10,7 +10,7 @@ import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from itertools import islice, product
 from pathlib import Path
@@ -278,11 +278,9 @@ _Key = tuple[int, bool]
 class CanSource(FormatSource):
     """The messages of a CAN trace, or of a file with bus logging."""
 
-    def __init__(
-        self, file: Path, bus: CanBus, spool: Spool, blocks: Callable[[], Iterator[FrameBlock]]
-    ) -> None:
+    def __init__(self, file: Path, bus: CanBus, blocks: Callable[[], Iterator[FrameBlock]]) -> None:
         """Take a file, what the mapping says of it, and what reads its frames."""
-        self._file, self._bus, self._spool, self._blocks = file, bus, spool, blocks
+        self._file, self._bus, self._spool, self._blocks = file, bus, Spool(), blocks
         self._database = parse_database(bus)
         self._messages = {message.name: message for message in self._database.messages}
         self._wanted: set[_Key] = set()
@@ -420,5 +418,4 @@ def _key(message: Any) -> _Key:
 @contextmanager
 def open_can_trace(bus: CanBus, budget: Budget) -> Iterator[CanSource]:
     """Open a CAN trace. Raises `InputError`, for a database that cannot be parsed too."""
-    with closing(Spool()) as spool:
-        yield CanSource(budget.file, bus, spool, partial(_read_trace, budget))
+    yield CanSource(budget.file, bus, partial(_read_trace, budget))

@@ -10,7 +10,7 @@ import json
 import re
 from array import array
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -122,9 +122,9 @@ _Fields = dict[str, str]
 class McapSource(FormatSource):
     """The topics of an MCAP file."""
 
-    def __init__(self, budget: Budget, spool: Spool) -> None:
-        """Take the file and what it may become, and where decoded messages are kept."""
-        self._file, self._budget, self._spool = budget.file, budget, spool
+    def __init__(self, budget: Budget) -> None:
+        """Take the file."""
+        self._file, self._spool = budget.file, Spool()
         self._kept: dict[str, _Fields] = {}
         self._numbers: set[str] = set()
         self._texts: set[str] = set()
@@ -240,5 +240,4 @@ class McapSource(FormatSource):
 @contextmanager
 def open_mcap(budget: Budget) -> Iterator[McapSource]:
     """Open an MCAP file. Raises `InputError`."""
-    with closing(Spool()) as spool:
-        yield McapSource(budget, spool)
+    yield McapSource(budget)

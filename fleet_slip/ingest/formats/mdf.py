@@ -3,7 +3,7 @@
 import mmap
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,6 @@ from fleet_slip.ingest.formats.source import (
     Budget,
     Channel,
     FormatSource,
-    Spool,
     as_column,
     load_library,
     missing_column,
@@ -380,5 +379,5 @@ def _payloads(samples: NDArray[Any]) -> Bytes:
 @contextmanager
 def open_mdf_bus(bus: CanBus, budget: Budget) -> Iterator[CanSource]:
     """Open an MDF file for the CAN frames in it. Raises `InputError`."""
-    with closing(Spool()) as spool, open_mdf(budget) as mdf:
-        yield CanSource(budget.file, bus, spool, partial(_read_bus, mdf, budget.file))
+    with open_mdf(budget) as mdf:
+        yield CanSource(budget.file, bus, partial(_read_bus, mdf, budget.file))

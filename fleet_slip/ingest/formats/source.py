@@ -289,7 +289,7 @@ class Spool:
 
     def __init__(self) -> None:
         """Begin without any."""
-        self._file = tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES)  # noqa: SIM115 - see close
+        self._file = tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES)  # noqa: SIM115 - as long as this
         self._pieces: dict[Hashable, list[tuple[int, int]]] = defaultdict(list)
         self._end = 0
 
@@ -327,7 +327,3 @@ class Spool:
         self._file.seek(0)
         self._file.truncate()
         self._end = 0
-
-    def close(self) -> None:
-        """Let go of all."""
-        self._file.close()
