@@ -415,12 +415,12 @@ class RowCondition(Config):
         given = {key: getattr(self, key) for key in _BOUNDS}
         return {key: bound for key, bound in given.items() if bound is not None}
 
-    def is_met(self, number: pl.Expr, text: pl.Expr) -> pl.Expr:
-        """Return whether a row meets it, given the column as a number and as a text."""
+    def is_met(self, value: pl.Expr) -> pl.Expr:
+        """Return whether a row meets it, given a text where it is one of some, else a number."""
         if self.one_of:
-            return text.is_in(self.one_of).fill_null(value=False)
-        met = (_BOUNDS[key](number, bound) for key, bound in self.bounds.items())
-        return reduce(operator.and_, met, number.is_finite()).fill_null(value=False)
+            return value.is_in(self.one_of).fill_null(value=False)
+        met = (_BOUNDS[key](value, bound) for key, bound in self.bounds.items())
+        return reduce(operator.and_, met, value.is_finite()).fill_null(value=False)
 
 
 def describe(conditions: Sequence[RowCondition]) -> str:

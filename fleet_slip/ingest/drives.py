@@ -26,12 +26,10 @@ from fleet_slip.ingest.resampling import (
     SNAP_TOLERANCE_S,
     STEP_S,
     TIME_EPSILON_S,
-    Antenna,
     Method,
     Resampler,
     build_resampler,
     choose_method,
-    course_and_speed,
     fixes_on_ticks,
     physical,
     place_label,
@@ -418,17 +416,15 @@ def _fixes(
     counts: dict[str, pa.Array],
 ) -> dict[str, pa.Array]:
     """Return the counts of course and speed over ground, null between fixes."""
-    source = mapping.signals[COURSE]
     if len(intervals_s) == 1:
         samples = pl.DataFrame([rows.column(name).alias(name) for name in (COURSE, SPEED)])
     else:
         samples = rows.samples(COURSE).join(rows.samples(SPEED), on="time", how="inner")
         resampler = _on_own_times(rows, COURSE, samples, resampler, intervals_s)
     fixes = fixes_on_ticks(
-        *course_and_speed(source, samples[COURSE].to_numpy(), samples[SPEED].to_numpy()),
+        mapping.signals[COURSE],
+        (samples[COURSE].to_numpy(), samples[SPEED].to_numpy()),
         resampler,
-        source.delay_s,
-        Antenna(source.antenna_x_m or 0.0, source.antenna_y_m or 0.0),
         physical(counts, "yaw_rate"),
         physical(counts, "ay") if "ay" in counts else None,
     )

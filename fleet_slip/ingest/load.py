@@ -41,13 +41,13 @@ from fleet_slip.ingest.recordings import (
     keep_drives,
     keep_refused,
     let_return,
+    size_of,
     tables_of,
     unit_of,
 )
 from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
 from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
 from fleet_slip.rendering import Answer, Part, TextTable
-from fleet_slip.storage.folder import StoredFile
 from fleet_slip.storage.table import Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse
@@ -225,7 +225,7 @@ def _written(
     if isinstance(executor, ThreadPoolExecutor):
         together: list[Batch] = []
         for batch in batches:
-            (alone if _size_of(batch[0].file) >= BATCH_BYTES else together).append(batch)
+            (alone if size_of(batch[0].file) >= BATCH_BYTES else together).append(batch)
         batches = together
     yield from run_tasks(executor, write, batches, lambda batch: str(batch[0].file))
     yield from run_tasks(None, write, alone, str)
@@ -236,7 +236,7 @@ def _batches(files: Iterable[AskedFile]) -> Iterator[Batch]:
     batch: list[AskedFile] = []
     size = 0
     for asked in files:
-        more = _size_of(asked.file)
+        more = size_of(asked.file)
         if batch and (size + more > BATCH_BYTES or len(batch) >= BATCH_FILES):
             yield tuple(batch)
             batch, size = [], 0
@@ -244,15 +244,6 @@ def _batches(files: Iterable[AskedFile]) -> Iterator[Batch]:
         size += more
     if batch:
         yield tuple(batch)
-
-
-def _size_of(log: Log) -> int:
-    if isinstance(log, StoredFile):
-        return log.size_bytes
-    try:
-        return log.stat().st_size
-    except OSError:
-        return 0  # whoever reads it says what is wrong
 
 
 def _finished(warehouse: Warehouse, one: WrittenFile, *, is_new: bool) -> IngestReport:

@@ -234,16 +234,17 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
     met = pl.lit(value=True)
     for condition in mapping.where:
         of = condition.signal
-        source = None if of is None else mapping.signals[of]
-        name = find_held(str(source.column if source else condition.column), schema)
-        column = pl.col(RAW + name)
-        if of is not None and source is not None:
-            number = _signed(source, name, schema, mapping)[1]
-            met &= condition.is_met(_si_value(of, source, number), column)
+        name = find_held(
+            str(condition.column if of is None else mapping.signals[of].column), schema
+        )
+        if of is not None:
+            source = mapping.signals[of]
+            value = _si_value(of, source, _signed(source, name, schema, mapping)[1])
         elif condition.one_of:
-            met &= condition.is_met(column, as_text(name, schema, mapping))
+            value = as_text(name, schema, mapping)
         else:
-            met &= condition.is_met(as_number(name, schema, mapping)[1], column)
+            value = as_number(name, schema, mapping)[1]
+        met &= condition.is_met(value)
     return met
 
 

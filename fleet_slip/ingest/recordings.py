@@ -226,14 +226,18 @@ def _name_of(log: Log) -> str:
 
 
 def _state_of(log: Log) -> tuple[int, int | str] | None:
-    """Return what changes when the content does; None if that is not known."""
+    """Return size and what changes when the content does; None if that is not known."""
     if isinstance(log, StoredFile):
         return log.size_bytes, log.identity
-    try:
+    with suppress(OSError):  # whoever reads it says what is wrong
         found = log.stat()
-    except OSError:
-        return None
-    return found.st_size, found.st_mtime_ns
+        return found.st_size, found.st_mtime_ns
+    return None
+
+
+def size_of(log: Log) -> int:
+    """Return the bytes of a log, 0 if that is not known."""
+    return (_state_of(log) or (0, 0))[0]
 
 
 # What becomes of a file whose recording is in the logs already.

@@ -216,24 +216,17 @@ class Resampler:
 
 
 def build_resampler(time_s: FloatArray, method: Method) -> Resampler:
-    """Return what brings signals at these times onto the ticks of their drive."""
+    """Return what brings signals at these times onto the ticks of their drive.
+
+    Tick 0 is the first sample, for averages half a tick later; samples are snapped to the nearest.
+    """
     if method == "snap":
-        return Resampler(time_s, method, snap(time_s), time_s[0])
-    start_s, number = tick_range(time_s, method)
-    return Resampler(time_s, method, np.arange(number), start_s)
-
-
-def snap(time_s: FloatArray) -> IntArray:
-    """Return the tick nearest to each sample, the first sample being tick 0."""
-    ticks: IntArray = np.rint((time_s - time_s[0]) / STEP_S).astype(np.int64)
-    return ticks
-
-
-def tick_range(time_s: FloatArray, method: Method) -> tuple[float, int]:
-    """Return the time of tick 0, half a tick late for averages, and the number of ticks."""
+        nearest = np.rint((time_s - time_s[0]) / STEP_S).astype(np.int64)
+        return Resampler(time_s, method, nearest, time_s[0])
     margin = STEP_S / 2 if method == "average" else 0.0
     span = time_s[-1] - time_s[0] - 2 * margin
-    return float(time_s[0] + margin), int(np.floor((span + TIME_EPSILON_S) / STEP_S)) + 1
+    number = int(np.floor((span + TIME_EPSILON_S) / STEP_S)) + 1
+    return Resampler(time_s, method, np.arange(number), float(time_s[0] + margin))
 
 
 def interpolate(
@@ -288,59 +281,46 @@ def _present(time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatA
     return time_s[present], values[present]
 
 
-@dataclass(frozen=True)
-class Antenna:
-    """Where the antenna is: before the centre of gravity, and to the left of it, in m."""
-
-    x_m: float
-    y_m: float
-
-
-def course_and_speed(
-    column: SignalColumn, first: FloatArray, second: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return course from east and speed of two columns: north and east, or course and speed."""
-    if column.component:
-        return np.arctan2(first, second), np.hypot(first, second)
-    course = np.pi / 2 - first if column.clockwise_from_north else first
-    return course, second
-
-
 def fixes_on_ticks(
-    course: FloatArray,
-    speed: FloatArray,
+    source: SignalColumn,
+    fixes: tuple[FloatArray, FloatArray],
     resampler: Resampler,
-    delay_s: float,
-    antenna: Antenna,
     yaw_rate: FloatArray,
     ay: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return course in rad and speed in m/s at the ticks nearest to the fixes, NaN elsewhere.
 
-    `course` and `speed` are the antenna's, of the resampler's samples; `yaw_rate` in rad/s and
-    `ay` in m/s² are of the ticks. A sample that repeats the one before is no fix. There is no
-    course without a yaw rate, below `LEAST_SPEED_MPS`, where it `is_held` or `is_backwards`.
+    `fixes` are two columns of the resampler's samples: the velocities to the north and to the east,
+    or course and speed, as the `source` of the course says; `yaw_rate` in rad/s and `ay` in m/s²
+    are of the ticks. A sample that repeats the one before is no fix. There is no course without a
+    yaw rate, below `LEAST_SPEED_MPS`, where it `is_held` or `is_backwards`.
 
     In the car's axes the antenna moves by (-r y, r x) against the centre of gravity, with the yaw
     rate r; a slip β makes an error of r y β over speed. A fix that is measured a part of a tick
     before its tick turns by r times that part.
     """
-    present = np.flatnonzero(_is_new(course, speed))
-    nearest, late_s = _nearest(resampler, present, delay_s)
+    course, speed = fixes
+    if source.component:
+        course, speed = np.arctan2(*fixes), np.hypot(*fixes)
+    elif source.clockwise_from_north:
+        course = np.pi / 2 - course
+    new = np.flatnonzero(_is_new(course, speed))
+    since = resampler.time_s[new] - source.delay_s - resampler.start_s
+    nearest = np.rint(since / STEP_S)
     place, found = find_ticks(resampler.ticks, nearest)
-    place, late_s, fixes = place[found], late_s[found], present[found]
-    r = yaw_rate[place]
-    across = r * antenna.x_m
-    along = np.sqrt(np.maximum(speed[fixes] ** 2 - across**2, 0.0))
-    turned = course[fixes] - np.arctan2(across, along) + r * late_s
+    place, late_s = place[found], (nearest * STEP_S - since)[found]
+    course, speed, r = course[new[found]], speed[new[found]], yaw_rate[place]
+    across = r * (source.antenna_x_m or 0.0)
+    along = np.sqrt(np.maximum(speed**2 - across**2, 0.0))
+    turned = course - np.arctan2(across, along) + r * late_s
     courses, speeds = (np.full(resampler.ticks.size, np.nan) for _ in range(2))
-    speeds[place] = along + r * antenna.y_m
-    sound = (speed[fixes] >= LEAST_SPEED_MPS) & ~is_held(course[fixes], yaw_rate, place)
+    speeds[place] = along + r * (source.antenna_y_m or 0.0)
+    sound = (speed >= LEAST_SPEED_MPS) & ~is_held(course, yaw_rate, place)
     if ay is not None:
-        sound &= ~is_backwards(yaw_rate, ay, speed[fixes], place)
+        sound &= ~is_backwards(yaw_rate, ay, speed, place)
     courses[place] = np.where(sound, turned, np.nan)
     courses, speeds = on_grid(resampler.ticks, courses, speeds, yaw_rate)
-    return _in_one_turn(courses), speeds
+    return np.asarray((courses + np.pi) % (2 * np.pi) - np.pi), speeds  # in one turn
 
 
 def _is_new(course: FloatArray, speed: FloatArray) -> BoolArray:
@@ -351,20 +331,6 @@ def _is_new(course: FloatArray, speed: FloatArray) -> BoolArray:
     new = np.zeros(course.size, dtype=np.bool_)
     new[there[~same]] = True
     return new
-
-
-def _nearest(
-    resampler: Resampler, samples: IntArray, delay_s: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the tick nearest to each sample, and how much later it is, in s."""
-    since = resampler.time_s[samples] - delay_s - resampler.start_s
-    nearest = np.rint(since / STEP_S)
-    return nearest, nearest * STEP_S - since
-
-
-def _in_one_turn(angle: FloatArray) -> FloatArray:
-    """Return the angle from -pi on, below pi."""
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi, dtype=np.float64)
 
 
 # The label is brought to the centre of gravity: with the yaw rate r, a sensor x before it and y to

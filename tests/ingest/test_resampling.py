@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.ingest.resampling import average, build_resampler, choose_method, interpolate, snap
+from fleet_slip.ingest.resampling import average, build_resampler, choose_method, interpolate
 
 steps = st.lists(st.floats(0.0005, 0.09), min_size=3, max_size=60)
 lines = st.tuples(st.floats(-100, 100), st.floats(-100, 100))
@@ -90,7 +90,7 @@ def test_jitter_of_a_tenth_of_a_sample_is_snapped(jitter_s: list[float]) -> None
     jitter = np.array([0.0, *jitter_s])
     t = np.arange(jitter.size) / 100 + jitter
     assert choose_method(t, 0.01) == "snap"
-    assert snap(t).tolist() == list(range(t.size))
+    assert build_resampler(t, "snap").ticks.tolist() == list(range(t.size))
 
 
 @pytest.mark.parametrize(
