@@ -32,11 +32,15 @@ from fleet_slip.base import shown
 from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.confined_reader import FORMATS, SIZES, Job
-from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
+from fleet_slip.ingest.formats.csv import (
+    VBO_BEGINS,
+    CsvFormat,
+    CsvSource,
+    PlainNumbers,
+    VboSource,
+)
 from fleet_slip.ingest.formats.source import Budget, Channel, Source, unreadable
 from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, open_parquet
-from fleet_slip.ingest.formats.vbo import BEGINS as VBO_BEGINS
-from fleet_slip.ingest.formats.vbo import VboSource
 from fleet_slip.ingest.log_files import parts_of
 
 [_HDF5], _HDF5_AT = FORMATS["mat73"].begins, 512
