@@ -49,21 +49,18 @@ def connect(
     It opens the files of the snapshot and no others, and its settings cannot be changed. DuckDB
     knows no right to read without the right to write: ask SQL of others through `Fleet.sql`.
     """
-    database, paths = _open_views(data_root(root), query, threads, scenarios=scenarios)
-    lock(database, paths)
-    return database
+    return open_views(data_root(root), query, threads, scenarios=scenarios)
 
 
-def connect_unlocked(
-    root: Folder, query: str | None = None, *, scenarios: bool = False
+def open_views(
+    root: Folder,
+    query: str | None,
+    threads: int | None = None,
+    *,
+    scenarios: bool,
+    unlocked: bool = False,
 ) -> duckdb.DuckDBPyConnection:
-    """Return a connection as `connect` does that can open any file and change any setting."""
-    return _open_views(root, query, scenarios=scenarios)[0]
-
-
-def _open_views(
-    root: Folder, query: str | None, threads: int | None = None, *, scenarios: bool
-) -> tuple[duckdb.DuckDBPyConnection, list[str]]:
+    """Return a connection as `connect` does; `unlocked`, it opens any file and takes settings."""
     warehouse = Warehouse(root)
     warehouse.require()
     wanted = VIEWS - {CALIBRATION} if query is None else needed_views(query)
@@ -73,7 +70,6 @@ def _open_views(
     scenarios = scenarios or _SOURCE.search(query or "") is not None
     of = ALL_DRIVES if scenarios else TRAINING_DRIVES
     database = open_tables(warehouse, wanted, snapshots, threads=threads, of=of)
-    paths = paths_of(snapshots, wanted)
     if "runs" in wanted:
         add_runs(database, warehouse.root)
     if "models" in wanted:
@@ -82,7 +78,9 @@ def _open_views(
         _calibrate(database)
     if "dictionary" in wanted:
         add_table(database, "dictionary", describe_columns(database, warehouse.catalogue))
-    return database, paths
+    if not unlocked:
+        lock(database, paths_of(snapshots, wanted))
+    return database
 
 
 def add_calibration(database: duckdb.DuckDBPyConnection, query: str) -> None:

@@ -63,28 +63,25 @@ class Fleet(LogsAndGrams, HealthAndUpkeep):
         return self.session(query, threads=threads, scenarios=scenarios).sql(query)
 
     def session(
-        self, query: str | None = None, *, threads: int | None = None, scenarios: bool = False
+        self,
+        query: str | None = None,
+        *,
+        threads: int | None = None,
+        scenarios: bool = False,
+        unlocked: bool = False,
     ) -> "Session":
         """Open the views of this moment for many queries, which all see the same commits.
 
-        With a `query`, only those that it names, which is faster. For `scenarios` see `sql`. Raises
-        `StorageError` without a data root.
+        With a `query`, only those that it names, which is faster. For `scenarios` see `sql`. If it
+        is `unlocked`, it allows any statement, and any file that you may read or write: only for
+        SQL that you trust, since it can overwrite the warehouse. Raises `StorageError` without a
+        data root.
         """
         from fleet_slip.api.session import Session
-        from fleet_slip.views import connect
+        from fleet_slip.views import open_views
 
-        opened = connect(self.root, threads=threads, query=query, scenarios=scenarios)
-        return Session(opened)
-
-    def unlocked_session(self, query: str | None = None, *, scenarios: bool = False) -> "Session":
-        """Open a session that allows any statement, and any file that you may read or write.
-
-        Only for SQL that you trust: it can overwrite the warehouse. Else like `session`.
-        """
-        from fleet_slip.api.session import Session, any_statement
-        from fleet_slip.views import connect_unlocked
-
-        return Session(connect_unlocked(self.root, query, scenarios=scenarios), any_statement)
+        opened = open_views(self.root, query, threads, scenarios=scenarios, unlocked=unlocked)
+        return Session(opened, unlocked)
 
     def cohort(
         self,

@@ -161,7 +161,7 @@ class HealthAndUpkeep(JudgedModels):
             if repair:
                 rebuilt = self.repair(found)
                 found = look()
-                found.rebuilt = rebuilt
+                found.rebuilt, found.repaired = rebuilt, True
         if grams and not found.damage:
             found.compared = check_grams(self.warehouse)
         return found

@@ -10,14 +10,12 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import Json, print_answer, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
-from fleet_slip.errors import DamageError, UsageError
+from fleet_slip.errors import UsageError
 
 if TYPE_CHECKING:
-    from fleet_slip.grams.calibration import Calibration
     from fleet_slip.operations.monitor import Chart
     from fleet_slip.operations.night import NightReport
     from fleet_slip.operations.status import WarehouseStatus
-    from fleet_slip.operations.verify import Verification
 
 
 @command(Fleet.status)
@@ -59,12 +57,10 @@ def quality() -> None:
 
 @command(Fleet.calibrate)
 def calibrate(
-    found: "Calibration",
     car: Annotated[
         str | None,
         typer.Option(help="Show this car's numbers, and how they go on board.", show_default=False),
     ] = None,
-    json: Json = False,
 ) -> None:
     """Tell from each car's own drives how its sensors are off: no label, no log row is read.
 
@@ -74,15 +70,6 @@ def calibrate(
 
     Example: **fleet-slip calibrate**
     """
-    if car is not None:
-        found.car(car)  # that there is such a car
-    if json:
-        shown = found.as_dict()
-        if car is not None:
-            shown["cars"] = {car: shown["cars"][car]}
-        print_json(shown)
-    else:
-        print_parts(found.parts() if car is None else found.parts_of_car(car))
 
 
 @command(Fleet.monitor, arguments=["model"])
@@ -135,22 +122,13 @@ def nightly(
 
 
 @command(Fleet.verify, progress=("verify", "bytes"))
-def verify(report: "Verification", fleet: Fleet, repair: bool, json: Json = False) -> None:
+def verify() -> None:
     """Verify every byte against its checksum, and everything against everything else.
 
     Exits with 9 if there is damage that was not repaired.
 
     Example: **fleet-slip verify --full**
     """
-    print_answer(report, json)
-    if report.damage:
-        advice = (
-            "What is left cannot be rebuilt here: restore these files from a backup. Data files "
-            "may be copied below their table under any name; then give the command again."
-            if repair
-            else "Rebuild what can be rebuilt with: fleet-slip verify --repair"
-        )
-        raise DamageError(f"{fleet.root}: {len(report.damage)} damaged. {advice}")
 
 
 @command(Fleet.compact, progress=("compact", "days"))

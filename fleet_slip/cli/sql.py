@@ -91,7 +91,7 @@ def sql(
         raise UsageError(f"{output}: the suffix says the format: .parquet, .csv or .json.")
     if not unsafe:
         limit_memory()
-    opened = (fleet.unlocked_session if unsafe else fleet.session)(text, scenarios=scenarios)
+    opened = fleet.session(text, scenarios=scenarios, unlocked=unsafe)
     with opened as session, _representation_errors():
         if output is not None:
             _write(_rows(session, text, limit), output, exact)

@@ -385,8 +385,15 @@ class Calibration(Answer):
             for car, numbers in self.cars.items()
         }
 
-    def parts(self) -> Iterator[Part]:
-        """Return a table of the numbers over all cars."""
+    def parts(self, car: str | None = None) -> Iterator[Part]:
+        """Return a table of the numbers over all cars, or those of a car and how they go on board.
+
+        Raises `QuestionError` for an unknown car.
+        """
+        yield from self._of_all() if car is None else self._of_car(car)
+        yield from self._remarks_on_roads()
+
+    def _of_all(self) -> Iterator[Part]:
         rows = []
         for name, about in CAR_NUMBERS.items():
             cars = [numbers[name] for numbers in self.cars.values() if name in numbers]
@@ -405,10 +412,8 @@ class Calibration(Answer):
         )
         if not any(one.uncertainty for cars in self.cars.values() for one in cars.values()):
             yield Remark("no car has two drives: uncertainties cannot be estimated")
-        yield from self._remarks_on_roads()
 
-    def parts_of_car(self, car: str) -> Iterator[Part]:
-        """Return a table of a car's numbers, and why others are missing."""
+    def _of_car(self, car: str) -> Iterator[Part]:
         yield TextTable(
             f"{car}, by its own drives",
             "number|unit|value|+-|drives|count on board|of",
@@ -422,7 +427,6 @@ class Calibration(Answer):
             names = [name for name, why in missing.items() if why == reason]
             are = "is" if len(names) == 1 else "are"
             yield Remark(f"{', '.join(names)} {are} missing: {reason}")
-        yield from self._remarks_on_roads()
 
     def _remarks_on_roads(self) -> Iterator[Remark]:
         if self.evidence.roads.hide_offsets:

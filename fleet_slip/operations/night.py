@@ -39,20 +39,7 @@ class Beginning:
     candidate: str | None = None
 
 
-@dataclass(frozen=True)
-class PastNight:
-    """How a night ended; `steps` are the state of each by name."""
-
-    night: date
-    exit_code: int
-    drives: int
-    rows: int
-    champion: str | None
-    steps: Mapping[str, str]
-    faulty: Hashes = frozenset()
-
-
-_BEGINNING, _PAST = TypeAdapter(Beginning), TypeAdapter(PastNight)
+_BEGINNING = TypeAdapter(Beginning)
 
 
 @dataclass(frozen=True)
@@ -64,29 +51,20 @@ class Nights:
 
     def begin(self, night: date, now: Beginning) -> Beginning:
         """Record the beginning of a night; return the one that is there, if the night has one."""
+        day, known = night.isoformat(), frozenset[str]()
         for content in self._newest_first():
-            if content["night"] < night.isoformat():
-                break
-            if content["night"] == night.isoformat() and content["event"] == "begun":
+            if content["event"] == "begun" and content["night"] == day:
                 return _BEGINNING.validate_python(content)
-        before = next(self.ended(before=night), None)
-        begun = replace(now, known=before.faulty if before else frozenset())
-        content = {"night": night.isoformat(), **_BEGINNING.dump_python(begun, mode="json")}
-        self._append("begun", content)
+            if content["event"] == "ended" and content["night"] < day:
+                known = frozenset(content["faulty"])
+                break
+        begun = replace(now, known=known)
+        self._append("begun", {"night": day, **_BEGINNING.dump_python(begun, mode="json")})
         return begun
 
-    def end(self, past: PastNight) -> None:
+    def end(self, content: Mapping[str, Any]) -> None:
         """Record how a night ended."""
-        self._append("ended", _PAST.dump_python(past, mode="json"))
-
-    def ended(self, before: date = date.max) -> Iterator[PastNight]:
-        """Yield the nights that ended, the newest first and each once, as it ended at last."""
-        seen = set[str]()
-        for content in self._newest_first():
-            night = content["night"]
-            if content["event"] == "ended" and night not in seen and night < before.isoformat():
-                seen.add(night)
-                yield _PAST.validate_python(content)
+        self._append("ended", content)
 
     def _newest_first(self) -> Iterator[Mapping[str, Any]]:
         documents = DocumentFolder(self.root / NIGHTS_FOLDER)
@@ -196,17 +174,17 @@ class NightReport(Answer):
         new = f"{number_of(drives, 'drive')}, {number_of(rows, 'row')}"
         return f"{new}; in quarantine: {number_of(held, 'row')}" if held else new
 
-    def as_past(self) -> PastNight:
-        """Return the night as the record keeps it."""
-        return PastNight(
-            self.night,
-            self.exit_code,
-            self.drives,
-            self.rows,
-            self.champion,
-            {step.name: step.state for step in self.steps},
-            frozenset(hash_drive(self.model, one.drive_id) for one in self.faults),
-        )
+    def as_past(self) -> dict[str, Any]:
+        """Return the night as the record keeps it; `faulty` are hashes of the faulty drives."""
+        return {
+            "night": self.night.isoformat(),
+            "exit_code": self.exit_code,
+            "drives": self.drives,
+            "rows": self.rows,
+            "champion": self.champion,
+            "steps": {step.name: step.state for step in self.steps},
+            "faulty": sorted({hash_drive(self.model, one.drive_id) for one in self.faults}),
+        }
 
     def parts(self) -> Iterator[Part]:
         """Return the summary for people, lines of text."""

@@ -19,7 +19,14 @@ import pyarrow.parquet as pq
 from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
-from fleet_slip.errors import DataError, FleetSlipError, QuestionError, RefusedError, StorageError
+from fleet_slip.errors import (
+    DamageError,
+    DataError,
+    FleetSlipError,
+    QuestionError,
+    RefusedError,
+    StorageError,
+)
 from fleet_slip.grams.check import (
     CheckReport,
     DriveGrams,
@@ -95,6 +102,7 @@ class Verification(Answer):
     documents: int = 0
     findings: list[Damage] = field(default_factory=list)
     rebuilt: Sequence[str] = ()
+    repaired: bool = False
     compared: CheckReport | None = None
 
     def note(self, kind: DamageKind, path: str, problem: str) -> None:
@@ -126,6 +134,17 @@ class Verification(Answer):
         )
         if self.compared:
             yield TextTable("", "way|drives|equal", self.compared.ways)
+
+    @property
+    def problem(self) -> DamageError | None:
+        """That something is damaged, and what to do."""
+        advice = (
+            "What is left cannot be rebuilt here: restore these files from a backup. Data files "
+            "may be copied below their table under any name; then give the command again."
+            if self.repaired
+            else "Rebuild what can be rebuilt with: fleet-slip verify --repair"
+        )
+        return DamageError(f"{len(self.damage)} damaged. {advice}") if self.damage else None
 
 
 @dataclass(frozen=True)

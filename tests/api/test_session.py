@@ -38,7 +38,7 @@ def test_a_closed_session_answers_no_more(fleet: Fleet) -> None:
 
 
 def test_an_unlocked_session_does_what_it_is_told(fleet: Fleet, tmp_path: Path) -> None:
-    with fleet.unlocked_session() as session:
+    with fleet.session(unlocked=True) as session:
         session.sql(COUNT).write_csv(str(tmp_path / "out.csv"))
         session.table("CREATE TABLE own AS SELECT 1 AS a")
         assert session.table("FROM own").to_pylist() == [{"a": 1}]
