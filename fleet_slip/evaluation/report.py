@@ -11,7 +11,7 @@ from fleet_slip.evaluation.claims import Status, judge_claims
 from fleet_slip.evaluation.judge import LEAST_COVERAGE
 from fleet_slip.evaluation.kept import PAPER_TABLE_TWO, ReportData, gather
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.pages.drawing import Picture, draw, png_file, svg_file
+from fleet_slip.pages.drawing import Drawn, draw
 from fleet_slip.pages.page import (
     Cell,
     ReportTable,
@@ -147,7 +147,7 @@ def measured_drives(data: ReportData) -> list[ReportTable]:
     ]
 
 
-def render(data: ReportData, shown: Sequence[Picture]) -> str:
+def render(data: ReportData, shown: Sequence[Drawn]) -> str:
     """Return the page."""
     claims = judge_claims(data)
     counted = Counter(one.status for one in claims)
@@ -155,7 +155,7 @@ def render(data: ReportData, shown: Sequence[Picture]) -> str:
         "report.html.j2",
         version=data.version,
         evaluation=data.evaluated.document,
-        paper=[draw(one) for one in shown],
+        paper=shown,
         tables=[table_one(data), table_two(data)],
         further=[*measured_drives(data), standings(data)],
         tiles=_tiles(data, counted),
@@ -249,10 +249,10 @@ class Written:
 def write_report(warehouse: Warehouse, version: ModelVersion, output: Folder) -> Written:
     """Write the report into a folder, the page last. Raises `DataError` if not evaluated."""
     data = gather(warehouse, version)
-    shown = tuple(draw_pictures(data))
+    shown = tuple(map(draw, draw_pictures(data)))
     page = render(data, shown).encode("utf-8")
-    for picture in shown:
-        output.put(f"{FIGURES}/{picture.key}.svg", svg_file(picture).encode("utf-8"))
-        output.put(f"{FIGURES}/{picture.key}.png", png_file(picture))
+    for one in shown:
+        output.put(f"{FIGURES}/{one.picture.key}.svg", one.svg_file.encode("utf-8"))
+        output.put(f"{FIGURES}/{one.picture.key}.png", one.png_file)
     output.put(PAGE, page)
     return Written(f"{output}/{PAGE}", len(page), len(shown))

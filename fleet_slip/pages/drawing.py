@@ -145,46 +145,38 @@ PIXELS_PER_POINT = 4 / 3
 
 @dataclass(frozen=True)
 class Drawn:
-    """A picture with its drawings for the page."""
+    """A picture for the page, by class: once for desks, once for phones; and as files of its own.
+
+    The files are on a light ground.
+    """
 
     picture: Picture
     svgs: Mapping[str, Markup]
+    svg_file: str
+    png_file: bytes
 
 
 def draw(picture: Picture) -> Drawn:
-    """Return a picture with its drawings for the page."""
-    return Drawn(picture, {kind: Markup(svg) for kind, svg in inline_svgs(picture).items()})  # noqa: S704
-
-
-def svg_file(picture: Picture) -> str:
-    """Return the picture as an SVG file of its own, on a light ground."""
-    svg = _lean(_svg(picture, DESK))
-    return svg.replace(f"'{FONT}'", f"'{FONT}', Verdana, sans-serif")
-
-
-def png_file(picture: Picture) -> bytes:
-    """Return the picture as a PNG file."""
-    stream = io.BytesIO()
-    with mpl.rc_context(STYLE):
-        picture.draw(DESK).savefig(stream, format="png", dpi=PNG_DPI, metadata={"Software": None})
-    return stream.getvalue()
-
-
-def inline_svgs(picture: Picture) -> dict[str, str]:
-    """Return the picture for the page, by class: once for desks, once for phones."""
-    return {
-        "desk": inline(_lean(_svg(picture, DESK)), f"{picture.key}-desk", picture.alternative),
-        "phone": inline(_lean(_svg(picture, PHONE)), f"{picture.key}-phone", picture.alternative),
-    }
-
-
-def _svg(picture: Picture, size: Size) -> str:
-    stream = io.StringIO()
-    settings: Any = {**STYLE, "svg.hashsalt": f"{picture.key}-{size.wide}"}
-    with mpl.rc_context(settings):
-        figure: Figure = picture.draw(size)
-        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
-    return stream.getvalue()
+    """Draw a picture in both sizes."""
+    png, svgs = io.BytesIO(), {}
+    for kind, size in (("desk", DESK), ("phone", PHONE)):
+        stream = io.StringIO()
+        settings: Any = {**STYLE, "svg.hashsalt": f"{picture.key}-{size.wide}"}
+        with mpl.rc_context(settings):
+            figure: Figure = picture.draw(size)
+            figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+            if kind == "desk":
+                figure.savefig(png, format="png", dpi=PNG_DPI, metadata={"Software": None})
+        svgs[kind] = _lean(stream.getvalue())
+    return Drawn(
+        picture,
+        {
+            kind: Markup(inline(svg, f"{picture.key}-{kind}", picture.alternative))  # noqa: S704
+            for kind, svg in svgs.items()
+        },
+        svgs["desk"].replace(f"'{FONT}'", f"'{FONT}', Verdana, sans-serif"),
+        png.getvalue(),
+    )
 
 
 def _lean(svg: str) -> str:

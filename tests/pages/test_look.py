@@ -6,7 +6,7 @@ import re
 import pytest
 from matplotlib.figure import Figure
 
-from fleet_slip.pages.drawing import PALETTE, Picture, Size, colour, inline, inline_svgs
+from fleet_slip.pages.drawing import PALETTE, Picture, Size, colour, draw, inline
 from fleet_slip.pages.page import degrees, listed, number, percent, scientific, size
 
 
@@ -60,7 +60,7 @@ def _draw(size: Size) -> Figure:
 
 def test_a_drawing_on_the_page_takes_its_colours_from_the_page() -> None:
     picture = Picture("key", "title", "caption", 'says "x" & <y>', _draw)
-    drawings = inline_svgs(picture)
+    drawings = draw(picture).svgs
     for svg in drawings.values():
         assert "var(--model-4)" in svg
         assert not [tone.light for tone in PALETTE.values() if tone.light in svg]

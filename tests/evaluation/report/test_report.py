@@ -29,7 +29,7 @@ from fleet_slip.evaluation.evaluate import evaluations_of, keep
 from fleet_slip.evaluation.judge import LEAST_COVERAGE
 from fleet_slip.evaluation.kept import PAPER_TABLE_TWO, ReportData, blocks_won, difference
 from fleet_slip.evaluation.report import render, standings, table_two
-from fleet_slip.pages.drawing import png_file, svg_file
+from fleet_slip.pages.drawing import draw
 from fleet_slip.pages.page import number
 from fleet_slip.resources import config_names
 from fleet_slip.storage.documents import Document
@@ -99,10 +99,10 @@ def test_a_scenario_that_was_left_out_is_said(reported: Reported, page: Page) ->
 
 def test_the_same_data_give_the_same_bytes(reported: Reported, data: ReportData) -> None:
     """Gathered and drawn once more, in another process where tests run in several."""
-    shown = tuple(draw_pictures(data))
-    assert render(data, shown) == reported.page.read_text(encoding="utf-8")
-    assert png_file(shown[0]) == (reported.figures / "figure-1a.png").read_bytes()
-    assert svg_file(shown[0]) == (reported.figures / "figure-1a.svg").read_text(encoding="utf-8")
+    first, *others = map(draw, draw_pictures(data))
+    assert render(data, (first, *others)) == reported.page.read_text(encoding="utf-8")
+    assert first.png_file == (reported.figures / "figure-1a.png").read_bytes()
+    assert first.svg_file == (reported.figures / "figure-1a.svg").read_text(encoding="utf-8")
 
 
 def test_table_two_has_the_evaluations_numbers(data: ReportData) -> None:
