@@ -54,7 +54,7 @@ from fleet_slip.grams.receiver_delay import (
 )
 from fleet_slip.regression.exact import sqrt as sqrt_exact
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import DriveTermSums, ExactSums, Influence, influence
+from fleet_slip.regression.least_squares import DriveTermSums, ExactSums, influence
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.warehouse.condition import Condition, parse_condition
 from fleet_slip.warehouse.tables import Warehouse
@@ -236,8 +236,8 @@ class CarEvidence:
     def _estimate(self, slices: Mapping[str, slice]) -> Estimates:
         return estimate_numbers(self._totals(slices), self._banked)
 
-    def influence(self, estimate: CarEstimate, at: slice) -> Influence | None:
-        """Return how drives move a number."""
+    def influence(self, estimate: CarEstimate, at: slice) -> tuple[FloatArray, FloatArray] | None:
+        """Return how far drives move a number, and their shares of its variance."""
         signals = self.sums[estimate.kind].table.signals
         sums = DriveTermSums(self._moments[estimate.kind][at], signals, estimate.terms)
         return influence(estimate.relation, sums, float(estimate.noise), estimate.gradient)
@@ -256,10 +256,11 @@ class CarEvidence:
                 found = self.influence(estimate, slices[estimate.kind])
                 if found is None:
                     continue
-                expected = found.shares * (1 - found.shares / found.shares.sum())
-                alone = expected <= LEAST_PART * found.shares
+                shifts, shares = found
+                expected = shares * (1 - shares / shares.sum())
+                alone = expected <= LEAST_PART * shares
                 ratios.setdefault(name, []).extend(
-                    (found.shifts[~alone] ** 2 / expected[~alone]).tolist()
+                    (shifts[~alone] ** 2 / expected[~alone]).tolist()
                 )
         return {name: sum(some) / len(some) for name, some in ratios.items() if some}
 
@@ -285,9 +286,8 @@ class CarEvidence:
         at = self.slices(car, drive, drive + 1)
         found = {}
         for name, estimate in self.estimate(at).items():
-            influence_of_it = self.influence(estimate, at[estimate.kind])
-            if influence_of_it is not None:
-                found[name] = float(estimate.value), float(influence_of_it.shares.sum())
+            if (moved := self.influence(estimate, at[estimate.kind])) is not None:
+                found[name] = float(estimate.value), float(moved[1].sum())
         return found
 
     def uncertainties(
@@ -299,9 +299,9 @@ class CarEvidence:
             found = self.influence(estimate, slices[estimate.kind])
             if found is None or name not in self.variances:
                 continue
-            drives = len(found.shares)
+            drives, share = len(found[1]), float(found[1].sum())
             of_one = self.variances_of_one if drives == 1 else self.variances
-            variance = of_one.get(name, self.variances[name]) * float(found.shares.sum())
+            variance = of_one.get(name, self.variances[name]) * share
             lasting = {**LASTING[self._banked], **LASTING_BY_SATELLITE.get(estimate.kind, {})}
             own[name] = variance * (1 + drives / ROADS) + lasting.get(name, 0.0) ** 2
         found_of: dict[NumberName, float] = {}

@@ -58,7 +58,10 @@ class Fixes:
         rest = self.gain * (yaw_rate[at[now]] - yaw_rate[at[before]]).astype(np.int64)
         change, sound = _change(self.course[now] - self.course[before], turned, rest)
         before, now, turned, change = before[sound], now[sound], turned[sound], change[sound]
-        straight = _straight(yaw_rate[at[before]], yaw_rate[at[now]], turned)
+        # Straight on by the yaw rate at both fixes and in between.
+        fastest = np.maximum(np.abs(yaw_rate[at[before]]), np.abs(yaw_rate[at[now]]))
+        units = course_units()
+        straight = (fastest <= units.slow) & (np.abs(turned) <= units.unturned)
         beside = [_rounded(turned, COARSER), straight, straight * change]  # `BESIDE`
         began = self.ticks[:1] == 0  # no change: so a drive without a course is remembered
         first, size = int(began.sum()), len(self.counts)
@@ -78,14 +81,6 @@ def _fixes(drive: DriveCounts, ticks: IntArray, whole: int) -> tuple[IntArray, I
     place = np.searchsorted(ticks, ticks[fixed] - whole)
     there = ticks[np.minimum(place, len(ticks) - 1)] == ticks[fixed] - whole
     return place[there], drive.counts[COURSE][fixed[there]].astype(np.int64)
-
-
-def _straight(before: FloatArray, now: FloatArray, turned: IntArray) -> IntArray:
-    """Return 1 where the car went straight on, by the yaw rate at both fixes and in between."""
-    units = course_units()
-    slow = np.maximum(np.abs(before), np.abs(now)) <= units.slow
-    straight: IntArray = (slow & (np.abs(turned) <= units.unturned)).astype(np.int64)
-    return straight
 
 
 def _pairs(ticks: IntArray, apart: int) -> tuple[IntArray, IntArray]:

@@ -36,12 +36,11 @@ class CheckReport:
     @property
     def ways(self) -> list[tuple[str, int, str]]:
         """What was compared, in how many drives, and that it was equal."""
-        ways = dict.fromkeys(
-            ("stored Gram rows against the kernel", "SQL against the kernel"), self.drives
-        )
-        if self.wide_sets:
-            ways[f"stored against the kernel: {', '.join(self.wide_sets)}"] = self.wide_drives
-        return [(way, drives, "yes") for way, drives in ways.items()]
+        ways = ("stored Gram rows against the kernel", "SQL against the kernel")
+        found = [(way, self.drives, "yes") for way in ways]
+        if wide := ", ".join(self.wide_sets):
+            found.append((f"stored against the kernel: {wide}", self.wide_drives, "yes"))
+        return found
 
 
 def check_grams(

@@ -261,7 +261,11 @@ def load_cohort(
         require_divided(feature_set, folding.by, folding.count)
     with open_grams(source, feature_set, condition) as opened:
         if folding is None:
-            kept = _read_rows(opened, condition)
+            rows = opened.rows(condition)
+            require_training(rows["source"].unique().to_pylist(), condition)
+            kept = _expand_rows(opened, rows)
+            if not kept["tables"]:  # no row, or none of changes
+                raise empty_cohort_error(opened, condition)
         else:
             names, fold_of = _find_folds(opened, folding, condition)
             grams, drives = _add_up(opened, condition, names, fold_of)
@@ -275,15 +279,6 @@ def load_cohort(
             source=source,
             **kept,
         )
-
-
-def _read_rows(opened: OpenedGrams, condition: Condition) -> dict[str, Any]:
-    rows = opened.rows(condition)
-    require_training(rows["source"].unique().to_pylist(), condition)
-    kept = _expand_rows(opened, rows)
-    if not kept["tables"]:  # no row, or none of changes
-        raise empty_cohort_error(opened, condition)
-    return kept
 
 
 def _expand_rows(opened: OpenedGrams, rows: pa.Table) -> dict[str, Any]:

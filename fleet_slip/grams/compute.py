@@ -384,10 +384,14 @@ def _by_tasks(
 ) -> Iterator[pa.Table]:
     """Yield the results of tasks in the order of their files; those that are early wait."""
     total = sum(file.rows for group in groups for file in group)
+
+    def name_of(group: Sequence[TableFile]) -> str:
+        return f"the Gram rows of {number_of(len(group), 'log file')} from {group[0].path}"
+
     done: dict[str, pa.Table] = {}
     following = iter(groups)
     awaited = next(following, None)
-    for group, rows in run_tasks(executor, task, groups, _group_name):
+    for group, rows in run_tasks(executor, task, groups, name_of):
         done[group[0].path] = rows
         progress(sum(file.rows for file in group), total)
         while awaited is not None and awaited[0].path in done:
@@ -397,10 +401,6 @@ def _by_tasks(
 
 def _groups(files: Sequence[TableFile], step: int) -> list[Sequence[TableFile]]:
     return [files[first : first + step] for first in range(0, len(files), step)]
-
-
-def _group_name(group: Sequence[TableFile]) -> str:
-    return f"the Gram rows of {number_of(len(group), 'log file')} from {group[0].path}"
 
 
 def by_sql(
@@ -490,7 +490,8 @@ def _gram_rows(
             found = drive_sums(workspace, parts, drive.counts)
     except DataError as error:
         raise DataError(f"{known['file']}: drive {drive.drive_id}: {error}") from None
-    for absent, part in sorted(found, key=_last_if_unknown):
+    # As SQL does: an unknown part, which is null there, comes last.
+    for absent, part in sorted(found, key=lambda kind: (kind[0], kind[1] == UNKNOWN, kind[1])):
         sums = found[absent, part]
         names = [name for i, name in enumerate(one.columns) if not absent >> i & 1]
         yield {
@@ -534,12 +535,6 @@ class PartSums:
 
 Kind = tuple[int, int]
 """Which columns rows lack, a number of one bit each, and which part of the drive they are."""
-
-
-def _last_if_unknown(kind: Kind) -> tuple[int, bool, int]:
-    """Sort as SQL does: an unknown part, which is null there, comes last."""
-    absent, part = kind
-    return absent, part == UNKNOWN, part
 
 
 def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[Kind, PartSums]:

@@ -111,15 +111,12 @@ def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
         mine = _only(rows, some)
         for identity in sorted(mine["feature_set"].unique().to_pylist()):
             part = _only(mine, pc.equal(mine["feature_set"], identity))
-            empty = [name for name in warehouse.grams.optional if _is_empty(part, name)]
+            optional = set(warehouse.grams.optional).intersection(part.column_names)
+            empty = [name for name in optional if part[name].null_count == len(part)]
             part = part.drop_columns(empty)
             name = f"{prefix}{identity}"
             actions.append(warehouse.grams.write_file(name, part))
     return actions
-
-
-def _is_empty(rows: pa.Table, name: str) -> bool:
-    return name in rows.column_names and rows[name].null_count == len(rows)
 
 
 def _only(rows: pa.Table, some: pa.ChunkedArray) -> pa.Table:

@@ -77,9 +77,11 @@ class OpenedGrams:
     def batches(self, condition: Condition, *more: str) -> Iterator[pa.RecordBatch]:
         """Yield the Gram rows of a cohort, in any order: `SUMMED` and `more` columns of them."""
         columns = ", ".join([*SUMMED, *more])
+        one = features().feature_set(features().name_of(self.identity))
+        rows = max(1, min(BATCH_ROWS, BATCH_NUMBERS // packed_size(len(one.columns))))
         text = f"SELECT {columns} FROM ({self.statement('cohort.sql', condition)})"
         with asking(self.database, condition):
-            yield from self.database.sql(text).to_arrow_reader(self._batch_rows)
+            yield from self.database.sql(text).to_arrow_reader(rows)
 
     def values_of(self, column: str, condition: Condition, most: int | None = None) -> pa.Array:
         """Return the distinct values of a cohort's column, at most so many."""
@@ -113,12 +115,6 @@ class OpenedGrams:
         statement = self.statement("course_delays.sql", condition, turned=TURNED)
         for car, least, largest in self._rows(statement, condition):
             yield car, (least, largest)
-
-    @property
-    def _batch_rows(self) -> int:
-        name = features().name_of(self.identity)
-        numbers = packed_size(len(features().feature_set(name).columns))
-        return max(1, min(BATCH_ROWS, BATCH_NUMBERS // numbers))
 
 
 class GramReader:
@@ -264,17 +260,14 @@ def collect_sums(
             if not len(rows):
                 continue
             table = gram_table(names, rows)
-            cars, days, names_of = (rows[key].to_pylist() for key in _KEY)
-            of = list(zip(map(str, cars), days, names_of, strict=True))
+            keys = (rows[key].to_pylist() for key in ("vehicle_id", "day", "drive_id"))
+            of = [(str(car), day, drive) for car, day, drive in zip(*keys, strict=True)]
             for kind, columns in kinds.items():
                 there = set(names.split(","))
                 if set(columns) <= there and lacking.get(kind) not in there:
                     parts[kind].append(table.restrict(columns))
                     drives[kind] += of
     return {kind: _sorted(some, drives[kind]) for kind, some in parts.items()}
-
-
-_KEY = ("vehicle_id", "day", "drive_id")
 
 
 def _sorted(parts: Sequence[GramTable], rows: Sequence[Drive]) -> DriveSums:

@@ -254,13 +254,11 @@ def course_delays(grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
             counts = pc.or_(pc.is_in(rows["file"].cast(pa.string()), counted), is_received(rows))
             yield from rows.filter(counts).to_batches()
 
-    return {car: in_parts(one) for car, one in receiver_delays(batches()).cars.items()}
-
-
-def in_parts(one: ReceiverDelay) -> int:
-    """Return a delay as Gram rows are corrected by it."""
     least, most = LATE_PARTS * MOST_EARLY, LATE_PARTS * MOST_LATE
-    return min(max(round(one.value / GRAIN_S), least), most)
+    return {
+        car: min(max(round(one.value / GRAIN_S), least), most)
+        for car, one in receiver_delays(batches()).cars.items()
+    }
 
 
 def files_of_other_delay(grams: Snapshot, identity: str, late: Mapping[str, int]) -> set[str]:

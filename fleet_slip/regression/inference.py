@@ -193,16 +193,12 @@ class Inference:
 
 def noise_variance(fitted: Fit) -> Fraction:
     """Return sigma^2 = RSS / (n - k - 1) in counts^2. Raises `DataError` for too few rows."""
-    _require_noise(fitted)
-    return fitted.rss / fitted.degrees_of_freedom
-
-
-def _require_noise(fitted: Fit) -> None:
     if fitted.degrees_of_freedom <= 0:
         raise DataError(
             f"{fitted.gram.n} rows are too few to estimate the noise of a model with "
             f"{fitted.size} signals."
         )
+    return fitted.rss / fitted.degrees_of_freedom
 
 
 def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
@@ -273,13 +269,6 @@ def cluster_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
     w = drives.direction(fitted.model)
     scores = -drives.products_with(w)[:, _columns(fitted, drives)]
     return drives.sum_clusters(scores)
-
-
-def small_sample_factor(fitted: Fit, clusters: int, unit: str) -> float:
-    """Return P/(P-1) (n-1)/(n-k-1). Raises `DataError` for a single cluster."""
-    _require_clusters(clusters, unit)
-    _require_noise(fitted)
-    return clusters / (clusters - 1) * (fitted.gram.n - 1) / fitted.degrees_of_freedom
 
 
 def _require_clusters(clusters: int, unit: str) -> int:
@@ -381,7 +370,8 @@ class Evidence:
         scores = cluster_scores(full, drives)
         rotated = np.linalg.solve(np.linalg.cholesky(total), scores.T)[1:]
         unit = float(drives.spread[-1]) ** 2
-        factor = small_sample_factor(full, len(scores), drives.unit)
+        clusters = _require_clusters(len(scores), drives.unit)
+        factor = clusters / (clusters - 1) * (full.gram.n - 1) / full.degrees_of_freedom
         noise = factor * np.sum(rotated**2, axis=1) * unit
         gains = np.array([float(gain) for gain in _gains(fits)])
         effects = noise / float(variance)

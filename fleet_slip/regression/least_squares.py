@@ -324,24 +324,17 @@ def solve(rows: Sequence[Sequence[Fraction]]) -> tuple[Fraction, ...] | None:
     return tuple(row[-1] for row in work)
 
 
-@dataclass(frozen=True)
-class Influence:
-    """By drive, how far it moves a combination of unknowns, and its share of the variance."""
-
-    shifts: FloatArray
-    shares: FloatArray
-
-
 def influence(
     relation: Relation,
     sums: Callable[[str, str], FloatArray],
     noise: float,
     gradient: Sequence[float],
-) -> Influence | None:
-    """Return the influence of drives on a combination of the unknowns; None if singular.
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return how far each drive moves a combination of unknowns, and its share of the variance.
 
-    `sums` gives the sums of each drive, shape (drives,). With the equations A_g of a drive, A of
-    all, and h = A'^-1 a, a drive moves a'theta by h'(y_g - A_g theta); its share is h'Z_g'Z_g h.
+    None if the equations are singular. `sums` gives the sums of each drive, shape (drives,). With
+    the equations A_g of a drive, A of all, and h = A'^-1 a, a drive moves a'theta by h'(y_g - A_g
+    theta); its share is h'Z_g'Z_g h.
     """
     each = _stacked(relation.system(sums, noise))
     left, right = each[:, :, :-1], each[:, :, -1]
@@ -352,10 +345,7 @@ def influence(
     except np.linalg.LinAlgError:
         return None
     squares = _stacked([[sums(a, b) for b in relation.instruments] for a in relation.instruments])
-    return Influence(
-        shifts=(right - left @ unknowns) @ h,
-        shares=np.einsum("i,gij,j->g", h, squares, h),
-    )
+    return (right - left @ unknowns) @ h, np.einsum("i,gij,j->g", h, squares, h)
 
 
 class DriveTermSums:
