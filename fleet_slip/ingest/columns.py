@@ -210,7 +210,9 @@ def require_satellites(signals: Named[str, SignalColumn]) -> None:
             raise ValueError(f"signals.course: needs {needed}, too")
     speed = signals[SPEED]
     if (course.time, course.delay_s) != (speed.time, speed.delay_s):
-        raise ValueError("signals.course: time and delay_s are one receiver's: give both alike")
+        raise ValueError(
+            "signals.course: give satellite_speed the same time and delay_s: it is one receiver"
+        )
 
 
 def count_range(name: str, column: SignalColumn) -> tuple[Signal, int, int]:
@@ -278,7 +280,7 @@ class TimeBase(Config):
                 "needs either 'column' or 'rate_hz', or 'own_clock' for files with clocks, as MDF"
             )
         if self.column is None and (self.unit is not None or self.format is not None):
-            raise ValueError("'unit' and 'format' describe a column, and there is none")
+            raise ValueError("'unit' and 'format' need a 'column'")
         if self.unit is not None and self.format is not None:
             raise ValueError("'unit' is for numbers and 'format' for timestamps: give one of them")
         if self.epoch and self.unit is None:
@@ -287,12 +289,12 @@ class TimeBase(Config):
             raise ValueError("'assumed' is for an unknown rate_hz")
         if self.date is not None:
             if self.format is None or not reads_clock(self.format):
-                raise ValueError("'date' stands beside a column whose format has the time alone")
+                raise ValueError("'date' needs a column whose 'format' has the time of day alone")
             if not _reads_back(str(self.moment_format)):
                 raise ValueError(f"{self.date.format!r} is not a strftime format of a date")
         zoned = self.format is not None and "%z" in self.format
         if self.zone is not None and (zoned or self.unit is not None or self.column is None):
-            raise ValueError("'zone' is for timestamps that do not say theirs")
+            raise ValueError("'zone' is for timestamps without a time zone")
         if self.longest_gap_s > self.split_gap_s:
             raise ValueError("longest_gap_s cannot be larger than split_gap_s")
         if self.unit is not None:
@@ -446,7 +448,7 @@ def text_conditions(text: str, signals: Collection[str]) -> list[dict[str, Any]]
         found = _COMPARISON.match(text, at)
         if found is None:
             raise ValueError(
-                f"{text[at:].strip()[:60]!r} is no condition. Write NAME > NUMBER UNIT, "
+                f"{text[at:].strip()[:60]!r} is not a condition. Write NAME > NUMBER UNIT, "
                 "NAME = 'text' or NAME in (4, 5); several are joined by: and"
             )
         conditions.append(_condition(found, signals))

@@ -73,7 +73,7 @@ def find_whole_logs(given: Iterable[Place]) -> list[Log]:
     for place in folders:
         if is_url(place) or not Path(place).is_dir():
             raise UsageError(
-                f"{place}: only a folder of this machine has the files of one log. Give it."
+                f"{place}: --as-one needs a local folder, which holds the files of one log."
             )
     return [Path(place) for place in folders]
 
@@ -131,7 +131,7 @@ def require_inside(file: Path) -> None:
     """Raise `InputError` for a link that leads out of the folder in which it was found."""
     if isinstance(file, StrayLink):
         raise InputError(
-            f"{shown(file)}: a link out of its folder, which is not followed. Give the file by "
+            f"{shown(file)}: a symbolic link out of its folder, not followed. Give the file by "
             "its own path."
         )
 

@@ -75,7 +75,7 @@ class LabelSensor(Config):
         """Raise `ValueError` for a mapping that lacks what the label is computed from."""
         label = catalogue().label
         if self.from_velocities and label in signals:
-            raise ValueError(f"label: from_velocities, and {label} has a column: leave out one")
+            raise ValueError(f"label: from_velocities computes {label}: remove its column")
         needed = ["vx", "vy"] if self.from_velocities else [label]
         needed += ["yaw_rate"] if self.is_elsewhere else []
         for name in needed:
@@ -83,7 +83,7 @@ class LabelSensor(Config):
                 raise ValueError(f"label: it needs the signal {name}")
         wheels = all(f"{WHEELS}{corner}" in signals for corner in ("fl", "fr", "rl", "rr"))
         if self.is_elsewhere and not wheels and not any(name in signals for name in SPEEDS):
-            raise ValueError("label: to move it needs a speed: vx, vehicle_speed or four wheels")
+            raise ValueError("label: moving it needs a speed: vx, vehicle_speed or four wheels")
 
 
 # What is known of each drive, from the mapping, a column or the path.

@@ -76,8 +76,8 @@ def copy_object(file: StoredFile, copy: Path) -> None:
             return
         arrived.add(digest)
     raise InputError(
-        f"{file}: it arrived {ATTEMPTS} times with other bytes than the store has. Run the same "
-        "command again, and have the network examined."
+        f"{file}: its bytes differed from the store's in {ATTEMPTS} transfers. Run the same "
+        "command again, and check the network."
     )
 
 

@@ -223,7 +223,7 @@ class MeasuredStream:
             )
         if counts.ticks > MAX_TICKS and counts.ticks > MOST_TICKS_A_ROW * counts.rows_kept:
             raise InputError(
-                f"{shown(self.file)}: {counts.rows_kept:,} rows last {counts.ticks:,} ticks of "
+                f"{shown(self.file)}: {counts.rows_kept:,} rows span {counts.ticks:,} ticks of "
                 f"100 Hz. Check the unit of time and split_gap_s in the mapping {name!r}."
             )
 
@@ -241,7 +241,7 @@ class MeasuredStream:
         if not counts.ticks:
             raise InputError(
                 f"{file}: no row is on a tick of 100 Hz, and longest_gap_s = "
-                f"{self.mapping.time.longest_gap_s:g} forbids to interpolate. Raise it in the "
+                f"{self.mapping.time.longest_gap_s:g} prevents interpolation. Raise it in the "
                 f"mapping {name!r} if the signals change slowly enough."
             )
         for signal, source in self.mapping.signals.items():

@@ -83,27 +83,27 @@ def _course(signals: "Signals") -> Iterator[Fault]:
     change, heading = _wrapped(course[SECOND:] - course[:-SECOND]), turned[SECOND:]
     slope, correlation = slope_of(change, heading - turned[:-SECOND], np.isfinite(change))
     if correlation:
-        figure = f"over a second it changes by {slope:+.2f} times what the yaw rate adds up to"
+        figure = f"over 1 s it changes by {slope:+.2f} times the integral of the yaw rate"
         if correlation < -LEAST_CORRELATION:
             remedy = "Turn clockwise_from_north, or swap north and east."
             yield Fault("reversed", (COURSE,), figure, remedy)
         elif correlation < LEAST_CORRELATION:
-            figure = f"over a second its change hardly goes with the yaw rate ({correlation:+.2f})"
+            figure = f"its change over 1 s hardly correlates with the yaw rate ({correlation:+.2f})"
             yield Fault("values", (COURSE,), figure, "Is it a course over ground, and of this car?")
         elif not SOUND[0] <= slope <= SOUND[1]:
             yield Fault("scaled", (COURSE,), figure, "Check its unit, and that of the yaw rate.")
     fast = signals[SPEED] > LEAST_SPEED_MPS if SPEED in signals else np.zeros(0, dtype=np.bool_)
     own = float(np.isfinite(course[fast]).mean()) if fast.any() else 1.0
     if own < LEAST_OF_THEIR_OWN:
-        figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of backwards"
+        figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of reversing"
         remedy = "They are left out. Map it as the receiver reports it."
         yield Fault("values", (COURSE,), figure, remedy)
     relation = _relation(signals, turned)
     if relation and (fault := relation.fault or relation.misplaced):
         yield replace(fault, signals=(COURSE,))
     elif relation and abs(relation.scale - 1) > MOST_SCALE_ERROR:
-        figure = f"it turns {relation.scale:.3f} times as the yaw rate adds up to"
-        remedy = "The gyroscope's is off, which learning allows for."
+        figure = f"it changes by {relation.scale:.3f} times the integral of the yaw rate"
+        remedy = "The scale of the gyroscope is off; learning corrects it."
         yield Fault("scale", (COURSE,), figure, remedy)
 
 
@@ -245,7 +245,7 @@ def _still(signals: Signals) -> Iterator[Fault]:
         if not present.size:
             yield Fault("absent", (name,), "it has no value at all", "Map another column.")
         elif present.size >= FEWEST_TICKS and present.min() == present.max():
-            figure = f"it is {present[0]:g} {catalogue()[name].unit} all the time"
+            figure = f"it is constant: {present[0]:g} {catalogue()[name].unit}"
             yield Fault("stuck", (name,), figure, "Map another column.")
 
 
@@ -341,7 +341,7 @@ def _label(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
     angle = signals[label]
     large = np.abs(angle[rows & (speed > 8) & np.isfinite(angle)])
     if large.size >= FEWEST_TICKS and np.median(large) > 0.5:
-        figure = f"half of the time it is above {np.degrees(np.median(large)):.0f} deg"
+        figure = f"its median magnitude is {np.degrees(np.median(large)):.0f} deg"
         yield Fault("scaled", (label,), figure, "Check its unit: degrees or radians?")
         return
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -364,7 +364,7 @@ def _lever(signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool)
     if ay.size < FEWEST_GENTLE_TICKS or abs(np.corrcoef(ay, curvature)[0, 1]) > LARGEST_COLLINEAR:
         return
     (_, lever), zero, explained = fit(signals[label], inputs, slow)
-    figure = f"turning slowly it goes with the yaw rate by {lever:+.2f} m, should be +1 to +2"
+    figure = f"in slow turns it is {lever:+.2f} m times the curvature, should be +1 to +2"
     if explained <= LEAST_CORRELATION:
         return
     if lever < -LEAST_LEVER_M / 2:

@@ -52,8 +52,8 @@ def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
                 ]
             if len(parts) > 1 and len(bases) > 1:
                 raise InputError(
-                    f"{shown(part)}: its signals have {len(bases)} time bases, and files of one "
-                    "log have one. Ingest each file as a log of its own: one trip joins them."
+                    f"{shown(part)}: its signals have {len(bases)} time bases; --as-one supports "
+                    "one. Ingest each file as a log of its own: they are joined as one trip."
                 )
             held, split_gap_s = mapping.common_columns(), mapping.time.split_gap_s
             for rows in merge_bases([*map(metered, bases)], time, held, split_gap_s):
@@ -67,8 +67,8 @@ def _with_times(
     for batch in batches:
         if not batch[own].dtype.is_numeric():
             raise InputError(
-                f"{shown(part)}: the time {own!r} is not of numbers; signals with times of their "
-                "own need them."
+                f"{shown(part)}: the time {own!r} is not numeric, as a signal with its own time "
+                "needs."
             )
         if own == time:
             yield batch

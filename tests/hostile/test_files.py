@@ -85,7 +85,7 @@ def test_a_pattern_does_not_lead_out_of_its_folder(tmp_path: Path) -> None:
     strays = {str(file): isinstance(file, StrayLink) for file in found}
     assert strays == {str(folder / "sound/a.csv"): False, str(folder / "below/secret.csv"): True}
     (folder / "sound" / "b.csv").symlink_to(other / "secret.csv")
-    with pytest.raises(InputError, match=r"b\.csv: a link out of its folder"):
+    with pytest.raises(InputError, match=r"b\.csv: a symbolic link out of its folder"):
         read_measured(folder / "sound", a_mapping())
     (tmp_path / "link").symlink_to(folder)  # a person's own link to a folder is followed
     assert not isinstance(find_logs([tmp_path / "link" / "sound"])[0], StrayLink)

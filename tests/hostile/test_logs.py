@@ -125,7 +125,7 @@ def test_rows_that_stand_nowhere_are_not_read(
     assert write(tmp_path / "a.h5").stat().st_size < 10_000
     for number, options in enumerate(({}, {"chunks": (1000,)}, {"chunks": (10**8,)})):
         told = failure(write(tmp_path / f"{number}.h5", **options))
-        assert "of a file of this size at most 1,000,000 are read" in told or "more than" in told
+        assert "the limit for a file of this size is 1,000,000" in told or "more than" in told
 
 
 # Parquet
@@ -159,7 +159,7 @@ def test_columns_that_unfold_to_many_bytes_are_not_read(
         pa.table({**numbers, "text": text}), file, compression="zstd", use_dictionary=False
     )
     assert file.stat().st_size < 10**7 / source.BYTES_PER_BYTE
-    assert "bytes unfold to" in failure(file)
+    assert "bytes decompress to" in failure(file)
 
 
 # MDF
@@ -212,7 +212,7 @@ def test_links_in_a_circle_are_refused(tmp_path: Path, monkeypatch: pytest.Monke
     data[at + 24 : at + 32] = at.to_bytes(8, "little")  # the next one is itself
     file.write_bytes(data)
     told = failure(file, MDF_MAPPING)
-    assert "did not suffice" in told or "more than" in told
+    assert "took more than" in told or "more than" in told
 
 
 def conversion(parts: list[int]) -> bytes:
@@ -276,7 +276,7 @@ def test_what_a_trace_unfolds_to_is_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(source, "FREE_MEMORY", 2**26)
-    assert "unfold to more than" in trace(tmp_path, "log.blf", blf(bytes(2**27)))
+    assert "need more than" in trace(tmp_path, "log.blf", blf(bytes(2**27)))
 
 
 @pytest.mark.parametrize("name", ["log.asc.gz", "log.db", "log.mf4"])

@@ -159,7 +159,7 @@ def test_names_of_values_can_be_a_condition(tmp_path: Path) -> None:
 def test_a_message_on_two_buses_must_be_told_apart(tmp_path: Path) -> None:
     frames = [frame for i in range(50) for frame in (motion(i, 1), motion(i, 2, ax=0.0))]
     file = write_trace(tmp_path, frames)
-    assert "Motion is on the buses 1, 2. Say in the mapping which counts" in failure(file)
+    assert "Motion is on the buses 1, 2. Choose one in the mapping" in failure(file)
     log = read(file, MAPPING.replace('"car.dbc"', '"car.dbc"\nchannel = "1"'))
     assert log.drives["ax"].to_pylist() == AX_COUNTS
     text = MAPPING.replace('"car.dbc"', '"car.dbc"\nchannel = "9"')
@@ -170,7 +170,7 @@ def test_a_database_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     file = write_trace(tmp_path, [motion(i) for i in range(50)])
     other = DBC.replace("BO_ 256 ", "BO_ 257 ").replace("VAL_ 256", "VAL_ 257")
     message = failure(file, MAPPING, other)
-    assert "the message Motion (0x101) is not in it. Of the 1 numbers in the trace 0" in message
+    assert "no message Motion (0x101). Of the 1 identifiers in the trace, 0" in message
     renamed = failure(file, MAPPING.replace("Motion.beta", "Motion.Beta"))
     assert "no column 'Motion.Beta'. Did the mapping mean 'Motion.beta'" in renamed
     short = [
@@ -205,7 +205,7 @@ def test_broken_traces_are_refused(tmp_path: Path) -> None:
         assert "truncated" in failure(file) or "Is it complete" in failure(file)
     for name in ("log.asc", "log.log"):
         (tmp_path / name).write_bytes(b"")
-        assert "there is no CAN frame in it" in failure(tmp_path / name)
+        assert "it has no CAN frames" in failure(tmp_path / name)
     (tmp_path / "log.log").write_bytes(b"garbage\n")
     assert "Is it complete" in failure(tmp_path / "log.log")
 
@@ -260,13 +260,11 @@ def test_bus_logging_says_what_is_not_in_it(tmp_path: Path) -> None:
     with MDF(version="4.10") as mdf:
         mdf.append([Signal(AX, TIME_S, name="ax")])
         file = Path(mdf.save(tmp_path / "log.mf4"))
-    with pytest.raises(
-        InputError, match=r"log\.mf4: there is no CAN frame in it .* without \[can\]"
-    ):
+    with pytest.raises(InputError, match=r"log\.mf4: it has no CAN frames .* without \[can\]"):
         read(file)
     with can.MF4Writer(tmp_path / "bus.mf4") as trace:
         trace.on_message_received(mux(0, 0, 1.0))
-    assert "the message Motion (0x100) is not in it" in failure(tmp_path / "bus.mf4")
+    assert "no message Motion (0x100)" in failure(tmp_path / "bus.mf4")
 
 
 @given(

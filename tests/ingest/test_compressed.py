@@ -72,4 +72,4 @@ def test_a_file_that_becomes_far_more_than_it_is_is_refused(
     assert "rows or more in" in failure(tmp_path, bomb)
     monkeypatch.setattr(source, "FREE_ROWS", 10**6)
     monkeypatch.setattr(source, "FREE_BYTES", 10_000)
-    assert "bytes unfold to" in failure(tmp_path, bomb)
+    assert "bytes decompress to" in failure(tmp_path, bomb)

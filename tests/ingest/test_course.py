@@ -154,7 +154,7 @@ def test_a_course_that_turns_the_other_way_is_suspicious() -> None:
     assert turned.signals == ("course",) and "-1.0" in turned.figure
     strange = np.where(np.isnan(course), np.nan, np.sin(17 * time))
     (other,) = (s for s in find_suspicions({**signals, "course": strange}) if s.kind == "values")
-    assert "hardly goes with the yaw rate" in other.figure
+    assert "hardly correlates with the yaw rate" in other.figure
 
 
 def suggested(tmp_path: Path, columns: Columns) -> str:

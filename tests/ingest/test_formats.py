@@ -179,7 +179,7 @@ def test_a_condition_of_one_group_holds_for_the_others(tmp_path: Path) -> None:
 def test_a_channel_of_two_groups_must_be_told_apart(tmp_path: Path) -> None:
     file = write_mdf(tmp_path, [a_x(), beta()], [beta(samples=BETA_DEG + 1)])
     message = failure(file, mdf_mapping())
-    assert "2 channels are called 'beta'. Say which: 'beta@0', 'beta@1'" in message
+    assert "2 channels are called 'beta'. Choose one: 'beta@0', 'beta@1'" in message
     require_the_drive(read_measured(file, mdf_mapping(signals=signals("a_x", "beta@0"))))
 
 
@@ -198,7 +198,7 @@ def test_a_truncated_mdf_file_is_refused(
     ("block", "offset", "value", "message"),
     [
         (b"##CN", 92, 60_000, "lies outside of the records of its group: the file is damaged"),
-        (b"##CG", 80, 10**9, "says that it has 1,000,000,000 samples of 18 bytes"),
+        (b"##CG", 80, 10**9, "states 1,000,000,000 samples of 18 bytes"),
         (b"##DZ", 32, 2**60, "cannot be read: "),
     ],
 )
@@ -389,4 +389,4 @@ def test_a_matlab_5_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(budget, "FREE_MEMORY", 2**26)
     file = tmp_path / "log.mat"
     scipy.io.savemat(file, {"t": np.zeros(2**24)}, do_compression=True)
-    assert "bytes unfold to" in failure(file, mat_mapping())
+    assert "bytes need more than" in failure(file, mat_mapping())

@@ -128,7 +128,9 @@ def test_a_topic_of_which_a_part_cannot_be_decoded_is_refused(tmp_path: Path) ->
     file = write_json(tmp_path / "log.mcap", [{"a": 1.0}] * 4, ("json", "protobuf"))
     with mcap_log.open_mcap(Budget.of(file)) as source, pytest.raises(InputError) as caught:
         list(source.batches(["imu.a"]))
-    assert "topic 'imu' has a channel that nothing decodes ('protobuf')" in str(caught.value)
+    assert "topic 'imu' has messages in an encoding that is not supported ('protobuf')" in str(
+        caught.value
+    )
 
 
 def test_a_field_with_a_text_far_down_is_one_of_texts(tmp_path: Path) -> None:

@@ -256,7 +256,7 @@ def test_a_rate_too_low_to_interpolate_leaves_what_was_measured(tmp_path: Path) 
     columns = {"t": [0.5 * i for i in range(9)], "ax": [1] * 9, "beta": [1] * 9}
     assert ticks(read_columns(tmp_path, columns)) == list(range(0, 401, 50))
     columns["t"] = [0.003 * i for i in range(9)]
-    with pytest.raises(InputError, match=r"longest_gap_s = 0\.001 forbids to interpolate"):
+    with pytest.raises(InputError, match=r"longest_gap_s = 0\.001 prevents interpolation"):
         read_columns(tmp_path, columns, a_mapping(time={"longest_gap_s": 0.001}))
 
 
@@ -272,7 +272,7 @@ def test_what_is_absurd_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     columns["t"] = [10 * i for i in range(300)]
     monkeypatch.setattr(stream, "MAX_TICKS", 100)
     monkeypatch.setattr(stream, "MOST_TICKS_A_ROW", 10)
-    with pytest.raises(InputError, match="300 rows last 299,001 ticks"):
+    with pytest.raises(InputError, match="300 rows span 299,001 ticks"):
         read_columns(tmp_path, columns, a_mapping(time={"split_gap_s": 60, "longest_gap_s": 10}))
 
 

@@ -210,10 +210,10 @@ def test_date_and_time_stand_in_columns_of_their_own(tmp_path: Path, column: str
 @pytest.mark.parametrize(
     ("time", "message"),
     [
-        ('column = "t"\nunit = "s"\nzone = "Europe/Berlin"', "that do not say theirs"),
+        ('column = "t"\nunit = "s"\nzone = "Europe/Berlin"', "without a time zone"),
         ('column = "t"\nformat = "%H:%M"\nzone = "Nowhere"', "is no time zone"),
         ('column = "t"\nepoch = true', "give their 'unit'"),
-        ('column = "t"\nunit = "s"\ndate = { column = "d" }', "whose format has the time alone"),
+        ('column = "t"\nunit = "s"\ndate = { column = "d" }', "has the time of day alone"),
         (
             'column = "t"\nformat = "%H:%M:%S"\ndate = { column = "d", format = "%H" }',
             "'%H' is not a strftime format of a date",

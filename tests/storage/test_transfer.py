@@ -69,7 +69,7 @@ def test_a_flipped_bit_on_the_way_is_seen_and_fetched_again(
     obstore.put(client(bucket), "log.csv", CONTENT)
     found = find_object(f"{bucket}/log.csv")
     assert found is not None
-    with server.misbehaving(flipping="log.csv"), pytest.raises(InputError, match="arrived 3 times"):
+    with server.misbehaving(flipping="log.csv"), pytest.raises(InputError, match="in 3 transfers"):
         copy_object(found, tmp_path / "log.csv")
     copy_once, attempts = object_inputs._copy_once, list[str]()
 

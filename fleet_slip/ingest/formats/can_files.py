@@ -307,8 +307,8 @@ class CanSource(FormatSource):
             raise missing_column(self._bus.database, column, known)
         if not math.isfinite(signal.scale) or not signal.scale:
             raise InputError(
-                f"{shown(self._bus.database)}: the conversion of {column!r} is not applied: it "
-                "is not one line (factor and offset). Write it so, or map another signal."
+                f"{shown(self._bus.database)}: the conversion of {column!r} is not linear (one "
+                "factor and offset). Make it so, or map another signal."
             )
         return name, signal
 
@@ -326,9 +326,7 @@ class CanSource(FormatSource):
             for block in self._blocks():
                 self._keep(block)
             if not self._numbers:
-                raise InputError(
-                    f"{shown(self._file)}: there is no CAN frame in it. Record it again."
-                )
+                raise InputError(f"{shown(self._file)}: it has no CAN frames. Record it again.")
 
     def read(self, name: str, signals: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield the signals of one message; rows are frames that have one of them."""
@@ -367,15 +365,15 @@ class CanSource(FormatSource):
         if _key(message) not in self._numbers:
             known = sum(_key(m) in self._numbers for m in self._database.messages)
             raise InputError(
-                f"{shown(self._file)}: the message {message.name} ({message.frame_id:#x}) is not "
-                f"in it. Of the {len(self._numbers)} numbers in the trace {known} are in "
+                f"{shown(self._file)}: no message {message.name} ({message.frame_id:#x}). Of the "
+                f"{len(self._numbers)} identifiers in the trace, {known} are in "
                 f"{self._bus.database}. Is it the database of this car and bus?"
             )
         buses = frames.buses
         if self._bus.channel is None and len(buses) > 1:
             raise InputError(
                 f"{shown(self._file)}: the message {message.name} is on the buses "
-                f"{', '.join(buses)}. Say in the mapping which counts: [can] channel = "
+                f"{', '.join(buses)}. Choose one in the mapping: [can] channel = "
                 f'"{buses[0]}".'
             )
         sizes = frames.sizes_on(self._bus.channel)

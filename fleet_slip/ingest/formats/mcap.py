@@ -172,7 +172,7 @@ class McapSource(FormatSource):
         if not found:
             raise InputError(
                 f"{shown(self._file)}: no message in it can be decoded "
-                f"({', '.join(sorted(encodings)) or 'none'}). Read are ROS 2 messages "
+                f"({', '.join(sorted(encodings)) or 'none'}). Supported are ROS 2 messages "
                 "(cdr with ros2msg schemas) and json."
             )
         return found
@@ -205,9 +205,9 @@ class McapSource(FormatSource):
                 continue
             if channel.decode is None:
                 raise InputError(
-                    f"{shown(self._file)}: topic {topic!r} has a channel that nothing "
-                    f"decodes ({channel.encoding!r}) beside one that is read. Record it in one "
-                    "encoding, or map another topic."
+                    f"{shown(self._file)}: topic {topic!r} has messages in an encoding that is "
+                    f"not supported ({channel.encoding!r}). Record it in one encoding, or map "
+                    "another topic."
                 )
             found = channel.decode(message.data)
             values = [value_at(found, path) for path in paths[topic]]

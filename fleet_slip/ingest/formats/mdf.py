@@ -49,7 +49,7 @@ _KINDS = {
     },
 }  # fmt: skip
 """What becomes of each type of conversion, of MDF 4 and of MDF 3; others are refused."""
-_NOT_COMPUTED = "its conversion is a formula, which is not computed"
+_NOT_COMPUTED = "its conversion is a formula, which is not evaluated"
 
 Array = np.ndarray[Any, Any]
 
@@ -64,7 +64,7 @@ def conversion_of(channel: Any) -> Any:
 def require_arithmetic(conversion: Any) -> None:
     """Raise `ValueError` for one that asammdf may not apply itself, as it does to times."""
     if _kind_of(conversion) not in {_NONE, _PLAIN}:
-        raise ValueError("times that a formula or a table computes are not read")
+        raise ValueError("times with a formula or a table as conversion are not supported")
 
 
 def to_physical(conversion: Any, raw: Array) -> Array:
@@ -77,9 +77,9 @@ def to_physical(conversion: Any, raw: Array) -> Array:
     if kind in {_VALUES_TO_TEXT, _RANGES_TO_TEXT, _RANGES_TO_NUMBERS}:
         return _by_ranges(conversion, kind, raw)
     if kind == _TABLE and np.any(np.diff(_listed(conversion, "raw")) < 0):
-        raise ValueError("the table of its conversion is not in order")
+        raise ValueError("the table of its conversion is not sorted")
     if any(not isinstance(part, bytes) for part in conversion.referenced_blocks.values()):
-        raise ValueError("the parts of its conversion are conversions themselves")
+        raise ValueError("its conversion refers to other conversions, which is not supported")
     converted: Array = conversion.convert(raw)
     return converted
 
@@ -89,7 +89,7 @@ def _kind_of(conversion: Any) -> str:
         return _NONE
     kinds, number = _KINDS[conversion.id], conversion.conversion_type
     if number not in kinds:
-        raise ValueError(f"a conversion of type {number} is not applied")
+        raise ValueError(f"conversions of type {number} are not supported")
     return kinds[number]
 
 
@@ -172,7 +172,7 @@ class MdfSource(FormatSource):
         if len(places) > 1:
             titles = ", ".join(repr(f"{name}@{number}") for number, _ in places[:5])
             raise InputError(
-                f"{shown(self._file)}: {len(places)} channels are called {column!r}. Say which: "
+                f"{shown(self._file)}: {len(places)} channels are called {column!r}. Choose one: "
                 f"{titles}."
             )
         return f"group {places[0][0]}", places[0]
@@ -227,8 +227,8 @@ class MdfSource(FormatSource):
         self._release()
         if len(signals[0]) < records:
             raise InputError(
-                f"{shown(self._file)}: group {number} has {start + len(signals[0]):,} samples and "
-                "not as many as it says: it is truncated. Copy it again."
+                f"{shown(self._file)}: group {number} has {start + len(signals[0]):,} samples, "
+                "fewer than it states: the file is truncated. Copy it again."
             )
         return list(signals)
 
@@ -260,8 +260,8 @@ class MdfSource(FormatSource):
         # MDF 3 knows no kinds: its masters are times.
         if master is None or kind not in {_TIME_SYNC, None}:
             raise InputError(
-                f"{shown(self._file)}: channel {name!r} is of group {number}, which has no times "
-                "(it is over an angle, a distance or an index). Map another channel."
+                f"{shown(self._file)}: channel {name!r} is in group {number}, whose master is not "
+                "time but an angle, a distance or an index. Map another channel."
             )
         self._physical(number, master, None)
 
@@ -292,8 +292,8 @@ class MdfSource(FormatSource):
         samples, size = group.channel_group.cycles_nr, group.channel_group.samples_byte_nr
         if samples * size > whole:
             raise InputError(
-                f"{shown(self._file)}: the group of {name!r} says that it has {samples:,} samples "
-                f"of {size:,} bytes, and there are {whole:,}: it is truncated or damaged. Copy it "
+                f"{shown(self._file)}: the group of {name!r} states {samples:,} samples of "
+                f"{size:,} bytes, and has {whole:,} bytes: it is truncated or damaged. Copy it "
                 "again."
             )
 
@@ -340,7 +340,7 @@ def _read_bus(mdf: MdfSource, file: Path) -> Iterator[FrameBlock]:
     groups = [*mdf.groups_with(f"{_FRAME}ID")]
     if not groups:
         raise InputError(
-            f"{shown(file)}: there is no CAN frame in it ({_FRAME}ID). Map its channels "
+            f"{shown(file)}: it has no CAN frames ({_FRAME}ID). Map its channels "
             "without [can] in the mapping."
         )
     for number, places in groups:

@@ -226,42 +226,42 @@ class Budget:
         """Raise `InputError` for more rows than a file of its size can have."""
         if rows > self.rows:
             raise self._too_much(
-                f"{rows:,} rows or more in {self.size:,} bytes; of a file of this size at most "
-                f"{self.rows:,} are read"
+                f"{rows:,} rows or more in {self.size:,} bytes; the limit for a file of this size "
+                f"is {self.rows:,}"
             )
 
     def require_unfolded(self, size: int) -> None:
         """Raise `InputError` for more bytes than a file of its size can unfold to."""
         if size > self.unfolded:
             raise self._too_much(
-                f"its {self.size:,} bytes unfold to {size:,} or more; of a file of this size at "
-                f"most {self.unfolded:,} are read"
+                f"its {self.size:,} bytes decompress to {size:,} or more; the limit for a file of "
+                f"this size is {self.unfolded:,}"
             )
 
     def over_memory(self) -> InputError:
         """Return the error of a file whose reader asked for more memory, or longer files."""
         return self._too_much(
-            f"its {self.size:,} bytes unfold to more than {self.memory:,} in memory or "
+            f"its {self.size:,} bytes need more than {self.memory:,} in memory or "
             f"{self.unfolded:,} in a temporary file"
         )
 
     def crashed(self) -> InputError:
         """Return the error of a file whose reader ended without a word, or talks nonsense."""
         return self._too_much(
-            f"its reader crashed, or was ended because it took more than {self.memory:,} bytes of "
-            "memory"
+            f"its reader crashed, or was stopped because it took more than {self.memory:,} bytes "
+            "of memory"
         )
 
     def over_time(self) -> InputError:
         """Return the error of a file that took too long."""
         return self._too_much(
-            f"{self.seconds:,.0f} s did not suffice to decode its {self.size:,} bytes"
+            f"decoding its {self.size:,} bytes took more than {self.seconds:,.0f} s"
         )
 
     def _too_much(self, what: str) -> InputError:
         return InputError(
-            f"{shown(self.file)}: {what}. Is it damaged? If it was measured so, export it as CSV "
-            "that is not compressed."
+            f"{shown(self.file)}: {what}. Is it damaged? If it is a real recording, export it as "
+            "uncompressed CSV."
         )
 
     def metered(self, batches: Iterator[pl.DataFrame]) -> Iterator[pl.DataFrame]:

@@ -96,7 +96,7 @@ def open_tdms(budget: Budget) -> Iterator[Vectors]:
             )
         channels = [one for group in tdms.groups() for one in group.channels() if len(one)]
         if not channels or any(one.scaler_data_types for one in channels):
-            what = "has raw data of DAQmx, counts of a converter" if channels else "has no values"
+            what = "has unscaled raw data of DAQmx" if channels else "has no values"
             raise InputError(f"{shown(file)}: it {what}. Save it from LabVIEW or DIAdem, scaled.")
         for of in (tdms, *tdms.groups(), *channels):
             _require_scales(budget, of.properties)
