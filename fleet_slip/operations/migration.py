@@ -14,15 +14,7 @@ from deltalake.schema import Schema
 from fleet_slip.base import number_of
 from fleet_slip.operations.rewriting import drop_unused_names
 from fleet_slip.rendering import Answer, Part, Remark
-from fleet_slip.storage.table import (
-    ALL_STATISTICS,
-    SCALE,
-    Evolution,
-    Table,
-    compare_schemas,
-    require_readable,
-    scales_of,
-)
+from fleet_slip.storage.table import ALL_STATISTICS, SCALE, Evolution, Table, scales_of
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -63,8 +55,7 @@ def migrate(warehouse: Warehouse) -> MigrationReport:
         delta = table.open_delta()
         found = None
         if delta is not None:
-            require_readable(table.folder, table.schema, delta)
-            found = compare_schemas(table.schema, delta)
+            found = table.require_readable(delta)
             _add_columns(table, delta, found)
     if found is None:
         return MigrationReport((), (), None)

@@ -43,13 +43,13 @@ from fleet_slip.operations.find_drives import find_temporary_files, find_unrefer
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.checksums import checksum_in, checksum_of
-from fleet_slip.storage.commits import LOG
+from fleet_slip.storage.commits import LOG, find_commit_faults
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.encoding import Names, read_names
 from fleet_slip.storage.folder import Folder, StoredFile
 from fleet_slip.storage.runs import find_changed_lines
 from fleet_slip.storage.storage_errors import storage_errors
-from fleet_slip.storage.table import Snapshot, Table, TableFile, find_commit_faults, on_newest
+from fleet_slip.storage.table import Snapshot, Table, TableFile, on_newest
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse

@@ -7,9 +7,9 @@ It lands with the commit, in any order; `verify` compares.
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -18,6 +18,9 @@ from deltalake.transaction import AddAction, RemoveAction
 from fleet_slip.base import canonical_json
 from fleet_slip.errors import StorageError
 from fleet_slip.storage.folder import Folder
+
+if TYPE_CHECKING:
+    from fleet_slip.storage.table import Snapshot
 
 LOG = "_delta_log"
 LATEST = "_last_checkpoint"
@@ -170,6 +173,33 @@ def check_commits(log: Folder, last: int | None = None) -> tuple[list[Commit], d
             faults[name] = problem
         commits.append(commit)
     return commits, faults
+
+
+def find_commit_faults(snapshot: "Snapshot") -> Iterator[tuple[str, str]]:
+    """Yield what is wrong with the log up to a snapshot: the file's name, and what.
+
+    While all commits are there and sound, their sum is compared with what Delta says.
+    """
+    if snapshot.version is None:
+        return
+    commits, faults = check_commits(snapshot.table.folder / LOG, snapshot.version)
+    yield from faults.items()
+    if faults or len(commits) <= snapshot.version:
+        return
+    files: set[str] = set()
+    units: dict[str, int] = {}
+    for action in (action for commit in commits for action in commit.actions):
+        match action:
+            case {"add": {"path": path}}:
+                files.add(path)
+            case {"remove": {"path": path}}:
+                files.discard(path)
+            case {"txn": {"appId": name, "version": number}}:
+                units[name] = number
+    if files != {file.path for file in snapshot.files}:
+        yield LATEST, "the active files are not those that the commits add up to"
+    if wrong := [name for name, number in units.items() if snapshot.units.get(name) != number]:
+        yield LATEST, f"does not know what has landed: {', '.join(wrong[:3])}"
 
 
 def read_landed_units(table: Folder, version: int) -> dict[str, int]:

@@ -8,7 +8,7 @@ import random
 import re
 import time
 import uuid
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from decimal import Decimal
@@ -26,7 +26,6 @@ from fleet_slip.storage.commits import (
     LATEST,
     LOG,
     NOTE,
-    check_commits,
     checked_note,
     read_landed_units,
 )
@@ -158,11 +157,11 @@ class Change:
 
 def rows_in(action: AddAction) -> int:
     """Return the number of rows of a file that an action adds."""
-    return int(_statistic(action, "numRecords"))
+    return int(json.loads(action.stats)["numRecords"])
 
 
-def _statistic(action: AddAction, name: str) -> Any:
-    return json.loads(action.stats)[name]
+def _columns_of(added: Iterable[AddAction]) -> set[str]:
+    return {name for action in added for name in json.loads(action.stats)["nullCount"]}
 
 
 def _partition(day: date | None) -> dict[str, str | None]:
@@ -291,30 +290,6 @@ def scales_of(schema: pa.Schema) -> dict[str, Decimal]:
     }
 
 
-def require_readable(folder: Folder, schema: pa.Schema, delta: DeltaTable) -> None:
-    """Raise `RefusedError` if a table's counts are in other scales than the catalogue's."""
-    found = compare_schemas(schema, delta)
-    if found.rescaled:
-        changes = ", ".join(f"{n} {old} -> {new}" for n, (old, new) in found.rescaled.items())
-        raise RefusedError(
-            f"{folder}: the counts are in other scales than those of the signal catalogue "
-            f"({changes}). Use the catalogue that the data was written with, or ingest the logs "
-            "into another data root."
-        )
-
-
-def require_writable(
-    folder: Folder, schema: pa.Schema, delta: DeltaTable, unneeded: Collection[str] = ()
-) -> None:
-    """Raise `RefusedError` if a table lacks other columns than `unneeded` ones."""
-    found = compare_schemas(schema, delta)
-    if needed := [name for name in found.added if name not in unneeded]:
-        raise RefusedError(
-            f"{folder}: the signal catalogue has columns that the table has not: "
-            f"{', '.join(needed)}. Add them with: fleet-slip migrate"
-        )
-
-
 MANY_UNITS = 8
 """So many units of work are not asked for one by one."""
 
@@ -432,7 +407,7 @@ class Snapshot:
         note = checked_note(change.note, actions, {u.name: u.version for u in change.units})
         with table.committing():
             delta = self.delta or table.create()
-            require_writable(table.folder, table.schema, delta, table.unneeded(change.add))
+            table.require_writable(_columns_of(change.add), delta)
             delta.create_write_transaction(
                 actions,
                 mode="append",
@@ -444,33 +419,6 @@ class Snapshot:
                 ),
             )
             table.folder.settle_commits(self.version)
-
-
-def find_commit_faults(snapshot: Snapshot) -> Iterator[tuple[str, str]]:
-    """Yield what is wrong with the log up to a snapshot: the file's name, and what.
-
-    While all commits are there and sound, their sum is compared with what Delta says.
-    """
-    if snapshot.version is None:
-        return
-    commits, faults = check_commits(snapshot.table.folder / LOG, snapshot.version)
-    yield from faults.items()
-    if faults or len(commits) <= snapshot.version:
-        return
-    files: set[str] = set()
-    units: dict[str, int] = {}
-    for action in (action for commit in commits for action in commit.actions):
-        match action:
-            case {"add": {"path": path}}:
-                files.add(path)
-            case {"remove": {"path": path}}:
-                files.discard(path)
-            case {"txn": {"appId": name, "version": number}}:
-                units[name] = number
-    if files != {file.path for file in snapshot.files}:
-        yield LATEST, "the active files are not those that the commits add up to"
-    if wrong := [name for name, number in units.items() if snapshot.units.get(name) != number]:
-        yield LATEST, f"does not know what has landed: {', '.join(wrong[:3])}"
 
 
 FENCE = "fleet_slip.fence"
@@ -509,7 +457,7 @@ class Table:
             return opened
         delta = self.open_delta()
         if delta is not None:
-            require_readable(self.folder, self.schema, delta)
+            self.require_readable(delta)
         return _remembered(Snapshot(self, delta))
 
     def open_delta(self, version: int | None = None) -> DeltaTable | None:
@@ -604,16 +552,31 @@ class Table:
         """Return the content of a file with these rows."""
         return self.encoding.encode(rows, self.partition_by)
 
-    def require_writable(self, columns: Iterable[str]) -> None:
-        """Raise `RefusedError` if rows with some of the optional columns cannot be committed."""
-        delta = self.open_delta()
-        if delta is not None:
-            without = frozenset(self.optional).difference(columns)
-            require_writable(self.folder, self.schema, delta, without)
+    def require_readable(self, delta: DeltaTable) -> Evolution:
+        """Return how the table and the catalogue differ.
 
-    def unneeded(self, added: Iterable[AddAction]) -> frozenset[str]:
-        """Return the optional columns that none of some new files has."""
-        return frozenset(self.optional).difference(*(_statistic(a, "nullCount") for a in added))
+        Raises `RefusedError` if the counts are in other scales.
+        """
+        found = compare_schemas(self.schema, delta)
+        if found.rescaled:
+            changes = ", ".join(f"{n} {old} -> {new}" for n, (old, new) in found.rescaled.items())
+            raise RefusedError(
+                f"{self.folder}: the counts are in other scales than those of the signal catalogue "
+                f"({changes}). Use the catalogue that the data was written with, or ingest the "
+                "logs into another data root."
+            )
+        return found
+
+    def require_writable(self, columns: Iterable[str], delta: DeltaTable | None = None) -> None:
+        """Raise `RefusedError` if rows with some of the optional columns cannot be committed."""
+        delta = delta or self.open_delta()
+        added = compare_schemas(self.schema, delta).added if delta else ()
+        unneeded = frozenset(self.optional).difference(columns)
+        if needed := [name for name in added if name not in unneeded]:
+            raise RefusedError(
+                f"{self.folder}: the signal catalogue has columns that the table has not: "
+                f"{', '.join(needed)}. Add them with: fleet-slip migrate"
+            )
 
     def fence(self) -> None:
         """Make a conflict of every commit that began before now and has not landed.

@@ -12,7 +12,8 @@ from deltalake import DeltaTable
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import verify
-from fleet_slip.storage.table import Change, Unit, find_commit_faults
+from fleet_slip.storage.commits import find_commit_faults
+from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import DAY, land, log_rows
 
