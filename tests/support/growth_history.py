@@ -138,7 +138,7 @@ def write_logs(warehouse: Warehouse, files: int) -> list[str]:
         rows = drives.log(warehouse)
         for i, number in enumerate(drives.numbers.tolist()):
             encoded = warehouse.logs.encode(rows.slice(i * ROWS, ROWS))
-            path = f"day={day_of(number)}/growth-{number:07d}-{encoded.checksum}.parquet"
+            path = encoded.path(f"growth-{number:07d}", day_of(number))
             target = Path(warehouse.logs.uri(path))
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(encoded.content)
