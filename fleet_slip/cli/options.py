@@ -202,7 +202,9 @@ def _parameter(one: inspect.Parameter, argument: bool, name: str | None) -> insp
             details["metavar"] = "MODEL"
         said: Any = typer.Argument(**details)
     else:
-        said = typer.Option(name or f"--{_UNIT.sub('', one.name).replace('_', '-')}", **details)
+        flag = _UNIT.sub("", one.name).replace("_", "-")
+        off = f"/--no-{flag}" if one.default is True else ""
+        said = typer.Option(name or f"--{flag}{off}", **details)
     kind = READ[one.name][0] if one.name in READ else type_of(one.annotation)
     left_out = one.default is inspect.Parameter.empty and type(None) in get_args(kind)
     default = None if left_out or one.default == () else one.default
