@@ -17,7 +17,7 @@ from fleet_slip.storage.checksums import checksum_in
 from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import RunCommand, finish, run, start_on
 from tests.support.dask_processes import DaskProcesses, dask_processes
-from tests.support.measured import csv_text, good_columns
+from tests.support.measured import MAPPING_TEXT, csv_text, good_columns
 from tests.support.orders import Order, obey
 from tests.support.waiting import until
 
@@ -25,14 +25,6 @@ pytestmark = pytest.mark.long
 
 UNTIL_ALL_HAD_ONE = 1000
 """So many tasks that every worker gets one, however late it comes and busy the machine is."""
-
-MAPPING = """
-name = "test"
-time = {column = "t", unit = "s"}
-drive = {day = 2024-05-31, vehicle_id = "car", vehicle_model = "sedan"}
-signals.ax = {column = "ax", unit = "m/s^2"}
-signals.sideslip = {column = "beta", unit = "deg"}
-"""
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +52,7 @@ def orders(folder: Path, number: int, seconds: float) -> Iterator[Order]:
 def test_every_command_gives_the_same_bits_as_on_one_machine(
     dask: DaskProcesses, run_command: RunCommand, tmp_path: Path
 ) -> None:
-    (tmp_path / "test.toml").write_text(MAPPING)
+    (tmp_path / "test.toml").write_text(MAPPING_TEXT)
     for n in range(3):
         rows = good_columns(30 + n)
         rows["ax"][3] = "broken"

@@ -1,16 +1,12 @@
 """A model with gates from the command line: selected, published, scored and evaluated."""
 
-import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.cli.app import app
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.registry import Registry
@@ -19,6 +15,7 @@ from fleet_slip.regression.figures import error_sums
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.once import made_once
+from tests.support.reported import answer
 
 PLAIN = "ay_mean_16, curvature_mean_8, steering_mean_16, rear_ay_mean_16, course_sum_64"
 LIST = """\
@@ -36,13 +33,6 @@ signals = [{plain}, "ax_mean", "yaw_rate_mean", {gates}]
 """
 
 
-def call(root: Path, *words: str) -> Any:
-    result = CliRunner().invoke(app, ["--root", str(root), *words, "--json"])
-    if result.exception is not None:
-        raise result.exception
-    return json.loads(result.stdout)
-
-
 @pytest.fixture(scope="module")
 def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("lists") / "gates.toml"
@@ -58,13 +48,13 @@ def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, models: Pat
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
         update_grams(Warehouse(LocalFolder(root)), feature_set="gated")
-        call(root, "publish", "roads", "--models", str(models), "--worth", "0.0001deg")
+        answer(root, "publish", "roads", "--models", str(models), "--worth", "0.0001deg")
 
     return made_once(tmp_path_factory, "gated_model", make)
 
 
 def test_select_says_what_the_gate_buys(root: Path, models: Path) -> None:
-    plain, gated = call(root, "select", "--models", str(models))["models"]
+    plain, gated = answer(root, "select", "--models", str(models))["models"]
     assert len(gated["signals"]) >= exact.MANY_INPUTS
     assert gated["rmse_deg"] < plain["rmse_deg"]
 
@@ -88,7 +78,7 @@ def test_score_finds_the_error_that_the_gram_rows_say(root: Path) -> None:
     figures = error_sums(fitted.model, total).figures(
         catalogue()[manifest.label.signal].exact_scale
     )
-    scored = call(root, "score", "roads", "--cohort", "true")
+    scored = answer(root, "score", "roads", "--cohort", "true")
     assert scored["rows"] == figures.rows
     assert scored["rmse_deg"] == pytest.approx(figures.rmse_deg, rel=1e-9)
 
@@ -96,7 +86,7 @@ def test_score_finds_the_error_that_the_gram_rows_say(root: Path) -> None:
 @pytest.mark.long
 def test_evaluate_ranks_it_among_the_filters(root: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(root, tmp_path / "data")
-    found = call(copy, "evaluate", "roads", "--scenario", "nominal")
+    found = answer(copy, "evaluate", "roads", "--scenario", "nominal")
     ours = found["scenarios"][0]["results"]["roads@1"]
     assert ours["coverage"] == 1.0
     assert ours["rmse_deg"] < found["scenarios"][0]["results"]["roads@1/4"]["rmse_deg"]

@@ -1,6 +1,5 @@
 """`--prior`: simulated drives join the training; `--half-life`: old drives count less."""
 
-import json
 from datetime import date
 from fractions import Fraction
 from pathlib import Path
@@ -27,6 +26,7 @@ from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import done_on, run_on
 from tests.support.logs import land, log_rows
 from tests.support.own_logs import ingest_own
+from tests.support.reported import answer
 
 INPUTS = "ax,ay,yaw_rate"
 FEW = """
@@ -87,14 +87,14 @@ def test_a_version_names_its_prior_and_is_trained_so_again(own: Path, few: str) 
     assert manifest.trained_on.drives == 6, "those of the cohort"
     assert "few: 2 simulated drives" in done_on(own, "show", "with").stdout
     assert "The prior has no weight" in made.stdout, "these drives have a label without noise"
-    again = json.loads(done_on(own, "publish", "with", "--json").stdout)
+    again = answer(own, "publish", "with")
     assert not again["new"], "it is trained as it was, to the same bits"
     half = ("--half-life", "30", "--force")
     done_on(own, "publish", "with", "--model", "ay,yaw_rate", *half)
-    facts = json.loads(done_on(own, "diff", "with@1", "with@2", "--json").stdout)["facts"]
+    facts = answer(own, "diff", "with@1", "with@2")["facts"]
     assert facts["prior.campaign"] == {"one": "few", "other": None}
     assert facts["selected_by.asked.half_life"]["other"] == 30
-    drives = json.loads(done_on(own, "sql", "SELECT DISTINCT source FROM drives", "--json").stdout)
+    drives = answer(own, "sql", "SELECT DISTINCT source FROM drives")
     assert "simulated" not in str(drives), "it is not in the warehouse"
 
 

@@ -1,16 +1,12 @@
 """A model is trained again as it was, unless something else is asked for."""
 
-import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import fleet_slip
-from fleet_slip.cli.app import app
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.manifest import SelectedBy
@@ -20,32 +16,27 @@ from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.commands import done_on
 from tests.support.logs import land, log_rows, random_counts
 from tests.support.manifests import manifest
+from tests.support.reported import answer
 
 FASTER = "speed_factor > 0.1"
-
-
-def call(root: Path, *words: str) -> Any:
-    result = CliRunner().invoke(app, ["--root", str(root), *words, "--json"])
-    if result.exception is not None:
-        raise result.exception
-    return json.loads(result.stdout)
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
     folder = tmp_path_factory.mktemp("recipes") / "data"
     shutil.copytree(smoke_root, folder)
-    call(folder, "publish", "plain", "--cohort", FASTER)
+    answer(folder, "publish", "plain", "--cohort", FASTER)
     options = ("--nested", "ax,ay,yaw_rate", "--rank", "forward", "--folds", "4", "--no-intercept")
-    call(folder, "publish", "ranked", "--cohort", FASTER, *options)
+    answer(folder, "publish", "ranked", "--cohort", FASTER, *options)
     return folder
 
 
 @pytest.mark.parametrize("name", ["plain", "ranked"])
 def test_publishing_again_without_options_is_the_same_model(root: Path, name: str) -> None:
-    again = call(root, "publish", name)
+    again = answer(root, "publish", name)
     assert (again["version"], again["new"]) == (1, False)
 
 
@@ -80,16 +71,16 @@ def test_a_version_from_before_that_no_list_chose_needs_to_be_told(tmp_path: Pat
 
 
 def test_a_dry_run_publishes_nothing(root: Path) -> None:
-    before = call(root, "models")
-    assert call(root, "publish", "unborn", "--models", "table1", "--dry-run")["publishes"]
-    told = call(root, "publish", "plain", "--cohort", "day > '2024-05-01'", "--dry-run")
+    before = answer(root, "models")
+    assert answer(root, "publish", "unborn", "--models", "table1", "--dry-run")["publishes"]
+    told = answer(root, "publish", "plain", "--cohort", "day > '2024-05-01'", "--dry-run")
     assert told["model"] == "plain"
-    assert call(root, "models") == before
+    assert answer(root, "models") == before
 
 
 def test_select_and_publish_compare_what_run_does(root: Path) -> None:
-    listed = {call(root, "show", name)["selected_by"]["model_list"] for name in ("plain", "smoke")}
-    assert listed == {"estimator"}
+    for name in ("plain", "smoke"):
+        assert answer(root, "show", name)["selected_by"]["model_list"] == "estimator"
 
 
 def test_without_the_columns_of_the_usual_list_logged_signals_are_compared(tmp_path: Path) -> None:
@@ -111,7 +102,7 @@ def test_publishing_computes_the_columns_of_the_usual_list(
     shutil.rmtree(tmp_path / "data/grams")
     shutil.rmtree(tmp_path / "data/models")
     fleet.gram()
-    made = call(tmp_path / "data", "publish", "m")
+    made = answer(tmp_path / "data", "publish", "m")
     chosen = fleet.model("m").manifest
     assert (made["new"], chosen.selected_by.model_list) == (True, "estimator")
     by_hand = fleet.cohort().select()
@@ -120,20 +111,20 @@ def test_publishing_computes_the_columns_of_the_usual_list(
 
 def test_a_score_leaves_out_what_the_model_was_trained_on(root: Path) -> None:
     first = "day = '2024-05-01'"
-    call(root, "publish", "early", "--cohort", first, "--models", "table1", "--force")
-    whole, new = call(root, "score", "smoke"), call(root, "score", "early")
+    answer(root, "publish", "early", "--cohort", first, "--models", "table1", "--force")
+    whole, new = answer(root, "score", "smoke"), answer(root, "score", "early")
     assert (whole["drives"], whole["drives_trained"], whole["drives_left_out"]) == (8, 8, 0)
     assert (new["drives"], new["drives_trained"], new["drives_left_out"]) == (8, 4, 4)
-    old = call(root, "score", "early", "--cohort", first)
+    old = answer(root, "score", "early", "--cohort", first)
     assert (old["drives"], old["drives_trained"], old["drives_left_out"]) == (4, 4, 0)
     assert old["rows"] + new["rows"] == whole["rows"]
-    told = CliRunner().invoke(app, ["--root", str(root), "score", "early"])
-    assert "left out: 4 drives of 8 that early@1 was trained on" in told.output
+    told = done_on(root, "score", "early").stderr
+    assert "left out: 4 drives of 8 that early@1 was trained on" in told
 
 
 def test_the_only_model_need_not_be_named(tmp_path: Path, smoke_root: Path, root: Path) -> None:
-    assert call(smoke_root, "show")["name"] == "smoke"
+    assert answer(smoke_root, "show")["name"] == "smoke"
     with pytest.raises(QuestionError, match=r"Models: .*plain, .*smoke"):
-        call(root, "show")
+        answer(root, "show")
     with pytest.raises(QuestionError, match="name a published model"):
-        call(root, "report")
+        answer(root, "report")

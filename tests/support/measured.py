@@ -21,6 +21,14 @@ SIGNALS = {
     "ax": {"column": "ax", "unit": "m/s^2"},
     "sideslip": {"column": "beta", "unit": "deg"},
 }
+MAPPING_TEXT = """
+name = "test"
+time = { column = "t", unit = "s" }
+drive = { day = 2024-05-31, vehicle_id = "car", vehicle_model = "sedan" }
+signals.ax = { column = "ax", unit = "m/s^2" }
+signals.sideslip = { column = "beta", unit = "deg" }
+"""
+"""The mapping of `a_mapping`, as a file."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """A data root with its report, and the command line in this process."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,8 @@ LITTLE_S = 4
 """So much of each drive filters are tuned on, and a car identified from: most of an evaluation."""
 
 
-def call(root: Path, *words: str) -> Any:
+def call(root: Path, *words: str) -> str:
+    """Run a command, its searches short; what stops it is raised."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fleet_slip.evaluation.filters.TUNING_S", LITTLE_S)
         patch.setattr("fleet_slip.evaluation.identify.STARTS", STARTS[:1])
@@ -40,3 +42,8 @@ def call(root: Path, *words: str) -> Any:
     if result.exception is not None:
         raise result.exception
     return result.stdout
+
+
+def answer(root: Path, *words: str) -> Any:
+    """Return what a command says as JSON."""
+    return json.loads(call(root, *words, "--json"))

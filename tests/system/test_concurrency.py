@@ -21,19 +21,10 @@ from fleet_slip.storage.table import Change, Unit, retry_conflicts
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import PATIENCE_S, RunCommand, finish, start_on
 from tests.support.logs import DAY, log_rows
-from tests.support.measured import csv_text, good_columns
+from tests.support.measured import MAPPING_TEXT, csv_text, good_columns
 from tests.support.state import state
 
 pytestmark = pytest.mark.long
-
-MAPPING = """
-name = "test"
-time = { column = "t", unit = "s" }
-drive = { day = 2024-05-31, vehicle_id = "car", vehicle_model = "sedan" }
-signals.ax = { column = "ax", unit = "m/s^2" }
-signals.sideslip = { column = "beta", unit = "deg" }
-"""
-
 
 WRITERS, COMMITS, FILES, ROWS = 3, 5, 2, 20
 """Files of a commit, and rows of a file, which is a drive."""
@@ -127,7 +118,7 @@ def test_commands_at_once_leave_what_they_leave_one_after_the_other(
     run_command: RunCommand, tmp_path: Path
 ) -> None:
     mapping = tmp_path / "mapping.toml"
-    mapping.write_text(MAPPING)
+    mapping.write_text(MAPPING_TEXT)
     files = []
     for number in range(2):
         columns = good_columns(60)

@@ -1,6 +1,5 @@
 """The blind set: drives that follow from the hash of what they judge, and are kept nowhere."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from fleet_slip.evaluation.evaluate import Evaluation
 from fleet_slip.evaluation.judge import Signals
 from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.scenario import load_scenario
-from tests.support.reported import call
+from tests.support.reported import answer
 
 HASH = "5e" * 32
 
@@ -97,7 +96,7 @@ def test_the_command_judges_and_writes_nothing(
     root = shutil.copytree(smoke_root, tmp_path / "data")
     shutil.copytree(tuned, root / "tuned")
     before = {path for path in root.rglob("*") if "runs" not in path.parts}
-    told = json.loads(call(root, "evaluate", "smoke", "--blind", "--json"))
+    told = answer(root, "evaluate", "smoke", "--blind")
     rows = {row["name"]: row["results"] for row in told["drives"]}
     assert rows["all"]["smoke@1"]["coverage"] > 0.95
     assert rows["all"]["smoke@1"]["rmse_deg"] > rows["all"]["smoke@1"]["error_std_deg"] > 0

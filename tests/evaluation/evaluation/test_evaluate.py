@@ -25,18 +25,14 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support import reported
+from tests.support.reported import LITTLE_S, answer
 
 SCENARIOS = ("nominal", "adhesion_0_4", "wheel_missing")
 
 
-def call(root: Path, *words: str) -> Any:
-    return json.loads(reported.call(root, *words, "--json"))
-
-
 def evaluate(root: Path, *scenarios: str) -> Any:
     options = [word for name in scenarios for word in ("--scenario", name)]
-    return call(root, "evaluate", "smoke", *options)
+    return answer(root, "evaluate", "smoke", *options)
 
 
 @pytest.fixture(scope="module")
@@ -80,11 +76,11 @@ def test_an_evaluation_that_another_process_has_just_kept_is_not_kept_twice(
 
 def test_no_model_is_trained_on_scenarios(root: Path) -> None:
     with pytest.raises(RefusedError, match="scenario"):
-        call(root, "select", "--cohort", "source = 'scenario'")
+        answer(root, "select", "--cohort", "source = 'scenario'")
     with pytest.raises(RefusedError, match="scenario"):
-        call(root, "publish", "leaking", "--cohort", "source IN ('simulation', 'scenario')")
-    assert call(root, "select", "--models", "table1")["drives"] == 8
-    assert not call(root, "run", "--campaign", "smoke")["changed"]
+        answer(root, "publish", "leaking", "--cohort", "source IN ('simulation', 'scenario')")
+    assert answer(root, "select", "--models", "table1")["drives"] == 8
+    assert not answer(root, "run", "--campaign", "smoke")["changed"]
 
 
 def test_a_cohort_that_does_not_ask_for_test_drives_has_none(root: Path, tmp_path: Path) -> None:
@@ -92,14 +88,14 @@ def test_a_cohort_that_does_not_ask_for_test_drives_has_none(root: Path, tmp_pat
     shutil.copytree(root, copy)
     asked = ("--cohort", "speed_factor > 0.1")
     chosen = (*asked, "--models", "table1")
-    assert call(copy, "select", *chosen)["drives"] == 8
-    assert call(copy, "publish", "fast", *chosen)["version"] == 1
+    assert answer(copy, "select", *chosen)["drives"] == 8
+    assert answer(copy, "publish", "fast", *chosen)["version"] == 1
     with pytest.raises(DataError, match="has 2 in the cohort"):  # and not for its test drives
-        call(copy, "monitor", "fast")
-    assert call(copy, "quality", *asked)["drives"] == 8
-    every = call(copy, "score", "fast", *asked)["rows"]
-    tests = call(copy, "score", "fast", "--cohort", "source = 'scenario'")["rows"]
-    assert call(copy, "score", "fast", "--cohort", "source <> ''")["rows"] == every + tests
+        answer(copy, "monitor", "fast")
+    assert answer(copy, "quality", *asked)["drives"] == 8
+    every = answer(copy, "score", "fast", *asked)["rows"]
+    tests = answer(copy, "score", "fast", "--cohort", "source = 'scenario'")["rows"]
+    assert answer(copy, "score", "fast", "--cohort", "source <> ''")["rows"] == every + tests
 
 
 def test_a_changed_scenario_is_refused(root: Path, tmp_path: Path) -> None:
@@ -129,8 +125,8 @@ def test_views_show_test_drives_to_those_who_ask(root: Path) -> None:
         hidden_too = "SELECT count(*) FROM drives WHERE source = 'scenario'"
         assert fleet_alone.sql(hidden_too).fetchall() == [(0,)]
         assert everything.sql(hidden_too).fetchall() == asked != [(0,)]
-    assert call(root, "sql", count) == [{"count_star()": 8}]
-    assert call(root, "sql", "--scenarios", count) == [{"count_star()": 8 + asked[0][0]}]
+    assert answer(root, "sql", count) == [{"count_star()": 8}]
+    assert answer(root, "sql", "--scenarios", count) == [{"count_star()": 8 + asked[0][0]}]
 
 
 def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path, evaluated: Any) -> None:
@@ -182,7 +178,7 @@ def test_the_filters_are_tuned_once(root: Path) -> None:
     tuned = json.loads((root / "tuned" / "kalman" / "1.json").read_text())["content"]
     assert tuned["key"]["program"] == checksum_of_sources()
     seconds, *drives = tuned["key"]["drives"]
-    assert seconds == reported.LITTLE_S
+    assert seconds == LITTLE_S
     assert [model for _, model, _ in drives] == ["d_class_sedan"] * 8
     assert all(name.startswith("smoke-") for name, _, _ in drives)
     assert all(mass_kg is None for _, _, mass_kg in drives), "the model does not know it"

@@ -1,6 +1,5 @@
 """`fleet-slip evaluate --cohort`: measured drives judge what was not fitted to them."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +28,7 @@ from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.commands import done_on, run_on
 from tests.support.drives import rolling_drive
 from tests.support.measured import csv_text
-from tests.support.own_logs import ingest_own
+from tests.support.own_logs import MAPPING, ingest_own
 
 ROWS = 400
 NO_SIGNALS = DriveSignals(*[np.full(ROWS, np.nan)] * 12)
@@ -98,7 +97,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_drives_without_a_vehicle_are_judged_by_models_alone(own: Path) -> None:
     four = "vehicle_id <> 'car-0' AND vehicle_id <> 'car-5'"
-    found = json.loads(done_on(own, "evaluate", "own", "--cohort", four, "--json").stdout)
+    found = done_on(own, "evaluate", "own", "--cohort", four, "--json").json
     assert found["vehicle"] is None
     assert found["estimators"]["own@1"]["told"] == "chosen and fitted without what is judged"
     assert found["estimators"]["own@1"]["rmse_deg"] < 0.05
@@ -113,26 +112,13 @@ def test_drives_without_a_vehicle_are_judged_by_models_alone(own: Path) -> None:
 
 def test_a_model_that_saw_none_of_the_drives_is_judged_as_it_is(own: Path) -> None:
     done = done_on(own, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'", "--json")
-    assert json.loads(done.stdout)["estimators"]["own@1"]["told"] == "as published"
+    assert done.json["estimators"]["own@1"]["told"] == "as published"
 
 
-NOISE = """
-name = "noise"
-[time]
-column = "t"
-unit = "s"
-[drive]
-vehicle_id = { column = "car" }
-vehicle_model = "own"
-day = 2026-05-04
-[signals]
-ax = { column = "ax", unit = "m/s^2" }
-ay = { column = "ay", unit = "m/s^2" }
-yaw_rate = { column = "r", unit = "rad/s" }
+MORE_SIGNALS = """
 steering_wheel = { column = "steer", unit = "rad" }
 steer_fl = { column = "left", unit = "rad" }
 steer_fr = { column = "right", unit = "rad" }
-sideslip = { column = "beta", unit = "rad" }
 """
 
 
@@ -149,7 +135,7 @@ def test_a_choice_that_saw_the_drives_flatters_and_one_made_again_does_not(tmp_p
         noise = 0.1 * generator.standard_normal(cars * rows)
         columns[name] = list((size * (of_drive + noise)).round(5))
     (tmp_path / "log.csv").write_text(csv_text(columns))
-    (tmp_path / "noise.toml").write_text(NOISE)
+    (tmp_path / "noise.toml").write_text(MAPPING + MORE_SIGNALS)
     root = tmp_path / "data"
     done_on(root, "ingest", tmp_path / "log.csv", "--mapping", tmp_path / "noise.toml")
     done_on(root, "gram")

@@ -1,7 +1,7 @@
 """A car is identified from labelled drives, of mass and geometry alone."""
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,12 +24,6 @@ from tests.support.drives import simulated_drive
 
 CAR = load_vehicle("d_class_sedan")
 MEASURED = Measured.of(CAR)
-
-
-@pytest.fixture(scope="module")
-def executor() -> Iterator[Executor]:
-    with ThreadPoolExecutor(2) as threads:
-        yield threads
 
 
 @pytest.fixture(scope="module")

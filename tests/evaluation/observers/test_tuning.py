@@ -1,7 +1,6 @@
 """The search finds a known optimum, and lowers the error of a filter with wrong noise."""
 
-from collections.abc import Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ from pydantic import Field
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
-from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, kalman
 from fleet_slip.evaluation.identify import checksum_of_sources, rmse_rad, tune
 from fleet_slip.evaluation.kalman import FilterNoise
@@ -28,12 +26,6 @@ class Inner(Config):
 class Parameters(Config):
     a: float = Field(default=1.0, gt=0, le=4)
     inner: Inner = Inner()
-
-
-@pytest.fixture
-def executor() -> Iterator[Executor]:
-    with ThreadPoolExecutor(2) as threads:
-        yield threads
 
 
 def labelled(seed: int, rows: int = 4000) -> LabelledDrive:
@@ -92,13 +84,6 @@ def test_what_is_tunable_exists_and_is_positive(names: tuple[str, ...], paramete
             value = getattr(value, part)
         assert isinstance(value, float)
         assert value > 0
-
-
-def test_drives_without_labels_are_refused(executor: Executor) -> None:
-    drive = labelled(1, rows=100)
-    unknown = LabelledDrive("x", drive.signals, np.full(100, np.nan))
-    with pytest.raises(DataError, match="no row has both"):
-        rmse_rad(lambda d: kalman.estimate(d.signals, CAR, FilterNoise()), [unknown], executor)
 
 
 def test_what_was_found_is_of_these_sources(tmp_path: Path) -> None:
