@@ -1,7 +1,7 @@
 """Drives that satisfy a condition, and what Gram rows tell of them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Unpack
 
 from typing_extensions import Doc
@@ -117,14 +117,13 @@ class FleetCohort(Rooted):
         """
         from fleet_slip.models.diagnose import diagnose
 
-        examined = self._examined(model, signals, features)
-        cohort = self._load(examined.feature_set)
+        cohort, inputs, version = self._opened(model, signals, features)
         return diagnose(
             cohort,
-            examined.inputs(cohort),
-            against=self._load(examined.feature_set, against) if against else None,
+            inputs,
+            against=self._load(cohort.feature_set, against) if against else None,
             cluster=cluster,
-            intercept=examined.intercept,
+            intercept=version is None or not version.manifest.through_origin,
         )
 
     def what_if(
@@ -158,16 +157,13 @@ class FleetCohort(Rooted):
             raise UsageError(
                 "say what is added: noise such as ay=0.2, or bias such as yaw_rate=0.02."
             )
-        examined = self._examined(model, signals, features)
-        cohort = self._load(examined.feature_set)
-        if examined.version is not None:
-            one = examined.version.manifest.counts_model()
+        cohort, inputs, version = self._opened(model, signals, features)
+        if version is not None:
+            one = version.manifest.counts_model()
         else:
-            inputs = examined.inputs(cohort)
             one = fit(cohort.serving(inputs).table.total(), inputs, catalogue().label).model
-        return what_if(
-            cohort, one, bias=bias or {}, noise=noise or {}, intercept=examined.intercept
-        )
+        intercept = version is None or not version.manifest.through_origin
+        return what_if(cohort, one, bias=bias or {}, noise=noise or {}, intercept=intercept)
 
     def identify(
         self,
@@ -217,37 +213,22 @@ class FleetCohort(Rooted):
 
         return load_cohort(self.warehouse, condition or self.condition, feature_set)
 
-    def _examined(
+    def _opened(
         self, model: str | ModelVersion | None, signals: str | None, features: str | None
-    ) -> "ExaminedModel":
-        """Return what is examined. Raises `UsageError` for both a model and signals."""
-        registry = Registry(self.root / "models")
+    ) -> "tuple[Cohort, tuple[str, ...], ModelVersion | None]":
+        """Return Gram rows, and the inputs of a published model, by default the only one, or named.
+
+        Raises `UsageError` for both a model and signals.
+        """
         if signals is not None or features is not None:
             if model is not None:
                 raise UsageError("name a published model or signals (of a feature set), not both.")
-            return ExaminedModel(features or PLAIN, signals, None)
+            cohort = self._load(features or PLAIN)
+            return cohort, inputs_of(cohort, signals or WHOLE_SET), None
+        registry = Registry(self.root / "models")
         if model is None:
             model = registry.only(", or signals")
         version = model if isinstance(model, ModelVersion) else registry.resolve(model)
         identity = version.manifest.trained_on.feature_set
-        return ExaminedModel(known_features().name_of(identity), None, version)
-
-
-@dataclass(frozen=True)
-class ExaminedModel:
-    """The inputs of a published model, by default the only one, or named ones."""
-
-    feature_set: str
-    named: str | None
-    version: ModelVersion | None
-
-    @property
-    def intercept(self) -> bool:
-        """Whether the model has one; inputs that are named alone have."""
-        return self.version is None or not self.version.manifest.through_origin
-
-    def inputs(self, cohort: "Cohort") -> tuple[str, ...]:
-        """Return the inputs; all that the cohort has, if that was asked for."""
-        if self.version is not None:
-            return self.version.manifest.signals
-        return inputs_of(cohort, self.named or WHOLE_SET)
+        cohort = self._load(known_features().name_of(identity))
+        return cohort, version.manifest.signals, version

@@ -242,18 +242,17 @@ class HealthAndUpkeep(JudgedModels):
 
         self.warehouse.require()
         subject, audit = _subject(vehicle, drive), Audit(self.root)
-        match audit.state(subject):
-            case None:
-                raise QuestionError(f"{subject.kind} {subject.value!r} was never forgotten.")
-            case "begun":
-                raise RefusedError(
-                    f"{subject.kind} {subject.value!r} is still being forgotten. Repeat "
-                    "that command until it is done, then allow it."
-                )
-            case "done":
-                audit.allow(subject)
-                return True
-        return False
+        state = audit.state(subject)
+        if state is None:
+            raise QuestionError(f"{subject.kind} {subject.value!r} was never forgotten.")
+        if state == "begun":
+            raise RefusedError(
+                f"{subject.kind} {subject.value!r} is still being forgotten. Repeat that command "
+                "until it is done, then allow it."
+            )
+        if state == "done":
+            audit.allow(subject)
+        return state == "done"
 
     @record_call
     def retain(

@@ -21,7 +21,6 @@ from fleet_slip.pages.page import (
     fill_in,
     number,
     percent,
-    table,
 )
 from fleet_slip.storage.folder import Folder
 from fleet_slip.warehouse.tables import Warehouse
@@ -31,13 +30,15 @@ PAPER_TABLE_ONE = {"1": 0.9013, "2": 0.9534, "3": 0.9796, "4": 0.9911, "5": 0.99
 
 
 def _marked(text: str, good: bool, miss: bool = False) -> Cell:
-    return Cell(text, "good" if good else "miss" if miss else "")
+    cell = Cell(text)
+    cell.mark = "good" if good else "miss" if miss else ""
+    return cell
 
 
 def table_one(data: ReportData) -> ReportTable:
     """Return Table I."""
     head = ["model", "signals", "paper", "ours", "standard error", "RMSE"]
-    rows: list[list[str | Cell]] = []
+    rows: list[list[str]] = []
     for one in data.trained.selection.models:
         paper = PAPER_TABLE_ONE.get(one.name)
         ours = _marked(number(one.correlation, 4), paper is not None and one.correlation >= paper)
@@ -54,12 +55,12 @@ def table_one(data: ReportData) -> ReportTable:
     else:
         note += f"Every RMSE here has the label's own noise in it, {degrees(noise, 4)}."
     caption = "Table I. Properties of the estimation models: cross-validated correlation"
-    return table("table-1", caption, head, rows, left=2, note=note)
+    return ReportTable("table-1", caption, head, rows, left=2, note=note)
 
 
 def table_two(data: ReportData) -> ReportTable:
     """Return Table II: the errors on the nominal test drive."""
-    rows: list[list[str | Cell]] = []
+    rows: list[list[str]] = []
     for name, estimator in data.evaluated.models.items():
         one = data.evaluated.figures("nominal", estimator)
         if one is None or one.error_std_deg is None:
@@ -77,7 +78,7 @@ def table_two(data: ReportData) -> ReportTable:
         )
     head = ["model", "mean, paper", "mean, ours", "std, paper", "std, ours", "correlation, ours"]
     caption = "Table II. Predictive accuracy on the nominal test drive: error in degrees"
-    return table("table-2", caption, head, rows)
+    return ReportTable("table-2", caption, head, rows)
 
 
 def standings(data: ReportData) -> ReportTable:
@@ -85,7 +86,7 @@ def standings(data: ReportData) -> ReportTable:
     evaluated = data.evaluated
     left_out = set(evaluated.models.values()) - {data.choice}
     names = [name for name in evaluated.estimators if name not in left_out]
-    rows: list[list[str | Cell]] = []
+    rows: list[list[str]] = []
     for scenario in evaluated.scenarios:
         errors, texts = {}, {}
         for name in names:
@@ -107,7 +108,7 @@ def standings(data: ReportData) -> ReportTable:
         if found
         else ""
     )
-    return table(
+    return ReportTable(
         "standings",
         "Every estimator on every test drive: root mean square error in degrees",
         ["test drive", *names],
@@ -135,7 +136,7 @@ def measured_drives(data: ReportData) -> list[ReportTable]:
         for place, (name, one) in enumerate(found["estimators"].items())
     ]
     return [
-        table(
+        ReportTable(
             "own-car",
             "A car of one's own: measured drives with a label",
             ["estimator", "knows", "RMSE", "mean", "error std", "correlation", "rows"],

@@ -193,21 +193,15 @@ def _unfit(root: Folder) -> Iterator[str]:
 
 
 def _table(snapshot: Snapshot) -> TableStatus:
+    with storage_errors(snapshot.table.folder):
+        last = snapshot.delta.history(limit=1) if snapshot.delta else []
     return TableStatus(
         version=snapshot.version,
-        committed_at=_committed_at(snapshot),
+        committed_at=_from_ms(last[0].get("timestamp") if last else None),
         files=len(snapshot.files),
         rows=snapshot.rows,
         size_bytes=snapshot.size_bytes,
     )
-
-
-def _committed_at(snapshot: Snapshot) -> datetime | None:
-    if snapshot.delta is None:
-        return None
-    with storage_errors(snapshot.table.folder):
-        last = snapshot.delta.history(limit=1)
-    return _from_ms(last[0].get("timestamp") if last else None)
 
 
 def _oldest_hours(logs: Snapshot, paths: set[str], now: datetime) -> float | None:

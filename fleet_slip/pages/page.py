@@ -63,15 +63,10 @@ def listed(words: list[str]) -> str:
     return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
-Mark = Literal["", "good", "miss"]
+class Cell(str):
+    """A text of a table that is marked as good or as a miss."""
 
-
-@dataclass(frozen=True)
-class Cell:
-    """One cell: its text, and whether it is marked."""
-
-    text: str
-    mark: Mark = ""
+    mark: Literal["", "good", "miss"] = ""
 
 
 @dataclass(frozen=True)
@@ -81,23 +76,9 @@ class ReportTable:
     key: str
     caption: str
     head: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
+    rows: Sequence[Sequence[str]]
     left: int = 1
     note: str = ""
-
-
-def table(
-    key: str,
-    caption: str,
-    head: Sequence[str],
-    rows: Sequence[Sequence[str | Cell]],
-    *,
-    left: int = 1,
-    note: str = "",
-) -> ReportTable:
-    """Return a table of plain texts and marked cells."""
-    cells = [[cell if isinstance(cell, Cell) else Cell(cell) for cell in row] for row in rows]
-    return ReportTable(key, caption, head, cells, left, note)
 
 
 @dataclass(frozen=True)
