@@ -163,13 +163,14 @@ def draw_sample(
     files = cohort_files(warehouse, cohort.condition)
     for file in (one for one in warehouse.logs.snapshot().files if one.path in files):
         for drive in read_drives(warehouse, file, plan):
-            if drive.drive_id not in trips:
+            name = str(drive.facts["drive_id"])
+            if name not in trips:
                 continue
-            told = (numbers or {}).get(str(drive.metadata["vehicle_id"]), {})
-            values = with_label.values(replace(drive.counts, numbers=told))
-            values = values[drive.counts.ticks % stride == 0]
+            told = (numbers or {}).get(str(drive.facts["vehicle_id"]), {})
+            values = with_label.values(replace(drive, numbers=told))
+            values = values[drive.ticks % stride == 0]
             parts.append(values[np.isfinite(values).all(axis=1)])
-            names.extend([drive.drive_id] * len(parts[-1]))
+            names.extend([name] * len(parts[-1]))
     if not names:
         raise DataError(
             f"no row of {cohort.condition.text!r} has all of {', '.join(with_label.names)}."

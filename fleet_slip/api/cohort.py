@@ -189,8 +189,6 @@ class FleetCohort(Rooted):
 
     def _make_usual(self, cohort: str) -> bool:
         """Make the Gram rows of the usual list, if that takes seconds; return whether it did."""
-        from importlib.util import find_spec
-
         from fleet_slip.grams.gram_files import find_backlog
         from fleet_slip.grams.job import update_grams
         from fleet_slip.grams.reader import cohort_files
@@ -202,7 +200,7 @@ class FleetCohort(Rooted):
         files = cohort_files(self.warehouse, parse_cohort(cohort))
         missing = find_backlog(logs, grams, known_features().identity(name)).missing
         rows = sum(file.rows for file in missing if file.path in files)
-        if not rows or rows > ROWS_ON_THE_WAY or find_spec("numba") is None:
+        if not rows or rows > ROWS_ON_THE_WAY:
             return False
         LOGGER.info("making the Gram rows of %s, which the list %s needs", name, DEFAULT_MODELS)
         update_grams(self.warehouse, feature_set=name, among=files)

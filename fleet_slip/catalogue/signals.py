@@ -250,16 +250,11 @@ def valid_values(values: FloatArray, signal: Signal) -> FloatArray:
     return np.where(beyond, np.nan, values) if beyond.any() else values
 
 
-def round_to_counts(values: FloatArray, signal: Signal) -> pa.Array:
-    """Return `values / scale` as int16 counts, null where a value is NaN.
+def round_chunks(chunks: Sequence[FloatArray], signal: Signal) -> pa.Array:
+    """Return `values / scale` as int16 counts, null where NaN, of arrays one after the other.
 
     Halves round to even. A value beyond the signal's valid range takes the range's end.
     """
-    return round_chunks([values], signal)
-
-
-def round_chunks(chunks: Sequence[FloatArray], signal: Signal) -> pa.Array:
-    """Return the counts of values that stand in several arrays, one after the other."""
     counts = np.empty(sum(chunk.size for chunk in chunks), dtype=np.int16)
     scaled, scale = np.empty(min(counts.size, BLOCK)), float(signal.scale)
     low, high = float(signal.min_count), float(signal.max_count)

@@ -3,8 +3,6 @@
 Only rows with a fix are kept, at most one in ten: they fit into memory.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
@@ -12,18 +10,6 @@ from fleet_slip.catalogue.course import COARSER, COURSE, course_units, split_lat
 from fleet_slip.catalogue.signals import HALF_TURN
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.columns.plan import BLOCK_ROWS
-
-
-@dataclass(frozen=True)
-class Changes:
-    """The changes of a drive's columns between fixes that are so many ticks apart.
-
-    `rows` are those with a change; `columns` end in `BESIDE` and the label, NaN where missing.
-    """
-
-    rows: IntArray
-    columns: FloatArray
-    clipped: FloatArray
 
 
 class Fixes:
@@ -49,8 +35,12 @@ class Fixes:
             self.first_clipped = here[:1].copy() if first == 0 else self.first_clipped
         self.counts, self.clipped = np.concatenate(values, axis=1), np.concatenate(clipped)
 
-    def changes(self, apart: int) -> Changes:
-        """Return the changes of the columns between fixes that are so many ticks apart."""
+    def changes(self, apart: int) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return the changes between fixes that are so many ticks apart.
+
+        The rows with a change, their columns, which end in `BESIDE` and the label and are NaN where
+        missing, shape (columns, changes), and how many were clipped in each.
+        """
         at, yaw_rate = self.at, self.yaw_rate
         before, now = _pairs(self.ticks[at], apart)
         turned, known = _twice_turned(self.ticks, yaw_rate, at[before], at[now])
@@ -69,11 +59,8 @@ class Fixes:
         columns[:size, first:] = self.counts.take(now, axis=1)
         columns[:size, first:] -= self.counts.take(before, axis=1)
         columns[size:, first:] = [*beside, change]
-        return Changes(
-            np.concatenate([np.flatnonzero(began), at[now]]),
-            columns,
-            np.concatenate([self.first_clipped[began], self.clipped[now]]),
-        )
+        clipped = np.concatenate([self.first_clipped[began], self.clipped[now]])
+        return np.concatenate([np.flatnonzero(began), at[now]]), columns, clipped
 
 
 def _fixes(drive: DriveCounts, ticks: IntArray, whole: int) -> tuple[IntArray, IntArray]:

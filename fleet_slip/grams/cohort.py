@@ -282,7 +282,7 @@ def load_cohort(
 
 
 def _expand_rows(opened: OpenedGrams, rows: pa.Table) -> dict[str, Any]:
-    expansion = expansion_of(opened, features().name_of(opened.identity))
+    expansion = expansion_of(opened)
     parts = list(expansion.tables(rows))
     lines = rows.drop_columns(["sums", "products", "signals"])
     # Rows whose calibrated columns are not the same are apart now: their lines follow them.
@@ -404,7 +404,7 @@ def _add_up(
     opened: OpenedGrams, condition: Condition, names: Sequence[object], fold_of: FoldOf
 ) -> tuple[dict[str, list[Gram]], pa.Table]:
     """Return the exact sums of Gram rows, by signals and fold, and whose each row is."""
-    expansion = expansion_of(opened, features().name_of(opened.identity))
+    expansion = expansion_of(opened)
     grams: dict[str, list[Gram]] = {}
     lines: list[pa.Table] = []
     for batch in opened.batches(condition, *HASHES):

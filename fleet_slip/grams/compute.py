@@ -39,17 +39,11 @@ from fleet_slip.warehouse.tables import Warehouse
 # The rows of drives, one drive at a time in the order of time: from log files, or from a query.
 
 
-@dataclass(frozen=True)
-class LoggedDrive:
-    """A drive of a log file: what it is, its metadata, and its counts."""
+def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iterator[DriveCounts]:
+    """Yield a log file's drives in the order of time, their metadata as facts.
 
-    drive_id: str
-    metadata: Mapping[str, Any]
-    counts: DriveCounts
-
-
-def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iterator[LoggedDrive]:
-    """Yield a log file's drives in the order of time; as in SQL, none without a row of tick 0."""
+    As in SQL, none without a row of tick 0.
+    """
     drive_columns = tuple(warehouse.catalogue.drive)
     present = warehouse.logs.read_metadata(file.path).schema.to_arrow_schema().names
     wanted = [name for name in (*drive_columns, "tick", *plan.signals) if name in present]
@@ -64,7 +58,7 @@ def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iter
             metadata = {
                 name: one[name][at].as_py() if name in wanted else None for name in drive_columns
             }
-            yield LoggedDrive(str(metadata["drive_id"]), metadata, counts_of(one, plan, metadata))
+            yield counts_of(one, plan, metadata)
 
 
 def counts_of(
@@ -469,27 +463,28 @@ def wide_grams(
     # Files are shared out among threads; a BLAS with threads of its own would be in their way.
     with threadpool_limits(1, user_api="blas"):
         for file in sorted(files, key=lambda one: one.path):
-            for drive in sorted(read_drives(warehouse, file, plan), key=lambda one: one.drive_id):
-                delay = (late or {}).get(drive.metadata["vehicle_id"])
-                known = {**drive.metadata, "feature_set": identity, COURSE_LATE: delay}
+            drives = read_drives(warehouse, file, plan)
+            for drive in sorted(drives, key=lambda drive: str(drive.facts["drive_id"])):
+                delay = (late or {}).get(drive.facts["vehicle_id"])
+                known = {**drive.facts, "feature_set": identity, COURSE_LATE: delay}
                 known |= {"file": file.path, "day": file.day}
                 rows += _gram_rows(workspace, one, drive, known)
     return pa.Table.from_pylist(rows, schema=schema)
 
 
 def _gram_rows(
-    workspace: Workspace, one: FeatureSet, drive: LoggedDrive, known: Mapping[str, Any]
+    workspace: Workspace, one: FeatureSet, drive: DriveCounts, known: Mapping[str, Any]
 ) -> Iterator[dict[str, Any]]:
     """Yield the Gram rows of a drive with what is known of it, sorted as by SQL."""
     parts = Parts.of_set(features(), one)
     try:
         if one.change_ticks:
             late = (known[COURSE_LATE] or 0) if one.in_time else 0
-            found = change_sums(workspace, drive.counts, one.change_ticks, late)
+            found = change_sums(workspace, drive, one.change_ticks, late)
         else:
-            found = drive_sums(workspace, parts, drive.counts)
+            found = drive_sums(workspace, parts, drive)
     except DataError as error:
-        raise DataError(f"{known['file']}: drive {drive.drive_id}: {error}") from None
+        raise DataError(f"{known['file']}: drive {known['drive_id']}: {error}") from None
     # As SQL does: an unknown part, which is null there, comes last.
     for absent, part in sorted(found, key=lambda kind: (kind[0], kind[1] == UNKNOWN, kind[1])):
         sums = found[absent, part]
@@ -572,9 +567,8 @@ def change_sums(
     fixes = Fixes(workspace, counts, late)
     found: dict[Kind, PartSums] = {}
     for part, apart in enumerate(times):
-        changes = fixes.changes(apart)
-        numbers = np.full(len(changes.rows), part)
-        _add_by_kind(found, changes.columns, changes.clipped, numbers, exact_rows)
+        rows, columns, clipped = fixes.changes(apart)
+        _add_by_kind(found, columns, clipped, np.full(len(rows), part), exact_rows)
     return found
 
 

@@ -5,7 +5,7 @@ log is read, and the numbers may be tonight's.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -162,10 +162,10 @@ def expand(
     )
 
 
-def expansion_of(opened: OpenedGrams, feature_set: str) -> Expansion:
+def expansion_of(opened: OpenedGrams) -> Expansion:
     """Return what adds a set's calibrated columns, by the numbers of all of a car's drives now."""
     known = features()
-    one = known.feature_set(feature_set)
+    one = known.feature_set(known.name_of(opened.identity))
     names, sweep = one.calibrated, bool(one.change_ticks)
     if not names:
         return Expansion({}, {}, sweep)
@@ -174,8 +174,6 @@ def expansion_of(opened: OpenedGrams, feature_set: str) -> Expansion:
         number = known.time_columns[name].definition.number
         if number is not None:
             columns[name] = (known.calibrated[name].of, number)
-    calibration = OpenedGrams(
-        opened.database, known.identity(CALIBRATION), opened.logs_version, opened.grams_version
-    )
+    calibration = replace(opened, identity=known.identity(CALIBRATION))
     cars = calibration_of(calibration, parse_condition(ALL_DRIVES)).counts()
     return Expansion(columns, cars, sweep)

@@ -21,7 +21,7 @@ import pyarrow.compute as pc
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.definitions import plain_column
 from fleet_slip.catalogue.facts import round_number
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue, round_to_counts, valid_values
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue, round_chunks, valid_values
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace, row_counts
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
 from fleet_slip.compiling import kernel
@@ -227,7 +227,7 @@ def _over_time(
     """Return the angles of a model that looks back, drive by drive in the order of time."""
     signals = catalogue()
     counts = {
-        name: round_to_counts(columns[signals[name].column], signals[name])
+        name: round_chunks([columns[signals[name].column]], signals[name])
         for name in predictor.plan.signals
     }
     if missing := [name for name in predictor.plan.facts if name not in frame.names]:
@@ -306,7 +306,7 @@ def _features(manifest: Manifest, columns: dict[str, FloatArray]) -> dict[str, F
     signals = catalogue()
     counts, present = {}, {}
     for name in {name for _, one in made for name in one.signals}:
-        rounded = round_to_counts(columns[signals[name].column], signals[name])
+        rounded = round_chunks([columns[signals[name].column]], signals[name])
         present[name] = rounded.is_valid().to_numpy(zero_copy_only=False)
         counts[name] = rounded.fill_null(0).to_numpy().astype(np.int64)
     found = {}

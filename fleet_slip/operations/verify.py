@@ -10,7 +10,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from importlib.util import find_spec
 from typing import Literal, TypeAlias
 
 import pyarrow as pa
@@ -35,7 +34,7 @@ from fleet_slip.grams.check import (
     grams_of,
     stored_grams,
 )
-from fleet_slip.grams.compute import by_sql, wide_grams
+from fleet_slip.grams.compute import wide_grams
 from fleet_slip.grams.gram_files import is_received, named_files
 from fleet_slip.grams.on_board import counted_sets, impossible_rows
 from fleet_slip.models.registry import Registry
@@ -329,8 +328,7 @@ def _verify_unique(warehouse: Warehouse, grams: Sequence[TableFile], report: Ver
 
 
 def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:
-    compiled = find_spec("numba") is not None  # an extra
-    return grams_of((wide_grams if compiled else by_sql)(warehouse, [file], PLAIN))
+    return grams_of(wide_grams(warehouse, [file], PLAIN))
 
 
 def verify_documents(root: Folder, report: Verification) -> None:

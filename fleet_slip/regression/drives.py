@@ -68,19 +68,14 @@ class DriveMoments:
 
     @classmethod
     def of(
-        cls,
-        table: GramTable,
-        cluster: IntArray | None = None,
-        unit: ClusterUnit = "drive",
-        *,
-        centred: bool = True,
+        cls, table: GramTable, cluster: IntArray | None = None, unit: ClusterUnit = "drive"
     ) -> "DriveMoments":
-        """Scale a table of drives, about zero unless centred. Raises `DataError` without rows."""
+        """Scale a table of drives. Raises `DataError` without rows."""
         total = table.total()
         if total.n == 0:
             raise DataError(f"no rows have all of {', '.join(table.signals)}.")
         k = len(table.signals)
-        centre = tuple(round(s / total.n) if centred else 0 for s in total.sums)
+        centre = tuple(round(s / total.n) for s in total.sums)
         squares = np.array([total.centred()[i][i] for i in range(k)], dtype=np.float64)
         spread = np.where(squares > 0, np.sqrt(squares) / total.n, 1.0)
         about = table.about(centre)

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
-from importlib.util import find_spec
 from itertools import pairwise
 
 import numpy as np
@@ -152,9 +151,7 @@ def _sweep(a: FloatArray) -> int:
 
 @cache
 def _compiled_sweep() -> Callable[[FloatArray], int]:
-    """Return the same as compiled code, of the same bits; where nothing compiles, as it is."""
-    if find_spec("numba") is None:
-        return _sweep
+    """Return the same as compiled code, of the same bits."""
     from fleet_slip.compiling import kernel  # noqa: PLC0415 - slow
 
     return kernel(_sweep)

@@ -243,9 +243,14 @@ class GramTable:
         """Return the drives at a slice, an index array or a boolean mask."""
         return GramTable(self.signals, self.n[rows], self.sums[rows], self.products[rows])
 
-    def total(self, rows: NDArray[Any] | None = None) -> Gram:
-        """Return the exact sum over all drives, or over those at an index array or a mask."""
-        return self._sum() if rows is None else self.take(rows)._sum()
+    def total(self) -> Gram:
+        """Return the exact sum over all drives."""
+        return Gram(
+            self.signals,
+            exact_sum(self.n[:, None])[0],
+            tuple(exact_sum(self.sums)),
+            tuple(exact_sum(self.products)),
+        )
 
     def totals(self, groups: NDArray[Any], count: int) -> list[Gram]:
         """Return the exact sum over each group of drives; `groups` says each one's, 0..count-1."""
@@ -255,7 +260,7 @@ class GramTable:
             raise ValueError(f"groups must lie in 0..{count - 1}")
         order = np.argsort(groups, kind="stable")
         stops = np.cumsum(np.bincount(groups, minlength=count))
-        return [self.take(rows)._sum() for rows in np.split(order, stops[:-1])]
+        return [self.take(rows).total() for rows in np.split(order, stops[:-1])]
 
     def merged(self, numbers: IntArray) -> "GramTable":
         """Return a Gram for each number 0, 1, ..., the sum of the rows that have it."""
@@ -296,14 +301,6 @@ class GramTable:
     def about_origin(self) -> "GramTable":
         """Return the table of `Gram.about_origin` of each drive."""
         return GramTable(self.signals, self.n, np.zeros_like(self.sums), self.products)
-
-    def _sum(self) -> Gram:
-        return Gram(
-            self.signals,
-            exact_sum(self.n[:, None])[0],
-            tuple(exact_sum(self.sums)),
-            tuple(exact_sum(self.products)),
-        )
 
 
 def exact_sum(values: IntArray) -> list[int]:

@@ -60,7 +60,7 @@ def test_the_order_and_the_size_of_counts_do_not_matter() -> None:
     order = np.random.default_rng(3).permutation(len(table))
     parts = robust_weights(DriveMoments.of(table)).parts
     assert np.array_equal(robust_weights(DriveMoments.of(table.take(order))).parts, parts[order])
-    origin = robust_weights(DriveMoments.of(table.about_origin(), centred=False), intercept=False)
+    origin = robust_weights(DriveMoments.of(table.about_origin()), intercept=False)
     assert np.array_equal(origin.parts, parts)
 
 

@@ -99,7 +99,7 @@ def test_days_add_up_to_those_of_the_drives(
         assert sums.days == tuple(sorted(set(days)))
         assert sums.drives == tuple(days.count(day) for day in sums.days)
         for day, gram in zip(sums.days, sums.grams, strict=True):
-            assert gram == served.table.total(np.array([one == day for one in days]))
+            assert gram == served.table.take(np.array([one == day for one in days])).total()
     with pytest.raises(DataError, match="no drive matches"):
         sum_days(warehouse, ["ax"], "mass_kg > 1e9")
     with pytest.raises(DataError, match="no drive of the cohort has all of"):

@@ -79,12 +79,12 @@ def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers(late: int) -
     plan = ColumnPlan.of_set(features(), "course")
     workspace, counts = Workspace(plan), counts_of(table, plan, {})
     workspace.load(counts)
-    found = Fixes(workspace, counts, late).changes(APART)
+    rows, columns, _ = Fixes(workspace, counts, late).changes(APART)
     expected = plain_changes(table, late)
     assert len(expected) > 40
-    assert counts.ticks[found.rows].tolist() == [0, *expected]
-    assert np.isnan(found.columns[:, 0]).all()
-    changes = found.columns[-4:, 1:].astype(int).tolist()
+    assert counts.ticks[rows].tolist() == [0, *expected]
+    assert np.isnan(columns[:, 0]).all()
+    changes = columns[-4:, 1:].astype(int).tolist()
     assert list(zip(*changes, strict=True)) == list(expected.values())
     assert 0 < sum(slow for _, slow, _, _ in expected.values()) < len(expected)
 
@@ -135,8 +135,8 @@ def test_the_label_is_the_change_of_the_side_slip_angle() -> None:
     plan = ColumnPlan.of_set(features(), "course")
     workspace, loaded = Workspace(plan), counts_of(log_rows("a", counts), plan, {})
     workspace.load(loaded)
-    found = Fixes(workspace, loaded).changes(APART)
-    rows, columns = found.rows[1:], found.columns[:, 1:]
+    rows, columns, _ = Fixes(workspace, loaded).changes(APART)
+    rows, columns = rows[1:], columns[:, 1:]
     assert len(rows) == 460
     changed = slip[rows] - slip[rows - APART]
     assert np.abs(columns[-1] * 1e-4 - changed).max() < 3e-4
