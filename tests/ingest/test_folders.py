@@ -116,12 +116,6 @@ def test_without_the_cache_nothing_lands_twice(folder: Path, content: str) -> No
     assert len(drives(folder)) == 5
 
 
-def test_a_cache_of_what_is_not_in_the_warehouse_is_not_believed(folder: Path) -> None:
-    ingest(folder)
-    (folder.parent / "root").rename(folder.parent / "elsewhere")
-    assert [report["new"] for report in ingest(folder)] == [True] * 5
-
-
 def test_a_root_that_was_restored_from_a_backup_is_asked_for_all(folder: Path) -> None:
     new = folder / "day 2" / "new.csv"
     ingest(folder)
@@ -195,12 +189,6 @@ def test_a_batch_of_which_another_process_lands_a_part_is_written_again(
     assert warehouse.quarantine.snapshot().rows == 1
     written = {path.name for path in (folder.parent / "root" / "logs").glob("*/*.parquet")}
     assert written == {file.path.rpartition("/")[2] for file in warehouse.logs.snapshot().files}
-
-
-def test_a_folder_without_logs_is_an_error(folder: Path) -> None:
-    (folder.parent / "empty").mkdir()
-    with pytest.raises(InputError, match=r"no file in this folder has the suffix of a log: \.csv"):
-        ingest(folder, folder.parent / "empty")
 
 
 def test_quarantine_rows_of_a_batch_are_those_of_its_files(folder: Path) -> None:

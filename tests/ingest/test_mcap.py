@@ -16,7 +16,7 @@ from fleet_slip.ingest.formats import mcap as mcap_log
 from fleet_slip.ingest.formats.source import OWN_TIME, Budget
 from fleet_slip.ingest.mapping import Mapping
 from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
-from tests.support.measured import a_mapping, read_measured
+from tests.support.measured import a_mapping, failure, read_measured
 from tests.support.reported import call
 from tests.support.ros2 import HEADER
 
@@ -78,14 +78,6 @@ def mapping(**signals: Any) -> Mapping:
     }
     clock = {"column": None, "unit": None, "own_clock": True}
     return a_mapping(time=clock, drive={"day": None}, signals=told)
-
-
-def failure(file: Path, of: Mapping | None = None) -> str:
-    with pytest.raises(InputError) as caught:
-        read_measured(file, of or mapping())
-    assert str(caught.value).startswith(str(file))
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
@@ -174,7 +166,7 @@ def test_a_truncated_file_is_refused(tmp_path: Path, share: float) -> None:
     file = write(tmp_path / "log.mcap")
     content = file.read_bytes()
     file.write_bytes(content[: int(share * len(content))])
-    assert "Is it complete? Copy it again" in failure(file)
+    assert "Is it complete? Copy it again" in failure(file, mapping())
 
 
 def test_a_chunk_with_a_flipped_bit_is_refused(tmp_path: Path) -> None:
@@ -183,7 +175,7 @@ def test_a_chunk_with_a_flipped_bit_is_refused(tmp_path: Path) -> None:
     at = data.index(np.float64(AX[50]).tobytes())
     data[at] ^= 1
     file.write_bytes(data)
-    assert "crc validation failed" in failure(file)
+    assert "crc validation failed" in failure(file, mapping())
 
 
 def test_messages_in_another_encoding_are_named(tmp_path: Path) -> None:
@@ -193,7 +185,7 @@ def test_messages_in_another_encoding_are_named(tmp_path: Path) -> None:
         channel = writer.register_channel("imu", "protobuf", 0)
         writer.add_message(channel, START_NS, b"\x08\x01", START_NS)
         writer.finish()  # type: ignore[no-untyped-call]
-    assert "no message in it can be decoded (protobuf)" in failure(tmp_path / "log.mcap")
+    assert "no message in it can be decoded (protobuf)" in failure(tmp_path / "log.mcap", mapping())
 
 
 MIXED = HEADER.format(

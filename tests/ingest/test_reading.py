@@ -20,6 +20,7 @@ from tests.support.logs import without_names
 from tests.support.measured import (
     a_mapping,
     csv_text,
+    failure,
     good_columns,
     read_measured,
     read_text,
@@ -28,14 +29,6 @@ from tests.support.measured import (
 )
 
 GOOD = csv_text(good_columns())
-
-
-def failure(file: Path) -> str:
-    with pytest.raises(InputError) as caught:
-        read_measured(file, a_mapping())
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
 
 
 def write(folder: Path, data: bytes, name: str = "log.csv") -> Path:

@@ -68,9 +68,12 @@ def test_rows_that_do_not_meet_the_conditions_are_counted(
         ([{"signal": "ay", "above": 1}], "'ay' is no signal of this mapping"),
         ([{"signal": "ax", "one_of": ["1"]}], "'one_of' is for a column"),
         ([{"at_least": 1}], "needs either 'column' or 'signal'"),
+        ([{"column": "speed"}], "needs 'at_least', 'at_most' or 'one_of'"),
+        ([{"column": "speed", "at_least": 1, "one_of": ["a"]}], "and not both"),
+        ([{"column": "speed", "at_least": float("nan")}], "finite number"),
     ],
 )
-def test_what_a_text_cannot_say(where: Any, message: str) -> None:
+def test_what_a_condition_cannot_be(where: Any, message: str) -> None:
     with pytest.raises(ValidationError, match=re.escape(message)):
         a_mapping(where=where)
 
@@ -95,19 +98,6 @@ def test_a_condition_that_no_row_meets_is_an_error(tmp_path: Path) -> None:
     where = [{"column": "speed", "at_least": 500}]
     with pytest.raises(InputError, match=r"none of 20 rows .* 'speed' is at least 500"):
         read_columns(tmp_path, columns(), a_mapping(where=where))
-
-
-@pytest.mark.parametrize(
-    ("condition", "message"),
-    [
-        ({}, "needs 'at_least', 'at_most' or 'one_of'"),
-        ({"at_least": 1, "one_of": ["a"]}, "and not both"),
-        ({"at_least": float("nan")}, "finite number"),
-    ],
-)
-def test_what_a_condition_cannot_be(condition: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValidationError, match=message):
-        a_mapping(where=[{"column": "speed", **condition}])
 
 
 def test_a_drive_ends_where_the_ignition_is_off(tmp_path: Path) -> None:

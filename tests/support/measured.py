@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from fleet_slip.base import shown
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.load import IngestReport, ingest_files, log_table
 from fleet_slip.ingest.mapping import Mapping
@@ -63,12 +64,12 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
     )
 
 
-def failure(file: Path, mapping: Mapping) -> str:
+def failure(file: Path, mapping: Mapping | None = None) -> str:
     """Return why a file cannot be read: a line that begins with its name."""
     with pytest.raises(InputError) as caught:
-        read_measured(file, mapping)
+        read_measured(file, mapping or a_mapping())
     message = str(caught.value)
-    assert message.startswith(str(file))
+    assert message.startswith(shown(file))
     assert "\n" not in message
     return message
 
