@@ -21,7 +21,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
 from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.log_rows import describe_refused, no_rows
-from fleet_slip.ingest.mapping import FromColumn, Mapping
+from fleet_slip.ingest.mapping import DriveMetadata, FromColumn, Mapping
 from fleet_slip.ingest.resampling import (
     SNAP_TOLERANCE_S,
     STEP_S,
@@ -318,10 +318,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _EARLIEST_S = 10**8
 """Times before 1973 are counted from the start of a recording, not from 1970."""
 _FROM_FILE = ("drive_name", "source_file", "trip_id")
-_FROM_MAPPING = (
-    *("vehicle_id", "vehicle_model", "track", "mass_kg"),
-    *("tyres", "receiver", "adhesion", "day"),
-)
+_FROM_MAPPING = tuple(name for name in DriveMetadata.model_fields if name != "column")
 
 
 @dataclass(frozen=True)
@@ -338,11 +335,6 @@ class MeasuredDrive:
     method: Method
     ticks: NDArray[np.int32]
     counts: dict[str, pa.Array]
-
-    @property
-    def num_rows(self) -> int:
-        """Number of its rows, as a table has it."""
-        return self.ticks.size
 
     @cached_property
     def counts_digest(self) -> str:

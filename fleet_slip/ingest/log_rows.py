@@ -87,8 +87,8 @@ def as_text(column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
     return without_missing(text, mapping)
 
 
-def as_number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr, pl.Expr, pl.Expr]:
-    """Return a column as it is, as float64 with null for missing, and whether there is a text."""
+def as_number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr, pl.Expr]:
+    """Return a column as float64 with null for missing, and whether there is a text."""
     raw = pl.col(RAW + column)
     absent = [float(text) for text in mapping.missing if is_number(text)]
     match schema[RAW + column]:
@@ -98,12 +98,12 @@ def as_number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr
                 text = text.str.replace(",", ".", literal=True)
             number = text.cast(pl.Float64, strict=False)
             if not absent:
-                return raw, number, text.is_not_null()
+                return number, text.is_not_null()
             is_present = text.is_not_null() & ~number.is_in(absent).fill_null(value=False)
-            return raw, pl.when(is_present).then(number), is_present
+            return pl.when(is_present).then(number), is_present
         case pl.Float64:
             number = pl.when(~raw.is_in(absent)).then(raw) if absent else raw
-            return raw, number, pl.lit(value=False)
+            return number, pl.lit(value=False)
         case other:
             raise unfit_column(column, other, "numbers")
 
@@ -147,14 +147,15 @@ def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
     unit = "s" if mapping.time.own_clock else mapping.time.unit
     if unit is None:
         return _timestamp(column, schema, mapping)
-    raw, number, present = as_number(column, schema, mapping)
+    number, present = as_number(column, schema, mapping)
     value = pl.col("time")
     problem = find_problems(
         (value.is_null() & present, "not_a_number"),
         (value.is_null(), "missing"),
         (~value.is_finite(), "not_finite"),
     )
-    return Field("time", "time", raw, number * conversion_factor(unit, "s"), problem)
+    time_s = number * conversion_factor(unit, "s")
+    return Field("time", "time", pl.col(RAW + column), time_s, problem)
 
 
 def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
@@ -239,11 +240,11 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
         )
         if of is not None:
             source = mapping.signals[of]
-            value = _si_value(of, source, _signed(source, name, schema, mapping)[1])
+            value = _si_value(of, source, _signed(source, name, schema, mapping)[0])
         elif condition.one_of:
             value = as_text(name, schema, mapping)
         else:
-            value = as_number(name, schema, mapping)[1]
+            value = as_number(name, schema, mapping)[0]
         met &= condition.is_met(value)
     return met
 
@@ -255,7 +256,8 @@ def _condition(*cases: tuple[pl.Expr, str], raw: pl.Expr, name: str = "") -> Fie
 def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
     """A signal in SI units. Its range is checked on the count that it will become."""
     source = mapping.signals[name]
-    raw, number, present = _signed(source, source.column, schema, mapping)
+    raw = pl.col(RAW + source.column)
+    number, present = _signed(source, source.column, schema, mapping)
     (signal, least, most), value = count_range(name, source), pl.col(name)
     count = value / float(signal.scale)
     outside = (count <= least - 0.5) | (count >= most + 0.5)
@@ -269,15 +271,15 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
 
 def _signed(
     source: SignalColumn, column: str, schema: pl.Schema, mapping: Mapping
-) -> tuple[pl.Expr, pl.Expr, pl.Expr]:
+) -> tuple[pl.Expr, pl.Expr]:
     """Return a column as `as_number` does, with the sign that stands in another one."""
-    raw, number, present = as_number(column, schema, mapping)
+    number, present = as_number(column, schema, mapping)
     if source.sign is None:
-        return raw, number, present
+        return number, present
     sign = as_text(find_held(source.sign.column, schema), schema, mapping)
     negative = sign == str(source.sign.negative)
     signed = pl.when(negative).then(-number).when(sign.is_not_null()).then(number)
-    return raw, signed, present & sign.is_not_null()
+    return signed, present & sign.is_not_null()
 
 
 def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
@@ -287,14 +289,14 @@ def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
 
 
 def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
-    raw, number, present = as_number(column, schema, mapping)
+    number, present = as_number(column, schema, mapping)
     value = pl.col(name)
     problem = find_problems(
         (value.is_null() & present, "not_a_number"),
         (~value.is_finite(), "not_finite"),
         (value <= 0, "out_of_range"),
     )
-    return Field(name, "key", raw, number, problem)
+    return Field(name, "key", pl.col(RAW + column), number, problem)
 
 
 def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:

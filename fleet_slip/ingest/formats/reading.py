@@ -110,8 +110,7 @@ def log_digest(log: Path) -> "hashlib._Hash":
     return hashlib.sha256(b"".join(digest.digest() for digest in digests))
 
 
-@contextmanager
-def open_source(file: Path, formats: FileFormats) -> Iterator[Source]:
+def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Source]:
     """Open a file, in the format that its first bytes say. Raises `InputError`.
 
     Each format makes sure that the file stands for itself: that no value of it is to be fetched
@@ -125,13 +124,6 @@ def open_source(file: Path, formats: FileFormats) -> Iterator[Source]:
             raise InputError(
                 f"{shown(file)}: it is an archive. Unpack it with {program} and give the files."
             )
-    with _opened(file, start, formats, budget) as source:
-        yield source
-
-
-def _opened(
-    file: Path, start: bytes, formats: FileFormats, budget: Budget
-) -> AbstractContextManager[Source]:
     suffix = file.suffix.lower()
     begun = start[_HDF5_AT:] if start.endswith(_HDF5) else start
     name = next((name for name, of in FORMATS.items() if begun.startswith(of.begins)), "")
