@@ -8,6 +8,7 @@ import re
 import warnings
 from collections.abc import Callable, Collection, Sequence
 from collections.abc import Mapping as Named
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import cache, reduce
 from typing import Annotated, Any, Literal, TypeAlias
@@ -65,6 +66,14 @@ def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
     if root.units != wanted.units:
         raise ValueError(f"is in {unit!r}, {needs}")
     return float(root.magnitude) / float(wanted.magnitude)
+
+
+def measures(unit: str, si_unit: str) -> bool:
+    """Whether a unit measures what an SI unit does."""
+    with suppress(ValueError):
+        conversion_factor(unit, si_unit)
+        return True
+    return False
 
 
 FiniteFloat = Annotated[float, Field(allow_inf_nan=False)]
@@ -145,7 +154,7 @@ class SignalColumn(Config):
         is_wheel = signal.startswith(WHEELS)
         if self.radius_m is not None and not is_wheel:
             raise ValueError("has radius_m, which is for wheel speeds only")
-        if self.radius_m is None and is_wheel and self._is_velocity():
+        if self.radius_m is None and is_wheel and measures(self.unit, VELOCITY):
             raise ValueError(
                 f"is a velocity in {self.unit!r}; {signal} needs an angular velocity: add "
                 "radius_m, the rolling radius of the wheel"
@@ -161,13 +170,6 @@ class SignalColumn(Config):
 
     def _measured_in(self, si_unit: str) -> str:
         return si_unit if self.radius_m is None and not self.component else VELOCITY
-
-    def _is_velocity(self) -> bool:
-        try:
-            conversion_factor(self.unit, VELOCITY)
-        except ValueError:
-            return False
-        return True
 
 
 def split_components(signals: Any) -> Any:

@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.ingest.columns import COURSE, SPEED, Component, conversion_factor, reads_clock
+from fleet_slip.ingest.columns import (
+    COURSE,
+    SPEED,
+    VELOCITY,
+    Component,
+    conversion_factor,
+    measures,
+    reads_clock,
+)
 from fleet_slip.ingest.profile import FileProfile, Profile, sample_rate_hz
 from fleet_slip.ingest.suspicion import RADIUS_M, TURNING, WHEELS
 from fleet_slip.ingest.vocabulary import (
@@ -199,7 +207,7 @@ def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
     else:
         reason = f"its unit is {unit}"
         radii = [{}, {"radius_m": RADIUS_M}] if signal.startswith("wheel_") else [{}]
-        fitting = [radius for radius in radii if _has_unit(signal, unit, **radius)]
+        fitting = [radius for radius in radii if measures(unit, _si_unit(signal, **radius))]
         if not fitting:
             return None
         keys = {"unit": unit, **fitting[0]}
@@ -218,18 +226,13 @@ def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
     )
 
 
-def si_factor(signal: str, unit: str, radius_m: float | None = None, **_: Any) -> float:
+def si_factor(signal: str, unit: str, radius_m: float | None = None) -> float:
     """Return what one of a unit is of a signal in SI units. Raises `ValueError`."""
-    measured_in = "m/s" if signal in {"north", "east"} or radius_m else catalogue()[signal].unit
-    return conversion_factor(unit, measured_in) / (radius_m or 1.0)
+    return conversion_factor(unit, _si_unit(signal, radius_m)) / (radius_m or 1.0)
 
 
-def _has_unit(signal: str, unit: str, radius_m: float | None = None) -> bool:
-    try:
-        si_factor(signal, unit, radius_m)
-    except ValueError:
-        return False
-    return True
+def _si_unit(signal: str, radius_m: float | None = None) -> str:
+    return VELOCITY if signal in {"north", "east"} or radius_m else catalogue()[signal].unit
 
 
 # Units that a file does not say: those in which its largest value is one of a car on a road.
@@ -262,8 +265,7 @@ def unit_readings(signal: str, largest: float) -> tuple[Keys, ...]:
     if signal in WHEELS:
         choices, (low, high) = _OF_WHEELS, _WHEELS_RAD_S
     else:
-        si_unit = "m/s" if signal in {"north", "east"} else catalogue()[signal].unit
-        low, high, units = _USUAL[si_unit]
+        low, high, units = _USUAL[_si_unit(signal)]
         low, high = _USUAL_OF.get(signal, (low, high))
         choices = tuple({"unit": unit} for unit in units)
     in_si = [largest * si_factor(signal, **keys) for keys in choices]
@@ -329,15 +331,17 @@ def guess_time(
     """Return where time is from; of several cars in turns, that of the first is looked at."""
     if profile.has_clock:
         return TimeGuess({"own_clock": True}, "the file says when each sample was taken", None)
-    found = []
+    found, known = [], set(vocabulary()["time"]["words"])
     for one in profile.profiles:
         values = one.values[group == group[0]] if group.size == one.values.size > 0 else one.values
-        named = _is_named(one) or one.time_format is not None
+        words = parts_of(split_unit(one.channel.name)[0]) if one.is_number else ()
+        named = one.time_format is not None or not known.isdisjoint(words)
         if not named or one.channel.name in taken or one.channel.base not in bases:
             continue
-        rising, distinct = _rising(values)
-        if rising >= _LEAST_RISING:
-            found.append((distinct, one, values))
+        values = values[np.isfinite(values)]
+        steps = np.diff(values)
+        if steps.size and (steps >= 0).mean() >= _LEAST_RISING:
+            found.append((float((steps > 0).mean()), one, values))
     if found:
         _, one, values = max(found, key=lambda some: round(some[0], 2))
         is_text = one.time_format is not None
@@ -377,21 +381,8 @@ def _are_dates(texts: tuple[str, ...], written: str) -> bool:
     return bool(texts) and all(day and date(1990, 1, 1) <= day < date(2100, 1, 1) for day in days)
 
 
-def _is_named(one: Profile) -> bool:
-    name, _ = split_unit(one.channel.name)
-    return one.is_number and bool(set(vocabulary()["time"]["words"]) & set(parts_of(name)))
-
-
-def _rising(values: FloatArray) -> tuple[float, float]:
-    """Return which part of the steps does not go back, and which part goes on."""
-    steps = np.diff(values[np.isfinite(values)])
-    if not steps.size:
-        return 0.0, 0.0
-    return float((steps >= 0).mean()), float((steps > 0).mean())
-
-
 def _timestamps(one: Profile, values: FloatArray) -> TimeGuess:
-    rate_hz = sample_rate_hz(values[np.isfinite(values)])
+    rate_hz = sample_rate_hz(values)
     keys: dict[str, Any] = {"column": one.channel.name}
     if one.time_format:
         keys["format"] = one.time_format
@@ -402,9 +393,8 @@ def _timestamps(one: Profile, values: FloatArray) -> TimeGuess:
     return TimeGuess(keys, reason, rate_hz)
 
 
-def _numbers(one: Profile, values: FloatArray) -> TimeGuess:
+def _numbers(one: Profile, present: FloatArray) -> TimeGuess:
     name, in_brackets = split_unit(one.channel.name)
-    present = values[np.isfinite(values)]
     if _is_clock(present):
         seconds = present // 10000 * 3600 + present // 100 % 100 * 60 + present % 100
         rate_hz = sample_rate_hz(seconds)
@@ -414,16 +404,16 @@ def _numbers(one: Profile, values: FloatArray) -> TimeGuess:
     ends = parts_of(name)[-1]
     named = _UNITS.get((one.channel.unit or in_brackets).lower()) or _UNITS.get(ends)
     since_1970 = [u for u, s in _SECONDS.items() if _EPOCH_S[0] < present[0] * s < _EPOCH_S[1]]
-    unit = named or (since_1970[0] if since_1970 else _unit_of_step(step))
-    reason = f"its name, it goes on in steps of {step:g}" + (
-        f", its unit is {named}" if named else ""
-    )
+    likely = [*since_1970, *(name for limit, name in _STEPS if step < limit)]
+    unit = named or likely[0]
+    reason = f"its name; it increases in steps of {step:g}"
+    reason += f"; its unit is {named}" if named else ""
     rate_hz = sample_rate_hz(present * _SECONDS[unit])
     keys: dict[str, Any] = {"column": one.channel.name, "unit": unit}
     if unit in since_1970:
         keys["epoch"] = True
         day = datetime.fromtimestamp(float(present[0]) * _SECONDS[unit], UTC).date()
-        reason += f", counted from 1970: it begins on {day.isoformat()}"
+        reason += f"; counted from 1970, it begins on {day.isoformat()}"
     return TimeGuess(keys | _gaps(rate_hz), reason, rate_hz)
 
 
@@ -433,10 +423,6 @@ def _is_clock(values: FloatArray) -> bool:
     steps = np.diff(values)
     rolls = ((steps > 40) & (steps <= 41)) | (steps < -235_900)  # a minute, midnight
     return bool(inside.all() and rolls.any() and np.median(steps) < 1)
-
-
-def _unit_of_step(step: float) -> str:
-    return next(name for limit, name in _STEPS if step < limit)
 
 
 def _gaps(rate_hz: float | None) -> dict[str, float]:

@@ -146,19 +146,17 @@ _FAR = 2.0
 _FEWEST = 20
 
 
-def find_absent(
-    channels: Sequence[tuple[FloatArray, tuple[str, ...]]],
-) -> tuple[tuple[str, ...], tuple[float, ...]]:
+def find_absent(profiles: Sequence["Profile"]) -> tuple[tuple[str, ...], tuple[float, ...]]:
     """Return what means no value in channels, of their numbers and of texts among these.
 
     All as text, as a mapping has it under `missing`; and the numbers among them. A number that is a
     value in some channel is none of them.
     """
     known = vocabulary()["missing"]
-    texts = [text for _, odd in channels for text in odd if text.lower() in known["texts"]]
+    texts = [text for one in profiles for text in one.texts if text.lower() in known["texts"]]
     means_none: dict[float, bool] = {}
-    for values, _ in channels:
-        present = values[np.isfinite(values)]
+    for one in profiles:
+        present = one.values[np.isfinite(one.values)]
         is_known = np.isin(present, known["numbers"])
         others = present[~is_known]
         for number in map(float, np.unique(present[is_known])):
@@ -247,7 +245,7 @@ def profile_file(file: Path, bus: CanBus | None = None) -> FileProfile:
         found = tuple(
             p for of in bases.values() for p in _profile_base(source, of, formats.csv, refused)
         )
-        missing, numbers = find_absent([(p.values, p.texts) for p in found if p.is_number])
+        missing, numbers = find_absent([p for p in found if p.is_number])
         without = (np.where(np.isin(p.values, numbers), np.nan, p.values) for p in found)
         cleaned = tuple(replace(p, values=v) for p, v in zip(found, without, strict=True))
         reasons = tuple(dict.fromkeys(refused))
@@ -298,7 +296,7 @@ def _profile(channel: Channel, rate_hz: float | None, column: pl.Series, csv: Cs
                 channel, rate_hz, numbers.fill_null(np.nan).to_numpy(), tuple(odd), _keys(texts)
             )
         some = tuple(texts.drop_nulls().unique(maintain_order=True)[:3])
-        for written in _time_formats(texts):
+        if written := _time_format(texts):
             return Profile(channel, rate_hz, _read_times(texts, written), some, time_format=written)
         return Profile(channel, rate_hz, np.zeros(0), some, _keys(texts))
     values = column.cast(pl.Float64).fill_null(np.nan)
@@ -312,13 +310,11 @@ def _keys(column: pl.Series) -> NDArray[np.int64]:
     return column.rank("dense").fill_null(0).cast(pl.Int64).to_numpy()
 
 
-def _time_formats(texts: pl.Series) -> Iterator[str]:
-    """Yield the first format that all texts at the beginning have."""
+def _time_format(texts: pl.Series) -> str | None:
+    """Return the first format that all texts at the beginning have."""
     some = texts.drop_nulls().head(_LOOKED_AT)
-    for written in vocabulary()["time"]["formats"]:
-        if some.len() and bool(np.isfinite(_read_times(some, written)).all()):
-            yield written
-            return
+    formats: list[str] = vocabulary()["time"]["formats"] if some.len() else []
+    return next((one for one in formats if np.isfinite(_read_times(some, one)).all()), None)
 
 
 def _read_times(texts: pl.Series, written: str) -> FloatArray:
