@@ -158,11 +158,7 @@ class RunReport(Trained):
         if not self.changed:
             yield self.nothing_done(self.campaign)
             return
-        simulated = self.simulation
-        drives, rows = number_of(simulated.drives, "drive"), number_of(simulated.rows, "row")
-        yield Remark(f"simulated {drives}, {rows}")
-        if simulated.changed:
-            yield Remark(simulated.checked)
+        yield from self.simulation.parts()
         yield from self.training_parts(everything)
 
     @property

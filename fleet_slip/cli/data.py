@@ -16,39 +16,19 @@ from fleet_slip.cli.progress import progress
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.rendering import TextTable
 from fleet_slip.storage.storage_errors import storage_errors
+from fleet_slip.warehouse.forgotten import skipped_drives
 
 if TYPE_CHECKING:
     from fleet_slip.ingest.draft import Draft
     from fleet_slip.ingest.load import IngestReport, Preview
-    from fleet_slip.simulation.job import SimulationReport
 
 
 @command(Fleet.simulate, arguments=["campaign"], progress=("simulate {campaign}", "rows"))
-def simulate(report: "SimulationReport", campaign: str) -> None:
+def simulate() -> None:
     """Simulate what is missing of a campaign and write it to the logs.
 
     Example: **fleet-slip simulate waterford --days 2**
     """
-    if not report.changed:
-        return say(f"{campaign}: nothing to do")
-    written = (
-        f"{campaign}: {number_of(report.drives, 'drive')}, {number_of(report.rows, 'row')} in "
-        f"{number_of(report.batches_written, 'file')}, "
-        f"{report.size_bytes / max(report.rows, 1):.1f} bytes a row"
-    )
-    say(_joined(written, forgotten=report.drives_forgotten))
-    say(report.checked)
-    say(f"{report.seconds:.1f} s, {report.rows / report.seconds:,.0f} rows/s")
-
-
-def _joined(*parts: str, replaced: int = 0, forgotten: int = 0) -> str:
-    """Return one sentence of what there is to say, and of drives that gave way or did not come."""
-    allow = "fleet-slip forget --allow readmits them"
-    parts += (
-        f"{number_of(replaced, 'drive')} replaced" if replaced else "",
-        f"{number_of(forgotten, 'drive')} skipped: forgotten before ({allow})" if forgotten else "",
-    )
-    return "; ".join(filter(None, parts))
 
 
 @command(Fleet.ingest, without=["workers"])
@@ -191,13 +171,14 @@ def _ingested(what: str, reports: "Sequence[IngestReport]") -> str:
     reasons = ", ".join(f"{rows:,} {reason}" for reason, rows in refused.items())
     left_out = sum(report.counts.rows_left_out for report in new)
     ticks, drives = (sum(getattr(one.counts, name) for one in new) for name in ("ticks", "drives"))
-    return _joined(
-        f"{what}: {number_of(ticks, 'row')} in {number_of(drives, 'drive')}",
-        f"excluded by the mapping's conditions: {number_of(left_out, 'row')}" if left_out else "",
-        f"in quarantine: {number_of(refused.total(), 'row')} ({reasons})" if refused else "",
-        replaced=sum(report.drives_replaced for report in new),
-        forgotten=sum(report.drives_forgotten for report in new),
-    )
+    text = f"{what}: {number_of(ticks, 'row')} in {number_of(drives, 'drive')}"
+    if left_out:
+        text += f"; excluded by the mapping's conditions: {number_of(left_out, 'row')}"
+    if refused:
+        text += f"; in quarantine: {number_of(refused.total(), 'row')} ({reasons})"
+    if replaced := sum(report.drives_replaced for report in new):
+        text += f"; {number_of(replaced, 'drive')} replaced"
+    return text + skipped_drives(sum(report.drives_forgotten for report in new))
 
 
 def _show_previews(previews: "list[Preview]", json: bool) -> None:

@@ -21,6 +21,7 @@ from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import RefusedError
+from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec
 from fleet_slip.simulation.receivers import ReceiverLog
 from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, road_with
@@ -28,7 +29,7 @@ from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measureme
 from fleet_slip.storage.table import Change, Snapshot, Unit, retry_conflicts, retrying
 from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
 from fleet_slip.vehicle.imperfections import PERFECT
-from fleet_slip.warehouse.forgotten import Audit
+from fleet_slip.warehouse.forgotten import Audit, skipped_drives
 from fleet_slip.warehouse.tables import Warehouse
 
 # From drives to the rows of a log: choose the speed, drive the car, measure, tabulate counts.
@@ -243,7 +244,7 @@ def day_units(campaign: Campaign, days: Iterable[date]) -> Iterator[tuple[Unit, 
 
 
 @dataclass
-class SimulationReport:
+class SimulationReport(Answer):
     """What a run of the job did."""
 
     batches_written: int = 0
@@ -260,17 +261,28 @@ class SimulationReport:
     size_bytes: int = 0
     logs_version: int | None = None
     seconds: float = 0.0
+    campaign: str = ""
 
     @property
     def changed(self) -> bool:
         """Whether there was anything to do."""
         return bool(self.batches_written)
 
-    @property
-    def checked(self) -> str:
-        """What was compared with highway-env, as a sentence."""
-        drives = number_of(self.drives_checked, "drive")
-        return f"checked against highway-env: {drives}, equal within {TOLERANCE:g}"
+    def parts(self) -> Iterator[Part]:
+        """Return what was written, and what was compared with highway-env."""
+        if not self.changed:
+            yield Remark(f"{self.campaign}: nothing to do, all is simulated")
+            return
+        drives, rows = number_of(self.drives, "drive"), number_of(self.rows, "row")
+        yield Remark(
+            f"{self.campaign}: simulated {drives}, {rows} in "
+            f"{number_of(self.batches_written, 'file')}, "
+            f"{self.size_bytes / max(self.rows, 1):.1f} bytes a row"
+            + skipped_drives(self.drives_forgotten)
+        )
+        checked = number_of(self.drives_checked, "drive")
+        yield Remark(f"checked against highway-env: {checked}, equal within {TOLERANCE:g}")
+        yield Remark(f"{self.seconds:.1f} s, {self.rows / self.seconds:,.0f} rows/s")
 
 
 @dataclass(frozen=True)
@@ -304,7 +316,7 @@ def simulate_campaign(
             has_landed(snapshot, batch)
     plan = (campaign.batches(day) for day in open_days)
     report = _simulate(warehouse, plan, len(open_days), executor, progress)
-    report.days_present = len(every) - len(open_days)
+    report.campaign, report.days_present = campaign.name, len(every) - len(open_days)
     _complete(warehouse, campaign, open_days)
     report.logs_version = warehouse.logs.snapshot().version
     return report

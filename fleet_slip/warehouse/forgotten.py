@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Literal, TypeAlias
 
+from fleet_slip.base import number_of
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
 
@@ -86,6 +87,12 @@ class Barred:
     def __bool__(self) -> bool:
         """Whether there are any."""
         return bool(self.vehicles or self.drives)
+
+
+def skipped_drives(number: int) -> str:
+    """Return the end of a sentence on drives that did not land; nothing if there are none."""
+    allow = "fleet-slip forget --allow readmits them"
+    return f"; {number_of(number, 'drive')} skipped: forgotten before ({allow})" if number else ""
 
 
 @dataclass(frozen=True)

@@ -145,7 +145,7 @@ def test_a_campaign_is_simulated_without_a_word_of_pygame(
     done = run([COMMAND, "--root", str(tmp_path / "data"), "simulate", short(tmp_path)])
     assert done.exit_code == 0, done.stderr
     assert not done.stdout
-    assert "short.toml: 2 drives, " in done.stderr
+    assert ": simulated 2 drives, " in done.stderr
     assert len(done.stderr.splitlines()) == 3, done.stderr
     assert "nothing to do" in run_command("simulate", short(tmp_path)).stderr
 
