@@ -77,7 +77,7 @@ def open_views(
     if CALIBRATION in wanted:
         _calibrate(database)
     if "dictionary" in wanted:
-        add_table(database, "dictionary", describe_columns(database, warehouse.catalogue))
+        add_table(database, "dictionary", describe_columns(database))
     if not unlocked:
         lock(database, paths_of(snapshots, wanted))
     return database

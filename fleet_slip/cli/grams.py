@@ -10,7 +10,6 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue
 from fleet_slip.catalogue.features import features as known_features
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
@@ -49,7 +48,7 @@ def gram(
     names = (PLAIN, *known_features().sets) if features == ALL_SETS else (features,)
     if sql:
         for name in names if features != ALL_SETS else filter(has_statement, names):
-            typer.echo(gram_statement(catalogue(), name))
+            typer.echo(gram_statement(name))
         return
     with open_workers(fleet.root, cluster or threads) as executor:
         if cohort:  # which files have its drives is known from the logged signals' Gram rows

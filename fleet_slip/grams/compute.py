@@ -24,7 +24,7 @@ from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.catalogue.course import COURSE_LATE
 from fleet_slip.catalogue.definitions import COUNT_BITS
 from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, FeatureSet, features
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.columns.sql import with_absent, with_columns
@@ -44,7 +44,7 @@ def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iter
 
     As in SQL, none without a row of tick 0.
     """
-    drive_columns = tuple(warehouse.catalogue.drive)
+    drive_columns = tuple(catalogue().drive)
     present = warehouse.logs.read_metadata(file.path).schema.to_arrow_schema().names
     wanted = [name for name in (*drive_columns, "tick", *plan.signals) if name in present]
     rows = warehouse.logs.read(file.path, wanted)
@@ -257,18 +257,14 @@ def has_statement(feature_set: str) -> bool:
 
 
 def gram_statement(
-    signals: SignalCatalogue,
-    feature_set: str = PLAIN,
-    *,
-    whole: bool = False,
-    absent: Sequence[str] = (),
+    feature_set: str = PLAIN, *, whole: bool = False, absent: Sequence[str] = ()
 ) -> str:
     """Return the statement that computes the Gram rows of a feature set.
 
     `whole`: no file has a column in only some rows; `absent` are later columns, which none has.
     Raises `QuestionError` for an unknown set, and for one that the kernel alone computes.
     """
-    known = features()
+    known, signals = features(), catalogue()
     one = known.feature_set(feature_set)
     if not has_statement(feature_set):
         raise QuestionError(
@@ -419,10 +415,10 @@ def _query(
     whole = feature_set == PLAIN and all(
         file.null_counts.get(signal, file.rows) in (0, file.rows)
         for file in files
-        for signal in warehouse.catalogue.gram_signals
+        for signal in catalogue().gram_signals
     )
-    absent = absent_columns(files, warehouse.catalogue.stored_columns)
-    statement = gram_statement(warehouse.catalogue, feature_set, whole=whole, absent=absent)
+    absent = absent_columns(files, catalogue().stored_columns)
+    statement = gram_statement(feature_set, whole=whole, absent=absent)
     identity = features().identity(feature_set)
     doing = f"the Gram query over {number_of(len(files), 'log file')} in {warehouse.logs.folder}"
     with reading_files(database, doing):

@@ -44,11 +44,6 @@ class Warehouse:
 
     root: Folder
 
-    @property
-    def catalogue(self) -> SignalCatalogue:
-        """The signal catalogue of the logs."""
-        return catalogue()
-
     def require(self) -> None:
         """Raise `StorageError` if there is no data root: a wrong path is not an empty warehouse."""
         if not self.root.exists():
@@ -60,7 +55,7 @@ class Warehouse:
     @cached_property
     def logs(self) -> Table:
         """Counts at 100 Hz, partitioned by day; a file holds whole drives."""
-        signals = self.catalogue
+        signals = catalogue()
         return Table(
             folder=self.root / "logs",
             schema=stored_schema(signals),
@@ -78,9 +73,9 @@ class Warehouse:
         """Gram rows of drives, by feature set: n, sums and sums of products of counts."""
         return Table(
             folder=self.root / "grams",
-            schema=pa.schema([*gram_schema(self.catalogue), (COURSE_LATE, pa.int64())]),
+            schema=gram_schema(),
             encoding=Encoding(
-                dictionary=("feature_set", "file", "part", "signals", *self.catalogue.drive),
+                dictionary=("feature_set", "file", "part", "signals", *catalogue().drive),
                 # A seventh smaller, and twice as fast to write and read, as zstd alone.
                 delta_packed=("sums.list.element", "products.list.element"),
                 compression="zstd",
@@ -124,26 +119,28 @@ def stored_schema(signals: SignalCatalogue) -> pa.Schema:
     )
 
 
-def gram_schema(signals: SignalCatalogue) -> pa.Schema:
+def gram_schema() -> pa.Schema:
     """Return the Arrow schema of the table `grams`.
 
     `part` is null where a Gram row is of a whole drive, else which of its rows it is of. `clipped`
     is how many values of the features were out of the range of int16.
     `signals` names the signals that the drive has, separated by commas, in the order of `sums`;
     `products` is the packed lower triangle, row by row: (0,0), (1,0), (1,1), (2,0), ...
+    `course_late` is by how many parts of a tick the course was taken to be late.
     """
     return pa.schema(
         [
             ("feature_set", pa.string()),
             ("file", pa.string()),
             ("day", pa.date32()),
-            *signals.drive_schema,
+            *catalogue().drive_schema,
             ("part", pa.string()),
             ("signals", pa.string()),
             ("n", pa.int64()),
             ("clipped", pa.int64()),
             ("sums", pa.list_(pa.int64())),
             ("products", pa.list_(pa.int64())),
+            (COURSE_LATE, pa.int64()),
         ]
     )
 
@@ -238,7 +235,7 @@ def open_tables(
     if of != ALL_DRIVES:
         for name in sources.keys() - {"stored_quarantine"}:
             sources[name] = f"(FROM {sources[name]} WHERE {of})"
-    columns = _generated_columns(warehouse.catalogue)
+    columns = _generated_columns()
     with database_errors(f"opening the warehouse {warehouse.root}"):
         for view in TABLE_VIEWS:
             if view in wanted:
@@ -279,7 +276,8 @@ def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot) -> str:
     return empty
 
 
-def _generated_columns(signals: SignalCatalogue) -> Mapping[str, Any]:
+def _generated_columns() -> Mapping[str, Any]:
+    signals = catalogue()
     separator = ",\n    "
     return {
         "drive_columns": separator.join(signals.drive),
@@ -316,10 +314,14 @@ def column_descriptions() -> dict[str, dict[str, ColumnDescription]]:
     return _Descriptions.model_validate(load_toml(folder("warehouse") / "columns.toml")).root
 
 
-def describe_columns(database: duckdb.DuckDBPyConnection, signals: SignalCatalogue) -> pa.Table:
+def describe_columns(database: duckdb.DuckDBPyConnection) -> pa.Table:
     """Comment the views' columns, and return all columns with unit and description as a table."""
-    from_catalogue = _catalogue_descriptions(signals)
-    by_view = column_descriptions()
+    by_view, signals = column_descriptions(), catalogue()
+    common = {n: ColumnDescription(description=c.description) for n, c in signals.drive.items()}
+    for name, signal in signals.signals.items():
+        for column, unit in ((name, f"{signal.scale} {signal.unit}"), (signal.column, signal.unit)):
+            common[column] = ColumnDescription(description=signal.description, unit=unit)
+    common |= by_view[COMMON]
     found = database.execute(
         "SELECT table_name, column_name, data_type FROM duckdb_columns() "
         "WHERE NOT internal AND NOT starts_with(table_name, 'empty_') "
@@ -327,32 +329,11 @@ def describe_columns(database: duckdb.DuckDBPyConnection, signals: SignalCatalog
     ).fetchall()
     rows = []
     for view, column, data_type in found:
-        described = {**from_catalogue, **by_view[COMMON], **by_view.get(view, {})}.get(column)
+        described = by_view.get(view, {}).get(column) or common.get(column)
         unit, description = (described.unit, described.description) if described else ("", "")
-        rows.append(
-            {
-                "view": view,
-                "column": column,
-                "type": data_type,
-                "unit": unit,
-                "description": description,
-            }
-        )
+        row = {"view": view, "column": column, "type": data_type}
+        rows.append(row | {"unit": unit, "description": description})
         if description:
             text = f"{description} [{unit}]" if unit else description
             database.execute(f"COMMENT ON COLUMN {view}.{column} IS {sql_text(text)}")
     return pa.Table.from_pylist(rows)
-
-
-def _catalogue_descriptions(signals: SignalCatalogue) -> dict[str, ColumnDescription]:
-    described = {
-        name: ColumnDescription(description=column.description)
-        for name, column in signals.drive.items()
-    }
-    for name, signal in signals.signals.items():
-        count = f"{signal.scale} {signal.unit}"
-        described[name] = ColumnDescription(description=signal.description, unit=count)
-        described[signal.column] = ColumnDescription(
-            description=signal.description, unit=signal.unit
-        )
-    return described
