@@ -88,6 +88,11 @@ def sha256_of(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def hash_fold(key: str, count: int) -> int:
+    """Return the fold 0..count-1 of a key: its SHA-256 modulo the number of folds, for ever."""
+    return int.from_bytes(hashlib.sha256(key.encode("utf-8")).digest()[:8], "big") % count
+
+
 # Days as people write them, in options and in calls.
 
 EXAMPLE = "2024-05-01"

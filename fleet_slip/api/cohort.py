@@ -82,6 +82,7 @@ class FleetCohort(Rooted):
         Raises what `examine` raises, `UsageError` for options that do not go together or an invalid
         list, and `DataError` if no model can be fitted.
         """
+        from fleet_slip.models.line import with_line_fitted
         from fleet_slip.models.select import answer_request
 
         examined = self.examine()
@@ -90,6 +91,7 @@ class FleetCohort(Rooted):
             return answer_request(self.warehouse, request, examined.cohort)
 
         with examined.explaining():
+            request = with_line_fitted(self.warehouse, request, self.condition, examined.cohort)
             try:
                 found = answer()
             except NotComputedError:  # a recipe names the list

@@ -256,7 +256,10 @@ class Training:
         self, fleet: "Fleet", workers: "Workers", progress: "ShowStep | None" = None
     ) -> "tuple[GramReport, ...]":
         """Make the Gram rows that the list needs: of the signals, its feature set, and others."""
-        wanted = load_model_list(self.models).features
+        models = load_model_list(self.models)
+        if models.line:  # from what its rows tell, select makes those of the list
+            models = load_model_list(models.line)
+        wanted = models.features
         names = dict.fromkeys((PLAIN, wanted, *features().beside(wanted)))
         return tuple(
             fleet.gram(

@@ -6,12 +6,12 @@ rule for all, in SQL, in the compiled kernel and on board:
 * A window of N ticks is what was logged in the last N ticks, this one included. Where a drive
   begins, or after a hole, that is fewer values; a mean divides by as many as there are.
 * Where the looked-back value itself is missing now, the mean and the sum are missing too.
-* The value N ticks ago is missing where no such tick was logged.
+* The value N ticks ago, and the change since, are missing where no such tick was logged.
 * Everything is an integer. A quotient is rounded to the nearest, halves away from zero, once; then
   the count is clipped to its bits.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from fractions import Fraction
 from typing import Annotated, Literal
@@ -24,9 +24,9 @@ from fleet_slip.catalogue.signals import COUNT_MAX, Identifier, catalogue
 from fleet_slip.config import Config
 from fleet_slip.errors import QuestionError
 
-Over = Literal["mean", "sum", "lag", "running_mean"]
+Over = Literal["mean", "sum", "lag", "change", "running_mean"]
 """What a window makes of the values: mean or sum over the last ticks, the value so many ticks ago,
-mean since the drive began."""
+its change since then, mean since the drive began."""
 
 LONGEST_TICKS = 2**16
 """Longest window: eleven minutes."""
@@ -40,7 +40,10 @@ LARGEST_FACT = 2**16
 COUNT_BITS = 16
 """Bits of a logged count, and of a feature that does not say how many."""
 
-Bits = Annotated[int, Field(ge=16, le=20)]
+LARGEST_BITS = 20
+"""Bits of a column that does not say how many."""
+
+Bits = Annotated[int, Field(ge=COUNT_BITS, le=LARGEST_BITS)]
 
 FactText = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]{1,60}$")]
 
@@ -87,6 +90,15 @@ def _not_unknowable(name: str) -> str:
 
 
 Ratio = Annotated[Fraction, AfterValidator(_ratio)]
+
+LARGEST_DIVISOR = 2**46
+
+LARGEST_WEIGHT = 2**10
+
+Whole = Annotated[int, Field(ge=-(2**62), le=2**62)]
+
+LineId = Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{12})?$")]
+"""The first digits of a line's checksum."""
 
 
 _LEFT_OUT = Field(exclude_if=lambda one: one is None)
@@ -172,12 +184,102 @@ class Number(Config):
         return self
 
 
+class Combination(Config):
+    """The estimate of a line, or any sum of columns: `(intercept + sum(c * column)) / divisor`.
+
+    `line` names the line whose coefficients these are; "" where none has been fitted yet.
+    """
+
+    intercept: Whole = 0
+    terms: tuple[tuple[Whole, "Definition"], ...] = ()
+    divisor: Annotated[int, Field(ge=1, le=LARGEST_DIVISOR)] = 1
+    line: Annotated[LineId | None, _LEFT_OUT] = None
+
+    @property
+    def columns(self) -> tuple["Definition", ...]:
+        """The columns that it is made of."""
+        return tuple(column for _, column in self.terms)
+
+
+def _product_ratio(value: Fraction) -> Fraction:
+    if not 0 < value.numerator <= 2**12 or value.denominator > 2**40:
+        raise ValueError(f"the scale of its factors is {value} of its own: choose another")
+    return value
+
+
+class Product(Config):
+    """The product of two columns times `ratio`; of one, it times `ratio`; of none, `ratio`."""
+
+    of: tuple["Definition", ...] = Field(max_length=2)
+    ratio: Annotated[Fraction, AfterValidator(_product_ratio)] = Fraction(1)
+
+    @property
+    def columns(self) -> tuple["Definition", ...]:
+        """The columns that it is made of."""
+        return self.of
+
+
+def _weight(value: Fraction) -> Fraction:
+    if not 0 < value <= 1 or value.denominator > LARGEST_WEIGHT:
+        raise ValueError(f"a weight is above 0, at most 1, in parts of at most {LARGEST_WEIGHT}")
+    return value
+
+
+class Equation(Config):
+    """What a column `y` is, but for noise, at each tick: a sum of unknowns times columns `x`.
+
+    A whole number in `x` is a column that is always the same. `weight` is that of its products.
+    """
+
+    y: "Definition"
+    x: tuple["Definition | Whole", ...] = Field(min_length=1, max_length=4)
+    weight: Annotated[Fraction, AfterValidator(_weight)] = Fraction(1)
+
+    @property
+    def columns(self) -> tuple["Definition", ...]:
+        """The columns that it is made of."""
+        return (self.y, *(one for one in self.x if isinstance(one, Definition)))
+
+
+class Slope(Config):
+    """The first unknown of equations, by least squares over all ticks since the drive began.
+
+    Products of columns, each a sixteenth and rounded, are summed up over the ticks that lack
+    nothing, and `ridge` is added to each diagonal: Gaussian elimination of whole numbers then
+    solves them (`fleet_slip.columns.operations`). The unknown times `ratio` is rounded.
+    """
+
+    equations: tuple[Equation, ...] = Field(min_length=1, max_length=4)
+    ridge: tuple[Annotated[int, Field(ge=1, le=2**40)], ...]
+    ratio: Annotated[Fraction, Field(gt=0)] = Fraction(1)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Slope":
+        if any(len(one.x) != len(self.ridge) for one in self.equations):
+            raise ValueError("each equation has as many columns as there are unknowns")
+        if max(self.ratio.numerator, self.ratio.denominator) > LARGEST_DIVISOR:
+            raise ValueError(f"the ratio of a slope has no part above {LARGEST_DIVISOR}")
+        if any(one.bits > COUNT_BITS for one in self.columns):
+            raise ValueError(f"the columns of a slope have {COUNT_BITS} bits")
+        return self
+
+    @property
+    def columns(self) -> tuple["Definition", ...]:
+        """The columns that it is made of."""
+        return tuple(column for one in self.equations for column in one.columns)
+
+
+Made = Combination | Product | Slope
+"""What is made of other columns."""
+
+
 class Definition(Config):
     """Everything that defines a column of counts over time, whatever it is called.
 
     Attributes:
-        of: the signal or feature that is looked back on.
+        of: the signal, feature, or what is made of columns, that is looked back on.
         sql: integer SQL of that feature; empty for a logged signal.
+        made: what is made of other columns, if that is looked back on.
         of_bits: to which the feature's count is clipped.
         over, ticks: the window; ticks is 0 for all since the drive began. Without `over` it is
             the value of this row.
@@ -190,6 +292,7 @@ class Definition(Config):
 
     of: Identifier
     sql: Annotated[str, AfterValidator(integer_arithmetic)] = ""
+    made: Annotated[Made | None, _LEFT_OUT] = None
     of_bits: Bits = COUNT_BITS
     over: Over | None = None
     ticks: int = Field(default=0, ge=0, le=LONGEST_TICKS)
@@ -201,24 +304,51 @@ class Definition(Config):
 
     @model_validator(mode="after")
     def _ticks_fit(self) -> "Definition":
-        if (self.over in {"mean", "sum", "lag"}) != bool(self.ticks):
-            raise ValueError("ticks is for mean, sum and lag, which must have it")
+        if (self.over in {"mean", "sum", "lag", "change"}) != bool(self.ticks):
+            raise ValueError("ticks is for mean, sum, lag and change, which must have it")
         return self
 
     @model_validator(mode="after")
     def _of_is_known(self) -> "Definition":
-        if not self.sql and self.of not in catalogue().feature_inputs:
+        logged = not (self.sql or self.made)
+        if self.sql and self.made:
+            raise ValueError(f"{self.of} is a feature, or made of columns, not both")
+        if logged and self.of not in catalogue().feature_inputs:
             raise ValueError(f"{self.of} is not an input signal")
-        if self.sql and self.of in {*catalogue().signals, *catalogue().drive, "tick", "day"}:
+        if not logged and self.of in {*catalogue().signals, *catalogue().drive, "tick", "day"}:
             raise ValueError(f"{self.of} is the name of a column of the logs")
         return self
 
     @property
     def signals(self) -> tuple[str, ...]:
         """The logged signals in it."""
-        own = parse(self.sql).inputs if self.sql else (self.of,)
-        beside = (self.gate and self.gate.by, self.number and self.number.running)
-        return tuple(dict.fromkeys((*own, *(n for one in beside if one for n in one.signals))))
+        found: dict[str, None] = {}
+        for row in self.rows():
+            own = parse(row.sql).inputs if row.sql else () if row.made else (row.of,)
+            found |= dict.fromkeys(own)
+        return tuple(found)
+
+    def rows(self, seen: "set[int] | None" = None) -> "Iterator[Definition]":
+        """Yield what it and the columns in it look back on, each as a column of one row.
+
+        What is made of columns is passed over if its identity was `seen`.
+        """
+        seen = set() if seen is None else seen
+        if self.made is None or id(self.made) not in seen:
+            seen.add(id(self.made))
+            yield self.row
+            for one in self.made.columns if self.made else ():
+                yield from one.rows(seen)
+        for beside in (self.gate and self.gate.by, self.number and self.number.running):
+            if beside:
+                yield from beside.rows(seen)
+
+    @property
+    def row(self) -> "Definition":
+        """What it looks back on, as a column of one row."""
+        return Definition.model_construct(
+            of=self.of, sql=self.sql, made=self.made, of_bits=self.of_bits, bits=self.of_bits
+        )
 
     @property
     def ungated(self) -> "Definition":
@@ -231,8 +361,8 @@ class Definition(Config):
         return (self.ungated, self.gate.by) if self.gate else (self,)
 
 
-Gate.model_rebuild()
-Number.model_rebuild()
+for one in (Gate, Number, Combination, Product, Equation, Slope):
+    one.model_rebuild()
 
 
 def plain_column(name: str, sql: str = "", bits: int = COUNT_BITS) -> Definition:
@@ -240,17 +370,19 @@ def plain_column(name: str, sql: str = "", bits: int = COUNT_BITS) -> Definition
     return Definition.model_construct(of=name, sql=sql, of_bits=bits, bits=bits)
 
 
-def features_behind(definitions: Mapping[str, Definition]) -> dict[str, Definition]:
-    """Return a definition with the SQL of each feature that columns are made of, by its name.
+def rows_behind(definitions: Mapping[str, Definition]) -> dict[str, Definition]:
+    """Return what columns look back on, each as a column of one row, by name.
 
-    Raises `QuestionError` if a column has the name of such a feature and is something else.
+    Raises `QuestionError` if a column has the name of a feature behind one and is something else,
+    or a feature is defined in two ways.
     """
-    parts = [part for one in definitions.values() for part in one.parts]
-    found = {part.of: part for part in parts if part.sql}
+    found: dict[str, Definition] = {}
+    seen = set[int]()
+    for row in (row for one in definitions.values() for row in one.rows(seen)):
+        if found.setdefault(row.of, row) != row:
+            raise QuestionError(f"the feature {row.of} is defined in two ways.")
     for name, one in definitions.items():
-        if name in found and (one.over or one.fact or one.gate or one.number or one.of != name):
+        computed = name in found and (found[name].sql or found[name].made)
+        if computed and (one.over or one.fact or one.gate or one.number or one.of != name):
             raise QuestionError(f"{name} is a column, and a feature that another looks back on.")
-    for part in parts:
-        if part.sql and (part.sql, part.of_bits) != (found[part.of].sql, found[part.of].of_bits):
-            raise QuestionError(f"the feature {part.of} is defined in two ways.")
     return found

@@ -1,12 +1,11 @@
 """The features in force: `configs/features.toml`, and one's own laid over it."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from decimal import Decimal
 from fractions import Fraction
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from importlib.resources.abc import Traversable
 from itertools import pairwise
-from typing import TypeVar
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
@@ -14,6 +13,7 @@ from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalogue.course import BESIDE, LONGEST_TICKS, YAW_RATE, course_units
 from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, plain_column
 from fleet_slip.catalogue.facts import CALIBRATION, DELAY, RECEIVED
+from fleet_slip.catalogue.lines import Fitting, Line, known_line
 from fleet_slip.catalogue.mirror import parity
 from fleet_slip.catalogue.signals import (
     SAMPLE_TIME_S,
@@ -24,14 +24,20 @@ from fleet_slip.catalogue.signals import (
 )
 from fleet_slip.catalogue.time_columns import (
     Calibrated,
+    Estimate,
     Factor,
     Feature,
     GateFamily,
+    ProductColumn,
+    SlopeColumn,
     TimeColumn,
     Window,
     calibrated_column,
+    estimate_column,
     factor_column,
     gated_columns,
+    product_column,
+    slope_column,
     window_column,
 )
 from fleet_slip.config import Config, faults_of, load_config, load_toml
@@ -160,7 +166,10 @@ class FeatureSet(Config):
 # feature over time; a factor is a column times what a car knows of itself; a gate is a column as
 # far as another one opens it.
 
-T = TypeVar("T")
+Columns = Mapping[str, TimeColumn]
+
+Maker = Callable[[Columns], Columns]
+"""Makes columns by name, given those that they are made of."""
 
 
 _identities: dict[str, tuple["FeatureCatalogue", SignalCatalogue, str]] = {}
@@ -172,6 +181,9 @@ class FeatureCatalogue(Config):
 
     features: dict[Identifier, Feature]
     windows: dict[Identifier, Window] = Field(default_factory=dict)
+    products: dict[Identifier, ProductColumn] = Field(default_factory=dict)
+    estimates: dict[Identifier, Estimate] = Field(default_factory=dict)
+    slopes: dict[Identifier, SlopeColumn] = Field(default_factory=dict)
     factors: dict[Identifier, Factor] = Field(default_factory=dict)
     gates: dict[Identifier, GateFamily] = Field(default_factory=dict)
     calibrated: dict[Identifier, Calibrated] = Field(default_factory=dict)
@@ -210,63 +222,104 @@ class FeatureCatalogue(Config):
 
     @cached_property
     def time_columns(self) -> Mapping[str, TimeColumn]:
-        """Every column over time: the members of the families of windows, then the factors.
+        """Every column over time: members of families of windows, products, factors, gates.
 
         Raises `ValueError` for one that looks back on nothing known, or twice the same name.
         """
         found: dict[str, TimeColumn] = {}
-
-        def add(where: str, columns: Mapping[str, TimeColumn]) -> None:
-            if twice := [name for name in columns if name in found]:
-                raise ValueError(f"{where}: {twice[0]} stands twice")
-            found.update(columns)
-
-        for family, window in self.windows.items():
-            row, scale = self._row(window.of, f"windows.{family}")
-            for name, ticks in window.members(family).items():
-                where = f"windows.{name}"
-                add(where, {name: _named(where, window_column, window, ticks, row, scale)})
-        for name, factor in self.factors.items():
-            where = f"factors.{name}"
-            if factor.of in found:
-                base, scale = found[factor.of].definition, found[factor.of].exact_scale
-            else:
-                base, scale = self._row(factor.of, where)
-            add(where, {name: _named(where, factor_column, factor, base, scale)})
-        for name, gate in self.gates.items():
-            where = f"gates.{name}"
-            add(where, _named(where, gated_columns, name, gate, dict(found)))
-        for name, calibrated in self.calibrated.items():
-            add(f"calibrated.{name}", {name: self._calibrated(name, calibrated, found)})
+        waiting = list(self._makers())
+        while waiting:
+            missing = {name for one in waiting for name in one[2]}
+            ready = [one for one in waiting if not one[1] & missing]
+            if not ready:
+                raise ValueError(f"{waiting[0][0]}: it is made of itself")
+            for where, _, names, make in ready:
+                if twice := [name for name in names if name in found]:
+                    raise ValueError(f"{where}: {twice[0]} stands twice")
+                found.update(_named(where, make, found))
+            waiting = [one for one in waiting if one not in ready]
         return found
 
-    def _calibrated(
-        self, name: str, one: Calibrated, known: Mapping[str, TimeColumn]
-    ) -> TimeColumn:
-        where = f"calibrated.{name}"
+    def _makers(self) -> Iterator[tuple[str, set[str], tuple[str, ...], Maker]]:
+        """Yield where columns are defined, what they need and are called, and what makes them."""
+        made = {*self.products, *self.estimates, *self.slopes}
+        for name, window in self.windows.items():
+            needs = {window.of} & made
+            yield f"windows.{name}", needs, self.members(name), partial(self._windows, name, window)
+        for name, product in self.products.items():
+            yield f"products.{name}", {*product.of}, (name,), partial(self._product, name, product)
+        for name, estimate in self.estimates.items():
+            yield f"estimates.{name}", set(), (name,), partial(self._estimate, name, estimate)
+        for name, slope in self.slopes.items():
+            needs = {of for one in slope.equations for of in one.names}
+            yield f"slopes.{name}", needs, (name,), partial(self._slope, name, slope)
+        for name, factor in self.factors.items():
+            yield f"factors.{name}", {factor.of}, (name,), partial(self._factor, name, factor)
+        for name, gate in self.gates.items():
+            yield (
+                f"gates.{name}",
+                {gate.of, *gate.columns},
+                self.members(name),
+                partial(gated_columns, name, gate),
+            )
+        for name, calibrated in self.calibrated.items():
+            needs = {calibrated.of, calibrated.running or ""}
+            make = partial(self._calibrated, name, calibrated)
+            yield f"calibrated.{name}", needs, (name,), make
+
+    def _windows(self, name: str, window: Window, known: Columns) -> Columns:
+        row, scale = self._row(window.of, known)
+        members = window.members(name).items()
+        return {one: window_column(window, ticks, row, scale) for one, ticks in members}
+
+    def _estimate(self, name: str, estimate: Estimate, _: Columns) -> Columns:
+        return {name: estimate_column(name, estimate)}
+
+    def _product(self, name: str, product: ProductColumn, known: Columns) -> Columns:
+        factors = [self._column_or_row(of, known) for of in product.of]
+        return {name: product_column(name, product, factors)}
+
+    def _slope(self, name: str, slope: SlopeColumn, known: Columns) -> Columns:
+        for one in slope.equations:
+            if unknown := [of for of in one.names if of not in known]:
+                raise ValueError(f"{', '.join(unknown)}: no column over time")
+        return {name: slope_column(name, slope, known)}
+
+    def _factor(self, name: str, factor: Factor, known: Columns) -> Columns:
+        return {name: factor_column(factor, *self._column_or_row(factor.of, known))}
+
+    def _calibrated(self, name: str, one: Calibrated, known: Columns) -> Columns:
         if one.running is not None and one.running not in known:
-            raise ValueError(f"{where}: {one.running} is no column over time")
+            raise ValueError(f"{one.running} is no column over time")
         of: Feature | Signal | TimeColumn
         if one.of in known:
             of, base = known[one.of], known[one.of].definition
         else:
-            base, _ = self._row(one.of, where)
+            base, _ = self._row(one.of, known)
             of = self.features[one.of] if one.of in self.features else catalogue()[one.of]
             if base.sql:  # the count itself, as it stands in the rows
                 base = base.model_copy(update={"bits": base.of_bits})
         if base.number is not None:
-            raise ValueError(f"{where}: {one.of} has a number already")
+            raise ValueError(f"{one.of} has a number already")
         running = known[one.running] if one.running else None
-        return _named(where, calibrated_column, one, base, of.scale, of.unit, running)
+        return {name: calibrated_column(one, base, of.scale, of.unit, running)}
 
-    def _row(self, name: str, where: str) -> tuple[Definition, Fraction]:
-        """Return a signal or feature of a row as the definition of a column, and its scale."""
+    def _column_or_row(self, name: str, known: Columns) -> tuple[Definition, Fraction]:
+        """Return a column over time, or a row as one, and its scale."""
+        if name in known:
+            return known[name].definition, known[name].exact_scale
+        return self._row(name, known)
+
+    def _row(self, name: str, known: Columns) -> tuple[Definition, Fraction]:
+        """Return what can be looked back on as the definition of a column, and its scale."""
+        if name in known and name in {*self.products, *self.estimates, *self.slopes}:
+            return known[name].definition, known[name].exact_scale
         if name in self.features:
             one = self.features[name]
             return Definition(of=name, sql=one.sql, of_bits=one.bits), one.exact_scale
         if name in catalogue().feature_inputs:
             return Definition(of=name), catalogue()[name].exact_scale
-        raise ValueError(f"{where}: {name} is no input signal or feature")
+        raise ValueError(f"{name} is no input signal or feature")
 
     def definition(self, name: str) -> Definition | None:
         """Return the definition of an input that is more than a signal or a feature of 16 bits."""
@@ -282,9 +335,29 @@ class FeatureCatalogue(Config):
         known = {name: self.features[name] for name in names if name in self.features}
         return {name: plain_column(name, one.sql, one.bits) for name, one in known.items()}
 
-    def definitions(self, name: str) -> dict[str, Definition]:
-        """Return the definitions of a set's columns over time, by name."""
-        return {w: self.time_columns[w].definition for w in self.feature_set(name).windows}
+    def definitions(self, name: str, fold: str | None = None) -> dict[str, Definition]:
+        """Return the definitions of a set's columns over time, by name.
+
+        Those of a set with a line are, for drives of a `fold`, made by that fitted without it.
+        """
+        line = self.line_of(name)
+        found = {w: self.time_columns[w].definition for w in self.feature_set(name).windows}
+        if line is None:
+            return found
+        fitting = Fitting(line, fold)
+        return {w: fitting(one) for w, one in found.items()}
+
+    def line_of(self, name: str) -> Line | None:
+        """Return the line of a set `SET_DIGEST`; None of others. Raises `QuestionError`."""
+        of, _, digest = name.rpartition("_")
+        return known_line(digest) if name not in self.sets and of in self.sets else None
+
+    def estimate_in(self, name: str) -> str | None:
+        """Return the estimate in a set that needs a line and has none."""
+        if name == PLAIN or name not in self.sets:
+            return None
+        used = (self.time_columns[w].definition for w in self.feature_set(name).windows)
+        return next((r.of for one in used for r in one.rows() if r.of in self.estimates), None)
 
     def feature_set(self, name: str) -> FeatureSet:
         """Return a feature set by name. Raises `QuestionError` for an unknown one.
@@ -293,10 +366,11 @@ class FeatureCatalogue(Config):
         """
         if name == PLAIN:
             return FeatureSet(description="The logged signals", signals=catalogue().inputs)
-        if name not in self.sets:
+        of = name.rpartition("_")[0] if self.line_of(name) else name
+        if of not in self.sets:
             known = ", ".join((PLAIN, *self.sets))
             raise QuestionError(f"no feature set is called {name!r}. Feature sets: {known}.")
-        one = self.sets[name]
+        one = self.sets[of]
         members = [member for window in one.windows for member in self.members(window)]
         one = one.model_copy(update={"windows": tuple(dict.fromkeys(members))})
         return one if one.of is None else self._changes_of(one, self.feature_set(one.of))
@@ -393,6 +467,8 @@ class FeatureCatalogue(Config):
             "row_folds": one.row_folds,
             "lagged": False,  # of sets that earlier releases had: identities stay
         }
+        if line := self.line_of(name):
+            content["line"] = {"sha256": line.sha256}
         if extras := self._extras(one):
             content["extras"] = {name: str(catalogue()[name].scale) for name in extras}
         if one.block_ticks:
@@ -423,7 +499,7 @@ class FeatureCatalogue(Config):
         Raises `QuestionError` otherwise.
         """
         name = identity.rpartition("-")[0] or identity
-        if name in {PLAIN, *self.sets} and self.identity(name) == identity:
+        if (name in {PLAIN, *self.sets} or self.line_of(name)) and self.identity(name) == identity:
             return name
         raise QuestionError(
             f"the feature set {identity} is not defined as it was then: configs/features.toml has "
@@ -447,10 +523,10 @@ class FeatureCatalogue(Config):
         return (*catalogue().feature_inputs, *self.features, *self.time_columns)
 
 
-def _named(where: str, make: Callable[..., T], *parts: object) -> T:
-    """Make a column, or several. Raises `ValueError` that says which one cannot be."""
+def _named(where: str, make: Maker, known: Columns) -> Columns:
+    """Make columns. Raises `ValueError` that says where they are defined."""
     try:
-        return make(*parts)
+        return make(known)
     except ValidationError as error:
         raise ValueError(f"{where}: {faults_of(error)}") from None
     except ValueError as error:

@@ -32,6 +32,8 @@ def parity(one: Definition) -> int:
 
     A gate must be opened by an even column: hats over an odd one differ from side to side.
     """
+    if one.made:  # no set of changes has what is made of columns
+        return 0
     if one.gate:
         return parity(one.ungated) if parity(one.gate.by) == 1 else 0
     if one.number:

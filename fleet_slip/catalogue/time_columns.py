@@ -1,25 +1,32 @@
 """Columns over time of `configs/features.toml`: windows, factors, gates and car numbers."""
 
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
+from typing import Literal
 
 from pydantic import Field, model_validator
 
 from fleet_slip.catalogue.arithmetic import nearest_sql, parse
 from fleet_slip.catalogue.definitions import (
     COUNT_BITS,
+    LARGEST_BITS,
     LONGEST_TICKS,
     Bits,
+    Combination,
     Definition,
+    Equation,
     Fact,
     FactText,
     Gate,
     Number,
     Over,
+    Product,
+    Slope,
     integer_arithmetic,
 )
 from fleet_slip.catalogue.facts import CAR_NUMBERS, NumberName, Unit
@@ -31,7 +38,7 @@ TICKS = "{ticks}"
 
 
 class Window(Config):
-    """A family of columns that look back on one signal or feature, one for each number of ticks.
+    """A family of columns that look back on a signal, feature, product or estimate: one of N ticks.
 
     The column of N ticks is called NAME_N; the mean since the drive began is called NAME.
     """
@@ -48,7 +55,7 @@ class Window(Config):
     @model_validator(mode="after")
     def _ticks_fit(self) -> "Window":
         if (self.over != "running_mean") != bool(self.ticks):
-            raise ValueError("ticks is for mean, sum and lag, which must have it")
+            raise ValueError("ticks is for mean, sum, lag and change, which must have it")
         if len(set(self.ticks)) < len(self.ticks):
             raise ValueError("a number of ticks stands twice")
         if any(not 1 <= n <= LONGEST_TICKS for n in self.ticks):
@@ -87,6 +94,54 @@ class Calibrated(Config):
     description: str = Field(min_length=1)
 
 
+class Estimate(Config):
+    """The estimate of a line that is fitted before, by the `line` of a model list."""
+
+    scale: Decimal = Field(gt=0)
+    column: Identifier
+    description: str = Field(min_length=1)
+
+
+class ProductColumn(Config):
+    """The product of two columns, signals or features; of none, 1."""
+
+    of: tuple[Identifier, ...] = Field(max_length=2)
+    scale: Decimal = Field(gt=0)
+    bits: Bits = 20
+    unit: SIUnit
+    column: Identifier
+    description: str = Field(min_length=1)
+
+
+class EquationColumns(Config):
+    """What tells a slope: `y`, a sum of columns, is the slope times `of`, but for noise.
+
+    Other unknowns times the columns `beside` come to it; a whole number there is a column that is
+    always the same. It counts with a `weight`, at most 1.
+    """
+
+    y: dict[Identifier, Literal[-1, 1]] = Field(min_length=1)
+    of: Identifier
+    beside: tuple[Identifier | int, ...] = ()
+    weight: Decimal = Decimal(1)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The columns in it."""
+        return (*self.y, self.of, *(one for one in self.beside if isinstance(one, str)))
+
+
+class SlopeColumn(Config):
+    """The first unknown of equations, by ridge regression over the drive so far."""
+
+    equations: tuple[EquationColumns, ...] = Field(min_length=1)
+    ridge: tuple[int, ...] = Field(min_length=1)
+    scale: Decimal = Field(gt=0)
+    unit: SIUnit
+    column: Identifier
+    description: str = Field(min_length=1)
+
+
 class TimeColumn(Scaled):
     """One column over time: how it is defined, and what a count of it is worth."""
 
@@ -101,6 +156,7 @@ def window_column(window: Window, ticks: int, row: Definition, scale: Fraction) 
     definition = Definition(
         of=row.of,
         sql=row.sql,
+        made=row.made,
         of_bits=row.of_bits,
         over=window.over,
         ticks=ticks,
@@ -114,6 +170,62 @@ def window_column(window: Window, ticks: int, row: Definition, scale: Fraction) 
         column=window.column.replace(TICKS, str(ticks)),
         description=window.description + (f", over {ticks} ticks" if ticks else ""),
     )
+
+
+def _made_column(
+    name: str, one: Estimate | ProductColumn | SlopeColumn, made: Combination | Product | Slope
+) -> TimeColumn:
+    """Return what is made of other columns as a column of its own."""
+    bits = one.bits if isinstance(one, ProductColumn) else LARGEST_BITS
+    return TimeColumn(
+        definition=Definition(of=name, made=made, of_bits=bits, bits=bits),
+        scale=one.scale,
+        unit="rad" if isinstance(one, Estimate) else one.unit,
+        column=one.column,
+        description=one.description,
+    )
+
+
+def estimate_column(name: str, one: Estimate) -> TimeColumn:
+    """Return the estimate of a line that has not been fitted."""
+    return _made_column(name, one, Combination(line=""))
+
+
+def product_column(
+    name: str, one: ProductColumn, factors: Sequence[tuple[Definition, Fraction]]
+) -> TimeColumn:
+    """Return a product, given each factor and its scale."""
+    scale = math.prod((scale for _, scale in factors), start=Fraction(1))
+    ratio = scale / Fraction(one.scale)
+    return _made_column(name, one, Product(of=tuple(of for of, _ in factors), ratio=ratio))
+
+
+def slope_column(name: str, one: SlopeColumn, known: Mapping[str, TimeColumn]) -> TimeColumn:
+    """Return a slope. Raises `ValueError` if a scale of its equations does not fit the others."""
+    equations, values = [], set()
+    for number, equation in enumerate(one.equations, 1):
+        of_y = {known[column].exact_scale for column in equation.y}
+        if len(of_y) > 1:
+            raise ValueError(f"{', '.join(equation.y)} differ in scale")
+        terms = tuple((sign, known[column].definition) for column, sign in equation.y.items())
+        y = Definition(
+            of=f"{name}_{number}",
+            made=Combination(terms=terms),
+            of_bits=COUNT_BITS,
+            bits=COUNT_BITS,
+        )
+        x = (equation.of, *equation.beside)
+        columns = tuple(known[of].definition if isinstance(of, str) else of for of in x)
+        equations.append(Equation(y=y, x=columns, weight=Fraction(equation.weight)))
+        values.add(of_y.pop() / known[equation.of].exact_scale)
+    if len(values) > 1:
+        raise ValueError(
+            "the scales of y and `of` have another ratio from one equation to the next"
+        )
+    slope = Slope(
+        equations=tuple(equations), ridge=one.ridge, ratio=values.pop() / Fraction(one.scale)
+    )
+    return _made_column(name, one, slope)
 
 
 def calibrated_column(

@@ -45,7 +45,7 @@ def gram(
 
     Example: **fleet-slip gram --features windows**
     """
-    names = (PLAIN, *known_features().sets) if features == ALL_SETS else (features,)
+    names = fleet.warehouse.feature_sets() if features == ALL_SETS else (features,)
     if sql:
         for name in names if features != ALL_SETS else filter(has_statement, names):
             typer.echo(gram_statement(name))

@@ -83,6 +83,11 @@ def compute(  # noqa: PLR0912 - one loop for each operation
     elif operation == op.AT_LEAST:
         for i in range(size):
             out[i] = a[i] if a[i] >= b[i] else np.nan
+    elif operation == op.POWER:
+        for i in range(size):
+            out[i] = 1.0 + 0.0 * a[i]  # NaN stays
+            while a[i] > b[i] * out[i]:
+                out[i] *= 2.0
     elif operation == op.WHERE:
         for i in range(size):
             out[i] = a[i] if b[i] == b[i] else np.nan

@@ -8,20 +8,28 @@ a table with a line an operation, and take ranges, missing and look-back from he
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
+from functools import reduce
+from itertools import combinations_with_replacement
 from typing import Any, Literal, TypeVar
 
 from fleet_slip.catalogue.arithmetic import nearest, parse, truncated
 from fleet_slip.catalogue.definitions import (
+    COUNT_BITS,
     LARGEST_FACT,
     WEIGHT,
     Definition,
+    Equation,
     Fact,
     Gate,
+    Made,
     Number,
+    Product,
+    Slope,
     limit_of,
 )
 from fleet_slip.catalogue.facts import CAR_NUMBERS
 from fleet_slip.catalogue.signals import COUNT_MAX
+from fleet_slip.errors import QuestionError
 
 Step = tuple[str | int, ...]
 Range = tuple[int, int]
@@ -64,6 +72,19 @@ def _first(a: Range, *_: object) -> Range:
     return a
 
 
+def _powers(a: Range, most: Range) -> Range:
+    return power(a[0], most[0]), power(a[1], most[0])
+
+
+POWERS = 32
+"""So many powers of two a target that cannot count them compares with."""
+
+
+def power(value: int, most: int) -> int:
+    """Return the least power of two, at least 1, times which `most` is not below a value."""
+    return 1 << max(0, (max(value, 1) - 1) // most).bit_length()
+
+
 def _sums(a: Range, _: int, most: int) -> Range:
     return min(0, a[0] * most), max(0, a[1] * most)
 
@@ -86,6 +107,7 @@ OPERATIONS: Mapping[str, Operation] = {
     "abs": Operation(lambda a: (0 if a[0] <= 0 <= a[1] else min(map(abs, a)), max(map(abs, a))), 1),
     "sign": Operation(lambda a: ((a[0] > 0) - (a[0] < 0), (a[1] > 0) - (a[1] < 0)), 1),
     "clip": Operation(lambda *of: (-of[1][1], of[1][1])),
+    "power": Operation(_powers),  # of two, the least p with a <= b p
     # What may be missing.
     "at_least": Operation(_first, missing="less"),
     "where": Operation(_first),
@@ -233,6 +255,7 @@ class Lowering:
     steps: dict[Step, int] = field(default_factory=dict)
     facts: dict[CarFact, int] = field(default_factory=dict)
     numbers: dict[CarCount, int] = field(default_factory=dict)
+    _made: dict[int, int] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -283,6 +306,11 @@ class Lowering:
 
     def row(self, one: Definition) -> int:
         """Return the step of what a column looks back on: a signal, or a feature clipped."""
+        if one.made:
+            key = id(one.made)  # of several columns, computed again for none
+            if key not in self._made:
+                self._made[key] = self._made_of(one.made)
+            return self.clip(self._made[key], limit_of(one.of_bits))
         if not one.sql:
             return self.do("signal", self.signals[one.of])
         arithmetic = parse(one.sql)
@@ -318,6 +346,8 @@ class Lowering:
         divisor = self.constant(one.ratio.denominator)
         if one.over == "lag":
             now = total = self.do("ago", now, one.ticks)
+        elif one.over == "change":
+            total = self.do("-", now, self.do("ago", now, one.ticks))
         elif one.over is not None:
             window = (now, one.ticks, most_values(one))
             total = self.do("sum", *window)
@@ -363,6 +393,100 @@ class Lowering:
         stand_in = self.constant(0) if running is None else running
         factor = self.do("else", self.less(self.do("number", place), number.less), stand_in)
         return self.do("where", factor, of) if number.alone else self.do("*", of, factor)
+
+    def _made_of(self, made: Made) -> int:
+        """Return the step of what is made of columns.
+
+        Raises `QuestionError` for the estimate of a line that has not been fitted.
+        """
+        if isinstance(made, Slope):
+            return self._slope(made)
+        if isinstance(made, Product):
+            factors = [self.column(one) for one in made.of] or [self.constant(1)]
+            found = factors[0] if len(factors) == 1 else self.do("*", *factors)
+            return self.nearest(found, made.ratio.numerator, self.constant(made.ratio.denominator))
+        if made.line == "":
+            raise QuestionError(
+                "its columns are made of the estimate of a line, which is fitted first. Run: "
+                "fleet-slip publish NAME --models learning, or another list of its feature set"
+            )
+        terms = [
+            self.column(one) if times == 1 else self.do("*", self.column(one), self.constant(times))
+            for times, one in made.terms
+        ]
+        total = reduce(lambda a, b: self.do("+", a, b), terms, self.constant(made.intercept))
+        return self.nearest(total, 1, self.constant(made.divisor))
+
+    def _slope(self, slope: Slope) -> int:
+        """Eliminate all unknowns but the first, which comes before the right-hand side.
+
+        Sums of products are divided by one power of two, so that no sum of squares is above
+        `PIVOT`. These bound all others (Cauchy and Schwarz), and elimination makes none larger:
+        clipping is for what rounding adds.
+        """
+        last = len(slope.ridge)
+        sums = self._normal_equations(slope)
+        places = [sums[i, i] for i in range(last + 1)]
+        largest = reduce(lambda a, b: self.do("max", a, b), places)
+        scale = self.do("power", largest, self.constant(PIVOT))
+        del sums[last, last]
+        left = {at: self.clip(self.nearest(one, 1, scale), PIVOT) for at, one in sums.items()}
+        for pivot in range(last - 1):
+            divisor = self.do("max", left[pivot, pivot], self.constant(1))
+            for i in range(pivot + 1, last):
+                for j in range(i, last + 1):
+                    times = self.do("*", left[pivot, i], left[pivot, j])
+                    less = self.do("-", left[i, j], self.do("nearest", times, divisor))
+                    left[i, j] = self.clip(less, PIVOT)
+        square = self.do("max", left[last - 1, last - 1], self.constant(1))
+        times = self.do("*", square, self.constant(slope.ratio.denominator))
+        return self.nearest(left[last - 1, last], slope.ratio.numerator, times)
+
+    def _normal_equations(self, slope: Slope) -> dict[tuple[int, int], int]:
+        """Return sums of products, with the ridge: the first unknown last, then `y`."""
+        order = [*range(len(slope.ridge) - 1, -1, -1), None]
+        products = [self._products_of(one, order) for one in slope.equations]
+        found = {}
+        for at in products[0]:
+            each = reduce(lambda a, b: self.do("+", a, b), (one[at] for one in products))
+            total = self.do("sum", each, 0, most_products(len(products)))
+            unknown = order[at[0]]
+            if at[0] == at[1] and unknown is not None:
+                total = self.do("+", total, self.constant(slope.ridge[unknown]))
+            found[at] = total
+        return found
+
+    def _products_of(
+        self, one: Equation, order: Sequence[int | None]
+    ) -> dict[tuple[int, int], int]:
+        """Return the products of an equation's columns at one tick; 0 where one is missing."""
+        columns = [one.y if unknown is None else one.x[unknown] for unknown in order]
+        steps = [self.constant(of) if isinstance(of, int) else self.column(of) for of in columns]
+        varying = [step for step, of in zip(steps, columns, strict=True) if not isinstance(of, int)]
+        there = reduce(lambda a, b: self.do("+", a, b), varying)
+        divisor, found = GRAIN * one.weight.denominator, {}
+        for i, j in combinations_with_replacement(range(len(order)), 2):
+            a, b = columns[i], columns[j]
+            if isinstance(a, int) and isinstance(b, int):
+                product = self.constant(nearest(a * b * one.weight.numerator, divisor))
+            else:
+                times = self.do("*", steps[i], steps[j])
+                product = self.nearest(times, one.weight.numerator, self.constant(divisor))
+            found[i, j] = self.do("else", self.do("where", product, there), self.constant(0))
+        return found
+
+
+GRAIN = 16
+"""Of the products that a slope sums up."""
+
+PIVOT = 2**25
+"""Largest size of a slope's equations, so that twice a product of two is exact in binary64."""
+
+
+def most_products(equations: int) -> int:
+    """Return how many ticks a slope sums up at most, so that twice a sum is below 2^53."""
+    each = equations * nearest(limit_of(COUNT_BITS) ** 2, GRAIN)
+    return 2**51 // each
 
 
 def given_ranges(

@@ -44,9 +44,9 @@ TILE = 4
 (
     COPY, ADD, SUBTRACT, MULTIPLY, NEGATE, ABSOLUTE, SIGN,  # the same for binary64 and int64
     LEAST, MOST, DIVIDE, NEAREST, FILL, BROADCAST, AT_LEAST, WHERE, ELSE, TO_BINARY64, CLIP, SHARE,
-    SCALE,
+    SCALE, POWER,
     ADD_UP, KEEP, QUOTIENT, AGO,  # on the rows of before
-) = range(24)  # fmt: skip
+) = range(25)  # fmt: skip
 
 INTEGERS = 30
 """An operation plus this writes int64; that of `COPY` reads binary64."""
@@ -276,7 +276,7 @@ _EXACT = 2**53
 _LOOPS = {
     **{"+": ADD, "-": SUBTRACT, "*": MULTIPLY, "//": DIVIDE, "nearest": NEAREST},
     **{"negative": NEGATE, "abs": ABSOLUTE, "sign": SIGN, "min": LEAST},
-    **{"max": MOST, "at_least": AT_LEAST, "where": WHERE, "else": ELSE},
+    **{"max": MOST, "at_least": AT_LEAST, "where": WHERE, "else": ELSE, "power": POWER},
 }
 """Operations of which each value is made of values of its own row."""
 
@@ -349,6 +349,8 @@ class _Writer:
             return self._do(AT_LEAST, excess, self._do(FILL, ratio=(0.0, 1.0, 0.0, inf)))
         if name == "ago":
             return self._ago(plain[0], plain[1])
+        if name == "sum":  # of a slope: what is missing is 0 there already
+            return self._quotient(number, {"row": plain[0], "ticks": plain[1], "#fixed": 1}, guard)
         if name == "clip":
             return self._clip(number, plain[0], self._ranges[plain[1]][1], guard)
         if name == "where":
@@ -482,7 +484,7 @@ class _Writer:
     def _quotient(self, number: int, found: Found, _: int | None) -> Value:
         """Write a sum over a window times numerator / (fixed + each * its values), rounded."""
         value = self.value(found["row"])
-        ticks, limit = found["ticks"], float(found["#limit"])
+        ticks, limit = found["ticks"], float(found.get("#limit", inf))
         fixed, each = (float(found.get(one, 0)) for one in ("#fixed", "#each"))
         slot, kind = _number(self.code.summed, value), _number(self.code.kinds, ticks)
         sums, counts, begins = (Region.SUM, slot), (Region.COUNT, slot), (Region.BEGIN, kind)
@@ -563,14 +565,17 @@ class ColumnPlan:
         return cls(tuple(names), rows_of(rows, windows), dict(windows), tuple(also))
 
     @classmethod
-    def of_set(cls, known: FeatureCatalogue, name: str) -> "ColumnPlan":
-        """Plan the columns of a feature set, the label last; of changes, what makes it."""
+    def of_set(cls, known: FeatureCatalogue, name: str, fold: str | None = None) -> "ColumnPlan":
+        """Plan the columns of a feature set, the label last; of changes, what makes it.
+
+        For the `fold` see `FeatureCatalogue.definitions`.
+        """
         one = known.feature_set(name)
         divided_by = [known.regimes[regime].of for regime in one.regimes]
         features = known.rows((*one.features, *divided_by))
         inputs = (*one.signals, *one.features, *one.windows)
         columns = (*inputs, COURSE, YAW_RATE) if one.change_ticks else one.columns
-        return cls.of(columns, features, known.definitions(name), divided_by)
+        return cls.of(columns, features, known.definitions(name, fold), divided_by)
 
     @property
     def signals(self) -> tuple[str, ...]:

@@ -8,12 +8,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from fleet_slip.catalogue.arithmetic import nearest_sql
-from fleet_slip.catalogue.definitions import LARGEST_FACT, Definition, features_behind, plain_column
+from fleet_slip.catalogue.definitions import LARGEST_FACT, Definition, rows_behind
 from fleet_slip.catalogue.features import FeatureCatalogue
 from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
 from fleet_slip.columns.operations import (
     GIVEN,
     OPERATIONS,
+    POWERS,
     CarFact,
     Lowering,
     Range,
@@ -28,6 +29,11 @@ from fleet_slip.errors import DataError, QuestionError
 QUOTIENT = "CAST(ROUND(({0} - {0} % {1}) / {1}) AS BIGINT)"
 """{0} / {1}, truncated; exact in floating point too: a small multiple of the divisor."""
 
+_POWER = "(1 + 0 * {0}" + "".join(
+    f" + CASE WHEN {{0}} > CAST({1 << bit} AS BIGINT) * {{1}} THEN {1 << bit} ELSE 0 END"
+    for bit in range(POWERS)
+)
+
 _NEAREST = QUOTIENT.format("(2 * ABS({0}) + {1})", "(2 * {1})")
 
 PLAIN_SQL: Mapping[str, str] = {
@@ -38,6 +44,7 @@ PLAIN_SQL: Mapping[str, str] = {
     "nearest": f"(CASE WHEN {{0}} < 0 THEN -{_NEAREST} ELSE {_NEAREST} END)",
     "min": "(CASE WHEN {0} <= {1} THEN {0} WHEN {1} < {0} THEN {1} END)",
     "max": "(CASE WHEN {0} >= {1} THEN {0} WHEN {1} > {0} THEN {1} END)",
+    "power": f"{_POWER})",
     "negative": "(-{0})",
     "abs": "ABS({0})",
     "sign": "(CASE WHEN {0} > 0 THEN 1 WHEN {0} < 0 THEN -1 ELSE 0 * {0} END)",
@@ -203,7 +210,7 @@ class CountedColumns:
         found = {name: lowered.column(one) for name, one in over_time.items()}
         steps = tuple(lowered.steps)
         ends = {*places.values()}
-        times = Counter(places[name] for name, row in rows.items() if row.sql)
+        times = Counter(places[name] for name, row in rows.items() if row.sql or row.made)
         for part in parts:
             times.update(_clips(steps, lowered.column(part), ends))
         ranges = lowered.ranges([LOGGED] * len(signals))
@@ -225,11 +232,9 @@ def rows_of(
 ) -> dict[str, Definition]:
     """Return columns of one row, looked back on ones too. Raises `QuestionError`, `DataError`."""
     found = dict(rows)
-    features_behind(over_time)
-    for one in (part for window in over_time.values() for part in parts_of(window)):
-        row = plain_column(one.of, one.sql, one.of_bits)
-        if found.setdefault(one.of, row) != row:
-            raise DataError(f"the feature {one.of} is defined in two ways.")
+    for name, row in rows_behind(over_time).items():
+        if found.setdefault(name, row) != row:
+            raise DataError(f"the feature {name} is defined in two ways.")
     return found
 
 

@@ -98,6 +98,8 @@ class StepWriter:
         name, values = operation_of(self.program.steps[step]), [self.value(one) for one in of]
         if name == "*" and "1" in values:
             return values[values[0] == "1"]
+        if name == "max" and self.size(step) > LARGEST_32:
+            name = "max_64"
         self.done[name] += 1
         if name in "+-*" and self.size(step) > LARGEST_32 >= max(map(self.size, of)):
             values[0] = f"(int64_t){values[0]}"
@@ -205,6 +207,8 @@ _WRITTEN = {
     "*": "{0} * {1}",
     "min": "smaller({0}, {1})",
     "max": "larger({0}, {1})",
+    "max_64": "larger_64({0}, {1})",
+    "power": "power_of_two({0}, {1})",
     "negative": "-{0}",
     "abs": "({0} < 0) ? -{0} : {0}",
     "sign": "sign({0})",

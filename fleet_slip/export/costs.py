@@ -132,9 +132,9 @@ _PARTS: Mapping[str, Mapping[str, int]] = {
 }
 """What each of them is made of, at most."""
 
-_ARITHMETIC = ("+", "-", "*", "//", "negative", "abs", "sign", "min", "max", "clip")
+_ARITHMETIC = ("+", "-", "*", "//", "negative", "abs", "sign", "min", "max", "max_64", "clip")
 _WINDOWS = ("ago_16", "ago_32", "slide_32", "slide_64", "keep_16", "keep_32", "gather")
-_WIDE = ("//64", "nearest_64")
+_WIDE = ("//64", "nearest_64", "power")
 
 _Weights = Sequence[tuple[int, Sequence[str]]]
 

@@ -20,7 +20,14 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.operations import GIVEN, operands_of, operation_of, plain_of, size_of
+from fleet_slip.columns.operations import (
+    GIVEN,
+    POWERS,
+    operands_of,
+    operation_of,
+    plain_of,
+    size_of,
+)
 from fleet_slip.export.program import Program
 from fleet_slip.models.registry import ModelVersion
 
@@ -303,6 +310,14 @@ def _sign(graph: Nodes, a: str) -> str:
     return graph.signed(a, graph.do("Min", graph.do("Abs", a), 1))
 
 
+def _power(graph: Nodes, a: str, most: str) -> str:
+    """Return one more than the sum of the powers of two times which `most` is below a value."""
+    powers = graph.constant([[1 << bit for bit in range(POWERS)]])
+    below = graph.do("Greater", a, graph.do("Mul", most, powers))
+    some = graph.do("Mul", graph.do("Cast", below, to=TensorProto.INT64), powers)
+    return graph.do("Add", graph.do("ReduceSum", some, graph.constant([1]), keepdims=1), 1)
+
+
 def _node(name: str) -> Callable[..., str]:
     return lambda graph, *operands: graph.do(name, *operands)
 
@@ -311,8 +326,9 @@ _OPERATIONS: Mapping[str, Callable[..., str]] = {
     "+": _node("Add"),
     "-": _node("Sub"),
     "*": _node("Mul"),
-    "min": _node("Min"),
-    "max": _node("Max"),
+    "min": lambda graph, a, b: graph.do("Where", graph.do("LessOrEqual", a, b), a, b),
+    "max": lambda graph, a, b: graph.do("Where", graph.do("GreaterOrEqual", a, b), a, b),
+    "power": _power,
     "negative": _node("Neg"),
     "abs": _node("Abs"),
     "sign": _sign,
@@ -320,4 +336,7 @@ _OPERATIONS: Mapping[str, Callable[..., str]] = {
     "nearest": lambda graph, a, b: graph.nearest(a, b),
     "clip": lambda graph, a, b: graph.do("Max", graph.do("Min", a, b), graph.do("Neg", b)),
 }
-"""What computes an operation of the values that it works on."""
+"""What computes an operation of the values that it works on.
+
+No `Min` and `Max` of two vectors of int64, of which onnxruntime 1.31 compares the lower 32 bits.
+"""

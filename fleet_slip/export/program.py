@@ -273,7 +273,7 @@ def _inputs(manifest: Manifest) -> tuple[Input, ...]:
     used: set[str] = set()
     for term in manifest.terms:
         parts = term.definition.parts if term.definition else (term,)
-        if any(part.sql and not parse(part.sql).inputs for part in parts):
+        if not term.inputs or any(part.sql and not parse(part.sql).inputs for part in parts):
             raise DataError(f"the feature {term.signal} is of no signal. Publish the model again.")
         used |= {*term.inputs}
     return tuple(

@@ -6,7 +6,7 @@ from typing import Any
 
 from fleet_slip.catalogue.arithmetic import COMPUTED, nearest
 from fleet_slip.catalogue.facts import round_number
-from fleet_slip.columns.operations import operation_of, plain_of
+from fleet_slip.columns.operations import operation_of, plain_of, power
 from fleet_slip.errors import InputError
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.program import Car, Program
@@ -17,6 +17,7 @@ _COMPUTED: Mapping[str, Callable[..., int | None]] = {
     "nearest": lambda a, b: nearest(a, b) if b > 0 else None,
     "min": min,
     "max": max,
+    "power": power,
     "clip": lambda a, most: max(-most, min(a, most)),
     "at_least": lambda a, least: a if a >= least else None,
     "where": lambda a, _: a,

@@ -73,7 +73,7 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
     known = features()
     wide = tuple(
         name
-        for name in known.sets
+        for name in warehouse.feature_sets()
         if known.feature_set(name).windows
         and grams.landed(unit_name(known.identity(name))) is not None
     )

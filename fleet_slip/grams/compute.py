@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.catalogue.course import COURSE_LATE
-from fleet_slip.catalogue.definitions import COUNT_BITS
+from fleet_slip.catalogue.definitions import COUNT_BITS, Slope, rows_behind
 from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, FeatureSet, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
@@ -252,8 +252,9 @@ longer than its block of 262,144 bytes."""
 def has_statement(feature_set: str) -> bool:
     """Whether SQL computes a feature set, too; else the kernel alone does."""
     one = features().feature_set(feature_set)
-    k = len(one.columns)
-    return not one.change_ticks and k + k * (k + 1) // 2 <= MOST_SUMS
+    k, windows = len(one.columns), features().definitions(feature_set)
+    slopes = any(isinstance(row.made, Slope) for row in rows_behind(windows).values())
+    return not (one.change_ticks or slopes) and k + k * (k + 1) // 2 <= MOST_SUMS
 
 
 def gram_statement(
@@ -269,7 +270,8 @@ def gram_statement(
     if not has_statement(feature_set):
         raise QuestionError(
             f"the Gram rows of {feature_set} have no SQL: the compiled kernel alone computes "
-            "changes of the course and sets of many columns. Its columns: fleet-slip features --sql"
+            "changes of the course, slopes and sets of many columns. Its columns: fleet-slip "
+            "features --sql"
         )
     names = one.columns
     windows = known.definitions(feature_set)
@@ -450,9 +452,12 @@ def wide_grams(
     `late` is the course's delay of cars, in parts of a tick. Raises `DataError` for a drive that
     cannot be looked back on, `StorageError` for sums of more than 64 bits.
     """
-    one = features().feature_set(feature_set)
-    workspace = Workspace(ColumnPlan.of_set(features(), feature_set))
-    plan = workspace.plan
+    warehouse.look_for_lines()
+    one, line = features().feature_set(feature_set), features().line_of(feature_set)
+    workspaces: dict[str | None, Workspace] = {
+        None: Workspace(ColumnPlan.of_set(features(), feature_set))
+    }
+    plan = workspaces[None].plan
     identity = features().identity(feature_set)
     schema = warehouse.computed_schema(in_time=one.in_time)
     rows: list[dict[str, Any]] = []
@@ -461,10 +466,13 @@ def wide_grams(
         for file in sorted(files, key=lambda one: one.path):
             drives = read_drives(warehouse, file, plan)
             for drive in sorted(drives, key=lambda drive: str(drive.facts["drive_id"])):
+                fold = line.fold_of(str(drive.facts["drive_id"])) if line else None
+                if fold not in workspaces:
+                    workspaces[fold] = Workspace(ColumnPlan.of_set(features(), feature_set, fold))
                 delay = (late or {}).get(drive.facts["vehicle_id"])
                 known = {**drive.facts, "feature_set": identity, COURSE_LATE: delay}
                 known |= {"file": file.path, "day": file.day}
-                rows += _gram_rows(workspace, one, drive, known)
+                rows += _gram_rows(workspaces[fold], one, drive, known)
     return pa.Table.from_pylist(rows, schema=schema)
 
 

@@ -96,7 +96,7 @@ def update_grams(
 def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list[GramReport]:
     """Bring up to date what was computed here before, but for `unreadable` log files."""
     grams = warehouse.grams.snapshot()
-    identities = {name: features().identity(name) for name in (PLAIN, *features().sets)}
+    identities = {name: features().identity(name) for name in warehouse.feature_sets()}
     used = [n for n, i in identities.items() if grams.landed(unit_name(i)) is not None]
     over_time = [name for name in used if features().feature_set(name).windows]
     drives = {name: _unique(grams, identities[name], "drive_id") for name in over_time}
@@ -234,7 +234,7 @@ def land_ahead(
     Raises `ConflictError` if a replaced file is gone, or the Gram rows change at that moment.
     """
     files = [_as_file(action) for action in new]
-    for name in (PLAIN, *features().sets):
+    for name in warehouse.feature_sets():
         identity = features().identity(name)
         grams = warehouse.grams.snapshot()
         done, _ = named_files(grams, identity)

@@ -186,11 +186,11 @@ def contest(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest
 
     Raises `DataError` or `QuestionError` if the features of a version are not defined as they were.
     """
+    feature_set = selection.cohort.feature_set
     for version in incumbents:
-        _require_same_features(version)
+        _require_same_features(version, feature_set)
     label, winner, found = catalogue().label, selection.winner.model, selection.searched_winner
     inputs = found.inputs if found is not None else winner.signals
-    feature_set = selection.cohort.feature_set
     models = tuple(version.manifest.counts_model(feature_set) for version in incumbents)
     every = (name for model in models for name in model.signals)
     signals = tuple(dict.fromkeys((*inputs, *every)))
@@ -312,13 +312,22 @@ def _shrunk(manifest: Manifest, champion: Manifest, part: float) -> list[str]:
     ]
 
 
-def _require_same_features(version: ModelVersion) -> None:
+def _has_another_line(version: ModelVersion, feature_set: str) -> bool:
+    """Whether a version has the same set with another line: its columns are in no Gram row here."""
+    line, then = features().line_of(feature_set), version.manifest.trained_on.feature_set
+    if line is None or then == features().identity(feature_set):
+        return False
+    return then.startswith(feature_set.removesuffix(line.digest))
+
+
+def _require_same_features(version: ModelVersion, feature_set: str) -> None:
     known, then = features(), version.manifest
+    of_set = known.definitions(feature_set)
     for name, one in then.features.items():
         if known.rows([name]).get(name) != one:
             raise DataError(f"the feature {name} of {version.reference} is not defined as then.")
     for name, definition in then.definitions.items():
-        if name not in known.inputs or known.definition(name) != definition:
+        if name not in known.inputs or (of_set.get(name) or known.definition(name)) != definition:
             raise DataError(f"the column {name} of {version.reference} is not defined as then.")
 
 
@@ -540,6 +549,17 @@ def judge(
     problems = find_faults(manifest, champion.manifest if champion else None)
     if champion is None:
         return Judgement(tuple(problems), "It is the first version")
+    if _has_another_line(champion, selection.cohort.feature_set):
+        was, now = (
+            champion.manifest.cross_validation.rmse_deg,
+            selection.winner.model.pooled.rmse_deg,
+        )
+        told = (
+            f"its line was fitted again; its cross-validated RMSE is {now:.4f} deg, that of "
+            f"{champion.reference} was {was:.4f} deg"
+        )
+        problems += [told] if now > was + floor().worth_deg else []
+        return Judgement(tuple(problems), told)
     try:
         incumbents = _incumbents(registry, champion)
         comparison = compare(selection, incumbents)

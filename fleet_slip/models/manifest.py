@@ -18,11 +18,14 @@ from pydantic import (
     FiniteFloat,
     PlainSerializer,
     PlainValidator,
+    SerializerFunctionWrapHandler,
+    TypeAdapter,
+    model_serializer,
     model_validator,
 )
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.catalogue.definitions import Definition, integer_arithmetic, plain_column
+from fleet_slip.catalogue.definitions import Definition, Made, integer_arithmetic, plain_column
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config
@@ -250,6 +253,9 @@ class ImportedFrom(Config):
     sha256: Sha256
 
 
+_MADE: TypeAdapter[Made] = TypeAdapter(Made)
+
+
 class Manifest(Config):
     """One model version; `trained_on` of an imported one is about another data root's tables."""
 
@@ -274,6 +280,50 @@ class Manifest(Config):
         Field(max_length=100, exclude_if=lambda assumed: not assumed),
     ] = ()
     """What the mappings of its logs leave open, and which value stands for it."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_what_is_made(cls, content: Any) -> Any:
+        """Put what is made of columns, which stands once in `made`, where columns name it."""
+        if not isinstance(content, dict) or not isinstance(content.get("made"), dict):
+            return content
+        waiting, found = dict(content["made"]), dict[str, Made]()
+
+        def within(part: Any) -> Any:
+            if isinstance(part, list | tuple):
+                return [within(one) for one in part]
+            if not isinstance(part, dict):
+                return part
+            part = {key: within(one) for key, one in part.items()}
+            if isinstance(name := part.get("made"), str):
+                if name in waiting:
+                    found[name] = _MADE.validate_python(within(waiting.pop(name)))
+                if name not in found:
+                    raise ValueError(f"made: {name} is missing, or made of itself")
+                part["made"] = found[name]
+            return part
+
+        rest = {key: one for key, one in content.items() if key != "made"}
+        return {**rest, "terms": within(content.get("terms"))}
+
+    @model_serializer(mode="wrap")
+    def _with_what_is_made_once(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content, found = handler(self), dict[str, Any]()
+
+        def within(part: Any) -> Any:
+            if isinstance(part, list | tuple):
+                return [within(one) for one in part]
+            if not isinstance(part, dict):
+                return part
+            if isinstance(part.get("made"), dict):
+                name = part["of"]
+                if name not in found:
+                    found[name] = within(part["made"])
+                part = {**part, "made": name}
+            return {key: within(one) for key, one in part.items()}
+
+        terms = within(content["terms"])
+        return {**content, "terms": terms, "made": found} if found else content
 
     @model_validator(mode="after")
     def _agrees(self) -> "Manifest":

@@ -2,12 +2,13 @@
 
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from fractions import Fraction
 from importlib.metadata import version as package_version
 from typing import Any
 
+from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.catalogue.facts import MEASURED, TRAINING_DRIVES
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
@@ -162,6 +163,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
     label = signals[signals.label]
     wanted = (*winner.signals, signals.label)
     drives = drives_of(selection, name)
+    definitions = features().definitions(selection.cohort.feature_set)
     unlabelled, changes = selection.cohort.count_unlabelled_with(wanted)
     return Manifest(
         name=name,
@@ -172,7 +174,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
         intercept_exact=winner.model.intercept,
         through_origin=not selection.intercept,
         terms=tuple(
-            _term(signal, exact)
+            _term(signal, exact, definitions)
             for signal, exact in zip(winner.signals, winner.model.coefficients, strict=True)
         ),
         cross_validation=_cross_validated(winner, selection),
@@ -242,7 +244,7 @@ def with_straight_intercept(
         intercept_spread_deg=math.degrees(found.spread),
     )
     scales = input_scales()
-    terms = (_term(column, slope / scales[column]) for column, slope in found.slopes.items())
+    terms = (_term(column, slope / scales[column], {}) for column, slope in found.slopes.items())
     own = {"intercept": float(found.intercept), "intercept_exact": found.intercept}
     origin = {"learned_from": learned, "terms": (*manifest.terms, *terms)}
     return manifest.model_copy(update={**own, **origin})
@@ -270,10 +272,11 @@ def drives_of(selection: Selection, name: str) -> bytes:
     return TrainedDrives.of(name, selection.cohort.hash_drives_with(signals)).content
 
 
-def _term(name: str, coefficient: Fraction) -> ModelTerm:
+def _term(name: str, coefficient: Fraction, definitions: Mapping[str, Definition]) -> ModelTerm:
+    """Return a term; `definitions` are those of the set's columns, which a line may have made."""
     known = features()
     one = known.of(name)
-    definition = known.definition(name)
+    definition = definitions.get(name) or known.definition(name)
     return ModelTerm(
         signal=name,
         column=one.column,

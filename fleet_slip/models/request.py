@@ -317,6 +317,8 @@ class ModelList(Config):
     description: str = Field(min_length=1)
     label: Label | None = None
     features: Identifier = PLAIN
+    line: Annotated[str, Field(min_length=1)] | None = None
+    """The list that the line is chosen from whose estimate is in the feature set."""
     folds: Folding = Folding()
     model: tuple[CandidateModel, ...] = Field(min_length=1)
     search: tuple[Search, ...] = ()
@@ -341,7 +343,7 @@ class ModelList(Config):
     @model_validator(mode="after")
     def _feature_set_has_the_inputs(self) -> "ModelList":
         known = features()
-        if self.features not in {PLAIN, *known.sets}:
+        if self.features not in {PLAIN, *known.sets} and not known.line_of(self.features):
             raise ValueError(f"features: no feature set is called {self.features!r}")
         if absent := self.absent_from(self.features):
             inputs = known.feature_set(self.features).inputs

@@ -4,7 +4,6 @@ It depends on the drive alone, so that models of different days share a split, w
 the folds out cannot. Sizes vary by chance; an empty fold is an error.
 """
 
-import hashlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,22 +14,12 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.base import Record, number_of
+from fleet_slip.base import Record, hash_fold, number_of
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.drives import missing_signals_error
 from fleet_slip.regression.figures import ErrorSums, Figures, error_sums
 from fleet_slip.regression.gram import Gram, GramTable, require_signals
 from fleet_slip.regression.least_squares import LinearModel, Scales, condition_number, fit
-
-
-def hash_number(key: str) -> int:
-    """Return a key's number below 2^64, the same on every machine and for ever."""
-    return int.from_bytes(hashlib.sha256(key.encode("utf-8")).digest()[:8], "big")
-
-
-def hash_fold(key: str, count: int) -> int:
-    """Return the fold 0..count-1 of a key."""
-    return hash_number(key) % count
 
 
 @dataclass(frozen=True)

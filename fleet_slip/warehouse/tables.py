@@ -1,5 +1,6 @@
 """The warehouse of one data root: which tables it holds and how they are encoded."""
 
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,15 +9,18 @@ from typing import Any
 
 import duckdb
 import pyarrow as pa
-from pydantic import Field, RootModel
+from pydantic import Field, RootModel, ValidationError
 
 from fleet_slip.catalogue.course import COURSE_LATE
 from fleet_slip.catalogue.facts import ALL_DRIVES
+from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalogue.lines import Line, look_for_lines, remember_line
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue, catalogue
 from fleet_slip.columns.sql import with_absent
 from fleet_slip.config import Config, load_toml
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.resources import folder, read_sql
+from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.encoding import Encoding
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.table import SCALE, Snapshot, Table, absent_columns
@@ -100,6 +104,47 @@ class Warehouse:
             ),
             description="Rows of measured logs that were refused, with the reason",
         )
+
+    @property
+    def lines(self) -> Folder:
+        """The folder of fitted lines, a folder of documents for each, by its digest."""
+        return self.root / "lines"
+
+    def look_for_lines(self) -> None:
+        """Let feature sets find the lines of this data root; nothing is read before one does."""
+        look_for_lines(str(self.root), self.line)
+
+    def feature_sets(self) -> tuple[str, ...]:
+        """Return the feature sets that Gram rows can be of, those with a line of this root, too."""
+        self.look_for_lines()
+        known = features()
+        learning = [name for name in known.sets if known.estimate_in(name)]
+        lines = [self.line(digest) for digest in sorted(self.lines.names())] if learning else []
+        fitted = [
+            f"{name}_{line.digest}"
+            for name in learning
+            for line in lines
+            if line and line.estimate == known.estimate_in(name)
+        ]
+        return (PLAIN, *(name for name in known.sets if name not in learning), *fitted)
+
+    def line(self, digest: str) -> Line | None:
+        """Return a line by its digest; None if there is none. Raises `StorageError`."""
+        kept = DocumentFolder(self.lines / digest)
+        if 1 not in kept.numbers():
+            return None
+        try:
+            line = Line.model_validate_json(json.dumps(kept.read(1).content["line"]))
+        except (ValidationError, KeyError):
+            line = None
+        if line is None or line.digest != digest:
+            raise StorageError(f"{kept.file(1)}: no line of that checksum. Restore the folder.")
+        return line
+
+    def keep_line(self, line: Line) -> None:
+        """Write a line down, durably, unless it is there."""
+        DocumentFolder(self.lines / line.digest).create(1, {"line": line.model_dump(mode="json")})
+        remember_line(line)
 
     @property
     def tables(self) -> tuple[Table, ...]:

@@ -7,7 +7,16 @@ from fractions import Fraction
 import numpy as np
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.definitions import Definition, Fact, Gate, Number
+from fleet_slip.catalogue.definitions import (
+    Combination,
+    Definition,
+    Equation,
+    Fact,
+    Gate,
+    Number,
+    Product,
+    Slope,
+)
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.export.compile import Sample
@@ -74,6 +83,43 @@ DEFINITIONS = {
     ),
 }
 
+LINE = Definition(
+    of="line",
+    made=Combination(
+        intercept=-700,
+        terms=((3000, DEFINITIONS["mean_3"]), (-20000, DEFINITIONS["below"])),
+        divisor=2**10,
+    ),
+)
+SPEED_NOW = Definition(of="wheel_fl", bits=16)
+PACE = Definition(of="pace", made=Product(of=(SPEED_NOW, LINE), ratio=Fraction(1, 1000)))
+CHANGES = tuple(
+    Definition(of=one.of, made=one.made, of_bits=one.of_bits, over="change", ticks=ticks, bits=16)
+    for one in (PACE, LINE)
+    for ticks in (2, 5)
+)
+SLOPE = Definition(
+    of="slope",
+    made=Slope(
+        equations=(
+            Equation(y=CHANGES[0], x=(CHANGES[2], 3000, SPEED_NOW)),
+            Equation(y=CHANGES[1], x=(CHANGES[3], -7000, SPEED_NOW), weight=Fraction(2, 5)),
+        ),
+        ridge=(5000, 2**20, 1),
+        ratio=Fraction(700, 3),
+    ),
+)
+LEARNING = {
+    "line": LINE,
+    "pace_2": CHANGES[0],
+    "slope": SLOPE,
+    "slope_above": SPEED.model_copy(update={"gate": Gate(by=SLOPE, low=-90, peak=7)}),
+    "one_below": Definition(
+        of="one", made=Product(of=(), ratio=Fraction(9)), gate=Gate(by=SLOPE, low=-99, peak=-9)
+    ),
+}
+"""What is made of columns, and learns in the car."""
+
 
 def model_of(
     coefficients: Mapping[str, Fraction], intercept: Fraction = Fraction(0), name: str = "sideslip"
@@ -94,7 +140,7 @@ def _term(name: str, coefficient: Fraction) -> ModelTerm:
         unit="1",
         scale=signal.scale if signal else Decimal("0.001"),
         sql=feature.sql if feature else "",
-        definition=None if signal or feature else DEFINITIONS[name],
+        definition=None if signal or feature else (DEFINITIONS | LEARNING)[name],
         coefficient=float(coefficient),
         coefficient_exact=coefficient,
     )
@@ -113,6 +159,7 @@ def cars(draw: st.DrawFn) -> Car:
 SMALL = Fraction(1, 10**4)
 MODELS: Mapping[str, Mapping[str, Fraction]] = {
     "every_kind": {name: SMALL * (-1) ** i for i, name in enumerate(DEFINITIONS)},
+    "learning": {name: SMALL * (-1) ** i for i, name in enumerate(LEARNING)},
     "signals": {"ay": Fraction(1, 3), "yaw_rate": Fraction(-22, 7)},
     "features": {"curvature": Fraction(1, 3), "ay_signed_square": SMALL},
     "a_lag": {"lag_2": Fraction(1)},

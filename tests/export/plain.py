@@ -8,13 +8,17 @@ def divide(a: int, b: int) -> int | None:
     return None if b <= 0 else a // b if a >= 0 else -(-a // b)
 
 
+def power(a: int, most: int) -> int:
+    return 1 << next(n for n in range(99) if a <= most << n)
+
+
 def nearest(a: int, b: int) -> int | None:
     return divide(2 * a + (b if a >= 0 else -b), 2 * b)
 
 
 DO: dict[str, Any] = {
     "+": add, "-": sub, "*": mul, "//": divide, "nearest": nearest, "min": min, "max": max,
-    "negative": neg, "abs": abs, "sign": lambda a: (a > 0) - (a < 0),
+    "negative": neg, "abs": abs, "power": power, "sign": lambda a: (a > 0) - (a < 0),
     "clip": lambda a, b: max(-b, min(a, b)), "where": lambda a, _: a,
     "at_least": lambda a, b: a if a >= b else None,
 }  # fmt: skip

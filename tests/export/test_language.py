@@ -17,7 +17,17 @@ from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from fleet_slip.catalogue.definitions import Definition, Fact, Gate, Number, Over
+from fleet_slip.catalogue.definitions import (
+    Combination,
+    Definition,
+    Equation,
+    Fact,
+    Gate,
+    Number,
+    Over,
+    Product,
+    Slope,
+)
 from fleet_slip.catalogue.facts import NumberName
 from fleet_slip.catalogue.time_columns import Feature
 from fleet_slip.columns.sql import with_columns
@@ -80,7 +90,7 @@ BITS = st.sampled_from([16, 18, 20])
 @st.composite
 def definitions(draw: st.DrawFn) -> Definition:
     """A column of any kind: window, factor, gate, number."""
-    found = draw(windows())
+    found = draw(st.one_of(windows(), windows(), made_of_columns()))
     kind = draw(st.sampled_from(["window", "window", "fact", "gate", "number"]))
     update: dict[str, Any] = {}
     if kind == "fact":
@@ -91,7 +101,8 @@ def definitions(draw: st.DrawFn) -> Definition:
     if kind == "gate":
         low, rises, falls = draw(st.tuples(st.integers(-9000, 9000), *[st.integers(1, 3000)] * 2))
         high = draw(st.sampled_from([None, low + rises + falls]))
-        update["gate"] = Gate(by=draw(windows()), low=low, peak=low + rises, high=high)
+        by = draw(st.one_of(windows(), made_of_columns()))
+        update["gate"] = Gate(by=by, low=low, peak=low + rises, high=high)
     if kind == "number":
         name = draw(st.sampled_from([*NUMBERS]))
         running = Definition(of="yaw_rate", over="running_mean", ratio=Fraction(16))
@@ -106,16 +117,50 @@ def definitions(draw: st.DrawFn) -> Definition:
 
 
 @st.composite
-def windows(draw: st.DrawFn) -> Definition:
-    """What looks back on a signal or a feature, or is it now."""
-    sql = draw(st.one_of(st.just(""), features()))
-    over: Over | None = draw(st.sampled_from([None, "mean", "sum", "lag", "running_mean"]))
-    ticks = draw(st.integers(1, 4)) if over in {"mean", "sum", "lag"} else 0
-    row: dict[str, Any] = {"of": draw(st.sampled_from(SIGNALS))}
+def made_of_columns(draw: st.DrawFn) -> Definition:
+    """A window over a sum, product or slope of windows, or it now."""
+    kind = draw(st.sampled_from(["sum", "product", "slope"]))
+    made: Combination | Product | Slope
+    if kind == "sum":
+        times = st.integers(-3000, 3000)
+        terms = draw(st.lists(st.tuples(times, windows()), max_size=3))
+        intercept = draw(st.integers(-(2**40), 2**40))
+        made = Combination(intercept=intercept, terms=tuple(terms), divisor=draw(DIVISOR))
+    elif kind == "product":
+        factors = draw(st.lists(windows(), max_size=2))
+        made = Product(of=tuple(factors), ratio=Fraction(draw(st.integers(1, 9)), draw(DIVISOR)))
+    else:
+        unknowns = draw(st.integers(1, 4))
+        column = windows(st.just(16))
+        x = st.tuples(column, *[st.one_of(column, st.integers(-(2**15), 2**15))] * (unknowns - 1))
+        weight = st.sampled_from([Fraction(1), Fraction(2, 5)])
+        equation = st.builds(Equation, y=column, x=x, weight=weight)
+        ridge = st.tuples(*[st.sampled_from([1, 1000, 2**40])] * unknowns)
+        ratio = st.sampled_from([Fraction(1), Fraction(10**6), Fraction(1, 7)])
+        equations = draw(st.lists(equation, min_size=1, max_size=2))
+        made = Slope(equations=tuple(equations), ridge=draw(ridge), ratio=draw(ratio))
+    row = {"of": f"m_{crc32(repr(made).encode())}", "made": made, "of_bits": draw(BITS)}
+    return draw(windows(BITS, row))
+
+
+DIVISOR = st.sampled_from([1, 7, 1000, 2**20])
+
+
+@st.composite
+def windows(
+    draw: st.DrawFn, bits: st.SearchStrategy[int] = BITS, row: dict[str, Any] | None = None
+) -> Definition:
+    """What looks back on a signal, a feature or what is made of columns, or is it now."""
+    over: Over | None = draw(
+        st.sampled_from([None, "mean", "sum", "lag", "change", "running_mean"])
+    )
+    ticks = draw(st.integers(1, 4)) if over in {"mean", "sum", "lag", "change"} else 0
+    sql = "" if row else draw(st.one_of(st.just(""), features()))
+    row = row or {"of": draw(st.sampled_from(SIGNALS))}
     if sql:
         row = {"of": f"f_{crc32(sql.encode())}", "sql": sql, "of_bits": draw(BITS)}
     try:
-        return Definition(**row, over=over, ticks=ticks, ratio=draw(RATIO), bits=draw(BITS))
+        return Definition(**row, over=over, ticks=ticks, ratio=draw(RATIO), bits=draw(bits))
     except ValidationError:  # it could need more than 64 bits
         assume(False)
         raise

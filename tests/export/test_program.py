@@ -12,7 +12,7 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.export.compile import compile_program, make_checks
 from fleet_slip.export.files import program_content
 from tests.export import plain
-from tests.export.models import DEFINITIONS, MODELS, model_of
+from tests.export.models import DEFINITIONS, LEARNING, MODELS, model_of
 
 
 def test_what_divides_by_a_constant_below_zero_has_no_program(
@@ -25,12 +25,12 @@ def test_what_divides_by_a_constant_below_zero_has_no_program(
 
 def test_every_kind_of_column_has_an_angle_in_the_checks() -> None:
     """Else the checks that travel with a program would check nothing of it."""
-    for name in DEFINITIONS:
+    for name in (*DEFINITIONS, *LEARNING):
         manifest = model_of({name: Fraction(1, 3)})
         program = compile_program(manifest)
         checks = make_checks(manifest, program)
         angles = {angle for check in checks for angle in check.angles}
-        assert None in angles, name
+        assert (None in angles) == (name not in ("slope", "one_below")), name  # always there
         assert len(angles) > (2 if name == "tyres" else 5), name
         for check in checks:
             content = program_content(program)

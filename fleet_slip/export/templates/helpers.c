@@ -40,6 +40,23 @@ static int32_t larger(int32_t one, int32_t other)
     return (one > other) ? one : other;
 }
 
+//: max_64
+static int64_t larger_64(int64_t one, int64_t other)
+{
+    return (one > other) ? one : other;
+}
+
+//: power
+/* The least power of two, at least 1, times which most is not below a value. */
+static int32_t power_of_two(int64_t value, int32_t most)
+{
+    int64_t found = 1;
+    while (value > (found * most)) {
+        found *= 2;
+    }
+    return (int32_t)found;
+}
+
 //: nearest_64
 /* value / divisor to the nearest, halves away from zero. */
 static int64_t nearest_64(int64_t value, int64_t divisor)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from fleet_slip.base import hash_fold
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.choice import Worth, choose
 from fleet_slip.regression.folds import (
@@ -20,7 +21,6 @@ from fleet_slip.regression.folds import (
     by_hash,
     by_value,
     cross_validate_inputs,
-    hash_fold,
 )
 from fleet_slip.regression.gram import Gram
 from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of

@@ -1,0 +1,129 @@
+"""How far models are from what they should reach, kind of driving by kind, on blind roads.
+
+    python -m benchmarks.goals DATA_ROOT MODEL [MODEL ...] [--roads 4] [--draws 5]
+
+Each kind of driving is on roads of its own, drawn from the hash of the first model's version, which
+nobody could know before it was published, with the drivers of `configs/blind.toml`. The car is the
+sedan, with the paper's sensors, of which the filters know the class, or everything (load and
+adhesion, too), and are not tuned. Printed is the RMSE in degrees against the exact angle, last on
+each of so many `--draws` of 24 blind drives.
+"""
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from hashlib import sha256
+from typing import Any
+
+import fleet_slip
+from fleet_slip.config import load_config
+from fleet_slip.evaluation.blind import BlindSet, blind_scenarios
+from fleet_slip.evaluation.drives import simulate_drives
+from fleet_slip.evaluation.filters import FILTERS, FilterEstimate, PublishedEstimate
+from fleet_slip.evaluation.judge import Estimate, evaluate_drive, judge
+from fleet_slip.resources import config_file
+from fleet_slip.simulation.roads import draw_road, random_generator
+from fleet_slip.simulation.scenario import Scenario, load_scenario
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2, load_vehicle
+
+CAR = "d_class_sedan"
+OPEN = ("country", "hill")
+TOP_SPEED_MPS = 35.0
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of driving: its goal in degrees, classes of roads, and in what it differs."""
+
+    goal_deg: float
+    roads: tuple[str, ...] = OPEN
+    adhesion: float = 1.0
+    friction_use: float = 0.5
+    """Planned lateral acceleration over adhesion times g, of a driver who sees the road."""
+    others: Mapping[str, Any] = field(default_factory=dict)
+
+
+def kinds() -> dict[str, Kind]:
+    """Return the kinds of driving by name."""
+    laden_kg = load_vehicle(CAR).body.sprung_mass_kg + 300
+    leaning = load_scenario("imperfect_road").imperfections
+    load = {"sprung_mass_kg": laden_kg, "load_position_m": -1.9}
+    return {
+        "country": Kind(0.035, ("country",)),
+        "hill": Kind(0.046, ("hill",)),
+        "300 kg behind the rear axle": Kind(0.16, others=load),
+        "adhesion .55": Kind(0.105, adhesion=0.55, friction_use=0.7),
+        "adhesion .5": Kind(0.105, adhesion=0.5, friction_use=0.7),
+        "adhesion .4": Kind(0.105, adhesion=0.4, friction_use=0.7),
+        "limit of grip": Kind(0.14, friction_use=0.82),
+        "banked": Kind(0.058, others={"imperfections": leaning.model_dump()}),
+    }
+
+
+def scenarios(kind: str, one: Kind, seed: int, roads: int) -> Iterator[Scenario]:
+    """Yield the drives of a kind."""
+    drivers = load_config(config_file("blind.toml"), BlindSet).drivers
+    for number in range(roads):
+        road = one.roads[number % len(one.roads)]
+        drawn = random_generator(seed, "goals", kind, str(number))
+        track = draw_road(road, int(drawn.integers(2**60)))
+        yield Scenario.model_validate(
+            {
+                "name": f"goal_{number}",
+                "description": kind,
+                "base": "nominal",
+                "pace": [],
+                "track": drivers.line(track, road, drawn),
+                "adhesion": one.adhesion,
+                "seed": number,
+                "limits": {
+                    "lateral_mps2": one.friction_use * one.adhesion * GRAVITY_MPS2,
+                    "acceleration_mps2": 2.5 * one.adhesion,
+                    "braking_mps2": 4.0 * one.adhesion,
+                    "top_speed_mps": TOP_SPEED_MPS,
+                },
+                **one.others,
+            }
+        )
+
+
+def errors_deg(some: Sequence[Scenario], estimators: Mapping[str, Estimate]) -> list[float]:
+    """Return the RMSE of each estimator over all drives in which no car is lost."""
+    drives = [one for one in simulate_drives(some) if one.lost_control_s is None]
+    found = judge([evaluate_drive(drive, estimators) for drive in drives])
+    return [found[name].rmse_deg or float("nan") for name in estimators]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("root")
+    parser.add_argument("models", nargs="+")
+    parser.add_argument("--roads", type=int, default=4)
+    parser.add_argument("--draws", type=int, default=0)
+    options = parser.parse_args()
+    fleet = fleet_slip.open(options.root)
+    versions = [fleet.model(name) for name in options.models]
+    estimators: dict[str, Any] = {
+        one.reference: PublishedEstimate.of(one.manifest) for one in versions
+    }
+    for one in FILTERS:
+        if one.module == "ekf":
+            estimators[one.name] = FilterEstimate(one, one.parameters, load_vehicle(CAR))
+    seed = int(versions[0].sha256[:15], 16)
+    drives = {"nominal": (0.014, [load_scenario("nominal")])} | {
+        kind: (one.goal_deg, list(scenarios(kind, one, seed, options.roads)))
+        for kind, one in kinds().items()
+    }
+    print("| | goal |", " | ".join(estimators), "|")
+    print("| --- " * (len(estimators) + 2) + "|")
+    for kind, (goal_deg, some) in drives.items():
+        found = " | ".join(f"{error:.3f}" for error in errors_deg(some, estimators))
+        print(f"| {kind} | {goal_deg:.3f} | {found} |", flush=True)
+    for number in range(options.draws):
+        drawn = sha256(f"{versions[0].sha256} {number}".encode()).hexdigest()
+        found = " | ".join(f"{e:.3f}" for e in errors_deg(blind_scenarios(drawn), estimators))
+        print(f"| 24 blind drives, draw {number + 1} | | {found} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,129 @@
+"""The inner line of a model list whose feature set has its estimate: fitted first, and kept."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.base import Progress, no_progress
+from fleet_slip.catalogue.definitions import Combination, Definition
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalogue.lines import Line, whole_line
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.errors import QuestionError
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.folding import assign_folds
+from fleet_slip.grams.gram_files import Hashes, hash_numbers
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.reader import cohort_files
+from fleet_slip.models.request import SelectionRequest, load_model_list
+from fleet_slip.models.select import SelectionPlan
+from fleet_slip.regression.folds import CohortFolds
+from fleet_slip.regression.least_squares import LinearModel, fit
+from fleet_slip.warehouse.condition import parse_cohort
+from fleet_slip.warehouse.tables import Warehouse
+
+FOLDS = 8
+
+KEPT_UNTIL = 2
+"""A line is fitted again where a cohort has so many times the drives that it was fitted to."""
+
+
+def with_line_fitted(
+    warehouse: Warehouse,
+    request: SelectionRequest,
+    asked: str,
+    condition: str,
+    progress: Progress = no_progress,
+) -> SelectionRequest:
+    """Return a request of a set with a line, which is fitted if none is kept; others as they are.
+
+    `asked` is the cohort, `condition` what of it is in order. The Gram rows of the set, and those
+    that the line needs, are made. Raises as `answer_request`.
+    """
+    warehouse.look_for_lines()
+    plan = SelectionPlan.of(request)
+    named = plan.feature_set
+    if estimate := features().estimate_in(named):
+        if plan.model_list is None or plan.model_list.line is None:
+            raise QuestionError(
+                f"the feature set {named} has the estimate of a line: take a list of models that "
+                "says which, such as models = learning."
+            )
+        about = {"estimate": estimate, "models": plan.model_list.line, "cohort": asked}
+        line = _kept_line(warehouse, about, condition)
+        if line is None:
+            line = fit_line(warehouse, about, condition, progress)
+            warehouse.keep_line(line)
+        named = f"{named}_{line.digest}"
+        request = replace(request, features=named)
+    if features().line_of(named):
+        files = cohort_files(warehouse, parse_cohort(condition))
+        update_grams(warehouse, progress, feature_set=named, among=files)
+    return request
+
+
+def _kept_line(warehouse: Warehouse, about: dict[str, str], condition: str) -> Line | None:
+    """Return the line that was fitted to the most drives, all of which are there.
+
+    None if there is none, or the cohort has outgrown it.
+    """
+    wanted = {**about, "models_sha256": load_model_list(about["models"]).sha256}
+    kept = [line for digest in warehouse.lines.names() if (line := warehouse.line(digest))]
+    there = load_cohort(warehouse, condition).hash_drives_with(())
+    fitting = [
+        line
+        for line in kept
+        if wanted.items() <= vars(line).items()
+        and np.isin(_unpacked(line.drive_hashes), there).all()
+    ]
+    best = max(fitting, key=lambda line: (line.drives, line.digest), default=None)
+    return best if best and len(there) < KEPT_UNTIL * best.drives else None
+
+
+def _unpacked(hashes: str) -> Hashes:
+    return np.frombuffer(bytes.fromhex(hashes), dtype=">u8").astype(np.uint64)
+
+
+def fit_line(
+    warehouse: Warehouse, about: dict[str, str], condition: str, progress: Progress = no_progress
+) -> Line:
+    """Choose a line from its model list, and fit it to all drives, and without each fold.
+
+    `about` are the `estimate`, `models` and `cohort` of a `Line`. Raises as `answer_request`, and
+    `QuestionError` if its estimate would not be exact.
+    """
+    models = load_model_list(about["models"])
+    plan = SelectionPlan.of(SelectionRequest(models=about["models"], by="drive"))
+    files = cohort_files(warehouse, parse_cohort(condition))
+    update_grams(warehouse, progress, feature_set=plan.feature_set, among=files)
+    cohort = plan.load(warehouse, condition)
+    signals, label = plan.choose(cohort).winner.model.signals, catalogue().label
+    served = cohort.serving(signals)
+    drives = served.drives["drive_id"].to_pylist()
+    hashed = FOLDS if len(set(drives)) > FOLDS else None
+    assignment = assign_folds(drives, "drive", FOLDS)
+    folds = CohortFolds.of([served.table], assignment).serving(signals, label)
+    known = features()
+    unit = input_scales()[label] / Fraction(known.estimates[about["estimate"]].scale)
+    columns = [
+        known.definition(one) or known.rows([one]).get(one) or Definition(of=one) for one in signals
+    ]
+
+    def whole(model: LinearModel) -> Combination:
+        slopes = [slope * unit for slope in model.coefficients]
+        return whole_line(model.intercept * unit, slopes, columns)
+
+    return Line(
+        **about,
+        fitted=whole(fit(folds.total, signals, label).model),
+        folds={
+            fold: whole(fit(training, signals, label).model)
+            for fold, (training, _) in zip(folds.names, folds.splits(), strict=True)
+        },
+        hashed=hashed,
+        models_sha256=models.sha256,
+        drives=len(set(drives)),
+        drive_hashes=np.unique(hash_numbers(pa.array(drives))).astype(">u8").tobytes().hex(),
+    )

@@ -1,0 +1,181 @@
+"""Two stages: a line that is fitted first, and one whose columns have its estimate."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fleet_slip
+from fleet_slip.api.fleet import Fleet
+from fleet_slip.catalogue.definitions import Combination
+from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalogue.lines import Line, _lines, whole_line
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.drive_columns import DriveColumns
+from fleet_slip.columns.plan import ColumnPlan
+from fleet_slip.errors import QuestionError, StorageError
+from fleet_slip.export.compile import compile_program, make_checks
+from fleet_slip.export.files import program_content
+from fleet_slip.grams.compute import read_drives
+from fleet_slip.grams.job import update_grams
+from fleet_slip.models.registry import ModelVersion
+from fleet_slip.resources import CONFIG_VARIABLE
+from tests.export import plain
+
+INNER = ("ay_mean_16", "curvature_mean_8", "steering_mean_16")
+SET = """\
+[sets.tiny]
+description = "A line's estimate, and what its error tells"
+signals = ["ay", "yaw_rate"]
+windows = ["curvature_mean_8", "steering_mean_16", "line", "error_slope"]
+"""
+LISTS = {
+    "inner": f"""\
+description = "Three columns"
+features = "windows"
+[[model]]
+name = "three"
+signals = {json.dumps(INNER)}
+""",
+    "outer": """\
+description = "With what the line tells"
+features = "tiny"
+line = "inner"
+[folds]
+by = "drive"
+count = 4
+[[model]]
+name = "all"
+signals = ["ay", "curvature_mean_8", "line", "error_slope"]
+""",
+}
+
+
+@pytest.fixture(autouse=True)
+def own_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Configs of one's own with the set `tiny`, and lists of models of it."""
+    (tmp_path / "own" / "models").mkdir(parents=True)
+    (tmp_path / "own" / "features.toml").write_text(SET)
+    for name, text in LISTS.items():
+        (tmp_path / "own" / "models" / f"{name}.toml").write_text(text)
+    monkeypatch.setenv(CONFIG_VARIABLE, str(tmp_path / "own"))
+    for cached in (features, input_scales):
+        cached.cache_clear()
+    yield
+    for cached in (features, input_scales):
+        cached.cache_clear()
+
+
+@pytest.fixture
+def fleet(tmp_path: Path, smoke_root: Path) -> Fleet:
+    return fleet_slip.open(shutil.copytree(smoke_root, tmp_path / "data"))
+
+
+def published(fleet: Fleet) -> ModelVersion:
+    return fleet.publish("tiny", fleet.cohort().select(models="outer")).version
+
+
+def the_line(fleet: Fleet) -> Line:
+    (digest,) = fleet.warehouse.lines.names()
+    line = fleet.warehouse.line(digest)
+    assert line is not None
+    return line
+
+
+def test_each_drive_has_the_estimate_of_a_line_that_was_fitted_without_it(fleet: Fleet) -> None:
+    """By numpy's least squares on the rows themselves."""
+    published(fleet)
+    line, label = the_line(fleet), catalogue().label
+    names = (*INNER, label)
+    plan = ColumnPlan.of(names, {}, {n: features().time_columns[n].definition for n in INNER})
+    rows = {
+        drive.drive_id: DriveColumns(plan, drive.counts).compute()
+        for file in fleet.warehouse.logs.snapshot().files
+        for drive in read_drives(fleet.warehouse, file, plan)
+    }
+    grams = fleet.sql(
+        f"SELECT drive_id, n, sums, signals FROM grams WHERE feature_set LIKE 'tiny_{line.digest}%'"
+    )
+    folds = {drive: line.fold_of(drive) for drive in rows}
+    assert len(set(folds.values())) == len(line.folds) > 2
+    found = grams.to_arrow_table().to_pylist()
+    assert len(found) == len(rows) > 4
+    for gram in found:
+        others = [rows[d] for d in rows if folds[d] != folds[gram["drive_id"]]]
+        training = np.hstack(others)
+        training = training[:, np.isfinite(training).all(axis=0)]
+        inputs = np.vstack([training[:-1], np.ones(training.shape[1])])
+        fitted, *_ = np.linalg.lstsq(inputs.T, training[-1], rcond=None)
+        own = rows[gram["drive_id"]]
+        own = own[:, np.isfinite(own).all(axis=0)]
+        micro_rad = (fitted[:-1] @ own[:-1] + fitted[-1]) * 100  # a count of the label is 0.0001
+        total = gram["sums"][gram["signals"].split(",").index("line")]
+        assert abs(total / gram["n"] - micro_rad.mean()) < 0.6
+
+
+def test_a_version_is_the_same_on_board(fleet: Fleet) -> None:
+    version = published(fleet)
+    manifest, line = version.manifest, the_line(fleet)
+    assert manifest.trained_on.feature_set.startswith(f"tiny_{line.digest}-")
+    estimate = manifest.definitions["line"].made
+    assert isinstance(estimate, Combination)
+    assert (estimate.terms, estimate.line) == (line.fitted.terms, line.digest)
+    program = compile_program(manifest)
+    for check in make_checks(manifest, program):
+        content, samples = program_content(program), list(check.samples)
+        angles = plain.angles(content, list(check.facts), list(check.numbers), samples)
+        assert angles == list(check.angles)
+    again = fleet.model("tiny@1").manifest
+    assert again == manifest
+    assert len(version.manifest.model_dump_json()) < 40_000  # what is made stands once
+
+
+def test_published_again_nothing_is_computed_again(fleet: Fleet) -> None:
+    first = published(fleet)
+    version = fleet.warehouse.grams.snapshot().version
+    assert published(fleet) == first
+    assert fleet.publish("tiny").version == first
+    assert fleet.warehouse.grams.snapshot().version == version
+    assert len(fleet.warehouse.lines.names()) == 1
+
+
+def test_the_line_is_fitted_again_where_a_drive_of_it_is_gone(fleet: Fleet) -> None:
+    published(fleet)
+    line = the_line(fleet)
+    ((drive,),) = fleet.sql("SELECT min(drive_id) FROM drives").fetchall()
+    fleet.forget(drive=drive)
+    after = published(fleet).manifest.trained_on.feature_set
+    assert line.digest not in after
+    others = set(fleet.warehouse.lines.names()) - {line.digest}
+    (digest,) = others
+    fitted = fleet.warehouse.line(digest)
+    assert fitted is not None
+    assert fitted.drives == line.drives - 1
+
+
+def test_a_line_that_was_changed_is_refused(fleet: Fleet) -> None:
+    published(fleet)
+    line = the_line(fleet)
+    file = Path(str(fleet.warehouse.lines)) / line.digest / "1.json"
+    file.write_text(file.read_text().replace('"drives": ', '"drives": 1', 1))
+    _lines.clear()
+    with pytest.raises(StorageError, match="SHA-256"):
+        published(fleet)
+
+
+def test_a_set_without_its_line_has_no_rows(fleet: Fleet) -> None:
+    with pytest.raises(QuestionError, match="fitted first"):
+        update_grams(fleet.warehouse, feature_set="tiny")
+    with pytest.raises(QuestionError, match="take a list of models"):
+        fleet.cohort().select(features="tiny", model="ay")
+    with pytest.raises(QuestionError, match="no line 0123456789ab"):
+        update_grams(fleet.warehouse, feature_set="tiny_0123456789ab")
+
+
+def test_a_line_whose_estimate_would_not_be_exact_is_refused() -> None:
+    column = features().time_columns["ay_mean_16"].definition
+    with pytest.raises(QuestionError, match="exact"):
+        whole_line(input_scales()["ay"], [input_scales()["ay"] * 2**40], [column])
