@@ -13,7 +13,7 @@ from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalogue.course import BESIDE, LONGEST_TICKS, YAW_RATE, course_units
 from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, plain_column
 from fleet_slip.catalogue.facts import CALIBRATION, DELAY, RECEIVED
-from fleet_slip.catalogue.lines import Fitting, Line, known_line
+from fleet_slip.catalogue.lines import FittedLine, Fitting, known_line
 from fleet_slip.catalogue.mirror import parity
 from fleet_slip.catalogue.signals import (
     SAMPLE_TIME_S,
@@ -24,7 +24,7 @@ from fleet_slip.catalogue.signals import (
 )
 from fleet_slip.catalogue.time_columns import (
     Calibrated,
-    Estimate,
+    EstimateColumn,
     Factor,
     Feature,
     GateFamily,
@@ -182,7 +182,7 @@ class FeatureCatalogue(Config):
     features: dict[Identifier, Feature]
     windows: dict[Identifier, Window] = Field(default_factory=dict)
     products: dict[Identifier, ProductColumn] = Field(default_factory=dict)
-    estimates: dict[Identifier, Estimate] = Field(default_factory=dict)
+    estimates: dict[Identifier, EstimateColumn] = Field(default_factory=dict)
     slopes: dict[Identifier, SlopeColumn] = Field(default_factory=dict)
     factors: dict[Identifier, Factor] = Field(default_factory=dict)
     gates: dict[Identifier, GateFamily] = Field(default_factory=dict)
@@ -272,7 +272,7 @@ class FeatureCatalogue(Config):
         members = window.members(name).items()
         return {one: window_column(window, ticks, row, scale) for one, ticks in members}
 
-    def _estimate(self, name: str, estimate: Estimate, _: Columns) -> Columns:
+    def _estimate(self, name: str, estimate: EstimateColumn, _: Columns) -> Columns:
         return {name: estimate_column(name, estimate)}
 
     def _product(self, name: str, product: ProductColumn, known: Columns) -> Columns:
@@ -347,7 +347,7 @@ class FeatureCatalogue(Config):
         fitting = Fitting(line, fold)
         return {w: fitting(one) for w, one in found.items()}
 
-    def line_of(self, name: str) -> Line | None:
+    def line_of(self, name: str) -> FittedLine | None:
         """Return the line of a set `SET_DIGEST`; None of others. Raises `QuestionError`."""
         of, _, digest = name.rpartition("_")
         return known_line(digest) if name not in self.sets and of in self.sets else None

@@ -29,7 +29,7 @@ MOST_BITS, LEAST_BITS = 50, 8
 """Of the largest sum of an estimate, so that twice it is exact in binary64; of its divisor."""
 
 
-class Line(Config):
+class FittedLine(Config):
     """A fitted line, and for each fold of drives the line of all others.
 
     Attributes:
@@ -73,21 +73,21 @@ class Line(Config):
         return one.model_copy(update={"line": self.digest})
 
 
-_lines: dict[str, Line] = {}
-_sources: dict[str, Callable[[str], Line | None]] = {}
+_lines: dict[str, FittedLine] = {}
+_sources: dict[str, Callable[[str], FittedLine | None]] = {}
 
 
-def remember_line(line: Line) -> None:
+def remember_line(line: FittedLine) -> None:
     """Know a line by its digest from now on."""
     _lines[line.digest] = line
 
 
-def look_for_lines(where: str, find: Callable[[str], Line | None]) -> None:
+def look_for_lines(where: str, find: Callable[[str], FittedLine | None]) -> None:
     """Look for unknown lines there, too, such as in a data root."""
     _sources[where] = find
 
 
-def known_line(digest: str) -> Line:
+def known_line(digest: str) -> FittedLine:
     """Return a line. Raises `QuestionError` for an unknown one."""
     for find in reversed(_sources.values()):
         if digest not in _lines and (found := find(digest)) is not None:
@@ -103,7 +103,7 @@ def known_line(digest: str) -> Line:
 class Fitting:
     """Puts a line in the place of its estimate: of a fold, that fitted without it."""
 
-    line: Line
+    line: FittedLine
     fold: str | None
     _made: dict[int, Made] = field(default_factory=dict)
 

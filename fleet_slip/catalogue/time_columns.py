@@ -94,7 +94,7 @@ class Calibrated(Config):
     description: str = Field(min_length=1)
 
 
-class Estimate(Config):
+class EstimateColumn(Config):
     """The estimate of a line that is fitted before, by the `line` of a model list."""
 
     scale: Decimal = Field(gt=0)
@@ -173,20 +173,22 @@ def window_column(window: Window, ticks: int, row: Definition, scale: Fraction) 
 
 
 def _made_column(
-    name: str, one: Estimate | ProductColumn | SlopeColumn, made: Combination | Product | Slope
+    name: str,
+    one: EstimateColumn | ProductColumn | SlopeColumn,
+    made: Combination | Product | Slope,
 ) -> TimeColumn:
     """Return what is made of other columns as a column of its own."""
     bits = one.bits if isinstance(one, ProductColumn) else LARGEST_BITS
     return TimeColumn(
         definition=Definition(of=name, made=made, of_bits=bits, bits=bits),
         scale=one.scale,
-        unit="rad" if isinstance(one, Estimate) else one.unit,
+        unit="rad" if isinstance(one, EstimateColumn) else one.unit,
         column=one.column,
         description=one.description,
     )
 
 
-def estimate_column(name: str, one: Estimate) -> TimeColumn:
+def estimate_column(name: str, one: EstimateColumn) -> TimeColumn:
     """Return the estimate of a line that has not been fitted."""
     return _made_column(name, one, Combination(line=""))
 

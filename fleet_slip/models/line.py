@@ -9,7 +9,7 @@ import pyarrow as pa
 from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.definitions import Combination, Definition
 from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.lines import Line, whole_line
+from fleet_slip.catalogue.lines import FittedLine, whole_line
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
@@ -64,7 +64,7 @@ def with_line_fitted(
     return request
 
 
-def _kept_line(warehouse: Warehouse, about: dict[str, str], condition: str) -> Line | None:
+def _kept_line(warehouse: Warehouse, about: dict[str, str], condition: str) -> FittedLine | None:
     """Return the line that was fitted to the most drives, all of which are there.
 
     None if there is none, or the cohort has outgrown it.
@@ -88,11 +88,11 @@ def _unpacked(hashes: str) -> Hashes:
 
 def fit_line(
     warehouse: Warehouse, about: dict[str, str], condition: str, progress: Progress = no_progress
-) -> Line:
+) -> FittedLine:
     """Choose a line from its model list, and fit it to all drives, and without each fold.
 
-    `about` are the `estimate`, `models` and `cohort` of a `Line`. Raises as `answer_request`, and
-    `QuestionError` if its estimate would not be exact.
+    `about` are the `estimate`, `models` and `cohort` of a `FittedLine`. Raises as `answer_request`,
+    and `QuestionError` if its estimate would not be exact.
     """
     models = load_model_list(about["models"])
     plan = SelectionPlan.of(SelectionRequest(models=about["models"], by="drive"))
@@ -115,7 +115,7 @@ def fit_line(
         slopes = [slope * unit for slope in model.coefficients]
         return whole_line(model.intercept * unit, slopes, columns)
 
-    return Line(
+    return FittedLine(
         **about,
         fitted=whole(fit(folds.total, signals, label).model),
         folds={

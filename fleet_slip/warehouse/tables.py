@@ -14,7 +14,7 @@ from pydantic import Field, RootModel, ValidationError
 from fleet_slip.catalogue.course import COURSE_LATE
 from fleet_slip.catalogue.facts import ALL_DRIVES
 from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.lines import Line, look_for_lines, remember_line
+from fleet_slip.catalogue.lines import FittedLine, look_for_lines, remember_line
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue, catalogue
 from fleet_slip.columns.sql import with_absent
 from fleet_slip.config import Config, load_toml
@@ -128,20 +128,20 @@ class Warehouse:
         ]
         return (PLAIN, *(name for name in known.sets if name not in learning), *fitted)
 
-    def line(self, digest: str) -> Line | None:
+    def line(self, digest: str) -> FittedLine | None:
         """Return a line by its digest; None if there is none. Raises `StorageError`."""
         kept = DocumentFolder(self.lines / digest)
         if 1 not in kept.numbers():
             return None
         try:
-            line = Line.model_validate_json(json.dumps(kept.read(1).content["line"]))
+            line = FittedLine.model_validate_json(json.dumps(kept.read(1).content["line"]))
         except (ValidationError, KeyError):
             line = None
         if line is None or line.digest != digest:
             raise StorageError(f"{kept.file(1)}: no line of that checksum. Restore the folder.")
         return line
 
-    def keep_line(self, line: Line) -> None:
+    def keep_line(self, line: FittedLine) -> None:
         """Write a line down, durably, unless it is there."""
         DocumentFolder(self.lines / line.digest).create(1, {"line": line.model_dump(mode="json")})
         remember_line(line)

@@ -114,6 +114,12 @@ PHYSICS: dict[str, Callable[[Row], Fraction | None]] = {
     "rear_ay": lambda row: rear_turn(row) * rear_speed(row),
     "rear_ay_speed": lambda row: rear_turn(row) * rear_speed(row) ** 2,
     "rear_ay_ax": lambda row: rear_turn(row) * rear_speed(row) * row["ax"],
+    "rear_speed": lambda row: rear_speed(row) * Fraction(102, 100),
+    "rear_path": lambda row: rear_speed(row) * Fraction(102, 10000),
+    "rear_turn": lambda row: row["yaw_rate"] * rear_speed(row) * Fraction(102, 10000),
+    "lateral_gain": lambda row: (
+        row["ay"] / 100 - row["yaw_rate"] * rear_speed(row) * Fraction(102, 10000)
+    ),
     "wheel_difference_front": lambda row: row["wheel_fr"] - row["wheel_fl"],
     "wheel_difference_rear": lambda row: row["wheel_rr"] - row["wheel_rl"],
     "wheel_difference_axles": lambda row: (

@@ -205,7 +205,7 @@ FORGED = (
         (
             ["select", "--models", "table9"],
             3,
-            "Known: course, estimator, gated, gated_small, table1",
+            "Known: course, estimator, gated, gated_small, learning, table1",
         ),
         (["select", "--by", "vehicle"], 5, "at least two folds"),
         (["show", "nothing"], 5, "no model is called"),

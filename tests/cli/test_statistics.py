@@ -66,7 +66,9 @@ def test_all_sets_are_up_to_date(run_command: RunCommand, every_set: Path) -> No
     reports = run_command("gram", "--features", "all", "--json", root=every_set).json
     assert [report["files_read"] for report in reports] == [0] * len(reports)
     assert [report["feature_set"] for report in reports] == [
-        features().identity(name) for name in (PLAIN, *features().sets)
+        features().identity(name)
+        for name in (PLAIN, *features().sets)
+        if not features().estimate_in(name)
     ]
 
 

@@ -12,7 +12,7 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.definitions import Combination
 from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.lines import Line, _lines, whole_line
+from fleet_slip.catalogue.lines import FittedLine, _lines, whole_line
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns
 from fleet_slip.columns.plan import ColumnPlan
@@ -78,7 +78,7 @@ def published(fleet: Fleet) -> ModelVersion:
     return fleet.publish("tiny", fleet.cohort().select(models="outer")).version
 
 
-def the_line(fleet: Fleet) -> Line:
+def the_line(fleet: Fleet) -> FittedLine:
     (digest,) = fleet.warehouse.lines.names()
     line = fleet.warehouse.line(digest)
     assert line is not None
@@ -92,7 +92,7 @@ def test_each_drive_has_the_estimate_of_a_line_that_was_fitted_without_it(fleet:
     names = (*INNER, label)
     plan = ColumnPlan.of(names, {}, {n: features().time_columns[n].definition for n in INNER})
     rows = {
-        drive.drive_id: DriveColumns(plan, drive.counts).compute()
+        str(drive.facts["drive_id"]): DriveColumns(plan, drive).compute()
         for file in fleet.warehouse.logs.snapshot().files
         for drive in read_drives(fleet.warehouse, file, plan)
     }
