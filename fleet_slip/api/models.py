@@ -64,13 +64,13 @@ class PublishedModels(Rooted):
             "trained_on_forgotten", [[f"{name}@{version}" in marked for name, version in pairs]]
         )
 
-    def model(self, model: Annotated[str | None, MODEL] = None) -> ModelVersion:
-        """Return the version that a reference names.
+    def model(self, model: Annotated[str | ModelVersion | None, MODEL] = None) -> ModelVersion:
+        """Return the version that a reference names; a version is returned as it is.
 
         Raises `QuestionError` for an unknown one, `StorageError` for one that was changed, and
         `RefusedError` for one without a required signature.
         """
-        return self.registry().resolve(model)
+        return model if isinstance(model, ModelVersion) else self.registry().resolve(model)
 
     @record_call
     def publish(
@@ -213,7 +213,7 @@ class PublishedModels(Rooted):
         """Tell two versions apart, by their manifests and their drives. Raises as `model`."""
         from fleet_slip.models.diff import compare_versions
 
-        return compare_versions(self.registry(), self.resolve(one), self.resolve(other))
+        return compare_versions(self.registry(), self.model(one), self.model(other))
 
     def estimator(
         self, model: str | ModelVersion, car: Mapping[str, Any] | None = None
@@ -226,7 +226,7 @@ class PublishedModels(Rooted):
         """
         from fleet_slip.export.stepping import Estimator
 
-        return Estimator(self.resolve(model).manifest, car)
+        return Estimator(self.model(model).manifest, car)
 
     def export(
         self,
@@ -251,7 +251,7 @@ class PublishedModels(Rooted):
         from fleet_slip.storage.local import LocalFolder
 
         folder = LocalFolder(output)
-        files = export_files(self.resolve(model), self.warehouse, to, with_gram=with_gram)
+        files = export_files(self.model(model), self.warehouse, to, with_gram=with_gram)
         for name, content in files.items():
             folder.put(name, content)
         return [output / name for name in files]
@@ -265,15 +265,11 @@ class PublishedModels(Rooted):
         """
         from fleet_slip.export.files import log_version
 
-        return log_version(self.resolve(model), self.warehouse, uri)
+        return log_version(self.model(model), self.warehouse, uri)
 
     def registry(self) -> Registry:
         """Return the registry of models."""
         return Registry.of(self.warehouse)
-
-    def resolve(self, model: str | ModelVersion | None) -> ModelVersion:
-        """Return the version that a reference names; a version is returned as it is."""
-        return model if isinstance(model, ModelVersion) else self.model(model)
 
 
 # The part of a `Fleet` that judges models: scores, evaluations, the report, pages of drives.
@@ -308,7 +304,7 @@ class JudgedModels(PublishedModels):
         from fleet_slip.models.score import cohort_of_rows, find_seen, score
         from fleet_slip.operations.examined import Examined, leave_out_faulty
 
-        version = self.resolve(model)
+        version = self.model(model)
         asked = ALL_DRIVES if cohort is None else cohort
         rows = cohort_of_rows(asked)
         examined = Examined(asked) if unexamined else leave_out_faulty(self.warehouse, asked)
@@ -355,7 +351,7 @@ class JudgedModels(PublishedModels):
         from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
 
         chosen = tuple(map(load_scenario, scenarios)) if scenarios else shipped_scenarios()
-        first, *rest = [self.resolve(one) for one in (model, *others)]
+        first, *rest = [self.model(one) for one in (model, *others)]
         with open_workers(self.root, threads) as executor:
             told = count_from_start(progress)
             simulate_scenarios(self.warehouse, chosen, executor, told)
@@ -389,7 +385,7 @@ class JudgedModels(PublishedModels):
         from fleet_slip.evaluation.measured import evaluate_measured
         from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 
-        versions = [self.resolve(one) for one in (model, *others)]
+        versions = [self.model(one) for one in (model, *others)]
         car: VehicleParameters | Measured | None = load_vehicle(vehicle) if vehicle else None
         if any(measured.values()):
             if car is not None:
@@ -414,7 +410,7 @@ class JudgedModels(PublishedModels):
         """
         from fleet_slip.evaluation.evaluate import evaluate_blindly
 
-        first, *rest = [self.resolve(one) for one in (model, *others)]
+        first, *rest = [self.model(one) for one in (model, *others)]
         with open_workers(self.root, threads) as executor:
             return evaluate_blindly(self.warehouse, first, rest, executor)
 
@@ -432,7 +428,7 @@ class JudgedModels(PublishedModels):
         from fleet_slip.storage.local import LocalFolder
 
         folder = LocalFolder(output) if output else self.root / "report"
-        return write_report(self.warehouse, self.resolve(model), folder)
+        return write_report(self.warehouse, self.model(model), folder)
 
     @record_call
     def watch(
@@ -461,7 +457,7 @@ class JudgedModels(PublishedModels):
 
         if output.suffix != ".html":
             raise UsageError(f"{output}: a drive is shown as a page, which ends with .html.")
-        version = self.resolve(model)
+        version = self.model(model)
         if is_scenario(what):
             frames = scenario_frames(what, version)
         else:

@@ -124,7 +124,7 @@ class HealthAndUpkeep(JudgedModels):
         """
         from fleet_slip.operations.monitor import monitor
 
-        return monitor(self.warehouse, self.resolve(model), cohort, date_of(since, "since"))
+        return monitor(self.warehouse, self.model(model), cohort, date_of(since, "since"))
 
     def verify(
         self,

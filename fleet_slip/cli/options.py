@@ -55,7 +55,6 @@ READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "scenarios": (list[str] | None, lambda names: names or ()),
     "since": (str | None, lambda since: date_of(since, "--since")),
     "through": (str | None, last_day),
-    "vehicle": (str | None, lambda vehicle: vehicle),
 }
 """Parameters of other types on the command line, and what reads them."""
 

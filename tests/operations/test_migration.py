@@ -1,12 +1,10 @@
 """Signals come and go, and old and new files live together; counts of another scale are refused."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE, catalogue
@@ -15,11 +13,10 @@ from fleet_slip.grams.check import check_grams
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.migration import migrate
 from fleet_slip.resources import folder
-from fleet_slip.storage.table import Change
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
-from tests.support.logs import land, log_rows, path_of
+from tests.support.logs import land, log_rows
 
 SHIPPED = (folder("configs") / "signals.toml").read_text()
 
@@ -146,20 +143,3 @@ def test_the_nightly_job_goes_on_after_a_signal_was_added(
     assert "added: tyre_pressure" in run_command("migrate").stderr
     assert run_command("run", "--campaign", "smoke").exit_code == 0
     assert "nothing to do" in run_command("migrate").stderr
-
-
-def test_a_quarantine_of_an_earlier_version_gets_its_column(warehouse: Warehouse) -> None:
-    now = warehouse.quarantine
-    schema = now.schema.remove(now.schema.get_field_index("vehicle_id"))
-    then = replace(now, schema=schema, encoding=replace(now.encoding, dictionary=()))
-    for table in (then, now):
-        row = {"file": "x.csv", "row": 1, "drive_id": "d", "vehicle_id": "car", "reason": "missing"}
-        action = table.write_file("q", pa.Table.from_pylist([row], schema=table.schema))
-        if table is now:
-            with pytest.raises(RefusedError, match="fleet-slip migrate"):
-                table.snapshot().commit(Change(add=[action]))
-            migrate(warehouse)
-        table.snapshot().commit(Change(add=[action]))
-    with connect(path_of(warehouse.root)) as database:
-        rows = database.execute("SELECT vehicle_id FROM quarantine ORDER BY ALL").fetchall()
-    assert rows == [("car",), (None,)]
