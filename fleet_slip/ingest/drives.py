@@ -15,7 +15,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.facts import LONGEST_PAUSE_S, MEASURED
+from fleet_slip.catalogue.facts import MEASURED
 from fleet_slip.catalogue.signals import catalogue, digest_drive, round_chunks
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
@@ -85,7 +85,9 @@ class DriveCutter:
             rows = rows.sort("group", "time", maintain_order=True)
         elif not rows["group"].is_sorted():
             rows = rows.sort("group", maintain_order=True)
-        self._grow(rows)
+        more = int(rows["group"][-1]) + 1 - self._state.size
+        if more > 0:
+            self._state = np.concatenate([self._state, np.full(more, _UNSEEN, dtype=_GROUP)])
         alone, waiting, known_at = self._isolated(rows, last=last)
         self._waiting = rows.filter(pl.Series(waiting)) if waiting.any() else None
         refused = [describe_refused(rows, alone, "isolated")]
@@ -103,12 +105,6 @@ class DriveCutter:
             if (disordered := twice | backwards).any():
                 rows = rows.filter(pl.Series(~disordered))
         return rows, pl.concat(refused)
-
-    def _grow(self, rows: pl.DataFrame) -> None:
-        """Make room for groups that were not there before."""
-        more = int(rows["group"][-1]) + 1 - self._state.size
-        if more > 0:
-            self._state = np.concatenate([self._state, np.full(more, _UNSEEN, dtype=_GROUP)])
 
     def _isolated(
         self, rows: pl.DataFrame, *, last: bool
@@ -496,19 +492,3 @@ def _metadata(
         "campaign": mapping.name,
         "saturated": 0,  # what is outside its range is quarantined, not clipped
     }
-
-
-class Trips:
-    """Names each drive's trip: the first of the drives of one file that follow each other."""
-
-    def __init__(self) -> None:
-        """Begin without drives."""
-        self._last: dict[int, tuple[str, float]] = {}
-
-    def name(self, drive_id: str, group: int, start_s: float, end_s: float) -> str:
-        """Return the trip of a group's next drive; a clock that goes back begins another."""
-        trip_id, ended_s = self._last.get(group, (drive_id, start_s))
-        if not 0 <= start_s - ended_s <= LONGEST_PAUSE_S:
-            trip_id = drive_id
-        self._last[group] = trip_id, end_s
-        return trip_id

@@ -305,7 +305,11 @@ def write_batch(
                     raise
                 failures.append(error)
             else:
-                batch.end(one, stream.longest)
+                for data in batch.data.values():
+                    data.end_log()
+                batch.written.append(one)
+                if one.report.new:
+                    batch.longest.append((one.report, stream.longest))
         _judge_longest(batch.longest)
         new = {name: data.finish() for name, data in batch.data.items()}
     return WrittenBatch(tuple(batch.written), tuple(failures), batch.forgotten, new)
@@ -392,14 +396,6 @@ class _Writer:
             found = self._same.find(asked.file, digest, one.fingerprints, stream.name, earlier)
             one.same, one.replaced, report.drives_replaced = found
         return one
-
-    def end(self, one: WrittenFile, longest: MeasuredDrive | None) -> None:
-        """Take a file that was written."""
-        for data in self.data.values():
-            data.end_log()
-        self.written.append(one)
-        if one.report.new:
-            self.longest.append((one.report, longest))
 
 
 def _groups(drives: Iterable[MeasuredDrive]) -> Iterator[list[MeasuredDrive]]:

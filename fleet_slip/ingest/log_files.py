@@ -219,15 +219,11 @@ def _copy(log: StoredFile, folder: Path) -> Path:
     from fleet_slip.ingest.object_inputs import copy_object  # noqa: PLC0415 - an extra
 
     names = log.path.split("/")
-    if not {"", ".", ".."}.isdisjoint(names) or not all(map(_can_be_copied, names)):
+    odd = {"", ".", ".."}.intersection(names) or _CONTROL.search(log.path)
+    if odd or max(len(os.fsencode(name)) for name in names) > LONGEST_NAME_BYTES:
         raise InputError(f"{shown(log)}: invalid file name. Rename it.")
     copy_object(log, folder / log.path)
     return folder / log.path
-
-
-def _can_be_copied(name: str) -> bool:
-    """Whether a part of a key is the name of a file, without characters that stores refuse."""
-    return len(os.fsencode(name)) <= LONGEST_NAME_BYTES and not _CONTROL.search(name)
 
 
 @contextmanager

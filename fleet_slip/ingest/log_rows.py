@@ -377,7 +377,7 @@ class RowChecker:
         self.left_out += batch.height - raw.height
         valued = raw.with_columns(f.value.alias(f.name) for f in fields if f.kind != "condition")
         rows, refused = _split(self.keys.number(valued, fields), fields)
-        if len(self.keys) > MAX_KEYS:
+        if len(self.keys.metadata) > MAX_KEYS:
             raise InputError(
                 f"{shown(self._file)}: more than {MAX_KEYS:,} combinations of drive metadata. "
                 f"Check the columns under [drive] in the mapping {self._mapping.name!r}."
@@ -406,10 +406,6 @@ class DriveKeys:
         self.metadata: list[dict[str, Any]] = []
         """What each number stands for."""
 
-    def __len__(self) -> int:
-        """Return how many there are so far."""
-        return len(self._numbers)
-
     def number(self, batch: pl.DataFrame, fields: list[Field]) -> pl.DataFrame:
         """Add `group` to a batch with values: the row's number, null where its key is faulty.
 
@@ -422,16 +418,13 @@ class DriveKeys:
         names = [field.name for field in of_key]
         sound = pl.all_horizontal([field.problem.is_null() for field in of_key])
         keys = batch.filter(sound).select(names).unique(maintain_order=True)
-        numbers = [self._number(dict(zip(names, key, strict=True))) for key in keys.rows()]
+        fresh = [key for key in keys.rows() if key not in self._numbers]
+        self._numbers |= {key: number for number, key in enumerate(fresh, len(self._numbers))}
+        self.metadata += [dict(zip(names, key, strict=True)) for key in fresh]
+        numbers = [self._numbers[key] for key in keys.rows()]
         keys = keys.with_columns(pl.Series("group", numbers, pl.Int32))
         joined = batch.join(keys, on=names, how="left", nulls_equal=True, maintain_order="left")
         return joined.with_columns(pl.when(sound).then("group").alias("group"))
-
-    def _number(self, key: dict[str, Any]) -> int:
-        number = self._numbers.setdefault(tuple(key.values()), len(self._numbers))
-        if number == len(self.metadata):
-            self.metadata.append(key)
-        return number
 
 
 def _split(batch: pl.DataFrame, fields: list[Field]) -> tuple[pl.DataFrame, pl.DataFrame]:

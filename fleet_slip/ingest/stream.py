@@ -15,6 +15,7 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.base import canonical_ascii, number_of, shown
+from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
@@ -24,7 +25,6 @@ from fleet_slip.ingest.drives import (
     DriveRows,
     MeasuredDrive,
     OpenDrives,
-    Trips,
     drive_id,
     sample_intervals_s,
     to_ticks,
@@ -102,7 +102,8 @@ class MeasuredStream:
         self._samples, self._values = Counter[str](), Counter[str]()
         self._open = OpenDrives()
         self._stretches: Counter[int] = Counter()
-        self._trips = Trips()
+        self._trips: dict[int, tuple[str, float]] = {}
+        """The trip of each group's last drive, and when that ended."""
         self._faults = LogFaults(file, mapping)
         self.name = os.fsencode(file.name).decode("utf-8", "replace")
         self._stem = self.name.split(".", 1)[0] or self.name
@@ -184,12 +185,16 @@ class MeasuredStream:
         group = int(next(iter(rows.bases.values()))["group"][0])
         self._stretches[group] += 1
         name = drive_id(self.prefix, group, self._stretches[group])
+        trip_id, ended_s = self._trips.get(group, (name, rows.start_s))
+        if not 0 <= rows.start_s - ended_s <= LONGEST_PAUSE_S:  # or the clock went back
+            trip_id = name
+        self._trips[group] = trip_id, rows.end_s
         in_file = self.checker.keys.metadata[group]
         known = {
             **in_file,
             "drive_name": in_file.get("drive", self._stem),
             "source_file": self.name,
-            "trip_id": self._trips.name(name, group, rows.start_s, rows.end_s),
+            "trip_id": trip_id,
         }
         for base in rows.bases.keys() - intervals_s.keys():
             steps_s = np.diff(rows.bases[base]["time"].head(RATE_ROWS).to_numpy())

@@ -4,7 +4,6 @@ import mmap
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +129,11 @@ def _by_ranges(conversion: Any, kind: str, raw: Array) -> Array:
 WINDOW_RECORDS = 2**17
 """Records that are read at once. asammdf takes four times as long for a whole group."""
 _TIME_SYNC = 1
+_FRAME = "CAN_DataFrame."
+"""How ASAM's associated standard begins the names of the channels of CAN frames."""
+_EXTENDED = 1 << 31
+"""Bit that marks an identifier of 29 bits, where no channel of its own does."""
+_IDENTIFIER = (1 << 29) - 1
 _EARLIEST_S = 10**8
 """Loggers without a clock write 0: a start before 1973 is not a date."""
 
@@ -180,8 +184,8 @@ class MdfSource(FormatSource):
     def read(self, _base: str, found: dict[str, tuple[int, int]]) -> Iterator[pl.DataFrame]:
         """Read channels of a group, some records at a time; what is marked as invalid is null."""
         [number] = {number for number, _ in found.values()}
-        for signals in self.windows(number, {name: index for name, (_, index) in found.items()}):
-            frame = {OWN_TIME: pl.Series(self.times_s(signals[0]))}
+        for signals in self._windows(number, {name: index for name, (_, index) in found.items()}):
+            frame = {OWN_TIME: pl.Series(self._times_s(signals[0]))}
             for name, signal in zip(found, signals, strict=True):
                 values = as_column(self._file, name, signal.samples)
                 invalid = signal.invalidation_bits
@@ -190,7 +194,7 @@ class MdfSource(FormatSource):
                 frame[name] = values
             yield pl.DataFrame(frame)
 
-    def windows(self, number: int, indices: dict[str, int]) -> Iterator[list[Any]]:
+    def _windows(self, number: int, indices: dict[str, int]) -> Iterator[list[Any]]:
         """Yield channels of a group as asammdf's signals, some records at a time."""
         # asammdf would read beyond the records of a damaged group.
         name = next(iter(indices))
@@ -202,16 +206,9 @@ class MdfSource(FormatSource):
         for start in range(0, max(records, 1), WINDOW_RECORDS):
             yield self._signals(number, indices, start, min(WINDOW_RECORDS, records - start))
 
-    def times_s(self, signal: Any) -> FloatArray:
+    def _times_s(self, signal: Any) -> FloatArray:
         """Return when a signal's samples were taken, since 1970 if the file knows the date."""
         return np.asarray(self._start_s + signal.timestamps.astype(np.float64))
-
-    def groups_with(self, name: str) -> Iterator[tuple[int, dict[str, int]]]:
-        """Yield the groups that have a channel of a name, and where each of their channels is."""
-        for number, _ in self._mdf.channels_db.get(name, ()):
-            group = self._mdf.groups[number]
-            if group.channel_group.cycles_nr:
-                yield number, {c.name: i for i, c in enumerate(group.channels)}
 
     def _signals(self, number: int, indices: dict[str, int], start: int, records: int) -> list[Any]:
         # Of 200 MiB and more `select` reads all records, however few it is asked for.
@@ -297,6 +294,40 @@ class MdfSource(FormatSource):
                 "again."
             )
 
+    def frames(self) -> Iterator[FrameBlock]:
+        """Yield the CAN frames of bus logging. Raises `InputError`."""
+        groups = [number for number, _ in self._mdf.channels_db.get(f"{_FRAME}ID", ())]
+        groups = [n for n in groups if self._mdf.groups[n].channel_group.cycles_nr]
+        if not groups:
+            raise InputError(
+                f"{shown(self._file)}: it has no CAN frames ({_FRAME}ID). Map its channels "
+                "without [can] in the mapping."
+            )
+        for number in groups:
+            places = {c.name: i for i, c in enumerate(self._mdf.groups[number].channels)}
+            names = ("ID", "DataBytes", "DataLength", "IDE", "BusChannel")
+            there = {n: places[_FRAME + n] for n in names if _FRAME + n in places}
+            if "DataBytes" not in there:
+                raise InputError(
+                    f"{shown(self._file)}: group {number} has frames without {_FRAME}DataBytes. "
+                    "Export it again, with payloads."
+                )
+            for window in self._windows(number, there):
+                found = {n: one.samples for n, one in zip(there, window, strict=True)}
+                numbers, payloads = found["ID"].astype(np.int64), _payloads(found["DataBytes"])
+                extended = numbers & _EXTENDED != 0
+                if "IDE" in found:
+                    extended |= found["IDE"].astype(np.int64) != 0
+                sizes = found.get("DataLength", np.full(len(numbers), payloads.shape[1]))
+                yield FrameBlock(
+                    numbers & _IDENTIFIER,
+                    extended,
+                    self._times_s(window[0]),
+                    found.get("BusChannel", np.zeros(len(numbers))).astype(np.int64),
+                    np.minimum(sizes.astype(np.int64), payloads.shape[1]),
+                    payloads,
+                )
+
     def _places(self, name: str) -> list[tuple[int, int]]:
         places = self._mdf.channels_db.get(name, ())
         return [(n, i) for n, i in places if i != self._mdf.masters_db.get(n)]
@@ -324,50 +355,6 @@ def open_mdf(budget: Budget) -> Iterator[MdfSource]:
         mdf.close()
 
 
-# Reads the CAN frames that a logger stored in an MDF 4 file (bus logging), through a database.
-#
-# ASAM's associated standard names the channels: a group of frames has `CAN_DataFrame.ID` and
-# others.
-
-_FRAME = "CAN_DataFrame."
-_EXTENDED = 1 << 31
-"""Bit that marks an identifier of 29 bits, where no channel of its own does."""
-_IDENTIFIER = (1 << 29) - 1
-
-
-def _read_bus(mdf: MdfSource, file: Path) -> Iterator[FrameBlock]:
-    """Yield the CAN frames of an MDF file. Raises `InputError`."""
-    groups = [*mdf.groups_with(f"{_FRAME}ID")]
-    if not groups:
-        raise InputError(
-            f"{shown(file)}: it has no CAN frames ({_FRAME}ID). Map its channels "
-            "without [can] in the mapping."
-        )
-    for number, places in groups:
-        names = ("ID", "DataBytes", "DataLength", "IDE", "BusChannel")
-        there = {n: places[_FRAME + n] for n in names if _FRAME + n in places}
-        if "DataBytes" not in there:
-            raise InputError(
-                f"{shown(file)}: group {number} has frames without {_FRAME}DataBytes. "
-                "Export it again, with payloads."
-            )
-        for window in mdf.windows(number, there):
-            found = {n: one.samples for n, one in zip(there, window, strict=True)}
-            numbers, payloads = found["ID"].astype(np.int64), _payloads(found["DataBytes"])
-            extended = numbers & _EXTENDED != 0
-            if "IDE" in found:
-                extended |= found["IDE"].astype(np.int64) != 0
-            sizes = found.get("DataLength", np.full(len(numbers), payloads.shape[1]))
-            yield FrameBlock(
-                numbers & _IDENTIFIER,
-                extended,
-                mdf.times_s(window[0]),
-                found.get("BusChannel", np.zeros(len(numbers))).astype(np.int64),
-                np.minimum(sizes.astype(np.int64), payloads.shape[1]),
-                payloads,
-            )
-
-
 def _payloads(samples: NDArray[Any]) -> Bytes:
     """Return payloads as a matrix of bytes, those that are shorter filled up."""
     if samples.ndim > 1:
@@ -380,4 +367,4 @@ def _payloads(samples: NDArray[Any]) -> Bytes:
 def open_mdf_bus(bus: CanBus, budget: Budget) -> Iterator[CanSource]:
     """Open an MDF file for the CAN frames in it. Raises `InputError`."""
     with open_mdf(budget) as mdf:
-        yield CanSource(budget.file, bus, partial(_read_bus, mdf, budget.file))
+        yield CanSource(budget.file, bus, mdf.frames)
