@@ -180,8 +180,6 @@ def sample_intervals_s(rows: pl.DataFrame) -> dict[int, float]:
     bases = rows.partition_by("base", as_dict=True) if several else {(0,): rows}
     found = {}
     for (number,), base in bases.items():
-        if not base["part"].is_sorted():
-            base = base.sort("part", maintain_order=True)  # noqa: PLW2901
         step_s, part = np.diff(base["time"].to_numpy()), base["part"].to_numpy()
         median = pl.Series(step_s[part[1:] == part[:-1]]).median()
         found[number] = median if isinstance(median, float) and median else STEP_S

@@ -49,8 +49,6 @@ def is_held(course: FloatArray, yaw_rate: FloatArray, place: IntArray) -> BoolAr
     Receivers hold the course when they are slow, or report it less often than the speed. `place`
     says at which tick each fix is; `course` is of the fixes, and `yaw_rate` of the ticks.
     """
-    if not course.size:
-        return np.zeros(0, dtype=np.bool_)
     heading = np.cumsum(np.nan_to_num(yaw_rate))[place] * STEP_S
     new = np.append(True, np.abs(np.diff(course)) > SAME_RAD)
     first = np.maximum.accumulate(np.where(new, np.arange(course.size), 0))
@@ -67,8 +65,6 @@ def is_backwards(
     second around a fix. Straight on it does not show it, and the course is right all the same.
     """
     second = np.ones(2 * round(0.5 / STEP_S) + 1)
-    if not place.size:
-        return np.zeros(0, dtype=np.bool_)
     squares, products = (
         np.convolve(np.nan_to_num(one), second)[second.size // 2 :][place]
         for one in (yaw_rate**2, yaw_rate * ay)
@@ -186,8 +182,6 @@ class Resampler:
         self, values: FloatArray, delay_s: float = 0.0, longest_gap_s: float = 0.1
     ) -> FloatArray:
         """Return a signal on the ticks; what was measured at t stands in the file at t + delay."""
-        if self.method == "snap" and not delay_s:
-            return values
         resample = average if self.method == "average" else interpolate
         return resample(self.time_s - delay_s, values, self.at_s, longest_gap_s)
 
@@ -195,8 +189,6 @@ class Resampler:
         self, values: FloatArray, delay_s: float = 0.0, longest_gap_s: float = 0.1
     ) -> FloatArray:
         """Return a signal that changes in steps: at each tick the last sample, unless too old."""
-        if self.method == "snap" and not delay_s:
-            return values
         time_s, values = _present(self.time_s - delay_s, values)
         last = np.searchsorted(time_s, self.at_s + TIME_EPSILON_S, side="right") - 1
         held = np.full(self.at_s.size, np.nan)
@@ -309,11 +301,13 @@ def fixes_on_ticks(
     nearest = np.rint(since / STEP_S)
     place, found = find_ticks(resampler.ticks, nearest)
     place, late_s = place[found], (nearest * STEP_S - since)[found]
+    courses, speeds = (np.full(resampler.ticks.size, np.nan) for _ in range(2))
+    if not place.size:
+        return courses, speeds
     course, speed, r = course[new[found]], speed[new[found]], yaw_rate[place]
     across = r * (source.antenna_x_m or 0.0)
     along = np.sqrt(np.maximum(speed**2 - across**2, 0.0))
     turned = course - np.arctan2(across, along) + r * late_s
-    courses, speeds = (np.full(resampler.ticks.size, np.nan) for _ in range(2))
     speeds[place] = along + r * (source.antenna_y_m or 0.0)
     sound = (speed >= LEAST_SPEED_MPS) & ~is_held(course, yaw_rate, place)
     if ay is not None:

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from fleet_slip.ingest.suspicion import find_suspicions
 from tests.support.cars import Signals, drive
-from tests.support.measured import MeasuredLog, a_mapping, physical, read_columns
+from tests.support.measured import MeasuredLog, a_mapping, physical, read_columns, read_measured
 from tests.support.reported import call
 from tests.support.satellites import speed_of, with_course
 
@@ -109,6 +109,17 @@ def test_a_fix_between_ticks_turns_to_its_tick_and_a_delay_is_taken_off(tmp_path
     signals = {**VELOCITIES, "course": {**VELOCITIES["course"], "delay_s": 0.104}}
     log = read_columns(tmp_path, columns, a_mapping(signals=signals))
     assert np.abs(course_error(log)).max() < 5e-4
+
+
+def test_a_course_with_times_of_its_own_is_the_same(tmp_path: Path) -> None:
+    rows = pl.DataFrame(on_time()).with_columns(pl.col("t", "r").cast(pl.Float64))
+    fix = rows.select(pl.col("t").alias("tg"), "vn", "ve").gather_every(FIX)
+    empty = fix.clear(ROWS - fix.height)
+    rows = rows.select("t", "r").hstack(pl.concat([fix, empty]))
+    rows.write_parquet(tmp_path / "log.parquet")
+    signals = {**VELOCITIES, "course": {**VELOCITIES["course"], "time": "tg"}}
+    error = course_error(read_measured(tmp_path / "log.parquet", a_mapping(signals=signals)))
+    assert len(error) == ROWS / FIX and np.abs(error).max() < 4e-4
 
 
 def test_slow_and_sudden_courses_are_none(tmp_path: Path) -> None:

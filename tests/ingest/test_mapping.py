@@ -88,6 +88,7 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
         ('"deg"', '"km/h", radius_m = 0.3', "radius_m, which is for wheel speeds"),
         ("steer_fl =", "wheel_fl =", "wheel_fl needs an angular velocity"),
         (STEER, WHEEL.replace("km/h", "rpm"), "wheel_fl needs a velocity, such as 'km/h'"),
+        (STEER, WHEEL.replace(", radius_m = 0.3", ""), "add radius_m, the rolling radius"),
         (STEER, WHEEL.replace("0.3", "0"), "signals.wheel_fl.radius_m"),
     ],
 )

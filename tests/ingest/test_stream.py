@@ -118,6 +118,7 @@ def test_what_lands_does_not_depend_on_the_size_of_data_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, files: int
 ) -> None:
     monkeypatch.setattr(load, "FILE_ROWS", limit)
+    monkeypatch.setattr(stream, "REFUSED_ROWS", limit)
     columns = good_columns(90)
     columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(90)]
     columns["ax"][3] = columns["ax"][70] = "x"
