@@ -211,7 +211,7 @@ def main() -> None:
     chosen = sample(cohort, rng)
     ids = cohort.drives["drive_id"].to_pylist()
     counts = read_counts(root, [ids[drive] for drive in chosen])
-    clean = examine(cohort, None, find_wrong_labels(cohort))
+    clean = examine(cohort, find_wrong_labels(cohort))
     false = 1000 * len(clean.findings) / clean.drives
     print(f"{clean.drives} drives without faults, {clean.compared} compared with their peers:")
     print(f"false alarms: {len(clean.findings)}, {false:.1f} per 1,000 drives\n")
@@ -219,7 +219,7 @@ def main() -> None:
     print("| --- | ---: | ---: | ---: | ---: |")
     for fault in FAULTS:
         faulty = inject(cohort, chosen, counts, fault, rng)
-        report = examine(faulty, None, find_wrong_labels(faulty))
+        report = examine(faulty, find_wrong_labels(faulty))
         one = score(cohort, report, chosen.tolist(), fault)
         print(
             f"| {fault.name} | {one.found / one.faulty:.0%} | {one.right_signal / one.faulty:.0%} "

@@ -220,9 +220,8 @@ class Night:
         drives = self.chart.drives_left_out
         left_out = f" {number_of(drives, 'drive')} without a log left out." if drives else ""
         told = f"{champion} on {number_of(len(new), 'new day')}: "
-        if alarms := self.chart.alarms:
-            days = ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in alarms)
-            return "attention", f"{told}beyond its limits on {days}.{left_out}"
+        if self.chart.alarms:
+            return "attention", f"{told}beyond its limits on {self.chart.alarm}.{left_out}"
         return "done", f"{told}within its limits.{left_out}"
 
     def _publish(self) -> Told:

@@ -26,7 +26,7 @@ from fleet_slip.errors import AlarmError, ConfigError, DataError, StorageError
 from fleet_slip.grams.cohort import remark_left_out, sum_days
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.operations.peers import MonitorThresholds, thresholds
+from fleet_slip.operations.peers import thresholds
 from fleet_slip.pages.drawing import DESK, STYLE, Size, colour
 from fleet_slip.regression.figures import error_sums, student_t_quantile
 from fleet_slip.regression.folds import least_squares
@@ -137,7 +137,6 @@ def monitor(
     version: ModelVersion,
     condition: str | Condition | None = None,
     since: date | None = None,
-    limits: MonitorThresholds | None = None,
 ) -> Chart:
     """Chart a model's error day by day. Reads Gram rows only.
 
@@ -145,8 +144,7 @@ def monitor(
     Days from `since` are new; by default those after the last day of the logs it was trained on.
     Raises `DataError` if fewer than `min_training_days` are left to learn from.
     """
-    limits = limits or thresholds().monitor
-    manifest = version.manifest
+    limits, manifest = thresholds().monitor, version.manifest
     condition = parse_cohort(condition or manifest.trained_on.cohort)
     feature_set = features().name_of(manifest.trained_on.feature_set)
     sums = sum_days(warehouse, manifest.signals, condition, feature_set)

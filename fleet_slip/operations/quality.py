@@ -82,9 +82,7 @@ class QualityReport(Answer):
 
 
 def examine_drives(
-    warehouse: Warehouse,
-    condition: str | Condition = TRAINING_DRIVES,
-    limits: QualityThresholds | None = None,
+    warehouse: Warehouse, condition: str | Condition = TRAINING_DRIVES
 ) -> QualityReport:
     """Examine the drives that satisfy a condition: labels beside all others, then model by model.
 
@@ -95,10 +93,8 @@ def examine_drives(
     with GramReader(warehouse) as reader:
         models = _vehicle_models(reader, drives)
         known = _faulty_courses(reader, drives)
-        known |= find_wrong_labels(load_cohort(reader, drives), limits)
-        reports = [
-            examine(load_cohort(reader, drives & of_model), limits, known) for of_model in models
-        ]
+        known |= find_wrong_labels(load_cohort(reader, drives))
+        reports = [examine(load_cohort(reader, drives & of_model), known) for of_model in models]
     findings = [finding for report in reports for finding in report.findings]
     return QualityReport(
         sum(report.drives for report in reports),
@@ -130,13 +126,13 @@ def _vehicle_models(reader: GramReader, condition: Condition) -> list[Condition]
     ]
 
 
-def find_wrong_labels(cohort: Cohort, limits: QualityThresholds | None = None) -> dict[str, Fault]:
+def find_wrong_labels(cohort: Cohort) -> dict[str, Fault]:
     """Return the drives whose label contradicts that of the others, of whatever vehicle model.
 
     One that is reversed, and one with another factor or zero since a day or in a file: what is
     wrong with many drives at once may be the usual in one vehicle model.
     """
-    limits = limits or thresholds().quality
+    limits = thresholds().quality
     found: dict[str, Fault] = {}
     for table, metadata in _long_drives(cohort, limits.min_rows):
         in_order = np.ones(len(table), dtype=np.bool_)
@@ -150,17 +146,13 @@ def find_wrong_labels(cohort: Cohort, limits: QualityThresholds | None = None) -
     return found
 
 
-def examine(
-    cohort: Cohort,
-    limits: QualityThresholds | None = None,
-    known: Mapping[str, Fault] | None = None,
-) -> QualityReport:
+def examine(cohort: Cohort, known: Mapping[str, Fault] | None = None) -> QualityReport:
     """Examine each drive of a cohort, beside other drives of its car and of its vehicle model.
 
     First for what no car does (`find_implausible`), then by comparison with its peers, if it has
     `min_drives` of them; see `_peer_groups`. `known` are drives that are not in order.
     """
-    limits = limits or thresholds().quality
+    limits = thresholds().quality
     drives = compared = 0
     known = {**(known or {}), **find_repeated(cohort.drives)}
     findings = []

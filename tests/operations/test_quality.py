@@ -11,7 +11,8 @@ from fleet_slip.catalogue.faults import Fault
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
-from fleet_slip.operations.peers import QualityThresholds, thresholds
+from fleet_slip.operations import quality
+from fleet_slip.operations.peers import thresholds
 from fleet_slip.operations.quality import QualityReport, examine, examine_drives, find_wrong_labels
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import TICKS, Signals, broken, counts, drive
@@ -142,7 +143,16 @@ def test_drives_in_order_raise_no_alarm(warehouse: Warehouse) -> None:
     assert (report.drives, report.compared, report.findings) == (DRIVES, DRIVES, ())
 
 
-def test_vehicle_models_are_examined_one_after_the_other(warehouse: Warehouse) -> None:
+def choose_limits(monkeypatch: pytest.MonkeyPatch, **changes: int) -> None:
+    limits = thresholds().quality.model_copy(update=changes)
+    chosen = thresholds().model_copy(update={"quality": limits})
+    monkeypatch.setattr(quality, "thresholds", lambda: chosen)
+
+
+def test_vehicle_models_are_examined_one_after_the_other(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    choose_limits(monkeypatch, min_rows=100, min_drives=8)
     rng = np.random.default_rng(3)
     for file, model in enumerate(("beetle", "driver's", None)):
         rows = [
@@ -153,15 +163,11 @@ def test_vehicle_models_are_examined_one_after_the_other(warehouse: Warehouse) -
     update_grams(warehouse)
     for condition in ("true", "drive_id LIKE '%-1' -- and '%-11'", "vehicle_model IS NULL"):
         cohort = load_cohort(warehouse, f"{condition}\n")
-        together = examine(cohort, few(), find_wrong_labels(cohort, few()))
-        assert examine_drives(warehouse, condition, few()) == together
+        together = examine(cohort, find_wrong_labels(cohort))
+        assert examine_drives(warehouse, condition) == together
         assert together.drives > 0
     with pytest.raises(DataError, match="no drive matches"):
         examine_drives(warehouse, "mass_kg > 1e9")
-
-
-def few() -> QualityThresholds:
-    return thresholds().quality.model_copy(update={"min_rows": 100, "min_drives": 8})
 
 
 def test_values_at_the_end_of_their_range_are_told(warehouse: Warehouse) -> None:
@@ -169,18 +175,16 @@ def test_values_at_the_end_of_their_range_are_told(warehouse: Warehouse) -> None
     assert only_finding(examine(load_cohort(warehouse))).kind == "saturated"
 
 
-def test_signs_need_no_peers_and_offsets_do(warehouse: Warehouse) -> None:
+def test_signs_need_no_peers_and_offsets_do(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
     fleet(warehouse, multiply("yaw_rate", -1))
     alone = load_cohort(warehouse, "drive_id IN ('d28', 'd29')")
     report = examine(alone)
     assert report.compared == 0
     assert only_finding(report).kind == "reversed"
-    limits = replace_min_rows(TICKS + 1)
-    assert examine(load_cohort(warehouse), limits).drives == 0
-
-
-def replace_min_rows(rows: int) -> QualityThresholds:
-    return thresholds().quality.model_copy(update={"min_rows": rows})
+    choose_limits(monkeypatch, min_rows=TICKS + 1)
+    assert examine(load_cohort(warehouse)).drives == 0
 
 
 def test_the_order_and_number_of_drives_do_not_matter_to_a_verdict(warehouse: Warehouse) -> None:
