@@ -18,9 +18,11 @@ import pint
 import polars as pl
 from pydantic import Field, field_validator, model_validator
 
+from fleet_slip.catalogue.course import COURSE
 from fleet_slip.catalogue.signals import HALF_TURN, Identifier, Signal, catalogue
 from fleet_slip.config import Config, Name, PositiveFloat, added
 from fleet_slip.ingest.formats.source import OWN_TIME
+from fleet_slip.ingest.suspicion import SPEED
 
 _TERM = r"(?:°|[^\W\d]+\d?)(?:(?:\^|\*\*)-?\d)?"
 _EXPRESSION = re.compile(rf"(?:1/)?{_TERM}(?:[*/ ]{_TERM})*")
@@ -80,13 +82,10 @@ FiniteFloat = Annotated[float, Field(allow_inf_nan=False)]
 OffsetM = Annotated[FiniteFloat, Field(ge=-15, le=15)]
 WHEELS = "wheel_"
 """How the names of wheel speeds begin."""
-RADIUS_M = 0.31
-"""Of a wheel whose mapping names none; a tenth more moves the label's correction by a tenth."""
 VELOCITY = "m/s"
 CHOOSE = "choose"
 """What a draft has for a unit that the file does not say, where several are possible."""
 
-COURSE, SPEED = "course", "satellite_speed"
 Component: TypeAlias = Literal["north", "east"]
 
 

@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.base import shown
+from fleet_slip.catalogue.course import COURSE
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.columns import CHOOSE, COURSE, SPEED, TimeBase
+from fleet_slip.ingest.columns import CHOOSE, TimeBase
 from fleet_slip.ingest.guess import (
     Guess,
     TimeGuess,
@@ -27,6 +28,7 @@ from fleet_slip.ingest.guess import (
     headings,
 )
 from fleet_slip.ingest.profile import FileProfile
+from fleet_slip.ingest.suspicion import SPEED
 
 _MOST_REFUSED = 20
 

@@ -15,11 +15,12 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
+from fleet_slip.catalogue.course import COURSE
 from fleet_slip.catalogue.facts import MEASURED
 from fleet_slip.catalogue.signals import catalogue, digest_drive, round_chunks
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.columns import COURSE, SPEED, TimeBase
-from fleet_slip.ingest.formats.source import Spool
+from fleet_slip.ingest.columns import TimeBase
+from fleet_slip.ingest.formats.source import EARLIEST_S, Spool
 from fleet_slip.ingest.log_rows import describe_refused, no_rows
 from fleet_slip.ingest.mapping import DriveMetadata, FromColumn, Mapping
 from fleet_slip.ingest.resampling import (
@@ -34,6 +35,7 @@ from fleet_slip.ingest.resampling import (
     physical,
     place_label,
 )
+from fleet_slip.ingest.suspicion import SPEED
 
 LONGEST_DRIVE_S = 2**19 * STEP_S
 """A longer stretch is cut after this time, some 87 minutes, so that a drive fits into memory."""
@@ -309,8 +311,6 @@ def _by_base(run: pl.DataFrame) -> list[pl.DataFrame]:
 
 _SECONDS_PER_DAY = 86_400
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_EARLIEST_S = 10**8
-"""Times before 1973 are counted from the start of a recording, not from 1970."""
 _FROM_FILE = ("drive_name", "source_file", "trip_id")
 _FROM_MAPPING = tuple(name for name in DriveMetadata.model_fields if name != "column")
 
@@ -477,11 +477,11 @@ def _metadata(
     given = {key: getattr(mapping.drive, key) for key in _FROM_MAPPING}
     known = {key: value for key, value in given.items() if not isinstance(value, FromColumn)}
     if given["day"] is None:  # then time is in timestamps, or those of the file's own clock
-        if mapping.time.own_clock and start_s < _EARLIEST_S:
+        if mapping.time.own_clock and start_s < EARLIEST_S:
             raise InputError("its clock has no date. Give it in the mapping: drive.day.")
         known["day"] = date.fromordinal(_EPOCH.toordinal() + int(start_s // _SECONDS_PER_DAY))
     known |= {key: value for key, value in of_drive.items() if key in given or key in _FROM_FILE}
-    dated = mapping.time.is_dated and start_s >= _EARLIEST_S
+    dated = mapping.time.is_dated and start_s >= EARLIEST_S
     return {
         **known,
         "started_at": _EPOCH + timedelta(seconds=start_s) if dated else None,  # to the microsecond

@@ -14,10 +14,9 @@ import polars as pl
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.course import COURSE
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.columns import (
-    COURSE,
-    SPEED,
     VELOCITY,
     Component,
     conversion_factor,
@@ -25,7 +24,7 @@ from fleet_slip.ingest.columns import (
     reads_clock,
 )
 from fleet_slip.ingest.profile import FileProfile, Profile, sample_rate_hz
-from fleet_slip.ingest.suspicion import RADIUS_M, TURNING, WHEELS
+from fleet_slip.ingest.suspicion import RADIUS_M, SPEED, TURNING, WHEELS
 from fleet_slip.ingest.vocabulary import (
     best_words,
     fits_any,

@@ -18,6 +18,7 @@ from pydantic import (
 )
 
 from fleet_slip.base import canonical_ascii, shown
+from fleet_slip.catalogue.course import COURSE
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import (
     Config,
@@ -29,8 +30,6 @@ from fleet_slip.config import (
 )
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import (
-    COURSE,
-    RADIUS_M,
     WHEELS,
     OffsetM,
     RowCondition,
@@ -44,6 +43,7 @@ from fleet_slip.ingest.formats.can import CanBus, read_can_database
 from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.reading import FileFormats
 from fleet_slip.ingest.formats.source import describe_unknown
+from fleet_slip.ingest.suspicion import RADIUS_M
 from fleet_slip.resources import find_config
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder

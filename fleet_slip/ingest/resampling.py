@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue, round_chunks
-from fleet_slip.ingest.columns import RADIUS_M, SignalColumn
+from fleet_slip.ingest.columns import SignalColumn
 from fleet_slip.ingest.mapping import SPEEDS, LabelSensor, Mapping
+from fleet_slip.ingest.suspicion import RADIUS_M, SECOND
 
 # Which fixes of a satellite receiver show where the car goes, and at which ticks.
 
@@ -33,7 +34,6 @@ BACKWARDS_MPS = 8.0
 LEAST_TURNING_RAD_S = 0.1
 """An accelerometer that is off by 0.15 m/s² seems to drive backwards at 1.5 m/s then, no faster."""
 
-SECOND = round(1 / STEP_S)
 GRIDS = tuple(ticks for ticks in range(1, SECOND + 1) if SECOND % ticks == 0)
 """Spacings of fixes, in ticks, of which a whole number is a second."""
 REGULAR = 0.8

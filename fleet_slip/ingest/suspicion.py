@@ -73,6 +73,7 @@ LEAST_OF_THEIR_OWN = 0.9
 MOST_SCALE_ERROR = 0.02
 LEAST_SPEED_MPS = 3.0
 SPEED = "satellite_speed"
+"""The signal of the speed over ground, which comes with a course."""
 
 
 def _course(signals: "Signals") -> Iterator[Fault]:
@@ -170,7 +171,8 @@ Signals: TypeAlias = Mapping[str, FloatArray]
 """Values in SI units on consecutive ticks, NaN where there is none; all of one shape (n_ticks,)."""
 
 RADIUS_M, TRACK_M = 0.31, 1.55
-"""Of a passenger car: what is looked for is a factor of 3.6, 9.8 or 57."""
+"""Of a passenger car: what is looked for is a factor of 3.6, 9.8 or 57. Where a wheel of a mapping
+has no radius, a tenth more moves the correction of the label by a tenth."""
 LONGEST_M, LARGE_RAD = 8.0, 0.15
 """No car's rear axle is so far behind, and a car that slips so often slides."""
 LARGEST_COLLINEAR = 0.995

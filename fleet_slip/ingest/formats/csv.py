@@ -83,17 +83,13 @@ def decompressed(stream: BinaryIO) -> BinaryIO:
     return stream
 
 
-def recoded(stream: BinaryIO, encoding: Encoding) -> BinaryIO:
-    """Return text in another encoding as UTF-8."""
-    if encoding == "utf-8":
-        return stream
-    plain = pa.transcoding_input_stream(pa.PythonFile(stream, "r"), encoding, "utf-8")
-    return BufferedReader(plain, 2**20)
-
-
 def text_of(stream: BinaryIO, csv_format: CsvFormat) -> BinaryIO:
-    """Return the UTF-8 text of a stream, whatever it is compressed with."""
-    return recoded(decompressed(stream), csv_format.encoding)
+    """Return the text of a stream as UTF-8, whatever it is compressed with."""
+    plain = decompressed(stream)
+    if csv_format.encoding == "utf-8":
+        return plain
+    plain = pa.transcoding_input_stream(pa.PythonFile(plain, "r"), csv_format.encoding, "utf-8")
+    return BufferedReader(plain, 2**20)
 
 
 def first_lines(file: Path, csv_format: CsvFormat, most: int) -> list[str]:
@@ -161,8 +157,7 @@ class CsvSource(FormatSource):
     def read(self, _base: str, found: dict[str, int]) -> Iterator[pl.DataFrame]:
         """Yield the columns as text or plain numbers, and `EXTRA_FIELDS`."""
         with self._file.open("rb") as stream:
-            unfolded = decompressed(stream)
-            plain = recoded(unfolded, self.csv_format.encoding)
+            plain = text_of(stream, self.csv_format)
             names = _csv_header(plain, self._file, self.csv_format)
             numbers = set(self._numbers.columns & set(found))
 
@@ -180,10 +175,11 @@ class CsvSource(FormatSource):
             # A line of separators before each block fixes the number of fields and keeps a block
             # from looking like a compressed file.
             padding = self.csv_format.separator.encode() * len(names) + b"\n"
-            blocks = _whole_lines(plain, self._file, padding)
-            if unfolded is not stream:
-                blocks = _within(self._budget, blocks)
-            yield from map(parse, blocks)
+            unfolded = 0
+            for block in _whole_lines(plain, self._file, padding):
+                unfolded += len(block) - len(padding)
+                self._budget.require_unfolded(unfolded)
+                yield parse(block)
 
     def _parse(
         self, block: bytes, width: int, positions: dict[str, int], numbers: Set[str]
@@ -203,17 +199,6 @@ class CsvSource(FormatSource):
         )
         selection = [pl.col(fields[i]).alias(name) for name, i in positions.items()]
         return frame.select(*selection, EXTRA_FIELDS).collect().slice(1)
-
-
-def _within(budget: Budget, blocks: Iterator[bytes]) -> Iterator[bytes]:
-    """Yield the blocks of a compressed file as long as they, and the lines in them, are few."""
-    unfolded = lines = 0
-    for block in blocks:
-        unfolded += len(block)
-        lines += block.count(b"\n") - 1  # the first is ours
-        budget.require_unfolded(unfolded)
-        budget.require_rows(lines)
-        yield block
 
 
 def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str]:

@@ -17,6 +17,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.can import Bytes, CanBus, FrameBlock
 from fleet_slip.ingest.formats.can_files import CanSource
 from fleet_slip.ingest.formats.source import (
+    EARLIEST_S,
     OWN_TIME,
     Budget,
     Channel,
@@ -134,8 +135,6 @@ _FRAME = "CAN_DataFrame."
 _EXTENDED = 1 << 31
 """Bit that marks an identifier of 29 bits, where no channel of its own does."""
 _IDENTIFIER = (1 << 29) - 1
-_EARLIEST_S = 10**8
-"""Loggers without a clock write 0: a start before 1973 is not a date."""
 
 
 class MdfSource(FormatSource):
@@ -145,7 +144,7 @@ class MdfSource(FormatSource):
         """Take what asammdf has opened."""
         self._file, self._mdf = budget.file, mdf
         start = mdf.start_time.timestamp()
-        self._start_s = start if start > _EARLIEST_S else 0.0
+        self._start_s = start if start > EARLIEST_S else 0.0
 
     def channels(self) -> list[Channel]:
         """Return all channels but the groups' masters."""

@@ -29,6 +29,9 @@ OWN_TIME = "\0time"
 BASE = "\0base"
 """Column with the number of the time base that a row is of, where there are several."""
 
+EARLIEST_S = 10**8
+"""A start before 1973 is no date: of loggers without a clock it is 0, of LabVIEW 1904."""
+
 MAX_COLUMNS = 10_000
 
 _SHOWN_COLUMNS = 30

@@ -17,7 +17,13 @@ import polars as pl
 from fleet_slip.base import shown
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.matlab import Matrix, Vectors
-from fleet_slip.ingest.formats.source import OWN_TIME, Budget, Channel, load_library
+from fleet_slip.ingest.formats.source import (
+    EARLIEST_S,
+    OWN_TIME,
+    Budget,
+    Channel,
+    load_library,
+)
 
 READ_AHEAD = 2**17
 """Values that are read at once: for each time npTDMS reads all that a segment has of a channel."""
@@ -26,8 +32,6 @@ _APPLIED = {
     "Polynomial", "Linear", "RTD", "Strain", "Table", "Thermistor", "Thermocouple", "Add",
     "Subtract", "AdvancedAPI",
 }  # fmt: skip
-_EARLIEST_S = 10**8
-"""A waveform that was given no start begins in 1904: before 1973 it is not a date."""
 
 
 class _Vector(Matrix):
@@ -39,7 +43,7 @@ class _Vector(Matrix):
         self.unit, self.step_s = str(of.get("unit_string", "")), float(of.get("wf_increment", 0))
         began_s = np.datetime64(of.get("wf_start_time", 0), "us").astype(np.int64) / 1e6
         offset_s = float(of.get("wf_start_offset", 0))
-        self.start_s = offset_s + (began_s if began_s > _EARLIEST_S else 0.0)
+        self.start_s = offset_s + (began_s if began_s > EARLIEST_S else 0.0)
         times = f"{self.start_s!r} s and each {self.step_s!r} s, {len(channel)} times"
         self.base = times if self.step_s > 0 else ""
 
