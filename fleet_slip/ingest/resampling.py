@@ -20,7 +20,7 @@ from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue, round_chunks
 from fleet_slip.ingest.columns import SignalColumn
 from fleet_slip.ingest.mapping import SPEEDS, LabelSensor, Mapping
-from fleet_slip.ingest.suspicion import RADIUS_M, SECOND
+from fleet_slip.ingest.suspicion import RADIUS_M, SECOND, wrapped
 
 # Which fixes of a satellite receiver show where the car goes, and at which ticks.
 
@@ -314,7 +314,7 @@ def fixes_on_ticks(
         sound &= ~is_backwards(yaw_rate, ay, speed, place)
     courses[place] = np.where(sound, turned, np.nan)
     courses, speeds = on_grid(resampler.ticks, courses, speeds, yaw_rate)
-    return np.asarray((courses + np.pi) % (2 * np.pi) - np.pi), speeds  # in one turn
+    return wrapped(courses), speeds
 
 
 def _is_new(course: FloatArray, speed: FloatArray) -> BoolArray:

@@ -81,7 +81,7 @@ def _course(signals: "Signals") -> Iterator[Fault]:
     if not {"course", "yaw_rate"} <= set(signals):
         return
     course, turned = signals["course"], np.cumsum(signals["yaw_rate"]) * float(SAMPLE_TIME_S)
-    change, heading = _wrapped(course[SECOND:] - course[:-SECOND]), turned[SECOND:]
+    change, heading = wrapped(course[SECOND:] - course[:-SECOND]), turned[SECOND:]
     slope, correlation = slope_of(change, heading - turned[:-SECOND], np.isfinite(change))
     if correlation:
         figure = f"over 1 s it changes by {slope:+.2f} times the integral of the yaw rate"
@@ -116,13 +116,14 @@ def _relation(signals: "Signals", turned: FloatArray) -> CourseRelation | None:
     fast = np.where(speed > LEAST_SPEED_MPS, speed, np.nan)
     series = np.array([yaw_rate / fast, signals["ay"], yaw_rate, turned, signals["course"]])
     changes = series[:, APART:] - series[:, :-APART]
-    changes[4] = _wrapped(changes[4] - changes[3])
+    changes[4] = wrapped(changes[4] - changes[3])
     sound = np.isfinite(changes).all(axis=0) & (np.abs(changes[4]) <= float(LARGEST_RAD))
     rows = np.vstack([np.ones(int(sound.sum())), changes[:, sound]])
     return relate(rows @ rows.T)
 
 
-def _wrapped(angle: FloatArray) -> FloatArray:
+def wrapped(angle: FloatArray) -> FloatArray:
+    """Return the angle from -π on, below π."""
     return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
 
 

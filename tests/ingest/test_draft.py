@@ -15,7 +15,6 @@ from fleet_slip.errors import ConfigError, InputError, UsageError
 from fleet_slip.ingest.guess import unit_readings
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
-from fleet_slip.ingest.vocabulary import parts_of
 from tests.support.measured import read_measured
 from tests.support.reported import call
 from tests.support.suggested import DEGREES, ENGLISH, KMH, LOGS, wrong_guesses
@@ -175,17 +174,3 @@ def test_what_cannot_be_drafted_says_so(tmp_path: Path) -> None:
         call(tmp_path, "mapping", "suggest", str(file), "--output", str(file))
     file.write_text("t,ay\n0,1\n1,x\n")
     assert "ay = { column" in call(tmp_path, "mapping", "suggest", str(file))
-
-
-@pytest.mark.parametrize(
-    ("name", "parts"),
-    [
-        ("WhlSpdFL", ["whl", "spd", "fl"]),
-        ("VelFR_obd", ["vel", "fr", "obd"]),
-        ("ESP_02.YawRate", ["esp", "02", "yaw", "rate"]),
-        ("a_x", ["a", "x"]),
-        ("RLwhlspd", ["rl", "whlspd"]),
-    ],
-)
-def test_parts_of_a_name(name: str, parts: list[str]) -> None:
-    assert parts_of(name) == parts

@@ -138,18 +138,6 @@ def test_a_file_of_another_time_and_the_same_content_is_not_new(folder: Path) ->
     assert ingest(folder) == []
 
 
-def test_a_file_that_has_grown_would_count_twice_and_is_refused(folder: Path) -> None:
-    ingest(folder)
-    file = folder / "day 1" / "1.csv"
-    write_log(file, rows=50)
-    with pytest.raises(InputError, match="it has changed since it was ingested") as caught:
-        ingest(folder)
-    assert any(name in str(caught.value) for name in drives(folder))
-    assert sorted(drives(folder).values()) == [20, 21, 22, 23, 24]
-    file.rename(folder / "whole.csv")
-    assert [report["new"] for report in ingest(folder)] == [True]
-
-
 def test_files_that_cannot_be_used_do_not_hold_up_the_rest(folder: Path) -> None:
     (folder / "bad.csv").write_text("t,ax\n0,1\n")
     with pytest.raises(InputError, match=r"bad\.csv: no column 'beta'"):
