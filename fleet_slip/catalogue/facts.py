@@ -47,9 +47,9 @@ class CarNumber(Config):
     grain: Decimal
     description: str
 
-    def count(self, value: Fraction | None) -> int | None:
-        """Return a value as an integer count of the grain; None stays None."""
-        return None if value is None else round_number(value, Fraction(self.grain))
+    def count(self, value: Fraction) -> int | None:
+        """Return a value as an integer count of the grain; None beyond 16 bits."""
+        return round_number(value, Fraction(self.grain))
 
 
 def round_number(value: Fraction, grain: Fraction) -> int | None:
