@@ -22,7 +22,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.evaluation.filters import choose_evenly
 from fleet_slip.evaluation.single_track import LabelledDrive, read_drive
 from fleet_slip.grams.cohort import Cohort, with_gram_rows
-from fleet_slip.grams.compute import Parts, counts_of, drive_sums
+from fleet_slip.grams.compute import Parts, counts_of, drive_sums, gram_rows
 from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
 from fleet_slip.grams.gram_files import hash_numbers
@@ -224,23 +224,16 @@ def _gram_rows(
     workspace: Workspace, parts: Parts, one: HeldOutDrive, quarter: int, line: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
     """Return the Gram rows of the labelled rows of a quarter; columns look back beyond it."""
-    names, label = workspace.plan.names, catalogue().label
+    label = catalogue().label
     counts = counts_of(one.rows, workspace.plan, line)
     labelled = counts.present.get(label, np.ones(len(one.rows), dtype=np.bool_))
     present = {**counts.present, label: labelled & (one.quarter == quarter)}
     name = _quarter_of(one.drive.drive_id, quarter)
     (number,) = hash_numbers(pa.array([name])).tolist()
     own = {"drive_id": name, "trip": name, "drive_hash": number, "trip_hash": number}
-    found = []
-    counts = replace(counts, present=present)
-    for (absent, part), sums in drive_sums(workspace, parts, counts).items():
-        has = [column for i, column in enumerate(names) if not absent >> i & 1]
-        if label in has:
-            products = sums.products[np.tril_indices(len(has))]
-            about = {"part": parts.name(part), "signals": ",".join(has), "n": sums.n}
-            values = {"sums": sums.sums, "products": products, "clipped": sums.clipped}
-            found.append({**line, **own, **about, **values})
-    return found
+    sums = drive_sums(workspace, parts, replace(counts, present=present))
+    rows = gram_rows(sums, workspace.plan.names, parts, {**line, **own})
+    return [row for row in rows if label in row["signals"].split(",")]
 
 
 def predict_drive(model: Predictor, one: HeldOutDrive, cars: CarCounts) -> FloatArray:

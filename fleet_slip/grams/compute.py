@@ -472,14 +472,13 @@ def wide_grams(
                 delay = (late or {}).get(drive.facts["vehicle_id"])
                 known = {**drive.facts, "feature_set": identity, COURSE_LATE: delay}
                 known |= {"file": file.path, "day": file.day}
-                rows += _gram_rows(workspaces[fold], one, drive, known)
+                rows += _rows_of_drive(workspaces[fold], one, drive, known)
     return pa.Table.from_pylist(rows, schema=schema)
 
 
-def _gram_rows(
+def _rows_of_drive(
     workspace: Workspace, one: FeatureSet, drive: DriveCounts, known: Mapping[str, Any]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the Gram rows of a drive with what is known of it, sorted as by SQL."""
     parts = Parts.of_set(features(), one)
     try:
         if one.change_ticks:
@@ -489,10 +488,17 @@ def _gram_rows(
             found = drive_sums(workspace, parts, drive)
     except DataError as error:
         raise DataError(f"{known['file']}: drive {known['drive_id']}: {error}") from None
+    return gram_rows(found, one.columns, parts, known)
+
+
+def gram_rows(
+    found: "Mapping[Kind, PartSums]", columns: Sequence[str], parts: Parts, known: Mapping[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """Yield the Gram rows of a drive's sums with what is known of it, sorted as by SQL."""
     # As SQL does: an unknown part, which is null there, comes last.
     for absent, part in sorted(found, key=lambda kind: (kind[0], kind[1] == UNKNOWN, kind[1])):
         sums = found[absent, part]
-        names = [name for i, name in enumerate(one.columns) if not absent >> i & 1]
+        names = [name for i, name in enumerate(columns) if not absent >> i & 1]
         yield {
             **known,
             "part": parts.name(part),
