@@ -355,6 +355,7 @@ def c_source(version: ModelVersion, program: Program) -> str:
         program,
         helpers=helper_texts(writer),
         start=start,
+        learned=[sum_key(*one) for one in program.learned],
         lines=lines,
         looks_back=any("state->" in line for line in lines),
         kind=integer_type(max(writer.size(place) for place, _ in angle.terms)),

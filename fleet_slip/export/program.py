@@ -23,6 +23,7 @@ from fleet_slip.columns.operations import (
     Range,
     Step,
     given_ranges,
+    operands_of,
     plain_of,
     ranges_of,
     rings_of,
@@ -205,6 +206,15 @@ class Steps:
     def sums(self) -> list[tuple[int, ...]]:
         """What is added up over time: a step, its ticks, and the most values."""
         return list(dict.fromkeys(plain_of(s) for s in self.steps if s[0] in ("sum", "values")))
+
+    @cached_property
+    def learned(self) -> list[tuple[int, ...]]:
+        """The sums that slopes are solved from, which may outlive a drive."""
+        solved = [step for step in self.steps if step[0] == "nearest"]
+        totals = [a for _, a, b in solved if self.steps[int(b)][0] == "power"]
+        parts = [place for a in totals for place in (a, *operands_of(self.steps[int(a)]))]
+        found = [self.steps[int(place)] for place in parts]
+        return list(dict.fromkeys(plain_of(step) for step in found if step[0] == "sum"))
 
     @property
     def longest_ticks(self) -> int:

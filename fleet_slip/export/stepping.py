@@ -24,6 +24,9 @@ _COMPUTED: Mapping[str, Callable[..., int | None]] = {
 }
 """What an operation is, of values of the same tick none of which is missing."""
 
+KEPT_PARTS = 256
+"""Parts of what a car has learned that it can keep for its next drive."""
+
 
 class Estimator:
     """Estimates the side-slip angle of a drive, a sample at a time.
@@ -60,6 +63,7 @@ class Estimator:
             (place, scale_of[t.signal] if t.logged else float(t.scale), t.coefficient)
             for t, place in zip(manifest.terms, program.angle.places, strict=True)
         ]
+        self._windows: dict[tuple[int, ...], list[int]] = {}
         self.restart()
 
     def step(self, sample: Mapping[str, float | None]) -> float | None:
@@ -103,12 +107,20 @@ class Estimator:
         for _ in range(min(ticks, self._program.longest_ticks + 1)):  # then nothing is left
             self.step(nothing)
 
-    def restart(self) -> None:
-        """Begin another drive of the same car."""
+    def restart(self, kept: int = 0) -> None:
+        """Begin another drive of the same car, which remembers `kept` of 256 parts of its slopes.
+
+        As the C export's `next` does. Raises `InputError` for more parts.
+        """
+        if not 0 <= kept <= KEPT_PARTS:
+            raise InputError(f"kept = {kept}: choose 0 to {KEPT_PARTS} parts.")
+        before = self._windows
         self._tick = 0
         rings = self._program.rings.items()
         self._rings: dict[int, list[int | None]] = {of: [None] * n for of, n in rings if n}
         self._windows = {window: [0, 0] for window in self._program.sums}
+        for window in self._program.learned if before else ():
+            self._windows[window] = [part * kept // KEPT_PARTS for part in before[window]]
 
     def _counts(self, sample: Mapping[str, float | None]) -> list[int | None]:
         """Return the counts of a sample, None where missing or out of range."""

@@ -33,7 +33,8 @@ int main(void)
     PREFIX_sample sample;
     int32_t angle;
 CAR
-    while (fread(&sample, sizeof sample, 1U, stdin) == 1U) {
+    for (uint32_t tick = 0U; fread(&sample, sizeof sample, 1U, stdin) == 1U; tick++) {
+BEFORE
         if (!PREFIX_step(&state, &sample, &angle)) { angle = INT32_MIN; }
         (void)fwrite(&angle, sizeof angle, 1U, stdout);
     }
@@ -99,12 +100,14 @@ def can_sanitize(folder: Path) -> bool:
     return ran.returncode == 0
 
 
-def build_driver(folder: Path, version: ModelVersion, program: Program, *options: str) -> Path:
-    """Return a program that reads a car and samples, and writes angles."""
+def build_driver(
+    folder: Path, version: ModelVersion, program: Program, *options: str, before: str = ""
+) -> Path:
+    """Return a program that reads a car and samples, and writes angles; `before` each tick."""
     prefix = c_prefix(version)
     has_car = bool(program.facts or program.numbers)
     car = GIVEN if has_car else "    PREFIX_start(&state);"
-    driver = DRIVER.replace("CAR", car).replace("PREFIX", prefix)
+    driver = DRIVER.replace("CAR", car).replace("BEFORE", before).replace("PREFIX", prefix)
     (folder / f"{prefix}.h").write_text(c_header(version, program))
     (folder / f"{prefix}.c").write_text(c_source(version, program))
     (folder / "driver.c").write_text(driver)

@@ -12,6 +12,7 @@ import pytest
 import fleet_slip
 from fleet_slip.export.c import LARGEST_UNSIGNED
 from fleet_slip.export.compile import angles_by_kernel, compile_program
+from fleet_slip.export.stepping import Estimator
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import (
     DEADLINE_S,
@@ -44,6 +45,33 @@ def test_hostile_drives_give_the_angles_of_the_kernel(name: str, tmp_path: Path)
         angles |= {*found}
     assert len(angles) > 10
     assert None in angles
+
+
+def test_the_next_drive_remembers_what_was_learned(tmp_path: Path) -> None:
+    """All of 256 parts, some, none: as the estimator in Python does, in counts of a column."""
+    manifest = model_of({"slope": Fraction(1, 3), "ever": Fraction(1, 7)}, name="any")
+    program, version = compile_program(manifest), ModelVersion(1, manifest, "0" * 64)
+    samples = hostile_drive(program, 300, 5)
+    after: dict[int, list[int | None]] = {}
+    for kept in (0, 77, 256, 1000):
+        again = f"if (tick == 200U) {{ PREFIX_next(&state, {kept}U); }}"
+        driver = build_driver(tmp_path, version, program, before=again)
+        after[kept] = drive(driver, program, CARS[0], samples)[200:]
+        estimator = Estimator(manifest)
+        columns = [one.column for one in program.signals]
+        scales = [float(one.scale) for one in program.signals]
+        stepped = []
+        for tick, sample in enumerate(samples):
+            if tick == 200:
+                estimator.restart(min(kept, 256))
+            values = [None if n is None else n * s for n, s in zip(sample, scales, strict=True)]
+            stepped.append(estimator.step(dict(zip(columns, values, strict=True))))
+        expected = [None if x is None else x / float(program.angle.scale) for x in stepped[200:]]
+        for found, angle in zip(after[kept], expected, strict=True):
+            assert (found is None) == (angle is None)
+            assert found is None or angle is None or abs(found - angle) <= 1
+    assert after[0] == drive(driver, program, CARS[0], samples[200:])
+    assert after[256] == after[1000] != after[77] != after[0]
 
 
 FUZZ = """

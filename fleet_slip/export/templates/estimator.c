@@ -13,6 +13,22 @@ void ${prefix}_start(${prefix}_state *state${", const " ~ prefix ~ "_car *car" i
 //% endfor
 }
 
+//% if learned
+void ${prefix}_next(${prefix}_state *state, ${"const " ~ prefix ~ "_car *car, " if knows}uint32_t kept)
+{
+    const uint32_t parts = (kept < 256U) ? kept : 256U;
+//% for key in learned
+    const int64_t sum_${key} = floor_shift(state->sum_${key} * (int64_t)parts, 8U);
+    const uint64_t values_${key} = ((uint64_t)state->values_${key} * parts) / 256U;
+//% endfor
+    ${prefix}_start(state${", car" if knows});
+//% for key in learned
+    state->sum_${key} = sum_${key};
+    state->values_${key} = (uint32_t)values_${key};
+//% endfor
+}
+
+//% endif
 bool ${prefix}_step(${prefix}_state *state, const ${prefix}_sample *sample, int32_t *angle)
 {
     /* Coefficients over 2^${angle.bits}: upper * 2^${angle.low_bits} + lower. */

@@ -54,6 +54,12 @@ typedef struct {
 /* Begins a drive. */
 void ${prefix}_start(${prefix}_state *state${", const " ~ prefix ~ "_car *car" if knows});
 
+//% if program.learned
+/* Begins another drive of the same car, which remembers so many of 256 parts of what drives have
+ * taught it of load and tyres. The state must be kept meanwhile, in memory that needs no power. */
+void ${prefix}_next(${prefix}_state *state, ${"const " ~ prefix ~ "_car *car, " if knows}uint32_t kept);
+
+//% endif
 /* Takes the next tick, and writes ${angle.column} in counts of ${angle.scale|decimal}
  * ${angle.unit}, within ${"%.12f"|format(angle.error|float)} counts of the exact model.
  * Returns whether there is an angle; else 0 is written. Call it at every tick: one
