@@ -12,16 +12,18 @@ angle, at last on each of so many `--draws` of 24 blind drives.
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from typing import Any
+
+import numpy as np
 
 import fleet_slip
 from fleet_slip.config import load_config
 from fleet_slip.evaluation.blind import BlindSet, blind_scenarios
-from fleet_slip.evaluation.drives import simulate_drives
+from fleet_slip.evaluation.drives import EvaluatedDrive, simulate_drives
 from fleet_slip.evaluation.evaluate import train_competitors
-from fleet_slip.evaluation.judge import Estimate, evaluate_drive, judge
+from fleet_slip.evaluation.judge import Estimate, EvaluatedScenario, evaluate_drive, judge
 from fleet_slip.resources import config_file
 from fleet_slip.simulation.roads import draw_road, random_generator
 from fleet_slip.simulation.scenario import Scenario, load_scenario
@@ -88,11 +90,25 @@ def scenarios(kind: str, one: Kind, seed: int, roads: int) -> Iterator[Scenario]
         )
 
 
-def errors_deg(some: Sequence[Scenario], estimators: Mapping[str, Estimate]) -> list[float]:
-    """Return the RMSE of each estimator over all drives in which no car is lost."""
+def errors_deg(
+    some: Sequence[Scenario], estimators: Mapping[str, Estimate], *, laden: bool = False
+) -> list[float]:
+    """Return the RMSE of each estimator over all drives in which no car is lost.
+
+    `laden`: judged at the centre of gravity of the loaded car instead of the empty one.
+    """
     drives = [one for one in simulate_drives(some) if one.lost_control_s is None]
-    found = judge([evaluate_drive(drive, estimators) for drive in drives])
+    runs = [evaluate_drive(drive, estimators) for drive in drives]
+    if laden:
+        runs = [_laden(run, drive) for run, drive in zip(runs, drives, strict=True)]
+    found = judge(runs)
     return [found[name].rmse_deg or float("nan") for name in estimators]
+
+
+def _laden(run: EvaluatedScenario, drive: EvaluatedDrive) -> EvaluatedScenario:
+    turned = drive.scenario.car.body.reference_m * drive.signals["yaw_rate_rad_s"]
+    turned = turned / np.maximum(drive.vx_mps, 1.0)
+    return replace(run, truth_rad=np.arctan(np.tan(run.truth_rad) - turned))
 
 
 def main() -> None:
@@ -118,6 +134,9 @@ def main() -> None:
     for kind, (goal_deg, some) in drives.items():
         found = " | ".join(f"{error:.3f}" for error in errors_deg(some, estimators))
         print(f"| {kind} | {goal_deg:.3f} | {found} |", flush=True)
+        if some[0].load_position_m is not None:
+            found = " | ".join(f"{e:.3f}" for e in errors_deg(some, estimators, laden=True))
+            print(f"| the same, at the laden centre of gravity | | {found} |", flush=True)
     for number in range(options.draws):
         drawn = sha256(f"{versions[0].sha256} {number}".encode()).hexdigest()
         found = " | ".join(f"{e:.3f}" for e in errors_deg(blind_scenarios(drawn), estimators))

@@ -29,7 +29,12 @@ from fleet_slip.evaluation.identify import (
     tune,
 )
 from fleet_slip.evaluation.judge import Estimate, Signals
-from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive, read_drive
+from fleet_slip.evaluation.single_track import (
+    DriveSignals,
+    LabelledDrive,
+    measured_speed_mps,
+    read_drive,
+)
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
@@ -233,8 +238,14 @@ class FilterEstimate:
         return replace(self, car=car)
 
     def __call__(self, signals: Signals) -> FloatArray:
-        """Return the estimate at each tick."""
-        return self.filter.estimate(seen(signals), self.car, self.parameters)
+        """Return the estimate at each tick, where the car's angle is meant."""
+        drive = seen(signals)
+        angle_rad = self.filter.estimate(drive, self.car, self.parameters)
+        if not (reference_m := self.car.body.reference_m):
+            return angle_rad
+        return angle_rad + reference_m * drive.yaw_rate_rad_s / np.maximum(
+            measured_speed_mps(drive, self.car), 1.0
+        )
 
     def description(self) -> dict[str, Any]:
         """Return what a JSON document says of it."""

@@ -140,24 +140,25 @@ MOTION = ("vx_mps", "vy_mps", "station_m", "lateral_offset_m")
 """What of the truth an evaluation needs, as no sensor measures it."""
 
 
-def simulate_logs(specs: Sequence[DriveSpec], channels: Sequence[str] = ()) -> list[DriveLog]:
+def simulate_logs(specs: Sequence[DriveSpec], kept: Sequence[str] = ()) -> list[DriveLog]:
     """Simulate drives together, each measured block by block by its own sensors and generator.
 
-    Of the truth itself only the named channels are kept.
+    Of the truth itself only the named channels are `kept`.
     """
     recorders = [Recorder(s.sensors, s.generator(), s.distortion()) for s in specs]
     receivers = [
         ReceiverLog(s.receiver, s.satellite_generator()) if s.receiver else None for s in specs
     ]
-    motions: list[dict[str, list[FloatArray]]] = [{name: [] for name in channels} for _ in specs]
+    motions: list[dict[str, list[FloatArray]]] = [{name: [] for name in kept} for _ in specs]
     logs: dict[int, DriveLog] = {}
     for block in simulate_blocks([lane_drive(spec) for spec in specs]):
         recorder, receiver = recorders[block.drive], receivers[block.drive]
+        channels = at_reference(block.channels, specs[block.drive].vehicle.body.reference_m)
         for name, parts in motions[block.drive].items():
-            parts.append(block.channels[name].copy())
-        recorder.record(block.channels)
+            parts.append(channels[name].copy())
+        recorder.record(channels)
         if receiver:
-            receiver.record(block.channels)
+            receiver.record(channels)
         if block.last:
             lost = block.lost_control_tick
             logs[block.drive] = DriveLog(
@@ -168,6 +169,15 @@ def simulate_logs(specs: Sequence[DriveSpec], channels: Sequence[str] = ()) -> l
                 {name: np.concatenate(parts) for name, parts in motions[block.drive].items()},
             )
     return [logs[drive] for drive in range(len(specs))]
+
+
+def at_reference(channels: dict[str, FloatArray], reference_m: float) -> dict[str, FloatArray]:
+    """Return channels with the velocity so far before the centre of gravity, and its angle."""
+    if not reference_m:
+        return channels
+    vy_mps = channels["vy_mps"] + reference_m * channels["yaw_rate_rad_s"]
+    angle_rad = np.arctan2(vy_mps, channels["vx_mps"])
+    return {**channels, "vy_mps": vy_mps, "sideslip_rad": angle_rad}
 
 
 def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:

@@ -34,6 +34,9 @@ class Body(Config):
     """Of the centre of gravity above the road."""
     track_front_m: FiniteFloat = Field(gt=0)
     track_rear_m: FiniteFloat = Field(gt=0)
+    reference_m: FiniteFloat = Field(default=0.0, exclude_if=lambda one: not one)
+    """Where the side-slip angle is meant, so far before the centre of gravity: a sensor is fixed to
+    the body, and stays at the centre of gravity of the empty car when it is loaded."""
 
     @property
     def mass_kg(self) -> float:
@@ -162,6 +165,7 @@ class VehicleParameters(Config):
             inertia += load_kg * (load_position_m - shift_m) ** 2
             changes["front_axle_m"] = body.front_axle_m - shift_m
             changes["rear_axle_m"] = body.rear_axle_m + shift_m
+            changes["reference_m"] = body.reference_m - shift_m
         changes["sprung_yaw_inertia_kgm2"] = inertia
         return self.model_copy(update={"body": self._changed(self.body, changes)})
 
