@@ -151,6 +151,28 @@ def test_left_turn_has_positive_yaw_rate_lateral_acceleration_and_steer() -> Non
     assert np.allclose(physical(steady, "sideslip"), beta, atol=0.005)
 
 
+def test_the_angle_of_a_loaded_car_is_that_of_the_place_where_the_empty_one_has_it() -> None:
+    """Slowly round a circle the rear wheels roll: the angle is their distance over the radius.
+
+    300 kg, 1.9 m behind, move the centre of gravity by a third of a metre, and 0.6 degrees.
+    """
+    (drive, *_) = load_campaign("smoke").drives(date(2024, 5, 1))
+    empty = on_skid_pad(drive, 0.3)
+    body = empty.vehicle.body
+    car = empty.vehicle.with_sprung_mass(body.sprung_mass_kg + 300, -1.9)
+    shift_m = 300 * 1.9 / (body.mass_kg + 300)
+    assert car.body.reference_m == pytest.approx(shift_m)
+    logs = simulate_logs([empty, replace(empty, vehicle=car)], ("vy_mps", "vx_mps"))
+    one, other = (np.mean(log.motion["vy_mps"][500:] / log.motion["vx_mps"][500:]) for log in logs)
+    radius_m = 1 / float(np.mean(empty.profile.track.curvature(empty.profile.station_m)))
+    assert one == pytest.approx(body.rear_axle_m / radius_m, abs=0.002)
+    assert other == pytest.approx(one, abs=0.1 * shift_m / radius_m)
+    label = catalogue()["sideslip"]
+    for log, expected in zip(logs, (one, other), strict=True):
+        measured = np.mean(log.measurement.counts["sideslip"][500:]) * float(label.scale)
+        assert measured == pytest.approx(expected, abs=0.0005)
+
+
 def test_a_drive_longer_than_a_block_goes_on_where_the_block_ended() -> None:
     drive = on_skid_pad(short_batch().drives[0], 4.0)
     long = replace(drive, laps=2 * BLOCK / drive.expected_rows * 1.1)
