@@ -100,20 +100,16 @@ def standings(data: ReportData) -> ReportTable:
         least = min(errors.values(), default=None)
         marked = [_marked(texts[name], name in errors and errors[name] == least) for name in names]
         rows.append([scenario, *marked])
-    found = evaluated.document.content.get("ranking")
-    won = (
-        f"Among all without satellite navigation {found['estimator']} wins {found['won']} of "
-        f"{found['drives']} drives, and comes within {found['close_ratio']} times the winner in "
-        f"{found['close']} more; drives that differ in satellite navigation alone are one. "
-        if found
-        else ""
-    )
+    found = evaluated.document.content["ranking"]
     return ReportTable(
         "standings",
         "Every estimator on every test drive: root mean square error in degrees",
         ["test drive", *names],
         rows,
-        note=f"Green: the smallest of the row. {won}A percentage: the share of the drive with an "
+        note="Green: the smallest of the row. Among all without satellite navigation "
+        f"{found['estimator']} wins {found['won']} of {found['drives']} drives, and comes within "
+        f"{found['close_ratio']} times the winner in {found['close']} more; drives that differ in "
+        "satellite navigation alone are one. A percentage: the share of the drive with an "
         "estimate; such do not compete.",
     )
 
