@@ -74,7 +74,7 @@ def fleet(two: Fleet, tmp_path: Path) -> Fleet:
     return fleet_slip.open(shutil.copytree(str(two.root), tmp_path / "data"))
 
 
-def test_both_teach_with_a_weight(fleet: Fleet, labelled: Fleet) -> None:
+def test_both_teach_with_a_weight(fleet: Fleet) -> None:
     selection = fleet.cohort("true").select(label="course+sideslip", model=COLUMNS)
     assert len(selection.winner.model.folds) == 2 and selection.winner.model.drives == 2
     assert selection.winner.model.pooled.rmse_deg < 0.2, "of the angle, without fixes' noise"

@@ -122,7 +122,7 @@ def test_a_score_leaves_out_what_the_model_was_trained_on(root: Path) -> None:
     assert "left out: 4 drives of 8 that early@1 was trained on" in told
 
 
-def test_the_only_model_need_not_be_named(tmp_path: Path, smoke_root: Path, root: Path) -> None:
+def test_the_only_model_need_not_be_named(smoke_root: Path, root: Path) -> None:
     assert answer(smoke_root, "show")["name"] == "smoke"
     with pytest.raises(QuestionError, match=r"Models: .*plain, .*smoke"):
         answer(root, "show")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fleet_slip.simulation.campaign import Campaign, load_campaign
+from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.receivers import Receiver, ReceiverLog
 from fleet_slip.simulation.sensors import Measurement
@@ -108,15 +108,9 @@ def test_blocks_change_neither_heading_nor_fixes() -> None:
         assert (counts == parts.counts[name]).all()
 
 
-@pytest.fixture
-def received(tmp_path: Path) -> Campaign:
-    file = tmp_path / "received.toml"
-    file.write_text(OF_SMOKE)
-    return load_campaign(str(file))
-
-
-def test_a_campaign_with_receivers_has_the_drives_of_its_base(received: Campaign) -> None:
-    plain = load_campaign("smoke")
+def test_a_campaign_with_receivers_has_the_drives_of_its_base(tmp_path: Path) -> None:
+    (tmp_path / "received.toml").write_text(OF_SMOKE)
+    plain, received = load_campaign("smoke"), load_campaign(str(tmp_path / "received.toml"))
     day = plain.days()[0]
     (before,), (after,) = (simulate_logs(c.drives(day)[:1]) for c in (plain, received))
     assert before.spec.drive_id != after.spec.drive_id

@@ -18,7 +18,7 @@ from fleet_slip.simulation.imperfections import Uniform
 from fleet_slip.simulation.job import simulate_batch, simulate_logs
 from fleet_slip.simulation.roads import SLOWEST_MPS
 from fleet_slip.simulation.traffic import SITES, TrafficDrive
-from tests.support.commands import COMMAND, RunCommand, run
+from tests.support.commands import RunCommand, run
 
 SHORT = """
 name = "short"
@@ -67,6 +67,7 @@ def digests_of(order: list[str]) -> list[tuple[str, int, str]]:
 
 
 def test_a_drive_has_the_same_bytes_in_every_process_and_order() -> None:
+    """In another process, which pygame does not greet."""
     roads = sorted(SITES)
     words = [sys.executable, "-c", PROGRAM, *roads[::-1]]
     there = run(words, env={**os.environ, "PYTHONHASHSEED": "2024"})
@@ -139,10 +140,8 @@ def short(folder: Path, tracks: str = "") -> str:
     return str(file)
 
 
-def test_a_campaign_is_simulated_without_a_word_of_pygame(
-    tmp_path: Path, run_command: RunCommand
-) -> None:
-    done = run([COMMAND, "--root", str(tmp_path / "data"), "simulate", short(tmp_path)])
+def test_a_campaign_in_traffic_is_simulated_once(tmp_path: Path, run_command: RunCommand) -> None:
+    done = run_command("simulate", short(tmp_path))
     assert done.exit_code == 0, done.stderr
     assert not done.stdout
     assert ": simulated 2 drives, " in done.stderr

@@ -17,7 +17,6 @@ from fleet_slip.vehicle.parameters import constants, load_vehicle
 from fleet_slip.vehicle.tyre import arctan2, cornering_stiffness
 
 CARS = ("compact_hatchback", "d_class_sedan", "rear_drive_sedan", "suv")
-SIZES = st.floats(1e-6, 1e6)
 
 
 @kernel

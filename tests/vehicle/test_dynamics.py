@@ -184,11 +184,6 @@ def test_nothing_blows_up_in_any_spin(x: State, u: Controls, adhesion: float) ->
     assert kinetic_energy(run.states).max() <= 1.01 * start + SEDAN.drivetrain.power_w * 3.0 + 1
 
 
-@given(x=STATES, u=CONTROLS)
-def test_rates_are_pure(x: State, u: Controls) -> None:
-    assert rates(x, u, CAR) == rates(x, u, CAR)
-
-
 @pytest.mark.parametrize("name", ["compact_hatchback", "d_class_sedan", "rear_drive_sedan", "suv"])
 @pytest.mark.parametrize("share", [0.75, 1.0, 1.33])
 def test_every_car_understeers_at_every_mass(name: str, share: float) -> None:
