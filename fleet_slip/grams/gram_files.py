@@ -168,15 +168,19 @@ def rows_to_keep(
 
 
 def read_rows(grams: Table, file: TableFile) -> pa.Table:
-    """Return the Gram rows of a file in the schema of the table; null in columns that it lacks."""
-    rows = grams.read(file.path)
+    """Return the Gram rows of a file in the schema of the table."""
+    return in_schema(grams.read(file.path), grams.schema)
+
+
+def in_schema(rows: pa.Table, schema: pa.Schema) -> pa.Table:
+    """Return rows in the columns of a schema, null in those that they lack."""
     columns = [
         rows[field.name].cast(field.type)
         if field.name in rows.column_names
         else pa.nulls(len(rows), field.type)
-        for field in grams.schema
+        for field in schema
     ]
-    return pa.table(columns, schema=grams.schema)
+    return pa.table(columns, schema=schema)
 
 
 def rows_of_set(grams: Snapshot, identity: str, *columns: str) -> Iterator[pa.Table]:

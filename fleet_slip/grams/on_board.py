@@ -44,6 +44,7 @@ from fleet_slip.grams.gram_files import (
     by_signals,
     files_to_rewrite,
     gram_table,
+    in_schema,
     rows_to_keep,
     write_rows,
 )
@@ -339,17 +340,11 @@ def _read(file: Path, content: bytes) -> pa.Table:
         absent = [name for name in COLUMNS.names if name not in {*table.column_names, *OPTIONAL}]
         if absent:
             raise InputError(f"{file}: no table of Gram rows: no column {absent[0]}. {_SEE}")
-        columns = [
-            table[one.name].cast(one.type)
-            if one.name in table.column_names
-            else pa.nulls(len(table), one.type)
-            for one in COLUMNS
-        ]
+        return in_schema(table, COLUMNS).combine_chunks()
     except (pa.ArrowException, OSError, ValueError, IndexError) as error:
         raise InputError(
             f"{file}: cannot be read as a table of Gram rows: {error}. {_SEE}"
         ) from None
-    return pa.table(columns, schema=COLUMNS).combine_chunks()
 
 
 _NOTE = {"job": "receive"}
@@ -396,13 +391,9 @@ def _gram_rows(table: pa.Table, schema: pa.Schema, name: str) -> pa.Table:
     """Return rows of `grams`."""
     identities = {one.key: identity for identity, one in counted_sets().items()}
     sets = pa.array([identities[key] for key in table["feature_set"].to_pylist()])
-    known = dict(zip(table.column_names, table.columns, strict=True)) | {"feature_set": sets}
-    known |= {"file": pa.repeat(name, len(table)), "clipped": pa.repeat(0, len(table))}
-    columns = [
-        known[one.name].cast(one.type) if one.name in known else pa.nulls(len(table), one.type)
-        for one in schema
-    ]
-    return pa.table(columns, schema=schema)
+    rows = table.set_column(table.column_names.index("feature_set"), "feature_set", sets)
+    rows = rows.append_column("file", pa.repeat(name, len(table)))
+    return in_schema(rows.append_column("clipped", pa.repeat(0, len(table))), schema)
 
 
 def _refuse(
