@@ -11,7 +11,6 @@ import re
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -87,24 +86,15 @@ def stamp_s(message: Any, published_ns: int) -> float:
     return published_ns * 1e-9
 
 
-@dataclass(frozen=True)
-class _McapChannel:
-    """What a file says of a channel, and what reads its messages, if anything does."""
-
-    topic: str
-    encoding: str
-    decode: Decode | None
-
-
-def _channel_of(record: Any, schema: Any) -> _McapChannel:
+def _decoder_of(channel: Any, schema: Any) -> Decode | None:
+    """Return what reads the messages of a channel, None if nothing does."""
     from mcap_ros2.decoder import DecoderFactory  # noqa: PLC0415 - of the extra `logs`
 
-    encoding = record.message_encoding
-    if encoding == "json":
-        return _McapChannel(record.topic, encoding, json.loads)
-    decode: Decode | None = DecoderFactory().decoder_for(encoding, schema)
+    if channel.message_encoding == "json":
+        return json.loads
+    decode: Decode | None = DecoderFactory().decoder_for(channel.message_encoding, schema)
     if decode is None:
-        return _McapChannel(record.topic, encoding, None)
+        return None
 
     def decode_plain(data: bytes) -> Any:
         # The decoder reads any other as this one too, with its numbers at wrong places.
@@ -112,7 +102,7 @@ def _channel_of(record: Any, schema: Any) -> _McapChannel:
             raise ValueError(f"a message is not plain CDR (it begins with {data[:2].hex()})")
         return decode(data)
 
-    return _McapChannel(record.topic, encoding, decode_plain)
+    return decode_plain
 
 
 _Fields = dict[str, str]
@@ -165,10 +155,10 @@ class McapSource(FormatSource):
         """The fields of the first message of each topic that can be decoded."""
         found: dict[str, list[str]] = {}
         encodings = set[str]()
-        for channel, message in self._messages():
-            encodings.add(channel.encoding)
-            if channel.decode is not None and channel.topic not in found:
-                found[channel.topic] = list(dict(leaves_of(channel.decode(message.data))))
+        for channel, decode, message in self._messages():
+            encodings.add(channel.message_encoding)
+            if decode is not None and channel.topic not in found:
+                found[channel.topic] = list(dict(leaves_of(decode(message.data))))
         if not found:
             raise InputError(
                 f"{shown(self._file)}: no message in it can be decoded "
@@ -177,21 +167,22 @@ class McapSource(FormatSource):
             )
         return found
 
-    def _messages(self) -> Iterator[tuple[_McapChannel, Any]]:
-        """Yield all messages, in the file's order, with their channels."""
+    def _messages(self) -> Iterator[tuple[Any, Decode | None, Any]]:
+        """Yield the channel, the decoder and the record of all messages, in the file's order."""
         mcap = load_library(self._file, "mcap.stream_reader")
         schemas: dict[int, Any] = {}
-        channels: dict[int, _McapChannel] = {}
+        channels: dict[int, tuple[Any, Decode | None]] = {}
         with self._file.open("rb") as file:
             reader = mcap.StreamReader(file, validate_crcs=True, record_size_limit=None)
             for record in reader.records:
                 kind = type(record).__name__
                 if kind == "Message":
-                    yield channels[record.channel_id], record
+                    yield *channels[record.channel_id], record
                 elif kind == "Schema":
                     schemas[record.id] = record
                 elif kind == "Channel" and record.id not in channels:
-                    channels[record.id] = _channel_of(record, schemas.get(record.schema_id))
+                    decode = _decoder_of(record, schemas.get(record.schema_id))
+                    channels[record.id] = record, decode
 
     def _decode(self, wanted: dict[str, _Fields]) -> None:
         """Put columns of some topics aside."""
@@ -199,17 +190,17 @@ class McapSource(FormatSource):
         self._kept, self._numbers, self._texts = {}, set(), set()
         waiting: dict[str, list[list[Any]]] = {topic: [] for topic in wanted}
         paths = {topic: [parse_path(name) for name in of.values()] for topic, of in wanted.items()}
-        for channel, message in self._messages():
+        for channel, decode, message in self._messages():
             topic = channel.topic
             if topic not in wanted:
                 continue
-            if channel.decode is None:
+            if decode is None:
                 raise InputError(
                     f"{shown(self._file)}: topic {topic!r} has messages in an encoding that is "
-                    f"not supported ({channel.encoding!r}). Record it in one encoding, or map "
-                    "another topic."
+                    f"not supported ({channel.message_encoding!r}). Record it in one encoding, or "
+                    "map another topic."
                 )
-            found = channel.decode(message.data)
+            found = decode(message.data)
             values = [value_at(found, path) for path in paths[topic]]
             waiting[topic].append([stamp_s(found, message.publish_time), *values])
             if len(waiting[topic]) >= PIECE_ROWS:
