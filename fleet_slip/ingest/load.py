@@ -278,25 +278,21 @@ FILE_ROWS = 2**18
 
 
 def write_batch(
-    warehouse: Warehouse,
-    mapping: Mapping,
-    files: Batch,
-    replace: Replace = "no",
+    warehouse: Warehouse, mapping: Mapping, files: Batch, replace: Replace = "no"
 ) -> WrittenBatch:
     """Read files, and write their rows together: one data file a day. Nothing is committed.
 
     A file that cannot be used is a failure of its own.
     """
     failures: list[InputError] = []
+    written: list[WrittenFile] = []
+    longest: list[tuple[_Judged, MeasuredDrive | None]] = []
     copies = local_copies(asked.file for asked in files)
     with copies as open_copy, ThreadPoolExecutor(WRITERS) as writers:
         batch = _Writer(warehouse, mapping, files, writers, replace)
         for asked in files:
             try:
-                with (
-                    open_copy(asked.file) as file,
-                    open_measured(file, mapping) as stream,
-                ):
+                with open_copy(asked.file) as file, open_measured(file, mapping) as stream:
                     one = batch.write(stream, asked)
             except BaseException as error:
                 for data in batch.data.values():
@@ -307,12 +303,12 @@ def write_batch(
             else:
                 for data in batch.data.values():
                     data.end_log()
-                batch.written.append(one)
+                written.append(one)
                 if one.report.new:
-                    batch.longest.append((one.report, stream.longest))
-        _judge_longest(batch.longest)
+                    longest.append((one.report, stream.longest))
+        _judge_longest(longest)
         new = {name: data.finish() for name, data in batch.data.items()}
-    return WrittenBatch(tuple(batch.written), tuple(failures), batch.forgotten, new)
+    return WrittenBatch(tuple(written), tuple(failures), batch.forgotten, new)
 
 
 def _judge_longest(found: Iterable[tuple[_Judged, MeasuredDrive | None]]) -> None:
@@ -342,8 +338,6 @@ class _Writer:
         logs = self._look()
         self.data = {name: DataFiles(t, writers) for name, t in tables_of(warehouse).items()}
         self._same = SameRecordings(warehouse, logs, mapping.name, replace)
-        self.written: list[WrittenFile] = []
-        self.longest: list[tuple[_Judged, MeasuredDrive | None]] = []
 
     def _look(self) -> Snapshot:
         """Look at the tables as they are now; return a snapshot of the logs."""

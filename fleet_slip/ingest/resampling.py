@@ -342,7 +342,11 @@ def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.
     sensor = mapping.label
     if sensor is None:
         return {}
-    found = _velocities(sensor, counts) if sensor.from_velocities else _angle(mapping, counts)
+    found: dict[str, FloatArray] = {}
+    if sensor.from_velocities:
+        found = _velocities(sensor, counts)
+    elif sensor.is_elsewhere:
+        found = _angle(sensor, _speed(mapping, counts), counts)
     return {name: round_chunks([values], catalogue()[name]) for name, values in found.items()}
 
 
@@ -355,12 +359,11 @@ def _velocities(sensor: LabelSensor, counts: Named[str, pa.Array]) -> dict[str, 
     return {"vx": vx, "vy": vy, catalogue().label: np.where(fast, np.arctan2(vy, vx), np.nan)}
 
 
-def _angle(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, FloatArray]:
-    sensor, label = mapping.label, catalogue().label
-    if sensor is None or not sensor.is_elsewhere:
-        return {}
+def _angle(
+    sensor: LabelSensor, speed: FloatArray, counts: Named[str, pa.Array]
+) -> dict[str, FloatArray]:
+    label = catalogue().label
     angle, yaw_rate = physical(counts, label), physical(counts, "yaw_rate")
-    speed = _speed(mapping, counts)
     vx = speed * np.cos(angle) + yaw_rate * sensor.sensor_y_m
     vy = speed * np.sin(angle) - yaw_rate * sensor.sensor_x_m
     return {label: np.where(speed >= LEAST_SPEED_MPS, np.arctan2(vy, vx), np.nan)}

@@ -55,9 +55,15 @@ class ParquetSource(FormatSource):
     def find(self, column: str) -> tuple[str, str | None]:
         """Return what a folder says of a column, or None. Raises `InputError`."""
         find_column(self._file, [*self._schema.names, *self._keys], column)
-        if column not in self._keys:  # before anything is decoded: one list can be all of a file
-            _require_readable(self._schema.field(column).type, column, self._file)
-        return "", self._keys.get(column)
+        if column in self._keys:
+            return "", self._keys[column]
+        kind = self._schema.field(column).type
+        if not is_readable(kind):  # before anything is decoded: one list can be all of a file
+            raise InputError(
+                f"{shown(self._file)}: column {column!r} has the type {shown(kind)[:80]}, which is "
+                "neither a number, text nor a time. Convert it or map another one."
+            )
+        return "", None
 
     def read(self, _base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield rows. Raises `InputError`."""
@@ -130,7 +136,7 @@ def _is_text(arrow_type: pa.DataType) -> bool:
 
 
 def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
-    """Return a column as text, float64, date or timestamp. Raises `InputError` for others."""
+    """Return a readable column as text, float64, date or timestamp. Raises `InputError`."""
     array.validate(full=True)  # what Parquet calls text need not be UTF-8, and Polars trusts it
     if pa.types.is_dictionary(array.type):
         longest = pc.max(pc.utf8_length(array.dictionary)).as_py() if _is_text(array.type) else 0
@@ -145,16 +151,7 @@ def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
         return array
     if pa.types.is_date(kind) or pa.types.is_timestamp(kind):
         return _in_calendar(array)
-    _require_readable(kind, name, file)  # then it is a number, or null
     return pc.cast(array, pa.float64(), safe=False)
-
-
-def _require_readable(kind: pa.DataType, name: str, file: Path) -> None:
-    if not is_readable(kind):
-        raise InputError(
-            f"{shown(file)}: column {name!r} has the type {shown(kind)[:80]}, which is neither a "
-            "number, text nor a time. Convert it or map another one."
-        )
 
 
 def _in_calendar(array: pa.Array) -> pa.Array:
