@@ -93,7 +93,7 @@ def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
         )
     if {"vx", "vy"} <= set(guesses) and "sideslip" not in guesses:
         yield (
-            "there is no side-slip angle, and vx and vy give it if they are a sensor's: [label] "
+            "there is no side-slip angle. If vx and vy are a sensor's, they give it: [label] "
             "from_velocities = true, sensor_x_m = ... before the centre of gravity."
         )
     elif "sideslip" in guesses:
@@ -158,7 +158,7 @@ def write_draft(draft: Draft, name: str, place: Path | str | None = None) -> str
     parts.append(_drive(draft))
     parts.append(_signals(draft))
     if draft.open_questions:
-        parts.append("".join(f"# Look at this: {text}\n" for text in draft.open_questions))
+        parts.append("".join(f"# To check: {text}\n" for text in draft.open_questions))
     return "\n".join(_wrapped(line) for line in "\n".join(parts).split("\n"))
 
 
@@ -198,10 +198,10 @@ def _signals(draft: Draft) -> str:
             lines.append(_line(name, guess, draft.guesses) + end)
     for name, guess in draft.questions.items():
         doubts = "; ".join(guess.doubts) or "its name and unit fit several columns"
-        lines.append(f"# Which one, if any? {name}: {doubts}")
+        lines.append(f"# Doubtful: {name}: {doubts}")
         if guess.component != "east":
             if guess.readings:
-                lines.append(f"# Choose the unit, too: {_choices(guess)}.")
+                lines.append(f"# Choose the unit too: {_choices(guess)}.")
             lines += ["# " + _line(name, o, draft.questions) for o in (guess, *guess.rivals)]
     known = {*draft.guesses, *draft.questions}
     absent = [name for name in catalogue().signals if name not in known]

@@ -210,7 +210,11 @@ def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
         if not fitting:
             return None
         keys = {"unit": unit, **fitting[0]}
-    named = f"the format calls it {words!r}" if profile.channel.title else f"its name has {words!r}"
+    named = (
+        f"the format calls it {words!r}"
+        if profile.channel.title
+        else f"its name contains {words!r}"
+    )
     readings = several if len(several) > 1 else ()
     guess = Guess(signal, profile, keys, (named, reason), readings=readings)
     if signal not in catalogue().signals or catalogue()[signal].cyclic:
@@ -220,7 +224,7 @@ def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
     if in_si <= most:
         return guess
     return guess.doubted(
-        f"in {keys['unit']} it would be up to {in_si:.3g} {known.unit}, and the catalogue has "
+        f"in {keys['unit']} it would reach {in_si:.3g} {known.unit}; the limit of the catalogue is "
         f"{most:g}"
     )
 
@@ -351,8 +355,8 @@ def guess_time(
             return _with_date(guess, beside)
         return guess
     keys = {"rate_hz": 100, "assumed": True}
-    reason = "no channel looks like a time: 100 Hz is assumed. Correct it"
-    return TimeGuess(keys, f"{reason}, and remove assumed", 100.0)
+    reason = "no channel looks like a time: 100 Hz is assumed. Correct it, and remove assumed"
+    return TimeGuess(keys, reason, 100.0)
 
 
 def _with_date(guess: TimeGuess, profiles: Iterable[Profile]) -> TimeGuess:
@@ -398,7 +402,7 @@ def _numbers(one: Profile, present: FloatArray) -> TimeGuess:
         seconds = present // 10000 * 3600 + present // 100 % 100 * 60 + present % 100
         rate_hz = sample_rate_hz(seconds)
         clock = {"column": one.channel.name, "format": "%H%M%S%.f", **_gaps(rate_hz)}
-        return TimeGuess(clock, "it counts hours, minutes and seconds of the day", rate_hz)
+        return TimeGuess(clock, "its digits are hours, minutes and seconds of the day", rate_hz)
     step = float(np.median(np.diff(present)))
     ends = parts_of(name)[-1]
     named = _UNITS.get((one.channel.unit or in_brackets).lower()) or _UNITS.get(ends)

@@ -185,7 +185,7 @@ def test_a_heading_is_a_question_and_no_line(tmp_path: Path, name: str) -> None:
     columns = on_time()
     text = suggested(tmp_path, {name: columns["cog"], "GPS_Speed": columns["sog"]})
     assert "course" not in tomllib.loads(text)["signals"]
-    (asked,) = (line for line in unwrapped(text) if line.startswith("# Look at this"))
+    (asked,) = (line for line in unwrapped(text) if line.startswith("# To check"))
     assert f"column = {json.dumps(name)}" in asked and "antenna_x_m" in asked
 
 
