@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import RefusedError
-from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.select import Selection
-from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram, packed_position
-from tests.support.cars import counts, drive
+from tests.support.cars import counts, drive, gram_of
 from tests.support.counted_rows import START_S, row_of, write_counted
 
 Rows = list[dict[str, Any]]
@@ -26,13 +23,8 @@ INPUTS = "ay,yaw_rate,steering_wheel,wheel_fl,wheel_fr"
 @pytest.fixture(scope="module")
 def grams() -> list[Gram]:
     """The Gram of a drive of half a minute of each car."""
-    names = catalogue().gram_signals
-    found = []
-    for car in range(CARS):
-        told = counts(drive(np.random.default_rng(car), gentleness=2.0))
-        matrix = np.column_stack([told[name].astype(np.int64) for name in names])
-        found.append(Gram.from_counts(names, matrix))
-    return found
+    drives = (drive(np.random.default_rng(car), gentleness=2.0) for car in range(CARS))
+    return [gram_of(counts(one)) for one in drives]
 
 
 @pytest.fixture
@@ -69,13 +61,6 @@ def lie(gram: Gram, gain: int = 1, offset: int = 0, times: int = 1) -> Gram:
     sums[y] = gain * sums[y] + offset * gram.n
     scaled = (tuple(times * number for number in some) for some in (sums, products))
     return Gram(gram.signals, times * gram.n, *scaled)
-
-
-def error_deg(manifest: Manifest, grams: Sequence[Gram]) -> float:
-    """RMSE of a version on the honest drives."""
-    model = manifest.counts_model()
-    total = sum(grams[1:], grams[0]).restrict((*model.signals, model.label))
-    return error_sums(model, total).figures(catalogue()[model.label].exact_scale).rmse_deg
 
 
 def forged(grams: Sequence[Gram], how: str) -> Rows:

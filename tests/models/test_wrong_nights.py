@@ -21,7 +21,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
-from tests.support.cars import Signals, counts, drive
+from tests.support.cars import Signals, counts, drive, gram_of
 from tests.support.commands import RunCommand
 from tests.support.logs import DAY, land, log_rows
 from tests.support.once import made_once
@@ -122,12 +122,8 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def truth() -> Gram:
     """The Gram of honest drives that train nothing."""
-    rng, names = np.random.default_rng(9), catalogue().gram_signals
-    grams = []
-    for _ in range(CARS):
-        told = counts(drive(rng, gentleness=2))
-        matrix = np.column_stack([told[name].astype(np.int64) for name in names])
-        grams.append(Gram.from_counts(names, matrix))
+    rng = np.random.default_rng(9)
+    grams = [gram_of(counts(drive(rng, gentleness=2))) for _ in range(CARS)]
     return sum(grams[1:], grams[0])
 
 

@@ -14,7 +14,6 @@ from fleet_slip.simulation.plan import DriveDraw, GridPlan
 from fleet_slip.simulation.roads import random_generator
 
 SMOKE = find_config("campaigns", "smoke").read_text(encoding="utf-8")
-FLEET = find_config("campaigns", "fleet").read_text(encoding="utf-8")
 
 
 def load_text(folder: Path, text: str) -> Campaign:

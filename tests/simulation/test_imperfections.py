@@ -17,7 +17,6 @@ from fleet_slip.vehicle.driver import handling
 from fleet_slip.vehicle.parameters import load_vehicle
 
 FLEET = find_config("campaigns", "fleet").read_text(encoding="utf-8")
-NOMINAL = find_config("scenarios", "nominal").read_text(encoding="utf-8")
 SEDAN = load_vehicle("d_class_sedan")
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.regression.gram import Gram
 
 Signals = dict[str, NDArray[np.float64]]
 
@@ -60,6 +61,12 @@ def counts(signals: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.i
         name: np.rint(values / float(catalogue()[name].scale)).astype(np.int16)
         for name, values in signals.items()
     }
+
+
+def gram_of(told: Mapping[str, NDArray[np.int16]]) -> Gram:
+    """Return the Gram of a drive's counts."""
+    names = catalogue().gram_signals
+    return Gram.from_counts(names, np.column_stack([told[n].astype(np.int64) for n in names]))
 
 
 def broken(signals: Signals, change: Callable[[Signals], None]) -> Signals:
