@@ -1,7 +1,7 @@
 """Which fold a drive belongs to: the SHA-256 of its id modulo the number of folds.
 
 It depends on the drive alone, so that models of different days share a split, which rules that even
-the folds out cannot. Sizes vary by chance; an empty fold is an error.
+the folds out cannot. Sizes vary by chance; a fold that no drive falls into is left out.
 """
 
 import math
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.base import Record, hash_fold, number_of
-from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.base import Record, hash_fold
+from fleet_slip.errors import DataError
 from fleet_slip.regression.drives import missing_signals_error
 from fleet_slip.regression.figures import ErrorSums, Figures, error_sums
 from fleet_slip.regression.gram import Gram, GramTable, require_signals
@@ -30,28 +30,18 @@ class FoldAssignment:
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        used = set(self.fold.tolist())
         if len(self.names) < 2:
             raise DataError(
                 "cross-validation needs at least two folds, and the cohort has one: "
                 f"{', '.join(self.names) or 'no drives'}. Widen the cohort, or fold by another key."
-            )
-        empty = [name for number, name in enumerate(self.names) if number not in used]
-        if empty:
-            raise DataError(
-                f"no drive falls into fold {', '.join(empty)} of {len(self.names)}: the cohort has "
-                f"{number_of(len(self.fold), 'drive')}. Choose fewer folds, or more drives."
             )
 
 
 def by_hash(keys: Sequence[str], count: int) -> FoldAssignment:
     """Deal drives into `count` folds by the hash of a key: the drive id, or a vehicle or track.
 
-    Folds that no drive falls into are left out. Raises `DataError` if fewer than two are left,
-    `QuestionError` if fewer are asked for.
+    Folds that no drive falls into are left out. Raises `DataError` if fewer than two are left.
     """
-    if count < 2:
-        raise QuestionError(f"cross-validation needs at least two folds, not {count}.")
     numbers = [hash_fold(key, count) for key in keys]
     used = sorted(set(numbers))
     fold = np.searchsorted(used, numbers).astype(np.int64)

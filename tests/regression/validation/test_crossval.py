@@ -110,7 +110,7 @@ def test_folds_that_no_drive_falls_into_are_left_out() -> None:
 def test_single_folds_are_errors() -> None:
     with pytest.raises(DataError, match="the cohort has one"):
         by_hash(["a", "a"], 5)
-    with pytest.raises(QuestionError, match="at least two folds"):
+    with pytest.raises(DataError, match="the cohort has one"):
         by_hash(["a", "b"], 1)
     with pytest.raises(DataError, match="the cohort has one: waterford"):
         by_value(["waterford", "waterford"])
