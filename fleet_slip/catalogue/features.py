@@ -533,11 +533,6 @@ def _named(where: str, make: Maker, known: Columns) -> Columns:
         raise ValueError(f"{where}: {error}") from None
 
 
-def load_features(file: Traversable) -> FeatureCatalogue:
-    """Read a file of features. Raises `ConfigError`."""
-    return load_config(file, FeatureCatalogue)
-
-
 def load_features_over(shipped: Traversable, own: Traversable) -> FeatureCatalogue:
     """Read a file of features laid over another: what it names is added, or takes the place.
 
@@ -559,7 +554,7 @@ def features() -> FeatureCatalogue:
     """Return the features that are in force: the shipped ones, and one's own over them."""
     shipped, chosen = folder("configs") / "features.toml", config_file("features.toml")
     if str(chosen) == str(shipped):
-        return load_features(shipped)
+        return load_config(shipped, FeatureCatalogue)
     return load_features_over(shipped, chosen)
 
 

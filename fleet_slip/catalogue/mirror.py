@@ -19,8 +19,7 @@ OPPOSITE = frozenset(
 EXCHANGED = {"wheel_fl": "wheel_fr", "wheel_rl": "wheel_rr"}
 EXCHANGED |= {right: left for left, right in EXCHANGED.items()}
 """Signals that are those of the other side in the mirror; what is in neither stays."""
-OFFSETS = frozenset({"yaw_rate_offset", "ay_offset"})
-OFFSETS |= {"steering_offset"}
+OFFSETS = frozenset({"yaw_rate_offset", "ay_offset", "steering_offset"})
 """Numbers of a car of the other sign in the mirror."""
 TRIALS = 16
 """Rows that a definition is tried on."""

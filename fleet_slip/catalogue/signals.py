@@ -5,7 +5,6 @@ from decimal import Decimal
 from fractions import Fraction
 from functools import cache, cached_property
 from hashlib import blake2b
-from importlib.resources.abc import Traversable
 from os import environ
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -219,16 +218,11 @@ class SignalCatalogue(Config):
         )
 
 
-def load_catalogue(file: Traversable) -> SignalCatalogue:
-    """Read a catalogue from a TOML file. Raises `ConfigError`."""
-    return load_config(file, SignalCatalogue)
-
-
 @cache
 def catalogue() -> SignalCatalogue:
     """Return the catalogue of `$FLEET_SLIP_SIGNALS`, else the one that ships with the package."""
     chosen = environ.get(CATALOGUE_VARIABLE)
-    return load_catalogue(Path(chosen) if chosen else config_file("signals.toml"))
+    return load_config(Path(chosen) if chosen else config_file("signals.toml"), SignalCatalogue)
 
 
 # From physical values to counts, as the cars' sensors and measured logs make them.

@@ -14,11 +14,12 @@ import pytest
 
 from fleet_slip.catalogue import features as features_module
 from fleet_slip.catalogue.definitions import limit_of
-from fleet_slip.catalogue.features import features, load_features
+from fleet_slip.catalogue.features import FeatureCatalogue, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.columns.sql import with_columns
+from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError, DataError, QuestionError
 from fleet_slip.grams import compute as aggregation
 from fleet_slip.grams import compute as gram_statement
@@ -210,7 +211,7 @@ def test_a_feature_that_is_not_integer_arithmetic_on_inputs_is_refused(
     assert old in text
     (tmp_path / "features.toml").write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(ConfigError, match=message):
-        load_features(tmp_path / "features.toml")
+        load_config(tmp_path / "features.toml", FeatureCatalogue)
 
 
 def cohort_gram(warehouse: Warehouse, feature_set: str, signals: list[str]) -> Gram:
@@ -263,7 +264,7 @@ def test_a_changed_definition_never_mixes_with_the_old_rows(
     text = (folder("configs") / "features.toml").read_text(encoding="utf-8")
     changed_text = text.replace("at_least = 120000", "at_least = 400000")
     (tmp_path / "features.toml").write_text(changed_text, encoding="utf-8")
-    changed = load_features(tmp_path / "features.toml")
+    changed = load_config(tmp_path / "features.toml", FeatureCatalogue)
     assert changed.identity("motion") != before.identity("motion")
     assert changed.identity("rows") == before.identity("rows")
     for module in (features_module, aggregation, job, gram_statement):

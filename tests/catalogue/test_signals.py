@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.signals import Signal, catalogue, load_catalogue
+from fleet_slip.catalogue.signals import Signal, SignalCatalogue, catalogue
+from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.resources import folder
 
@@ -56,14 +57,14 @@ def test_a_mistake_is_told_with_file_key_and_reason(
 ) -> None:
     file = edited(tmp_path, old, new)
     with pytest.raises(ConfigError) as caught:
-        load_catalogue(file)
+        load_config(file, SignalCatalogue)
     assert str(file) in str(caught.value)
     assert fault in str(caught.value)
 
 
 def test_a_missing_catalogue_and_an_unknown_signal_are_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file"):
-        load_catalogue(tmp_path / "none.toml")
+        load_config(tmp_path / "none.toml", SignalCatalogue)
     with pytest.raises(QuestionError, match=r"unknown signal 'beta'. Known signals: ax, ay"):
         catalogue()["beta"]
 

@@ -20,8 +20,9 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.catalogue.features import load_features
-from fleet_slip.catalogue.signals import catalogue, load_catalogue
+from fleet_slip.catalogue.features import FeatureCatalogue
+from fleet_slip.catalogue.signals import SignalCatalogue, catalogue
+from fleet_slip.config import load_config
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import FoldKey
@@ -166,8 +167,8 @@ LOADERS: dict[str, Load] = {
     "scenarios": load_scenario,
     "tracks": load_track,
     "vehicles": load_vehicle,
-    "signals.toml": lambda path: load_catalogue(Path(path)),
-    "features.toml": lambda path: load_features(Path(path)),
+    "signals.toml": lambda path: load_config(Path(path), SignalCatalogue),
+    "features.toml": lambda path: load_config(Path(path), FeatureCatalogue),
     "retention.toml": load_retention,
 }
 
