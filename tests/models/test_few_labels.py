@@ -16,8 +16,6 @@ from fleet_slip.errors import DataError, UsageError
 from fleet_slip.grams.cohort import load_cohort, load_mixed_labels
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import fit
-from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land
 
 CAMPAIGN = """
@@ -38,35 +36,25 @@ SETS = ("signals", "delay", "calibration", "windows", "course")
 
 
 @pytest.fixture(scope="module")
-def labelled(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+def two(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+    """Drives of which those of two cars alone have the label."""
     folder = tmp_path_factory.mktemp("some")
     (folder / "some.toml").write_text(CAMPAIGN)
-    made = fleet_slip.open(folder / "data")
-    made.simulate(str(folder / "some.toml"))
-    return made
-
-
-def with_labels(labelled: Fleet, root: Path, cars: int) -> Fleet:
-    """The same drives, of which only those of some cars have the label."""
-    files = sorted(Path(str(labelled.root)).glob("logs/**/*.parquet"))
+    fleet_slip.open(folder / "labelled").simulate(str(folder / "some.toml"))
+    files = sorted(folder.glob("labelled/logs/**/*.parquet"))
     logs = pl.read_parquet(files, missing_columns="insert", hive_partitioning=True)
     names = sorted(logs["vehicle_id"].unique().to_list())
     label = catalogue().label
-    known = pl.when(pl.col("vehicle_id").is_in(names[:cars])).then(pl.col(label))
+    known = pl.when(pl.col("vehicle_id").is_in(names[:2])).then(pl.col(label))
     drives = logs.with_columns(known.otherwise(None).alias(label))
     absent = [pl.lit(None).alias(n) for n in catalogue().log_schema.names if n not in logs.columns]
     table = drives.with_columns(absent).select(catalogue().log_schema.names).to_arrow()
     day = logs["day"][0]
-    land(Warehouse(LocalFolder(root)), "all", table.cast(catalogue().log_schema), day=day)
-    made = fleet_slip.open(root)
+    made = fleet_slip.open(folder / "data")
+    land(made.warehouse, "all", table.cast(catalogue().log_schema), day=day)
     for name in SETS:
         made.gram(name)
     return made
-
-
-@pytest.fixture(scope="module")
-def two(labelled: Fleet, tmp_path_factory: pytest.TempPathFactory) -> Fleet:
-    return with_labels(labelled, tmp_path_factory.mktemp("two") / "data", 2)
 
 
 @pytest.fixture
