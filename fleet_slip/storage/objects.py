@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from os import environ
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import duckdb
 import fsspec
@@ -64,41 +64,12 @@ RETRY_S = 60
 """No attempt begins later than so long after the first."""
 
 
-@dataclass(frozen=True)
-class AwsProfile:
-    """What a profile says of S3, where credentials are not in the environment."""
-
-    credentials: "Credentials"
-    region: str | None
-    endpoint: str | None
-
-    @property
-    def store_options(self) -> dict[str, Any]:
-        """Options of obstore."""
-        return {"credential_provider": self._fresh, **self._location}
-
-    @property
-    def delta_options(self) -> dict[str, str]:
-        """Options of the Delta library, which looks for the credentials itself."""
-        return {CHAIN_VARIABLE: "true"} | self._location
-
-    @property
-    def _location(self) -> dict[str, str]:
-        known = {"region": self.region, "endpoint": self.endpoint}
-        return {name: value for name, value in known.items() if value}
-
-    def _fresh(self) -> dict[str, Any]:
-        found = self.credentials.get_frozen_credentials()
-        return {
-            "access_key_id": found.access_key,
-            "secret_access_key": found.secret_key,
-            "token": found.token,
-            "expires_at": datetime.now(UTC) + FRESH if found.token else None,
-        }
+Profile: TypeAlias = "tuple[Credentials, dict[str, str]]"
+"""Of S3, where credentials are not in the environment: these, and region and endpoint."""
 
 
 @functools.cache
-def aws_profile() -> AwsProfile | None:
+def aws_profile() -> "Profile | None":
     """Return the profile in use, unless the environment has credentials. Raises `StorageError`."""
     if environ.get("AWS_ACCESS_KEY_ID"):
         return None
@@ -130,19 +101,32 @@ def aws_profile() -> AwsProfile | None:
             "AWS_PROFILE, or run: aws configure"
         )
     endpoint = environ.get("AWS_ENDPOINT_URL_S3") or environ.get("AWS_ENDPOINT_URL")
-    endpoint = endpoint or scoped.get("endpoint_url")
-    return AwsProfile(credentials, region, endpoint)
+    known = {"region": region, "endpoint": endpoint or scoped.get("endpoint_url")}
+    return credentials, {name: value for name, value in known.items() if value}
 
 
-def profile_of(bucket: str) -> AwsProfile | None:
+def profile_of(bucket: str) -> "Profile | None":
     """Return where credentials are, if it is a bucket of S3 and they are not in the environment."""
     return aws_profile() if bucket.startswith("s3://") else None
+
+
+def _copy(credentials: "Credentials") -> dict[str, Any]:
+    found = credentials.get_frozen_credentials()
+    return {
+        "access_key_id": found.access_key,
+        "secret_access_key": found.secret_key,
+        "token": found.token,
+        "expires_at": datetime.now(UTC) + FRESH if found.token else None,
+    }
 
 
 @functools.cache
 def client(bucket: str) -> "ObjectStore":
     """Return the client for a bucket, which a process makes when it first needs it."""
-    profile = profile_of(bucket)
+    options: dict[str, Any] = {}
+    if profile := profile_of(bucket):
+        credentials, place = profile
+        options = {"credential_provider": functools.partial(_copy, credentials), **place}
     with object_errors(bucket):
         return from_url(
             bucket,
@@ -153,7 +137,7 @@ def client(bucket: str) -> "ObjectStore":
                 "connect_timeout": timedelta(seconds=CONNECT_TIMEOUT_S),
             },
             retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(seconds=RETRY_S)},
-            **(profile.store_options if profile else {}),
+            **options,
         )
 
 
@@ -166,7 +150,7 @@ def delta_options(bucket: str) -> dict[str, str]:
         "max_retries": f"{RETRIES}",
         "retry_timeout": f"{RETRY_S}s",
         "conditional_put": "etag",
-        **(profile.delta_options if profile else {}),
+        **({CHAIN_VARIABLE: "true"} | profile[1] if profile else {}),
     }
 
 
