@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property, partial
 from io import BytesIO
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -244,7 +243,7 @@ class DriveRows:
     def column(self, name: str) -> pl.Series:
         """Return a column of the only base."""
         (rows,) = self.bases.values()
-        return rows.get_column(name, default=pl.repeat(np.nan, rows.height, eager=True))
+        return rows[name] if name in rows.columns else pl.repeat(np.nan, rows.height, eager=True)
 
     def samples(self, name: str) -> pl.DataFrame:
         """Return `time` and a signal where it has a value, by time."""
@@ -279,10 +278,13 @@ class OpenDrives:
         for part in parts:
             in_memory = self._rows.pop(part, [])
             self._in_memory -= sum(piece.height for piece in in_memory)
-            bases = defaultdict[int, list[pl.DataFrame]](list)
-            for piece in chain(map(pl.read_ipc_stream, self._spool.take(part)), in_memory):
-                bases[piece["base"][0] if "base" in piece.columns else 0].append(piece)
-            if bases:
+            pieces = [*map(pl.read_ipc_stream, self._spool.take(part)), *in_memory]
+            if pieces and "base" not in pieces[0].columns:
+                yield DriveRows({0: pl.concat(pieces)})
+            elif pieces:
+                bases = defaultdict[int, list[pl.DataFrame]](list)
+                for piece in pieces:
+                    bases[piece["base"][0]].append(piece)
                 joined = {one: pl.concat(bases[one], how="diagonal") for one in sorted(bases)}
                 yield DriveRows(joined)
 
