@@ -202,11 +202,7 @@ FORGED = (
         (["quality", "--cohort", "true) OR (true"], 5, "not valid SQL"),
         (["monitor", "smoke", "--cohort", "true UNION SELECT 1"], 5, "not valid SQL"),
         (["score", "smoke", "--cohort", "true) OR (true"], 5, "not valid SQL"),
-        (
-            ["select", "--models", "table9"],
-            3,
-            "Known: course, estimator, gated, gated_small, learning, table1",
-        ),
+        (["select", "--models", "table9"], 3, "Known: course, estimator, gated"),
         (["select", "--by", "vehicle"], 5, "at least two folds"),
         (["show", "nothing"], 5, "no model is called"),
         (["score", "smoke@9"], 5, "has no version"),
