@@ -1,12 +1,16 @@
 """How far models are from what they should reach, kind of driving by kind, on blind roads.
 
     python -m benchmarks.goals DATA_ROOT MODEL [MODEL ...] [--roads 4] [--draws 5]
+    python -m benchmarks.goals DATA_ROOT MODEL --nights
 
 Each kind of driving is on roads of its own, drawn from the hash of the first model's version, which
 nobody could know before it was published, with the drivers of `configs/blind.toml`. The car is the
 sedan, with the paper's sensors, of which the filters know the class, or everything (load and
 adhesion, too), tuned on the first model's drives. Printed is the RMSE in degrees against the exact
 angle, at last on each of so many `--draws` of 24 blind drives.
+
+`--nights`: nine drives of two minutes, the fourth to the sixth with the load, of a car that
+remembers so many of 256 parts of what it learned from drive to drive.
 """
 
 import argparse
@@ -24,6 +28,8 @@ from fleet_slip.evaluation.blind import BlindSet, blind_scenarios
 from fleet_slip.evaluation.drives import EvaluatedDrive, simulate_drives
 from fleet_slip.evaluation.evaluate import train_competitors
 from fleet_slip.evaluation.judge import Estimate, EvaluatedScenario, evaluate_drive, judge
+from fleet_slip.export.stepping import Estimator
+from fleet_slip.models.registry import ModelVersion
 from fleet_slip.resources import config_file
 from fleet_slip.simulation.roads import draw_road, random_generator
 from fleet_slip.simulation.scenario import Scenario, load_scenario
@@ -31,6 +37,8 @@ from fleet_slip.vehicle.parameters import GRAVITY_MPS2, load_vehicle
 
 CAR = "d_class_sedan"
 OPEN = ("country", "hill")
+LADEN = "300 kg behind the rear axle"
+MINUTE_TICKS = 6000
 TOP_SPEED_MPS = 35.0
 
 
@@ -54,7 +62,7 @@ def kinds() -> dict[str, Kind]:
     return {
         "country": Kind(0.035, ("country",)),
         "hill": Kind(0.046, ("hill",)),
-        "300 kg behind the rear axle": Kind(0.16, others=load),
+        LADEN: Kind(0.16, others=load),
         "adhesion .55": Kind(0.105, adhesion=0.55, friction_use=0.7),
         "adhesion .5": Kind(0.105, adhesion=0.5, friction_use=0.7),
         "adhesion .4": Kind(0.105, adhesion=0.4, friction_use=0.7),
@@ -111,20 +119,48 @@ def _laden(run: EvaluatedScenario, drive: EvaluatedDrive) -> EvaluatedScenario:
     return replace(run, truth_rad=np.arctan(np.tan(run.truth_rad) - turned))
 
 
+def print_nights(version: ModelVersion, seed: int) -> None:
+    """Print the error of each drive's first and second minute, by what is remembered."""
+    every = {kind: one for kind, one in kinds().items() if kind in ("country", LADEN)}
+    order = ["country"] * 3 + [LADEN] * 3 + ["country"] * 3
+    some = [next(scenarios(kind, every[kind], seed + i, 1)) for i, kind in enumerate(order)]
+    drives = simulate_drives(some)
+    print("| remembered |", " | ".join(f"{i}: {kind}" for i, kind in enumerate(order, 1)), "|")
+    print("| --- " * (len(order) + 1) + "|")
+    for kept in (0, 128, 200, 240, 256):
+        estimator, found = Estimator(version.manifest), []
+        for drive in drives:
+            estimator.restart(kept)
+            rows = min(2 * MINUTE_TICKS, len(drive.time_s))
+            columns = [drive.signals[name][:rows].tolist() for name in estimator.columns]
+            angles = [
+                estimator.step(dict(zip(estimator.columns, sample, strict=True)))
+                for sample in zip(*columns, strict=True)
+            ]
+            error = np.array(angles, dtype=float) - drive.sideslip_rad[:rows]
+            parts = (error[:MINUTE_TICKS], error[MINUTE_TICKS:])
+            found.append(", ".join(f"{np.degrees(np.sqrt(np.nanmean(e**2))):.3f}" for e in parts))
+        print(f"| {kept} | {' | '.join(found)} |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("root")
     parser.add_argument("models", nargs="+")
     parser.add_argument("--roads", type=int, default=4)
     parser.add_argument("--draws", type=int, default=0)
+    parser.add_argument("--nights", action="store_true")
     options = parser.parse_args()
     fleet = fleet_slip.open(options.root)
     versions = [fleet.model(name) for name in options.models]
+    seed = int(versions[0].sha256[:15], 16)
+    if options.nights:
+        print_nights(versions[0], seed)
+        return
     with ThreadPoolExecutor(2) as executor:
         _, bank = train_competitors(fleet.warehouse, versions[0], versions[1:], executor)
     wanted = [one.reference for one in versions] + [name for name in bank if name.startswith("ekf")]
     estimators = {name: bank[name][0] for name in wanted}
-    seed = int(versions[0].sha256[:15], 16)
     drives = {"nominal": (0.014, [load_scenario("nominal")])} | {
         kind: (one.goal_deg, list(scenarios(kind, one, seed, options.roads)))
         for kind, one in kinds().items()
