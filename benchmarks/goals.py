@@ -124,7 +124,7 @@ def print_nights(version: ModelVersion, seed: int) -> None:
     every = {kind: one for kind, one in kinds().items() if kind in ("country", LADEN)}
     order = ["country"] * 3 + [LADEN] * 3 + ["country"] * 3
     some = [next(scenarios(kind, every[kind], seed + i, 1)) for i, kind in enumerate(order)]
-    drives = simulate_drives(some)
+    drives = [drive for one in some for drive in simulate_drives([one])]  # all of one name
     print("| remembered |", " | ".join(f"{i}: {kind}" for i, kind in enumerate(order, 1)), "|")
     print("| --- " * (len(order) + 1) + "|")
     for kept in (0, 128, 200, 240, 256):
