@@ -350,7 +350,16 @@ class FeatureCatalogue(Config):
     def line_of(self, name: str) -> FittedLine | None:
         """Return the line of a set `SET_DIGEST`; None of others. Raises `QuestionError`."""
         of, _, digest = name.rpartition("_")
-        return known_line(digest) if name not in self.sets and of in self.sets else None
+        if name in self.sets or of not in self.sets:
+            return None
+        line = known_line(digest)
+        estimate = self.estimates.get(line.estimate)
+        if estimate is None or estimate.scale != line.scale:
+            raise QuestionError(
+                f"{name}: the line's estimate was in counts of {line.scale} rad. "
+                "configs/features.toml has changed: publish the model again, from its list."
+            )
+        return line
 
     def estimate_in(self, name: str) -> str | None:
         """Return the estimate in a set that needs a line and has none."""

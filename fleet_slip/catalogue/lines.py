@@ -8,6 +8,7 @@ fitted without it: the other would flatter itself.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from decimal import Decimal
 from fractions import Fraction
 from functools import cached_property
 
@@ -38,7 +39,9 @@ class FittedLine(Config):
         folds: by the name of the fold, see `fold_of`.
         hashed: the number of folds that drives are dealt into by the hash of their id; None where
             each drive is a fold.
+        scale: what a count of the estimate is worth, in rad.
         models, cohort, drives: the model list that it was chosen from, and what it was fitted to.
+        feature_set: the identity of the set whose Gram rows these were.
         drive_hashes: of these drives, 16 digits each, sorted.
     """
 
@@ -46,7 +49,9 @@ class FittedLine(Config):
     fitted: Combination
     folds: dict[str, Combination]
     hashed: int | None = None
+    scale: Decimal
     models: str
+    feature_set: str
     models_sha256: str
     cohort: str
     drives: int

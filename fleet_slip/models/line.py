@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -25,6 +26,9 @@ from fleet_slip.warehouse.condition import parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
 
 FOLDS = 8
+
+About = dict[str, Any]
+"""What a `FittedLine` is of: its `estimate`, `scale`, `models`, their checksum, set and cohort."""
 
 KEPT_UNTIL = 2
 """A line is fitted again where a cohort has so many times the drives that it was fitted to."""
@@ -51,7 +55,15 @@ def with_line_fitted(
                 f"the feature set {named} has the estimate of a line: take a list of models that "
                 "says which, such as models = learning."
             )
-        about = {"estimate": estimate, "models": plan.model_list.line, "cohort": asked}
+        models = load_model_list(plan.model_list.line)
+        about = {
+            "estimate": estimate,
+            "scale": features().estimates[estimate].scale,
+            "models": plan.model_list.line,
+            "models_sha256": models.sha256,
+            "feature_set": features().identity(models.features),
+            "cohort": asked,
+        }
         line = _kept_line(warehouse, about, condition)
         if line is None:
             line = fit_line(warehouse, about, condition, progress)
@@ -64,18 +76,17 @@ def with_line_fitted(
     return request
 
 
-def _kept_line(warehouse: Warehouse, about: dict[str, str], condition: str) -> FittedLine | None:
+def _kept_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine | None:
     """Return the line that was fitted to the most drives, all of which are there.
 
     None if there is none, or the cohort has outgrown it.
     """
-    wanted = {**about, "models_sha256": load_model_list(about["models"]).sha256}
     kept = [line for digest in warehouse.lines.names() if (line := warehouse.line(digest))]
     there = load_cohort(warehouse, condition).hash_drives_with(())
     fitting = [
         line
         for line in kept
-        if wanted.items() <= vars(line).items()
+        if about.items() <= vars(line).items()
         and np.isin(_unpacked(line.drive_hashes), there).all()
     ]
     best = max(fitting, key=lambda line: (line.drives, line.digest), default=None)
@@ -87,14 +98,12 @@ def _unpacked(hashes: str) -> Hashes:
 
 
 def fit_line(
-    warehouse: Warehouse, about: dict[str, str], condition: str, progress: Progress = no_progress
+    warehouse: Warehouse, about: About, condition: str, progress: Progress = no_progress
 ) -> FittedLine:
     """Choose a line from its model list, and fit it to all drives, and without each fold.
 
-    `about` are the `estimate`, `models` and `cohort` of a `FittedLine`. Raises as `answer_request`,
-    and `QuestionError` if its estimate would not be exact.
+    Raises as `answer_request`, and `QuestionError` if its estimate would not be exact.
     """
-    models = load_model_list(about["models"])
     plan = SelectionPlan.of(SelectionRequest(models=about["models"], by="drive"))
     files = cohort_files(warehouse, parse_cohort(condition))
     update_grams(warehouse, progress, feature_set=plan.feature_set, among=files)
@@ -106,7 +115,7 @@ def fit_line(
     assignment = assign_folds(drives, "drive", FOLDS)
     folds = CohortFolds.of([served.table], assignment).serving(signals, label)
     known = features()
-    unit = input_scales()[label] / Fraction(known.estimates[about["estimate"]].scale)
+    unit = input_scales()[label] / Fraction(about["scale"])
     columns = [
         known.definition(one) or known.rows([one]).get(one) or Definition(of=one) for one in signals
     ]
@@ -123,7 +132,6 @@ def fit_line(
             for fold, (training, _) in zip(folds.names, folds.splits(), strict=True)
         },
         hashed=hashed,
-        models_sha256=models.sha256,
         drives=len(set(drives)),
         drive_hashes=np.unique(hash_numbers(pa.array(drives))).astype(">u8").tobytes().hex(),
     )

@@ -125,6 +125,7 @@ class Warehouse:
             for name in learning
             for line in lines
             if line and line.estimate == known.estimate_in(name)
+            if line.scale == known.estimates[line.estimate].scale
         ]
         return (PLAIN, *(name for name in known.sets if name not in learning), *fitted)
 

@@ -156,6 +156,23 @@ def test_the_line_is_fitted_again_where_a_drive_of_it_is_gone(fleet: Fleet) -> N
     assert fitted.drives == line.drives - 1
 
 
+def test_counts_of_another_grain_need_another_line(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A line of micro-radians is none of ten of them."""
+    published(fleet)
+    line = the_line(fleet)
+    estimate = '\n[estimates.line]\nscale = 0.00001\ncolumn = "line_rad"\ndescription = "coarser"\n'
+    (tmp_path / "own" / "features.toml").write_text(SET + estimate)
+    for cached in (features, input_scales):
+        cached.cache_clear()
+    with pytest.raises(QuestionError, match=r"counts of 0\.000001 rad"):
+        update_grams(fleet.warehouse, feature_set=f"tiny_{line.digest}")
+    assert f"tiny_{line.digest}" not in fleet.warehouse.feature_sets()
+    fleet.cohort().select(models="outer")
+    assert len(fleet.warehouse.lines.names()) == 2
+
+
 def test_a_line_that_was_changed_is_refused(fleet: Fleet) -> None:
     published(fleet)
     line = the_line(fleet)
