@@ -141,7 +141,8 @@ def _families(known: FeatureCatalogue) -> TextTable:
         [name, " ".join(map(str, one.members(name).values())), one.description]
         for name, one in known.windows.items()
     ]
-    single = {**known.factors, **known.calibrated}
+    made = {**known.products, **known.estimates, **known.slopes}
+    single = {**made, **known.factors, **known.calibrated}
     families += [[name, "", known.time_columns[name].description] for name in single]
     families += [[f"COLUMN_{name}_…", "", gate.description] for name, gate in known.gates.items()]
     many = number_of(len(known.time_columns), "column")

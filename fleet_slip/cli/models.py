@@ -145,6 +145,8 @@ def _facts(version: ModelVersion) -> dict[str, str]:
         "selected": f"model {chosen.model} of {chosen.model_list}",
         "why": chosen.reason,
     }
+    if line := manifest.line:
+        facts["inner line"] = f"{line}, fitted first; feature set {trained.feature_set}"
     if prior := manifest.prior:
         facts["prior"] = (
             f"{prior.campaign}: {number_of(prior.drives, 'simulated drive')} of "

@@ -25,7 +25,13 @@ from pydantic import (
 )
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.catalogue.definitions import Definition, Made, integer_arithmetic, plain_column
+from fleet_slip.catalogue.definitions import (
+    Combination,
+    Definition,
+    Made,
+    integer_arithmetic,
+    plain_column,
+)
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
 from fleet_slip.config import Config
@@ -393,6 +399,13 @@ class Manifest(Config):
     def definitions(self) -> dict[str, Definition]:
         """Definition of each input that has one: columns over time."""
         return {term.signal: term.definition for term in self.terms if term.definition}
+
+    @property
+    def line(self) -> str | None:
+        """The digest of the line whose estimate columns have; None without."""
+        made = (row.made for one in self.definitions.values() for row in one.rows())
+        lines = (one.line for one in made if isinstance(one, Combination))
+        return next((line for line in lines if line), None)
 
     def same_estimator(self, other: "Manifest") -> bool:
         """Whether both are the same numbers from the same rows."""

@@ -123,6 +123,7 @@ def test_a_version_is_the_same_on_board(fleet: Fleet) -> None:
     estimate = manifest.definitions["line"].made
     assert isinstance(estimate, Combination)
     assert (estimate.terms, estimate.line) == (line.fitted.terms, line.digest)
+    assert manifest.line == line.digest
     program = compile_program(manifest)
     for check in make_checks(manifest, program):
         content, samples = program_content(program), list(check.samples)
