@@ -95,6 +95,9 @@ LARGEST_DIVISOR = 2**46
 
 LARGEST_WEIGHT = 2**10
 
+LARGEST_SLOPE = 2**36
+"""Largest part of a slope's ratio: times 25 bits it has 61."""
+
 Whole = Annotated[int, Field(ge=-(2**62), le=2**62)]
 
 LineId = Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{12})?$")]
@@ -257,8 +260,8 @@ class Slope(Config):
     def _consistent(self) -> "Slope":
         if any(len(one.x) != len(self.ridge) for one in self.equations):
             raise ValueError("each equation has as many columns as there are unknowns")
-        if max(self.ratio.numerator, self.ratio.denominator) > LARGEST_DIVISOR:
-            raise ValueError(f"the ratio of a slope has no part above {LARGEST_DIVISOR}")
+        if max(self.ratio.numerator, self.ratio.denominator) > LARGEST_SLOPE:
+            raise ValueError(f"the ratio of a slope has no part above {LARGEST_SLOPE}")
         if any(one.bits > COUNT_BITS for one in self.columns):
             raise ValueError(f"the columns of a slope have {COUNT_BITS} bits")
         return self

@@ -200,6 +200,14 @@ def size_of(one: Range) -> int:
     return max(-one[0], one[1])
 
 
+def largest_in(step: Step, number: int, ranges: Sequence[Range]) -> int:
+    """Return the largest size of a step's value, and of what rounding it computes."""
+    if step[0] == "nearest":
+        a, b = (size_of(ranges[i]) for i in operands_of(step))
+        return 2 * a + b
+    return size_of(ranges[number])
+
+
 # Lowers signals, features, windows, factors, gates and own numbers to steps: the one place.
 #
 # Columns are `fleet_slip.catalogue.definitions`, steps `fleet_slip.columns.operations`, once each.
@@ -268,8 +276,18 @@ class Lowering:
         return self, [self.column(one) for one in columns]
 
     def ranges(self, signals: Sequence[Range]) -> list[Range]:
-        """Return the range of each step, given those of the signals."""
-        return ranges_of(tuple(self.steps), given_ranges(signals, self.facts, self.numbers))
+        """Return the range of each step, given those of the signals.
+
+        Raises `QuestionError` for a step that may need more than 63 bits.
+        """
+        steps = tuple(self.steps)
+        found = ranges_of(steps, given_ranges(signals, self.facts, self.numbers))
+        if any(largest_in(step, i, found) > LARGEST_WORD for i, step in enumerate(steps)):
+            raise QuestionError(
+                "a column may need more than 63 bits: choose smaller coefficients, or columns of "
+                "fewer bits."
+            )
+        return found
 
     def do(self, operation: str, *operands: int) -> int:
         """Add a step; return its number."""

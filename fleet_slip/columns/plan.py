@@ -23,6 +23,7 @@ from fleet_slip.columns.operations import (
     OPERATIONS,
     CarCount,
     CarFact,
+    largest_in,
     operands_of,
     operation_of,
     plain_of,
@@ -407,7 +408,7 @@ class _Writer:
             return False
         if any(OPERATIONS[operation_of(self._steps[n])].over_time for n in operands_of(step)):
             return False  # a drive with so many rows is refused
-        size = size_of(self._ranges[number])
+        size = largest_in(step, number, self._ranges)
         return size >= _EXACT or any(self._whole(one) for one in operands_of(step))
 
     def _integers(self, number: int, guard: int | None) -> Value:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.base import canonical_json, sha256_of
-from fleet_slip.catalogue.definitions import Definition
+from fleet_slip.catalogue.definitions import Combination, Definition
 from fleet_slip.columns.operations import most_values
 from fleet_slip.errors import QuestionError
 from fleet_slip.export.compile import compile_program, make_checks
@@ -61,6 +61,26 @@ def test_a_running_mean_takes_no_more_than_its_most_values() -> None:
     first = plain.angles(content, [], [], [[5], [7], [None], [90]])
     assert first[1] == first[3] != first[0]
     assert first[2] is None
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_needs_more_than_63_bits_has_no_program(
+    monkeypatch: pytest.MonkeyPatch, sign: int
+) -> None:
+    """20 bits times 2^43 have 62, which rounding doubles: computed exactly, by the kernel, too."""
+    column = Definition(of="ay", over="sum", ticks=9, ratio=Fraction(16), bits=20)
+    for times in (2**43, 2**44):
+        made = Combination(terms=((sign * times + 1, column),), divisor=2**40)
+        monkeypatch.setitem(LEARNING, "large", Definition(of="large", made=made, bits=20))
+        manifest = model_of({"large": Fraction(1, 7)})
+        if times > 2**43:
+            with pytest.raises(QuestionError, match="63 bits"):
+                compile_program(manifest)
+            continue
+        program = compile_program(manifest)
+        for check in make_checks(manifest, program):
+            samples = list(check.samples)
+            assert plain.angles(program_content(program), [], [], samples) == list(check.angles)
 
 
 def test_a_running_mean_ends_before_its_sum_overflows() -> None:
