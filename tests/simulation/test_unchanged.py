@@ -1,8 +1,9 @@
 """What was simulated before stays what it was: the bits of rows and the digests of batches.
 
 The sums were taken before cars, roads and sensors had imperfections; those of `proving_ground` and
-of drives with imperfections before roads were rough. Digests name files and tell a changed
-campaign, so that they must not change either.
+of drives with imperfections before roads were rough; those of `fleet_realistic` and `imperfect`
+since a load of its own place does not move where the angle is meant. Digests name files and tell a
+changed campaign, so that they must not change either.
 """
 
 from hashlib import sha256
@@ -37,8 +38,8 @@ CAMPAIGNS = {
     ),
     "fleet_realistic": (
         "811e4a664234c2ad30f5c0450d34b9cb01d8746d20931b4d094672d7f4c9f134",
-        "5cd5ad22cfefb706c9fce81e49dbde3386c5bc91516b0999f18c18377e0c0c09",
-        "28d36f05bd13a20fee83f8a8ca940c456508e9c18eed3e328f247a9021a69c57",
+        "4cdabd00be7d1b9bf7119159a6fabc8de40ed09fd6004e20da7d0dba19d231d3",
+        "d22a13985e36ea65522d48fdc13fc08a009eb37518566e187110ade566bd9bb8",
     ),
 }
 """Digest of the campaign, of its first batch, and of the rows of that batch's first two drives."""
@@ -49,8 +50,8 @@ SCENARIOS = {
         "dd90dec81007115530cbe34f68ed40345ba7bd5aa5dab4ccdc4bb17399fea7cb",
     ),
     "imperfect": (
-        "e4836c9e7441765ec4a789262fae0c652491c4abf3a7d0f7570e7af72593fc4c",
-        "e800e1d53879b6c9b14df42244d301d19092ef0185a8306327e6a71a1c9ee26d",
+        "1039ce481c01490a6d2bdaec114dfbb936a9241a2441f271d4522692892a47ed",
+        "5ae6553a0fb46d74fb3327f1620609941adb3973977a54ff4292449a49c61e85",
     ),
     "adhesion_0_4": (
         "9166610825998f76ca310a6aaeab4d2025651cc91a4342a4dc0fc748f087dc6e",

@@ -24,6 +24,7 @@ TINY = {
     "crash": "--kills 2 --commands gram",
     "flips": "--flips 1",
     "fuzz": "--cases 10 --target config",
+    "goals": "{root} smoke --roads 1",
     "gram_variants": "--root {root} --campaign smoke --only DOUBLE",
     "growth": "--root {folder} --part versions --sizes 2 3",
     "ingest": "--rows 2000,4000",
