@@ -51,7 +51,7 @@ static int64_t larger_64(int64_t one, int64_t other)
 static int32_t power_of_two(int64_t value, int32_t most)
 {
     int64_t found = 1;
-    while (value > (found * most)) {
+    for (uint32_t bit = 0U; (bit < 31U) && (value > (found * most)); bit++) {
         found *= 2;
     }
     return (int32_t)found;
