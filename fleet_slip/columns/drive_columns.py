@@ -187,6 +187,8 @@ def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
         summed = one.over not in {None, "lag"}
         if summed and 2 * (rows + 1) * limit_of(one.of_bits) * one.ratio.numerator >= _EXACT:
             raise DataError(f"the drive has {rows:,} rows: too many to look back on.")
+    if rows > plan.most_rows:
+        raise DataError(f"the drive has {rows:,} rows: too many to look back on.")
     for name in plan.program.signals:
         counts = drive.counts[name]
         if counts.dtype == np.int16 or not rows:

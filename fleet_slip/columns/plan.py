@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.course import COURSE, YAW_RATE
-from fleet_slip.catalogue.definitions import Definition, limit_of, plain_column
+from fleet_slip.catalogue.definitions import (
+    Definition,
+    Slope,
+    limit_of,
+    plain_column,
+    rows_behind,
+)
 from fleet_slip.catalogue.features import FeatureCatalogue
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.operations import (
@@ -24,6 +30,7 @@ from fleet_slip.columns.operations import (
     CarCount,
     CarFact,
     largest_in,
+    most_products,
     operands_of,
     operation_of,
     plain_of,
@@ -605,6 +612,13 @@ class ColumnPlan:
             else limit_of(self.rows[name].of_bits) + (not self.rows[name].sql)
             for name in self.names
         )
+
+    @cached_property
+    def most_rows(self) -> float:
+        """Of how many rows its slopes are exact, and the same on board, which adds up no more."""
+        made = (row.made for row in rows_behind(self.windows).values())
+        slopes = [len(one.equations) for one in made if isinstance(one, Slope)]
+        return min(map(most_products, slopes), default=inf)
 
     @cached_property
     def program(self) -> BlockProgram:

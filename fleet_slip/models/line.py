@@ -46,7 +46,6 @@ def with_line_fitted(
     `asked` is the cohort, `condition` what of it is in order. The Gram rows of the set, and those
     that the line needs, are made. Raises as `answer_request`.
     """
-    warehouse.look_for_lines()
     plan = SelectionPlan.of(request)
     named = plan.feature_set
     if estimate := features().estimate_in(named):

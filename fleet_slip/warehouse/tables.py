@@ -110,13 +110,18 @@ class Warehouse:
         """The folder of fitted lines, a folder of documents for each, by its digest."""
         return self.root / "lines"
 
+    def __post_init__(self) -> None:
+        self.look_for_lines()
+
     def look_for_lines(self) -> None:
-        """Let feature sets find the lines of this data root; nothing is read before one does."""
+        """Let feature sets find the lines of this data root; nothing is read before one does.
+
+        Done when one is made; a process that was sent one does it again.
+        """
         look_for_lines(str(self.root), self.line)
 
     def feature_sets(self) -> tuple[str, ...]:
         """Return the feature sets that Gram rows can be of, those with a line of this root, too."""
-        self.look_for_lines()
         known = features()
         learning = [name for name in known.sets if known.estimate_in(name)]
         lines = [self.line(digest) for digest in sorted(self.lines.names())] if learning else []

@@ -12,11 +12,11 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.definitions import Combination
 from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.lines import FittedLine, _lines, whole_line
+from fleet_slip.catalogue.lines import FittedLine, _lines, _sources, whole_line
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns
 from fleet_slip.columns.plan import ColumnPlan
-from fleet_slip.errors import QuestionError, StorageError
+from fleet_slip.errors import DataError, QuestionError, StorageError
 from fleet_slip.export.compile import compile_program, make_checks
 from fleet_slip.export.files import program_content
 from fleet_slip.grams.compute import read_drives
@@ -155,6 +155,30 @@ def test_the_line_is_fitted_again_where_a_drive_of_it_is_gone(fleet: Fleet) -> N
     fitted = fleet.warehouse.line(digest)
     assert fitted is not None
     assert fitted.drives == line.drives - 1
+
+
+def test_whoever_opens_the_root_later_knows_the_line(fleet: Fleet) -> None:
+    published(fleet)
+    for number in range(3):
+        _lines.clear()  # as in another process
+        _sources.clear()
+        later = fleet_slip.open(str(fleet.root))
+        if number == 0:
+            later.cohort().diagnose("tiny")
+        elif number == 1:
+            later.cohort().what_if("tiny", noise={"ay": 0.1})
+        else:
+            later.score("tiny")
+
+
+def test_a_drive_too_long_for_its_slope_is_refused(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On board a slope adds up no more from then on: the two would differ."""
+    version = published(fleet)
+    monkeypatch.setattr("fleet_slip.columns.plan.most_products", lambda _: 1000)
+    with pytest.raises(DataError, match="too many to look back on"):
+        fleet.score(version)
 
 
 def test_counts_of_another_grain_need_another_line(
