@@ -6,33 +6,27 @@ a signal that has no other values the name itself.
 """
 
 import math
-import os
-import struct
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from itertools import islice, product
+from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any
 
 import numpy as np
 import polars as pl
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.arrays import BoolArray
 from fleet_slip.base import shown
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.can import (
     MOST_BYTES,
-    Bytes,
     CanBus,
     CanFrames,
     FrameBlock,
     is_possible,
     is_sent,
-    joined,
     needed_bytes,
     parse_database,
     physical,
@@ -47,187 +41,6 @@ from fleet_slip.ingest.formats.source import (
     load_library,
     missing_column,
 )
-
-# BLF, of which nobody published the format, is read as python-can does, as arrays: a hundred times
-# faster. Sizes are looked at before anything is unfolded or read.
-
-MAGIC = b"LOGG"
-_MARK, _OBJECT = b"LOBJ", struct.Struct("<4s4xII")
-"""What an object begins with: the mark, its size and its kind."""
-_CONTAINER, _CONTAINER_HEADER = 10, struct.Struct("<16xH14x")
-_PLAIN, _COMPRESSED = 0, 2
-_LARGEST_OBJECT, _PADDING = 2**20, 4
-_REACH = len(_MARK) + _PADDING
-_AT_ONCE = 2**22
-"""Bytes of containers that are read together."""
-
-_HEADERS = {1: 32, 2: 40}
-"""Bytes of an object's header, by its version."""
-_HEADER = {"version": ("<u2", 6), "size": ("<u4", 8), "kind": ("<u4", 12)}
-_TIMED = {"flags": ("<u4", 16), "time": ("<u8", 24)}
-"""What begins every object, and what more a header has: the types of fields, and where."""
-
-
-class _Kind(NamedTuple):
-    """What follows the header in a kind of frame."""
-
-    fields: dict[str, tuple[str, int]]
-    """Types and places of fields; `further` is where other data follow, if not at the end."""
-    size: int
-    remote: int
-    """The bit in `how` of a frame that asks for data and has none."""
-
-
-_CLASSIC = _Kind(
-    {"bus": ("<u2", 0), "how": ("u1", 2), "length": ("u1", 3), "number": ("<u4", 4)}
-    | {"data": ("8u1", 8)},
-    size=16,
-    remote=0x80,
-)
-_FD = _Kind(
-    {"bus": ("<u2", 0), "how": ("u1", 2), "number": ("<u4", 4), "length": ("u1", 14)}
-    | {"data": ("64u1", 20)},
-    size=84,
-    remote=0x80,
-)
-_FD_64 = _Kind(
-    {"bus": ("u1", 0), "length": ("u1", 2), "number": ("<u4", 4), "how": ("<u4", 12)}
-    | {"further": ("u1", 35)},
-    size=40,
-    remote=0x10,
-)
-_KINDS = {1: _CLASSIC, 86: _CLASSIC, 100: _FD, 101: _FD_64}
-_EXTENDED, _IDENTIFIER, _TENS_OF_US = 1 << 31, (1 << 29) - 1, 1
-_NONE = np.empty(0, dtype=np.int64)
-_NOTHING = FrameBlock(_NONE, _NONE > 0, _NONE / 1.0, _NONE, _NONE, np.empty((0, 0), dtype=np.uint8))
-
-
-def read_blf_frames(budget: Budget, start_s: float) -> Iterator[FrameBlock]:
-    """Yield the data frames of a file that begins at `start_s`; all other objects are passed over.
-
-    Raises `InputError` for a file that is damaged or more than it seems, and `OSError`.
-    """
-    rest = b""
-    with budget.file.open("rb") as stream:
-        for some in _containers(stream, budget):
-            content = rest + some
-            begins, end = _objects(content, budget)
-            rest = content[end:]
-            if len(begins):
-                yield _frames(content, begins, start_s, budget)
-    if _MARK in rest:
-        raise _damaged(budget, "a last object that ends too early")
-
-
-def _damaged(budget: Budget, what: str) -> InputError:
-    return InputError(
-        f"{shown(budget.file)}: {what}, which no trace has: it is damaged. Record or copy it again."
-    )
-
-
-def _containers(stream: BinaryIO, budget: Budget) -> Iterator[bytes]:
-    """Yield the contents of containers, several at once: looking at one costs as much."""
-    stream.seek(len(MAGIC))
-    (at,) = struct.unpack("<I", stream.read(4).ljust(4, b"\0"))
-    some: list[bytes] = []
-    while header := os.pread(stream.fileno(), _CONTAINER_HEADER.size, at):
-        mark, size, kind = _OBJECT.unpack_from(header.ljust(_CONTAINER_HEADER.size))
-        if mark != _MARK or len(header) < _CONTAINER_HEADER.size:
-            raise _damaged(budget, f"no object at byte {at:,}")
-        if size < len(header):
-            raise _damaged(budget, f"an object of {size:,} bytes")
-        if kind == _CONTAINER:
-            content = os.pread(stream.fileno(), size - len(header), at + len(header))
-            if len(content) < size - len(header):
-                raise _damaged(budget, "a container that ends too early")
-            (method,) = _CONTAINER_HEADER.unpack(header)
-            if method not in {_PLAIN, _COMPRESSED}:
-                raise _damaged(budget, f"a container compressed by an unknown method, {method}")
-            try:
-                some.append(zlib.decompress(content) if method == _COMPRESSED else content)
-            except zlib.error as error:
-                raise _damaged(budget, f"a container that zlib cannot unfold ({error})") from None
-        if sum(map(len, some)) >= _AT_ONCE:
-            yield b"".join(some)
-            some = []
-        at += size + size % _PADDING
-    yield b"".join(some)
-
-
-def _objects(content: bytes, budget: Budget) -> tuple[IntArray, int]:
-    """Return where whole objects begin, and where the last of them ends."""
-    begins: list[int] = []
-    at = 0
-    while (begin := content.find(_MARK, at, at + _REACH)) >= 0:
-        if len(content) < begin + _OBJECT.size:
-            break
-        _, size, _ = _OBJECT.unpack_from(content, begin)
-        if not _OBJECT.size <= size <= _LARGEST_OBJECT:
-            raise _damaged(budget, f"an object of {size:,} bytes")
-        if begin + size > len(content):
-            break
-        begins.append(begin)
-        at = begin + size
-    left = content[at : at + _REACH]
-    if len(left) == _REACH and _MARK not in left:
-        raise _damaged(budget, "no object where the next should begin")
-    return np.array(begins, dtype=np.int64), at
-
-
-def _frames(content: bytes, begins: IntArray, start_s: float, budget: Budget) -> FrameBlock:
-    """Return the data frames among some objects, in their order."""
-    data = np.frombuffer(content, dtype=np.uint8)
-    heads = _read(data, begins, _HEADER, _OBJECT.size)
-    blocks, places = [_NOTHING], [_NONE]
-    for (number, kind), (version, header) in product(_KINDS.items(), _HEADERS.items()):
-        at = np.flatnonzero((heads["kind"] == number) & (heads["version"] == version))
-        if not len(at):
-            continue
-        least, size = heads["size"][at].min(), header + kind.size
-        if least < size:
-            raise _damaged(budget, f"a frame of {least} bytes")
-        fields = {name: (form, header + place) for name, (form, place) in kind.fields.items()}
-        found = _read(data, begins[at], _TIMED | fields, size)
-        if "data" in fields:
-            payloads = found["data"]
-        else:
-            ends = np.where(found["further"] > 0, found["further"], heads["size"][at])
-            payloads = _data_behind(data, begins[at] + size, ends.astype(np.int64) - size)
-        numbers = found["number"].astype(np.int64)
-        block = FrameBlock(
-            numbers & _IDENTIFIER,
-            numbers & _EXTENDED != 0,
-            found["time"] / np.where(found["flags"] == _TENS_OF_US, 1e5, 1e9) + start_s,
-            found["bus"].astype(np.int64) - 1,
-            np.minimum(found["length"].astype(np.int64), payloads.shape[1]),
-            payloads,
-        )
-        sent = found["how"] & kind.remote == 0
-        blocks.append(block.where(sent))
-        places.append(at[sent])
-    return joined(blocks).where(np.argsort(np.concatenate(places), kind="stable"))
-
-
-def _data_behind(data: Bytes, starts: IntArray, there: IntArray) -> Bytes:
-    """Return the data at some places; where too little is there, zeros, as CANoe reads it."""
-    found: Bytes = sliding_window_view(np.pad(data, (0, MOST_BYTES)), MOST_BYTES)[starts]
-    found[np.arange(MOST_BYTES) >= there[:, np.newaxis]] = 0
-    return found
-
-
-def _read(
-    data: Bytes, begins: IntArray, fields: dict[str, tuple[str, int]], size: int
-) -> NDArray[Any]:
-    """Return fields of so many bytes at some places."""
-    formats, offsets = zip(*fields.values(), strict=True)
-    kind = np.dtype(
-        {"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": size}
-    )
-    if not len(begins):  # perhaps there is not even room for one
-        return np.empty(0, dtype=kind)
-    records: NDArray[Any] = sliding_window_view(data, size)[begins].view(kind)[:, 0]
-    return records
-
 
 SUFFIXES = {".blf", ".asc", ".log", ".trc"}
 AT_ONCE = 2**14
@@ -250,12 +63,14 @@ def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
                 f"{shown(budget.file)}: {budget.size:,} of {stated:,} bytes: it is truncated. Copy "
                 "it again."
             )
-        if isinstance(trace, can.BLFReader):
-            yield from read_blf_frames(budget, trace.start_timestamp)
-            return
         sent = (one for one in trace if not (one.is_error_frame or one.is_remote_frame))
         while some := list(islice(sent, AT_ONCE)):
             yield _block_of(some)
+        if b"LOBJ" in getattr(trace, "_tail", b""):  # which python-can passes over
+            raise InputError(
+                f"{shown(budget.file)}: an object in it is damaged, or ends too early. Copy it "
+                "again."
+            )
 
 
 def _block_of(frames: list[Any]) -> FrameBlock:
