@@ -57,21 +57,6 @@ class SensorImperfections(Config):
     """Of the errors of velocity that last, beside the white noise."""
     gps_correlation_s: FiniteFloat = Field(default=10.0, ge=0.1)
     """Time constant of both errors."""
-    acceleration_drift_mps2: FiniteFloat = added(0.0, ge=0)
-    """Standard deviation of what the accelerometers' biases change by within a drive."""
-    yaw_rate_drift_rad_s: FiniteFloat = added(0.0, ge=0)
-    drift_s: FiniteFloat = added(300.0, ge=1)
-    """Time constant of both."""
-    label_x_m: FiniteFloat = added(0.0, ge=-5, le=5)
-    """How far before the place that the log's maker took it for the reference sensor is."""
-    label_velocity_std_mps: FiniteFloat = added(0.0, ge=0)
-    """Of the reference sensor's lateral velocity: the angle's noise grows with 1 / v."""
-    clock_jitter_s: FiniteFloat = added(0.0, ge=0, le=0.01)
-    """Values are up to so much older than their time, one sample more than another."""
-    inertial_held_ticks: int = added(1, ge=1, le=100)
-    """A value stands in the log for so many ticks: 2 at 50 Hz, 10 at 10 Hz."""
-    steering_held_ticks: int = added(1, ge=1, le=100)
-    wheel_held_ticks: int = added(1, ge=1, le=100)
 
 
 class RoadImperfections(Config):
@@ -91,8 +76,6 @@ class RoadImperfections(Config):
     wind_mps: NotNegative = 0.0
     """Steady wind at the height of the car, from a direction of the drive's own."""
     gust_std_mps: NotNegative = 0.0
-    roughness_cm3: FiniteFloat = added(0.0, ge=0, le=2048)
-    """Power spectral density of the road's height at 0.1 cycles/m (ISO 8608)."""
 
 
 class Imperfections(Config):

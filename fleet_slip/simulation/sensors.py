@@ -128,13 +128,6 @@ def _wander(
 
 
 # What sensors make of the truth, block by block, before bias and noise: place, tilt, delay ...
-#
-# A wheel speed sensor that counts the pulses of an encoder.
-#
-# What an uneven road adds to accelerations and wheel speeds.
-#
-# ISO 8608: height has a power spectral density Gd (n0 / n)², n0 = 0.1 cycles/m, so that a wheel's
-# vertical velocity is white noise, of density (2π n0)² Gd v. Body and wheels answer as oscillators.
 
 
 class Pulses:
@@ -189,85 +182,11 @@ def _timed_pulses(speed: FloatArray, places: FloatArray, state: FloatArray) -> F
     return reports
 
 
-BODY = (1.5, 0.3)
-"""Natural frequency in Hz and damping of a body's roll and pitch on its springs."""
-
-WHEEL = (12.0, 0.15)
-"""Of a wheel on its tyre (both: Mitschke and Wallentowitz 2014; Gillespie 1992, ch. 5)."""
-
-TRACK_M, WHEELBASE_M, RADIUS_M = 1.5, 2.7, 0.32
-
-UNIT_ABOVE_ROLL_AXIS_M = 0.3
-
-AX, AY, FIRST_WHEEL = range(3)
-
-
-class Vibration:
-    """The vibration of one drive."""
-
-    def __init__(self, roughness_cm3: float, generator: np.random.Generator) -> None:
-        density = (2 * math.pi * 0.1) ** 2 * roughness_cm3 * 1e-6 / (2 * SAMPLE_S)
-        body_1ps = 2 * math.pi * BODY[0]
-        per_rad = GRAVITY_MPS2 + body_1ps**2 * UNIT_ABOVE_ROLL_AXIS_M  # it leans, and swings
-        gains = [per_rad / WHEELBASE_M, per_rad / TRACK_M, *4 * (1 / (3 * RADIUS_M),)]
-        self._gains = math.sqrt(density) * np.array(gains)
-        self._oscillators = np.array([_oscillator(*kind) for kind in (BODY, BODY, *4 * (WHEEL,))])
-        self._state = np.zeros((len(gains), 2))
-        self._generator = generator
-
-    def next(self, speed_mps: FloatArray) -> FloatArray:
-        """Return ax and ay in m/s², and what wheel speeds change by, relative; (6, ticks)."""
-        shape = (len(self._gains), len(speed_mps))
-        noise = self._generator.standard_normal(shape, dtype=np.float32)
-        return _answer(
-            noise, np.sqrt(np.abs(speed_mps)), self._oscillators, self._state, self._gains
-        )
-
-
-def _oscillator(frequency_hz: float, damping: float) -> tuple[float, ...]:
-    """Return the filter (b0, b1, b2, a1, a2) from the road's velocity to what a spring gives.
-
-    −(s + b) / (s² + b s + ω²), b = 2 ζ ω, by the trapezoidal rule, s = k (1 − z⁻¹) / (1 + z⁻¹).
-    """
-    k, omega = 2 / SAMPLE_S, 2 * math.pi * frequency_hz
-    b = 2 * damping * omega
-    whole = k * k + b * k + omega * omega
-    top = (-(k + b), -2 * b, k - b)
-    below = (2 * (omega * omega - k * k), k * k - b * k + omega * omega)
-    return *(one / whole for one in top), *(one / whole for one in below)
-
-
-@kernel
-def _answer(
-    noise: NDArray[np.float32],
-    swell: FloatArray,
-    oscillators: FloatArray,
-    state: FloatArray,
-    gains: FloatArray,
-) -> FloatArray:
-    """Return what oscillators make of noise that swells with the speed; keep their state."""
-    values = np.empty(noise.shape)
-    for j in range(len(noise)):
-        b0, b1, b2, a1, a2 = oscillators[j]
-        first, second = state[j]
-        for i in range(len(swell)):
-            pushed = gains[j] * swell[i] * noise[j, i]
-            value = b0 * pushed + first
-            first = b1 * pushed - a1 * value + second
-            second = b2 * pushed - a2 * value
-            values[j, i] = value
-        state[j, 0], state[j, 1] = first, second
-    return values
-
-
 WHEELS = ("wheel_fl_rad_s", "wheel_fr_rad_s", "wheel_rl_rad_s", "wheel_rr_rad_s")
 INERTIAL = ("ax_mps2", "ay_mps2", "yaw_rate_rad_s")
 STEERING = ("steering_wheel_rad", "steer_fl_rad", "steer_fr_rad")
 GPS = ("gps_vx_mps", "gps_vy_mps")
 LABEL = "sideslip_rad"
-
-SLOWEST_LABEL_MPS = 1.0
-"""The reference sensor's errors are those at this speed where the car is slower."""
 
 
 class Distortion:
@@ -294,29 +213,10 @@ class Distortion:
             if pulses
         }
         self._gps: Wander | None = None
-        self._drift: Wander | None = None
-        roughness_cm3 = flaws.road.roughness_cm3
-        self._vibration = Vibration(roughness_cm3, of_drive) if roughness_cm3 else None
-        self._latest: dict[str, float] = {}
-
-    @property
-    def held_ticks(self) -> dict[str, int]:
-        """For how many ticks a value stands in the log, by column; those of every tick are not."""
-        sensors = self._flaws.sensors
-        groups = {
-            INERTIAL: sensors.inertial_held_ticks,
-            STEERING: sensors.steering_held_ticks,
-            WHEELS: sensors.wheel_held_ticks,
-        }
-        return {name: ticks for names, ticks in groups.items() for name in names if ticks > 1}
 
     def apply(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Return the next block as the sensors see it, with satellite velocity besides."""
-        truth = self._shaken(truth)
-        seen = dict(truth)
-        seen |= self._accelerations(truth)
-        self._let_drift(seen)
-        seen |= self._angles(truth)
+        seen = {**truth, **self._accelerations(truth), **self._angles(truth)}
         for name, pulses in self._pulses.items():
             seen[name] = pulses.apply(truth[name])
         seen |= self._satellite(truth)
@@ -324,56 +224,7 @@ class Distortion:
             seen[name] = low_pass.apply(seen[name])
         for name, delay in self._delays.items():
             seen[name] = delay.apply(seen[name])
-        if self._flaws.sensors.clock_jitter_s:
-            for names in (INERTIAL, STEERING, WHEELS):
-                self._jitter(seen, names)
         return seen
-
-    def _shaken(self, truth: Mapping[str, FloatArray]) -> Mapping[str, FloatArray]:
-        """Return what an uneven road makes of accelerations and wheel speeds."""
-        if self._vibration is None:
-            return truth
-        shaken = self._vibration.next(truth["vx_mps"])
-        wheels = {
-            name: truth[name] * (1 + one)
-            for name, one in zip(WHEELS, shaken[FIRST_WHEEL:], strict=True)
-        }
-        ax, ay = truth["ax_mps2"] + shaken[AX], truth["ay_mps2"] + shaken[AY]
-        return {**truth, **wheels, "ax_mps2": ax, "ay_mps2": ay}
-
-    def _let_drift(self, seen: dict[str, FloatArray]) -> None:
-        """Let the biases of the inertial unit change within the drive."""
-        sensors = self._flaws.sensors
-        acceleration, rate = sensors.acceleration_drift_mps2, sensors.yaw_rate_drift_rad_s
-        if acceleration or rate:
-            self._drift = self._drift or Wander(3, sensors.drift_s, self._generator)
-            errors = self._drift.next(len(seen[LABEL]))
-            for name, std, error in zip(
-                INERTIAL, (acceleration, acceleration, rate), errors, strict=True
-            ):
-                seen[name] = seen[name] + std * error
-
-    def _jitter(self, seen: dict[str, FloatArray], names: tuple[str, ...]) -> None:
-        """Make the values of one message older, up to the jitter, each by another time."""
-        most = self._flaws.sensors.clock_jitter_s / SAMPLE_S
-        late = most * self._generator.random(len(seen[LABEL]))
-        for name in names:
-            now = seen[name]
-            before = np.concatenate([[self._latest.get(name, now[0])], now[:-1]])
-            self._latest[name] = float(now[-1])
-            seen[name] = now - late * (now - before)
-
-    def _reference(self, truth: Mapping[str, FloatArray]) -> FloatArray:
-        """Return the label's angle at its sensor: of the velocities there, by small angles."""
-        sensors = self._flaws.sensors
-        angle = truth[LABEL] + math.radians(sensors.label_offset_deg)
-        if not (sensors.label_x_m or sensors.label_velocity_std_mps):
-            return angle
-        across = sensors.label_x_m * truth["yaw_rate_rad_s"]
-        if sensors.label_velocity_std_mps:
-            noise = self._generator.standard_normal(len(angle))
-            across = across + sensors.label_velocity_std_mps * noise
-        return angle + across / np.maximum(truth["vx_mps"], SLOWEST_LABEL_MPS)
 
     def _accelerations(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Return what the inertial unit feels at its place on a leaning body.
@@ -406,7 +257,7 @@ class Distortion:
             + math.radians(sensors.steering_offset_deg),
             "steer_fl_rad": scale * truth["steer_fl_rad"] + math.radians(left),
             "steer_fr_rad": scale * truth["steer_fr_rad"] + math.radians(right),
-            LABEL: self._reference(truth),
+            LABEL: truth[LABEL] + math.radians(sensors.label_offset_deg),
         }
 
     def _satellite(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -566,7 +417,6 @@ class Recorder:
         self._counts: dict[str, list[NDArray[np.int16]]] = {}
         self._gps_fix: list[BoolArray] = []
         self._saturated = 0
-        self._held = {} if distortion is None else distortion.held_ticks
 
     def record(self, truth: Mapping[str, FloatArray]) -> None:
         """Measure the next block, float64 by SI column but GPS; a missing one is not measured."""
@@ -580,7 +430,8 @@ class Recorder:
                 continue
             if name in errors:
                 self._generator.standard_normal(out=noise, dtype=np.float32)
-            self._add(name, truth[signal.column], noise, errors.get(name, EXACT))
+            error = errors.get(name, EXACT)
+            self._keep(name, *noisy_counts(truth[signal.column], noise, error, signal))
         self._record_gps(truth, ticks)
         self._ticks += ticks
 
@@ -596,20 +447,9 @@ class Recorder:
             std = self._sensors.gps.velocity_std_mps
             counts = np.zeros(ticks, dtype=np.int16)
             counts[fix], clipped = noisy_counts(fixed, noise, (0.0, std), catalogue()[name])
-            self._counts.setdefault(name, []).append(counts)
-            self._saturated += clipped
+            self._keep(name, counts, clipped)
 
-    def _add(
-        self,
-        name: str,
-        physical: FloatArray,
-        noise: NDArray[np.float32],
-        bias_and_std: tuple[float, float],
-    ) -> None:
-        counts, clipped = noisy_counts(physical, noise, bias_and_std, catalogue()[name])
-        if ticks := self._held.get(catalogue()[name].column):
-            earlier = self._counts.get(name)
-            counts = held(counts, ticks, self._ticks, earlier[-1][-1] if earlier else counts[0])
+    def _keep(self, name: str, counts: NDArray[np.int16], clipped: int) -> None:
         self._counts.setdefault(name, []).append(counts)
         self._saturated += clipped
 
@@ -628,13 +468,6 @@ class Recorder:
 
 def _joined(parts: list[NDArray[Scalar]]) -> NDArray[Scalar]:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-
-def held(counts: NDArray[np.int16], ticks: int, first: int, before: np.int16) -> NDArray[np.int16]:
-    """Return counts as a log has them that takes a value every so many ticks from tick 0 on."""
-    begun = -first % ticks
-    values = np.repeat(counts[begun::ticks], ticks)
-    return np.concatenate([np.full(begun, before), values])[: len(counts)]
 
 
 def noisy_counts(

@@ -10,7 +10,7 @@ from typing import Annotated, NamedTuple
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.compiling import equation
-from fleet_slip.config import Config, added
+from fleet_slip.config import Config
 from fleet_slip.vehicle.dynamics import (
     Acceleration,
     Derivative,
@@ -28,7 +28,6 @@ from fleet_slip.vehicle.dynamics import (
 from fleet_slip.vehicle.integration import extrapolate
 from fleet_slip.vehicle.parameters import (
     AIR_DENSITY_KGPM3,
-    GRAVITY_MPS2,
     Constants,
     Controls,
     State,
@@ -40,12 +39,6 @@ from fleet_slip.vehicle.tyre import CREEP_SPEED_MPS, brush_force
 
 Angle = Annotated[FiniteFloat, Field(ge=-5, le=5)]
 RadiusError = Annotated[FiniteFloat, Field(ge=-0.1, le=0.1)]
-
-PNEUMATIC_TRAIL_M = 0.03
-"""Of a tyre that does not slide: a third of half a contact patch of 0.18 m (Pacejka 2012, 3.2)."""
-
-CAMBER_PER_SLIP = 0.1
-"""Side force of a tyre per camber angle over that per slip angle (Gillespie 1992, ch. 6)."""
 
 
 class CarImperfections(Config):
@@ -81,10 +74,6 @@ class CarImperfections(Config):
     """Frontal area times the slope of the side force coefficient, per rad of air flow angle."""
     yawing_moment_volume_m3: FiniteFloat = Field(default=0.0, ge=0)
     """Frontal area times wheelbase times the slope of the yawing moment coefficient, per rad."""
-    aligning_compliance_deg_per_knm: FiniteFloat = added(0.0, ge=0, le=5)
-    """How far the front wheels give way to an aligning torque of each of their tyres."""
-    camber_per_roll: FiniteFloat = added(0.0, ge=-1, le=1)
-    """Angle by which wheels lean out of the bend over the body's roll."""
 
 
 PERFECT = CarImperfections()
@@ -117,10 +106,6 @@ class Traits(NamedTuple):
     """Lateral acceleration per speed and cross-wind, in 1/m."""
     wind_moment: float
     """Yaw acceleration per speed and cross-wind, in 1/m²."""
-    aligning: float
-    """Tangent of the road wheels' angle lost per aligning torque of both front tyres."""
-    lean: float
-    """Slip angle as which the wheels' camber acts, per lateral acceleration."""
 
 
 def traits(vehicle: VehicleParameters, flaws: CarImperfections, sample_s: float) -> Traits:
@@ -128,7 +113,6 @@ def traits(vehicle: VehicleParameters, flaws: CarImperfections, sample_s: float)
     radius, body = vehicle.tyre.rolling_radius_m, vehicle.body
     toe_rear, thrust = math.radians(flaws.toe_rear_deg), math.radians(flaws.thrust_angle_deg)
     length_m = flaws.relaxation_length_m
-    roll = math.radians(flaws.roll_gradient_deg_per_g) / GRAVITY_MPS2
     pressure = 0.5 * AIR_DENSITY_KGPM3
     return Traits(
         half_lash=math.radians(flaws.steering_lash_deg) / 2,
@@ -147,8 +131,6 @@ def traits(vehicle: VehicleParameters, flaws: CarImperfections, sample_s: float)
         cooling=1 - sample_s / flaws.warm_up_s,
         wind_force=pressure * flaws.side_force_area_m2 / body.mass_kg,
         wind_moment=pressure * flaws.yawing_moment_volume_m3 / body.yaw_inertia_kgm2,
-        aligning=math.radians(flaws.aligning_compliance_deg_per_knm) / 2000,
-        lean=CAMBER_PER_SLIP * flaws.camber_per_roll * roll,
     )
 
 
@@ -180,8 +162,6 @@ class Give(NamedTuple):
     side_fr: float
     side_rl: float
     side_rr: float
-    rack_torque: float = 0.0
-    """Aligning torque of the front tyres as the steering has given way to it, in Nm."""
 
 
 class GiveRates(NamedTuple):
@@ -192,13 +172,11 @@ class GiveRates(NamedTuple):
     side_fr: float
     side_rl: float
     side_rr: float
-    rack_torque: float = 0.0
 
 
 class _Wheel(NamedTuple):
     force: WheelForce
     side_rate: float
-    torque: float
 
 
 @equation
@@ -210,8 +188,7 @@ def wheel_tangent(tangent: float, far: float, toe: float) -> tuple[float, float]
 @equation
 def rack_tangent(give: Give, c: Constants, t: Traits) -> float:
     """Return the tangent of the mean front wheel's angle: less where the steering gives way."""
-    given = t.compliance * give.rack_force + t.aligning * give.rack_torque
-    return c.steer_per_wheel * give.rack - given
+    return c.steer_per_wheel * give.rack - t.compliance * give.rack_force
 
 
 @equation
@@ -237,7 +214,6 @@ def _imperfect_wheel(
     return _Wheel(
         in_car_frame(force, to),
         speed * t.inverse_relaxation * (across - followed_side),
-        PNEUMATIC_TRAIL_M * force.trail * force.y,
     )
 
 
@@ -247,11 +223,9 @@ def _wheels(
 ) -> tuple[WheelForces, GiveRates]:
     tangent = rack_tangent(give, c, t)
     bend = c.ackermann * tangent
-    lean = t.lean * x.ay_lag
-    left = direction_of(*wheel_tangent(tangent - lean, 1.0 - bend, -t.toe))
-    right = direction_of(*wheel_tangent(tangent - lean, 1.0 + bend, t.toe))
-    rear_left = direction_of(1.0, t.rear_left - lean)
-    rear_right = direction_of(1.0, t.rear_right - lean)
+    left = direction_of(*wheel_tangent(tangent, 1.0 - bend, -t.toe))
+    right = direction_of(*wheel_tangent(tangent, 1.0 + bend, t.toe))
+    rear_left, rear_right = direction_of(1.0, t.rear_left), direction_of(1.0, t.rear_right)
     front, rear = x.vy + c.front * x.yaw_rate, x.vy - c.rear * x.yaw_rate
     turn_f, turn_r = c.half_track_front * x.yaw_rate, c.half_track_rear * x.yaw_rate
     peak_f, peak_r = around.stiffness * c.stiffness_front, around.stiffness * c.stiffness_rear
@@ -273,8 +247,7 @@ def _wheels(
         x.vx + turn_r, rear, give.side_rr, rear_right, roll_rr, load.rr, peak_r, grip_r, c, t
     )
     yielding = (fl.force.y + fr.force.y - give.rack_force) * c.inverse_steering_lag
-    turning = (fl.torque + fr.torque - give.rack_torque) * c.inverse_steering_lag
-    rates = GiveRates(yielding, fl.side_rate, fr.side_rate, rl.side_rate, rr.side_rate, turning)
+    rates = GiveRates(yielding, fl.side_rate, fr.side_rate, rl.side_rate, rr.side_rate)
     return WheelForces(fl.force, fr.force, rl.force, rr.force), rates
 
 
@@ -315,5 +288,4 @@ def advance_give(
         give.side_fr + step * extrapolate(d.side_fr, before.side_fr, extrapolation),
         give.side_rl + step * extrapolate(d.side_rl, before.side_rl, extrapolation),
         give.side_rr + step * extrapolate(d.side_rr, before.side_rr, extrapolation),
-        give.rack_torque + step * extrapolate(d.rack_torque, before.rack_torque, extrapolation),
     )

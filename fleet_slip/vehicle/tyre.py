@@ -36,8 +36,6 @@ class TyreForce(NamedTuple):
     """Longitudinal slip σx, positive when driven."""
     slip_per_speed: float
     """∂σx/∂(rolling speed), in s/m."""
-    trail: float
-    """Pneumatic trail over that of a tyre that does not slide: λ², within 0.04 of the brush's."""
 
 
 @equation
@@ -96,7 +94,6 @@ def brush_force(
         stuck2 * bristle_x + drag * direction_y * direction_y,
         slide_x * per_speed,
         per_speed,
-        stuck2,
     )
 
 

@@ -6,9 +6,7 @@ import pytest
 from fleet_slip.vehicle.batch import LaneDrive, Road, Surface, simulate_blocks
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
 from fleet_slip.vehicle.imperfections import (
-    CAMBER_PER_SLIP,
     PERFECT,
-    PNEUMATIC_TRAIL_M,
     Around,
     CarImperfections,
     Give,
@@ -259,25 +257,3 @@ def test_the_body_s_motion_is_recorded_for_its_sensors() -> None:
     found = channels["yaw_acceleration_rad_s2"]
     assert np.sqrt(np.mean((found - rate)[20:] ** 2)) < 0.1 * np.std(rate) + 0.01
     assert end(channels["leaning_ay_mps2"]) == pytest.approx(end(channels["ay_mps2"]), abs=0.01)
-
-
-def test_aligning_torque_takes_as_much_steering_as_its_compliance_says() -> None:
-    """Mz = F t of each front tyre; at a gentle lateral acceleration t is nearly whole."""
-    road, mass = circle(60.0, 10.0), SEDAN.body.mass_kg
-    plain = drive(road)
-    given = drive(road, CarImperfections(aligning_compliance_deg_per_knm=5.0))
-    front_n = mass * end(plain.ay_mps2) * SEDAN.body.rear_axle_m / SEDAN.body.wheelbase_m
-    expected_deg = 5.0 * PNEUMATIC_TRAIL_M * front_n / 2 / 1000
-    more_deg = np.degrees(end(given.steering_wheel_rad) - end(plain.steering_wheel_rad))
-    assert 0.6 * expected_deg < more_deg / SEDAN.steering.ratio < 1.05 * expected_deg
-
-
-def test_wheels_that_lean_outwards_slip_more_at_both_axles() -> None:
-    """Camber acts as slip: both axles need more of it, so that the car turns further inwards."""
-    road = circle(60.0, 14.0)
-    flaws = {"roll_gradient_deg_per_g": 5.0}
-    plain = drive(road, CarImperfections(**flaws))
-    leaning = drive(road, CarImperfections(**flaws, camber_per_roll=0.8))
-    expected_deg = CAMBER_PER_SLIP * 0.8 * 5.0 * end(plain.ay_mps2) / GRAVITY_MPS2
-    turned_deg = np.degrees(end(plain.sideslip_rad) - end(leaning.sideslip_rad))
-    assert turned_deg == pytest.approx(expected_deg, rel=0.1)
