@@ -41,7 +41,6 @@ READING: tuple[tuple[str, ...], ...] = (
     ("score", "smoke", "--json"),
     ("quality", "--json"),
     ("diagnose", "smoke", "--json"),
-    ("what-if", "smoke", "--noise", "ay=0.1", "--json"),
     ("monitor", "smoke", "--since", "2024-05-07", "--json"),
     ("status", "--json"),
     ("verify", "--grams", "--json"),

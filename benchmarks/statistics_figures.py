@@ -33,7 +33,6 @@ from fleet_slip.regression.folds import CohortFolds, by_hash
 from fleet_slip.regression.inference import Evidence, infer_by_clusters, infer_classically
 from fleet_slip.regression.least_squares import correlation_matrix, fit
 from fleet_slip.regression.orders import RANKINGS, rank
-from fleet_slip.regression.shrinkage import disturb
 from fleet_slip.regression.subsets import (
     CRITERIA,
     all_rss,
@@ -145,11 +144,6 @@ def uncertainty(training: TrainingFolds, fold: IntArray) -> None:
     models = [fit(folds.total - test, NINE, LABEL).model for test in folds.grams]
     products = held_out_products(training.drives, fold, models)
     print(" ", percentile_interval(bootstrap_correlations(products, 1000, seed=1)))
-    final = cross_validate_nested(training, NINE, LABEL)[-1]
-    for factor in (0, 1, 2):
-        noise = {"ax": 0.1 * factor, "ay": 0.1 * factor, "yaw_rate": 0.01 * factor}
-        after = disturb(final.sums, final.counts, SCALES, noise=noise).figures(SCALES[LABEL])
-        print(f"  noise {noise}: r {after.correlation:.4f}, rmse {after.rmse_deg:.4f} deg")
 
 
 def save(figure: Figure, file: Path) -> None:

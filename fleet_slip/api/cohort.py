@@ -1,6 +1,5 @@
 """Drives that satisfy a condition, and what Gram rows tell of them."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Unpack
 
@@ -26,7 +25,7 @@ from fleet_slip.warehouse.tables import Warehouse
 if TYPE_CHECKING:
     from fleet_slip.evaluation.identify import Identified
     from fleet_slip.grams.cohort import Cohort
-    from fleet_slip.models.diagnose import Diagnosis, WhatIf
+    from fleet_slip.models.diagnose import Diagnosis
     from fleet_slip.models.select import Selection
     from fleet_slip.operations.examined import Examined
 
@@ -127,45 +126,6 @@ class FleetCohort(Rooted):
             cluster=cluster,
             intercept=version is None or not version.manifest.through_origin,
         )
-
-    def what_if(
-        self,
-        model: Annotated["str | ModelVersion | None", OR_SIGNALS] = None,
-        *,
-        signals: Annotated[str | None, SIGNALS] = None,
-        features: Annotated[str | None, OF_SIGNALS] = None,
-        noise: Annotated[
-            Mapping[str, float] | None,
-            Doc(
-                "Standard deviation of white noise that is added, in SI units, such as ay=0.2, "
-                "once for each signal."
-            ),
-        ] = None,
-        bias: Annotated[
-            Mapping[str, float] | None,
-            Doc("Bias that is added, in SI units, such as yaw_rate=0.02, once for each signal."),
-        ] = None,
-    ) -> "WhatIf":
-        """Predict a model's error with worse sensors, in closed form, and the best model for these.
-
-        Raises `UsageError` if nothing is added or both a model and signals are named,
-        `QuestionError` for a signal inside a feature, and what `Fleet.model` raises.
-        """
-        from fleet_slip.catalogue.signals import catalogue
-        from fleet_slip.models.diagnose import what_if
-        from fleet_slip.regression.least_squares import fit
-
-        if not noise and not bias:
-            raise UsageError(
-                "say what is added: noise such as ay=0.2, or bias such as yaw_rate=0.02."
-            )
-        cohort, inputs, version = self._opened(model, signals, features)
-        if version is not None:
-            one = version.manifest.counts_model()
-        else:
-            one = fit(cohort.serving(inputs).table.total(), inputs, catalogue().label).model
-        intercept = version is None or not version.manifest.through_origin
-        return what_if(cohort, one, bias=bias or {}, noise=noise or {}, intercept=intercept)
 
     def identify(
         self,

@@ -210,19 +210,3 @@ def diagnose() -> None:
 
     Example: **fleet-slip diagnose waterford**
     """
-
-
-@command(
-    Fleet.cohort,
-    FleetCohort.what_if,
-    arguments=["model"],
-    without=SOUND,
-    echo=["condition", "noise", "bias"],
-)
-def what_if() -> None:
-    """Predict a model's error with worse sensors, in closed form; nothing is simulated.
-
-    Bias and noise come on top of what the logs have. Shown too: the best model for such sensors.
-
-    Example: **fleet-slip what-if waterford --noise ay=0.2 --bias yaw_rate=0.02**
-    """

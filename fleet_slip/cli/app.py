@@ -75,7 +75,6 @@ GROUPS = {
         "watch": "accuracy",
         "explore": "accuracy",
         "diagnose": "accuracy",
-        "what-if": "accuracy",
     },
     "Operations": {
         "nightly": "operations",

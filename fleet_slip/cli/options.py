@@ -4,7 +4,7 @@ import functools
 import inspect
 import re
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
 from typing import Annotated, Any, get_args
 
@@ -13,7 +13,6 @@ import typer
 from fleet_slip.api.calls import doc_of, open_workers, type_of
 from fleet_slip.base import date_of, document_of, last_day
 from fleet_slip.cli.output import Json, print_json, print_parts
-from fleet_slip.errors import UsageError
 from fleet_slip.storage.runs import recording
 
 DETAILS: dict[str, dict[str, Any]] = {
@@ -39,7 +38,6 @@ NAMES = {
 not in its name."""
 
 READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
-    "bias": (list[str] | None, lambda values: quantities(values, "--bias")),
     "campaign": (str, str),
     "folds": (str | None, lambda folds: folds),
     "landing": (str, str),
@@ -47,7 +45,6 @@ READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "mapping": (str, lambda mapping: mapping),
     "model": (str | None, lambda model: model),
     "night": (str | None, lambda night: date_of(night, "--night")),
-    "noise": (list[str] | None, lambda values: quantities(values, "--noise")),
     "one": (str, str),
     "other": (str, str),
     "others": (list[str] | None, lambda names: names or ()),
@@ -214,20 +211,6 @@ def _plain(name: str, annotation: Any, default: Any = None) -> inspect.Parameter
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
     )
-
-
-def quantities(values: Sequence[str] | None, option: str) -> dict[str, float]:
-    """Return what options like `--noise ay=0.2` say, in SI units. Raises `UsageError`."""
-    found = {}
-    for value in values or ():
-        name, _, number = value.partition("=")
-        try:
-            found[name.strip()] = float(number)
-        except ValueError:
-            raise UsageError(
-                f"{option} {value}: write SIGNAL=NUMBER in SI units, such as ay=0.2."
-            ) from None
-    return found
 
 
 # Where a command's tasks run: threads of this process, or the workers of a Dask cluster.

@@ -17,7 +17,6 @@ from fleet_slip.regression.drives import (
     ClusterUnit,
     DriveMoments,
 )
-from fleet_slip.regression.figures import Figures, error_sums
 from fleet_slip.regression.inference import (
     INTERCEPT,
     Evidence,
@@ -28,8 +27,7 @@ from fleet_slip.regression.inference import (
     variance_inflation,
     wald_test,
 )
-from fleet_slip.regression.least_squares import Fit, LinearModel, condition_number, fit
-from fleet_slip.regression.shrinkage import disturb, fit_noise_matched
+from fleet_slip.regression.least_squares import Fit, condition_number, fit
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 
 
@@ -205,82 +203,3 @@ def _compare(
     except DataError:  # too few of them
         test = None
     return CohortComparison(condition, _infer(other, other_moments), test)
-
-
-# What worse sensors would do to a model's error, in closed form: no drive is simulated again.
-
-
-@dataclass(frozen=True)
-class WhatIf(Answer):
-    """Figures of a model before and after bias and noise come, and of the best model after it."""
-
-    DOCUMENT = "drives before after refitted_after refitted"
-
-    drives: int
-    before: Figures
-    after: Figures
-    refitted: LinearModel
-    refitted_after: Figures
-
-    def parts(self) -> Iterator[Part]:
-        """Return figures and the best model for such sensors."""
-        figures = {
-            "as logged": self.before,
-            "with these sensors": self.after,
-            "best model for these sensors": self.refitted_after,
-        }
-        yield TextTable(
-            f"{number_of(self.drives, 'drive')}, {number_of(self.before.rows, 'row')}",
-            "|correlation|RMSE deg|mean deg|std deg",
-            ({"name": name, "of": one} for name, one in figures.items()),
-            "{name}|{of.correlation:.4f}|{of.rmse_deg:.4f}|{of.error_mean_deg:+.4f}|"
-            "{of.error_std_deg:.4f}",
-        )
-        weights = {INTERCEPT: self.refitted.offset, **self.refitted.weights}
-        title = "\nbest model for these sensors"
-        yield TextTable(title, "signal|coefficient", weights.items(), "{0}|{1:.6g}")
-
-
-def what_if(
-    cohort: Cohort,
-    model: LinearModel,
-    *,
-    bias: Mapping[str, float],
-    noise: Mapping[str, float],
-    intercept: bool = True,
-) -> WhatIf:
-    """Return the figures to expect once bias and white noise come on top of what is logged.
-
-    `model` is of counts; `bias` and `noise` (standard deviations) are in SI units. Raises
-    `QuestionError` for a signal that the model lacks, or has in a feature: that is not linear.
-    """
-    for name in {*bias, *noise}:
-        _require_linear(name, model)
-    scales = input_scales()
-    served = cohort.serving(model.signals)
-    total = served.table.total()
-    unit = scales[model.label]
-
-    def after(one: LinearModel) -> Figures:
-        return disturb(error_sums(one, total), one, scales, bias=bias, noise=noise).figures(unit)
-
-    seen = total if intercept else total.about_origin()
-    refitted = fit_noise_matched(seen, model.signals, model.label, noise, scales)
-    return WhatIf(
-        len(served.table),
-        error_sums(model, total).figures(unit),
-        after(model),
-        refitted.physical(scales),
-        after(refitted),
-    )
-
-
-def _require_linear(name: str, model: LinearModel) -> None:
-    known = features().features
-    inside = [f for f in model.signals if f in known and name in known[f].inputs]
-    if inside:
-        raise QuestionError(
-            f"{name} also enters the model through {', '.join(inside)}, where its error has no "
-            "closed form. Use a model without that feature, or simulate the campaign with other "
-            "sensors."
-        )

@@ -202,12 +202,6 @@ def condition_number(gram: Gram, inputs: Sequence[str]) -> float:
     return largest / smallest if smallest > 0 else float("inf")
 
 
-def through_means(gram: Gram, label: str, slopes: dict[str, Fraction]) -> LinearModel:
-    """Return the model with given slopes whose intercept makes the mean error zero."""
-    intercept = Fraction(gram.sum(label)) - sum(b * gram.sum(s) for s, b in slopes.items())
-    return LinearModel(tuple(slopes), label, tuple(slopes.values()), intercept / gram.n)
-
-
 # Relations that hold on average, from sums of products: exactly, and how single drives move them.
 #
 # A relation says y = theta_1 x_1 + theta_2 x_2 + ... + noise. Multiplied by instruments z and

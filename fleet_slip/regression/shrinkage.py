@@ -9,24 +9,12 @@ Statistical Science 26 (2011), 271-287.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from fractions import Fraction
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.exact import eliminate
-from fleet_slip.regression.figures import ErrorSums
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import (
-    LinearModel,
-    Scales,
-    dependence,
-    moments,
-    through_means,
-)
 
 FEWEST_MEMBERS = 4
 """Of fewer nothing says how much they differ."""
@@ -96,87 +84,3 @@ def _root(falling: Callable[[float], float], least: float, most: float) -> float
         middle = (least + most) / 2
         least, most = (middle, most) if falling(middle) > 0 else (least, middle)
     return (least + most) / 2
-
-
-# What sensor bias and noise do to a model's error, in closed form (the paper's section III-A).
-#
-# With biases d_j and noise v_j, the prediction changes by b'd + sum b_j v_j: every sum follows. The
-# best model for noise to come solves (S + Lambda) b = S_xy, Lambda n times its variance (Bishop
-# 1995): ridge regression.
-
-
-def fit_noise_matched(
-    gram: Gram, inputs: Sequence[str], label: str, noise: Mapping[str, float], scales: Scales
-) -> LinearModel:
-    """Return the model of counts that is best with independent noise to come, in SI units.
-
-    Raises `QuestionError` for noise of another signal, and as `fit_penalised`.
-    """
-    unknown = [name for name in noise if name not in inputs]
-    if unknown:
-        raise QuestionError(
-            f"noise is given for {', '.join(unknown)}, which the model does not use. "
-            f"It uses {', '.join(inputs)}."
-        )
-    variances = [(Fraction(noise.get(name, 0)) / scales[name]) ** 2 for name in inputs]
-    return fit_penalised(gram, inputs, label, [gram.n * one for one in variances])
-
-
-def fit_penalised(
-    gram: Gram, inputs: Sequence[str], label: str, penalties: Sequence[Fraction]
-) -> LinearModel:
-    """Solve (S + diag(penalties)) b = S_xy exactly, penalties >= 0 in counts^2, or `DataError`."""
-    part = gram.restrict([*inputs, label])
-    common = math.lcm(*(penalty.denominator for penalty in penalties))
-    matrix = [[common * entry for entry in row] for row in moments(part)]
-    for i, penalty in enumerate(penalties):
-        matrix[i][i] += int(part.n * common * penalty)
-    triangle = eliminate(matrix)
-    if triangle.singular is not None:
-        raise DataError(dependence(part, inputs))
-    numerators, determinant = triangle.solve(len(inputs))
-    slopes = {name: Fraction(x, determinant) for name, x in zip(inputs, numerators, strict=True)}
-    return through_means(part, label, slopes)
-
-
-def disturb(
-    sums: ErrorSums,
-    model: LinearModel,
-    scales: Scales,
-    *,
-    bias: Mapping[str, float] | None = None,
-    noise: Mapping[str, float] | None = None,
-) -> ErrorSums:
-    """Return the error sums to expect once bias and white noise are added to the signals.
-
-    MSE' = MSE + 2 e (b'd) + (b'd)^2 + sum b_j^2 s_j^2, e the mean error. Model and sums are of
-    counts; `bias` and `noise` (deviations) physical. Raises `QuestionError` for an unused signal.
-    """
-    shift = sum(
-        (model.coefficients[i] * value for i, value in _counts(model, scales, bias or {})),
-        Fraction(0),
-    )
-    variance = sum(
-        ((model.coefficients[i] * value) ** 2 for i, value in _counts(model, scales, noise or {})),
-        Fraction(0),
-    )
-    return replace(
-        sums,
-        p=sums.p + sums.n * shift,
-        pp=sums.pp + 2 * shift * sums.p + sums.n * (shift**2 + variance),
-        py=sums.py + shift * sums.y,
-    )
-
-
-def _counts(
-    model: LinearModel, scales: Scales, values: Mapping[str, float]
-) -> list[tuple[int, Fraction]]:
-    unused = [name for name in values if name not in model.signals]
-    if unused:
-        raise QuestionError(
-            f"the model does not use {', '.join(unused)}: it uses {', '.join(model.signals)}."
-        )
-    return [
-        (model.signals.index(name), Fraction(value) / scales[name])
-        for name, value in values.items()
-    ]

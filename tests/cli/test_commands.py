@@ -198,7 +198,7 @@ FORGED = (
         (["select", "--cohort", "campain = 'x'"], 5, "campain"),
         (["select", "--cohort", "random() < 0.5"], 5, "must always mean the same"),
         (["publish", "forged", "--cohort", FORGED], 5, "not valid SQL"),
-        (["what-if", "smoke", "--cohort", "EXISTS (FROM log)", "--bias", "ay=1"], 5, "subquery"),
+        (["diagnose", "smoke", "--cohort", "EXISTS (FROM log)"], 5, "subquery"),
         (["quality", "--cohort", "true) OR (true"], 5, "not valid SQL"),
         (["monitor", "smoke", "--cohort", "true UNION SELECT 1"], 5, "not valid SQL"),
         (["score", "smoke", "--cohort", "true) OR (true"], 5, "not valid SQL"),

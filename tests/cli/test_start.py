@@ -82,7 +82,7 @@ def test_help_groups_the_commands_and_begins_with_eight() -> None:
     assert places == sorted(places)
     assert len(GROUPS["Start here"]) == 8
     assert len(COMMANDS) <= 34
-    assert "\n  what-if    Predict a model's error" in text
+    assert "\n  diagnose   Fit a model's signals" in text
     assert "Without logs: fleet-slip run --campaign smoke\n" in text
     assert max(map(len, text.splitlines())) <= 80
 
@@ -113,7 +113,6 @@ def test_a_selections_options_stand_once_and_are_those_of_the_api() -> None:
         ("forget", Fleet.forget),
         ("monitor", Fleet.monitor),
         ("diagnose", FleetCohort.diagnose),
-        ("what-if", FleetCohort.what_if),
     ],
 )
 def test_options_are_the_parameters_of_a_method_with_their_words(

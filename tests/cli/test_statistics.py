@@ -1,4 +1,4 @@
-"""Selection, diagnostics and what-if by command, and against a campaign with worse sensors."""
+"""Selection and diagnostics by command."""
 
 import json
 import math
@@ -15,19 +15,8 @@ import fleet_slip
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.cli.app import app
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.resources import find_config
 from tests.support.commands import Finished, RunCommand, done_on
 from tests.support.once import made_once
-
-NOISE = {
-    "ax": 0.1,
-    "ay": 0.1,
-    "yaw_rate": 0.01,
-    "steering_wheel": 0.002,
-    "wheel_fl": 0.02,
-    "wheel_fr": 0.02,
-}
-"""The smoke campaign's sensors, in SI units."""
 
 
 @pytest.fixture
@@ -178,40 +167,6 @@ def test_diagnose_shows_both_kinds_of_errors(run_command: RunCommand, every_set:
     assert "Wald, by drives" in run_command(*compared, root=every_set).stdout
 
 
-def test_what_if_agrees_with_a_campaign_of_doubled_noise(
-    run_command: RunCommand, own_set: Path, tmp_path: Path
-) -> None:
-    text = find_config("campaigns", "smoke").read_text()
-    stds = ("acceleration_std_mps2", "yaw_rate_std_rad_s", "wheel_speed_std_rad_s")
-    for name in (*stds, "steering_wheel_std_rad"):
-        std = re.search(rf"{name} = (.+)", text)
-        assert std is not None
-        text = text.replace(std[0], f"{name} = {2 * float(std[1])}")
-    (tmp_path / "noisy.toml").write_text(text)
-    noisy = tmp_path / "noisy"
-    done_on(noisy, "simulate", str(tmp_path / "noisy.toml"))
-    nested = ("--nested", ",".join(NOISE), "--rank", "declared", "--criterion", "aic", "--naive")
-    run_command("publish", "doubled", *nested, root=own_set)
-    shown = run_command("show", "doubled", "--json", root=own_set).json
-    used = [term["signal"] for term in shown["terms"]]
-    # Noise of twice the standard deviation is what there is, plus noise of sqrt(3) times it.
-    options = [
-        word for name in used for word in ("--noise", f"{name}={NOISE[name] * math.sqrt(3)}")
-    ]
-    predicted = run_command("what-if", "doubled", *options, "--json", root=own_set).json
-    (noisy / "models").symlink_to(own_set / "models")
-    simulated = run_command("score", "doubled", "--json", root=noisy).json
-    assert predicted["after"]["rmse_deg"] > 1.2 * predicted["before"]["rmse_deg"]
-    assert predicted["after"]["rmse_deg"] == pytest.approx(simulated["rmse_deg"], rel=0.01)
-    assert predicted["after"]["correlation"] == pytest.approx(simulated["correlation"], abs=1e-3)
-    assert predicted["refitted_after"]["rmse_deg"] < predicted["after"]["rmse_deg"]
-    # A bias of d in one signal moves the mean error by its coefficient times d.
-    weight = next(term["coefficient"] for term in shown["terms"] if term["signal"] == "ay")
-    biased = run_command("what-if", "doubled", "--bias", "ay=0.5", "--json", root=own_set).json
-    moved = biased["after"]["error_mean_deg"] - biased["before"]["error_mean_deg"]
-    assert moved == pytest.approx(math.degrees(weight * 0.5), rel=1e-9)
-
-
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "message"),
     [
@@ -223,11 +178,8 @@ def test_what_if_agrees_with_a_campaign_of_doubled_noise(
         (["select", "--all-subsets", "--rank", "t"], 2, "needs no order"),
         (["select", "--by", "row", "--features", "motion"], 5, "sets that make them: rows"),
         (["select", "--by", "row", "--bootstrap", "100"], 5, "Fold by drive"),
-        (["what-if", "smoke"], 2, "noise such as ay=0.2"),
-        (["what-if", "smoke", "--noise", "ay"], 2, "write SIGNAL=NUMBER"),
-        (["what-if", "smoke", "--noise", "vx=1"], 5, "noise is given for vx"),
-        (["what-if", "nothing", "--noise", "ay=1"], 5, "no model is called"),
-        (["what-if", "smoke", "--signals", "ay", "--noise", "ay=1"], 2, "not both"),
+        (["diagnose", "nothing"], 5, "no model is called"),
+        (["diagnose", "smoke", "--signals", "ay"], 2, "not both"),
         (["diagnose", "--signals", "ay,ay"], 2, "stands twice"),
         (["diagnose", "smoke", "--against", "speed_factor > 0.85"], 5, "AND NOT (speed_factor"),
     ],
@@ -239,15 +191,6 @@ def test_a_mistake_is_one_line_and_its_exit_code(
     assert done.exit_code == exit_code, done
     assert message in done.stderr.replace("\n", " ")
     assert done.stdout == ""
-
-
-def test_noise_inside_a_feature_has_no_closed_form(
-    run_command: RunCommand, every_set: Path
-) -> None:
-    arguments = ("what-if", "--features", "motion", "--signals", "ay,ay_signed_square")
-    done = run_command(*arguments, "--noise", "ay=0.1", root=every_set)
-    assert done.exit_code == 5
-    assert "ay_signed_square" in done.stderr
 
 
 def test_features_are_listed(run_command: RunCommand) -> None:
@@ -346,8 +289,6 @@ def test_a_model_through_the_origin_is_published_as_one(
     assert "through the origin" in run_command("show", "straight", root=root).stdout
     by_rows = run_command("diagnose", "straight", "--json", root=root).json["by_rows"]
     assert {one["name"]: one["value"] for one in by_rows} == coefficients
-    better = run_command("what-if", "straight", "--noise", "ay=1", "--json", root=root).json
-    assert better["refitted"]["intercept"] == 0
     run_command("export", "straight", "--to", "json", "--output", str(tmp_path), root=root)
     exported = json.loads((tmp_path / "straight-1.json").read_text())
     assert exported["model"]["manifest"]["through_origin"] is True

@@ -159,14 +159,12 @@ def test_the_line_is_fitted_again_where_a_drive_of_it_is_gone(fleet: Fleet) -> N
 
 def test_whoever_opens_the_root_later_knows_the_line(fleet: Fleet) -> None:
     published(fleet)
-    for number in range(3):
+    for number in range(2):
         _lines.clear()  # as in another process
         _sources.clear()
         later = fleet_slip.open(str(fleet.root))
         if number == 0:
             later.cohort().diagnose("tiny")
-        elif number == 1:
-            later.cohort().what_if("tiny", noise={"ay": 0.1})
         else:
             later.score("tiny")
 

@@ -6,6 +6,7 @@ harmful for collinear signals such as four wheel speeds.
 """
 
 import csv
+import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from functools import cache
@@ -16,13 +17,13 @@ import pytest
 
 from fleet_slip.regression import exact as exact_roots
 from fleet_slip.regression.choice import nested_fits
+from fleet_slip.regression.exact import eliminate
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import CrossValidation, Folds, cross_validate
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Evidence
 from fleet_slip.regression.least_squares import LinearModel, fit
 from fleet_slip.regression.orders import backward
-from fleet_slip.regression.shrinkage import fit_penalised
 from tests.support.counts import columns_to_counts
 from tests.support.evidence import EVIDENCE, evidence
 
@@ -77,6 +78,21 @@ class _Search:
     def fit(self, inputs: list[str]) -> LinearModel:
         penalties = standardised_penalty(self.gram, inputs, self.ridge)
         return fit_penalised(self.gram, inputs, self.label, penalties)
+
+
+def fit_penalised(
+    gram: Gram, inputs: Sequence[str], label: str, penalties: Sequence[Fraction]
+) -> LinearModel:
+    """Solve (S + diag(penalties)) b = S_xy exactly, penalties >= 0 in counts^2, or `DataError`."""
+    part = gram.restrict([*inputs, label])
+    common = math.lcm(*(penalty.denominator for penalty in penalties))
+    matrix = [[common * entry for entry in row] for row in part.centred()]
+    for i, penalty in enumerate(penalties):
+        matrix[i][i] += int(part.n * common * penalty)
+    numerators, determinant = eliminate(matrix).solve(len(inputs))
+    slopes = [Fraction(x, determinant) for x in numerators]
+    total = part.sums[-1] - sum(b * s for b, s in zip(slopes, part.sums, strict=False))
+    return LinearModel(tuple(inputs), label, tuple(slopes), Fraction(total, part.n))
 
 
 class _Akaike:
