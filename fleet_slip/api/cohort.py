@@ -107,9 +107,6 @@ class FleetCohort(Rooted):
         *,
         signals: Annotated[str | None, SIGNALS] = None,
         features: Annotated[str | None, OF_SIGNALS] = None,
-        against: Annotated[
-            str | None, Doc("Condition of another cohort: does it have the same coefficients?")
-        ] = None,
         cluster: Annotated[ClusterUnit | None, CLUSTER] = None,
     ) -> "Diagnosis":
         """Fit a model's signals to the cohort and examine the fit.
@@ -122,7 +119,6 @@ class FleetCohort(Rooted):
         return diagnose(
             cohort,
             inputs,
-            against=self._load(cohort.feature_set, against) if against else None,
             cluster=cluster,
             intercept=version is None or not version.manifest.through_origin,
         )

@@ -535,27 +535,22 @@ class DriveFolds:
 def clustered_moments(
     served: Served,
     cluster: ClusterUnit | None = None,
-    cars: Sequence[str] = (),
     *,
     intercept: bool = True,
 ) -> DriveMoments:
     """Return the moments of each drive, and which of them are one piece of evidence.
 
-    By default cars where there are several, else drives; numbered by place among `cars`, so that
-    two cohorts can share them. Without an intercept moments are about zero.
+    By default cars where there are several, else drives. Without an intercept moments are about
+    zero.
     """
     table = served.table if intercept else served.table.about_origin()
-    owners = served.drives["vehicle_id"].to_pylist()
-    cars = cars or owners
-    if (cluster or ("vehicle" if len(set(cars)) > 1 else "drive")) == "drive":
-        trips = served.drives["trip"].to_pylist()
-        if len(set(trips)) == len(trips):
-            return DriveMoments.of(table)
-        _, of_trip = np.unique(trips, return_inverse=True)
-        return DriveMoments.of(table, of_trip.astype(np.int64), "drive")
-    number = {car: i for i, car in enumerate(sorted(set(cars)))}
-    of_drive = np.array([number[car] for car in owners], dtype=np.int64)
-    return DriveMoments.of(table, of_drive, "vehicle")
+    cars = served.drives["vehicle_id"].to_pylist()
+    unit = cluster or ("vehicle" if len(set(cars)) > 1 else "drive")
+    owners = cars if unit == "vehicle" else served.drives["trip"].to_pylist()
+    number = {owner: i for i, owner in enumerate(sorted(set(owners), key=str))}
+    if unit == "drive" and len(number) == len(owners):
+        return DriveMoments.of(table)
+    return DriveMoments.of(table, np.array([number[one] for one in owners]), unit)
 
 
 def drive_folds(

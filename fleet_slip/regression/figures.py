@@ -162,14 +162,6 @@ def student_t_quantile(p: float, degrees: float) -> float:
     return high
 
 
-def f_upper(f: float, numerator: float, denominator: float) -> float:
-    """Return P(F >= f) for the F distribution with the given degrees of freedom."""
-    if f <= 0:
-        return 1.0
-    x = denominator / (denominator + numerator * f)
-    return incomplete_beta(denominator / 2, numerator / 2, x)
-
-
 def incomplete_beta(a: float, b: float, x: float) -> float:
     """Return I_x(a, b), by Lentz's method on Abramowitz and Stegun 26.5.8."""
     if x <= 0:

@@ -3,34 +3,32 @@
 In the orthogonal basis of a nested order, signal j has the squared length A_j in units of the
 noise, and every criterion is a price on it. Neighbouring rows at 100 Hz are not independent, so the
 evidence that decides is over drives.
-
-Do two sets of drives have the same coefficients? Wald's test by clusters.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
 
-from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression import exact
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.exact import inverse_matrix
-from fleet_slip.regression.figures import f_upper, student_t_two_sided
+from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import Fit, Scales, dependence, moments
 
-# A test of two sets of coefficients that holds its level with few clusters, from Gram rows alone.
+# Standard errors that hold with few clusters, from Gram rows alone.
 #
 # Residuals of a cluster shrink with its leverage, and a sandwich of few is uncertain. CR2 (Bell
 # and McCaffrey, Survey Methodology 28, 2002) multiplies the residuals by (I - H_g)^(-1/2), H_g
-# their block of the hat matrix; degrees of freedom are Zhang's for Hotelling's T^2 (Pustejovsky
-# and Tipton, JBES 36, 2018, section 3.2). Both take rows for independent only for the mean of a
+# their block of the hat matrix; degrees of freedom are Satterthwaite's (Imbens and Kolesar, Review
+# of Economics and Statistics 98, 2016). Both take rows for independent only for the mean of a
 # matrix.
 #
 # No row is needed: in inputs x~ whose moments are I, with N_g those of a cluster, X~' (I - X~
@@ -41,126 +39,32 @@ SINGULAR = 1e-9
 """A direction of which one cluster has all but so little: without it nothing is known of it."""
 
 
-@dataclass(frozen=True)
-class ClusteredFit:
-    """Least squares over clusters, in any coordinates of inputs and label.
-
-    Attributes:
-        moments: of the inputs of each cluster, shape (clusters, q, q).
-        scores: sums of inputs times residual, shape (clusters, q).
-        cluster: a number of each, the same for the same cluster of another fit.
-        to_common: from these coordinates to the coefficients that are compared, shape (q, q).
-        noise: standard deviation of rows, in units of the label here.
-    """
-
-    moments: FloatArray
-    scores: FloatArray
-    cluster: IntArray
-    to_common: FloatArray
-    noise: float
-
-
-@dataclass(frozen=True)
-class _Adjusted:
-    """The parts of one fit: how each cluster moves the coefficients, and its covariances."""
-
-    moved: FloatArray
-    scale: FloatArray
-    single: FloatArray
-    double: FloatArray
-
-
-def hotelling(
-    difference: FloatArray, fits: tuple[ClusteredFit, ClusteredFit]
-) -> tuple[float, float]:
-    """Return F and its denominator's degrees of freedom (the numerator's are q) for a difference.
-
-    A cluster may be in both fits. Raises `DataError` for too few, or too much leverage.
-    """
-    size = len(difference)
-    numbers = np.unique(np.concatenate([one.cluster for one in fits]))
-    parts = [_adjust(one, np.searchsorted(numbers, one.cluster), len(numbers)) for one in fits]
-    expected = sum(part.scale @ part.scale.T for part in parts)
-    unit = np.sqrt(np.diag(expected))  # coefficients may be of very different sizes
-    values, vectors = np.linalg.eigh(expected / np.outer(unit, unit))
-    whiten = (vectors / np.sqrt(values)).T / unit
-    moved = whiten @ (parts[0].moved - parts[1].moved)
-    contrasts = [whiten @ part.scale for part in parts]
-    singles = sum(
-        np.asarray(c @ part.single @ c.T) for c, part in zip(contrasts, parts, strict=True)
-    )
-    doubles = np.concatenate(
-        [c @ part.double for c, part in zip(contrasts, parts, strict=True)], axis=2
-    )
-    eta = size * (size + 1) / _variance_of_estimate(np.asarray(singles), doubles)
-    denominator = eta - size + 1
-    if denominator <= 0:
-        raise DataError(
-            f"{len(numbers)} clusters are worth {eta:.1f} of like leverage, too few to compare "
-            f"{size} coefficients by. Take fewer signals."
-        )
-    whitened = whiten @ difference
-    square = float(whitened @ np.linalg.solve(moved @ moved.T, whitened))
-    return square * denominator / (eta * size), denominator
-
-
-def variances_of_few(one: ClusteredFit) -> tuple[FloatArray, FloatArray]:
-    """Return the CR2 variance of each coefficient, and Satterthwaite's degrees of freedom.
+def clustered_variances(fitted: Fit, drives: DriveMoments) -> tuple[FloatArray, FloatArray]:
+    """Return the CR2 variance of each coefficient, in counts, and its degrees of freedom.
 
     The variance is a sum of squares, one a cluster. With P the covariance of what is squared, were
     rows independent, they are (tr P)^2 / tr P^2.
     """
-    clusters = len(one.moments)
-    part = _adjust(one, np.arange(clusters), clusters)
-    contrasts = part.scale
-    single = np.einsum("ja,gab,jb->jg", contrasts, part.single, contrasts, optimize=True)
-    double = np.einsum("ja,gab->jgb", contrasts, part.double)
-    shared = (double**2).sum(axis=2)
-    trace = (single - shared).sum(axis=1)
-    square = (single**2 - 2 * single * shared).sum(axis=1)
-    square += ((double.swapaxes(1, 2) @ double) ** 2).sum(axis=(1, 2))
-    degrees = np.divide(trace**2, square, out=np.full(len(trace), clusters - 1.0), where=square > 0)
-    return (part.moved**2).sum(axis=1), degrees
-
-
-def _adjust(one: ClusteredFit, at: IntArray, clusters: int) -> _Adjusted:
-    """Return the parts of a fit, for the clusters of both; those that it has not have zeros."""
-    lower = np.linalg.cholesky(one.moments.sum(axis=0))
-    back = np.linalg.inv(lower)
-    leverage = back @ one.moments @ back.T
-    values, vectors = np.linalg.eigh(np.eye(len(lower)) - leverage)
+    at, first = _columns(fitted, drives), int(not fitted.has_intercept)
+    chosen = at[first:]
+    each = drives.matrix(drives.clusters.packed)[:, chosen][:, :, chosen]
+    back = np.linalg.inv(np.linalg.cholesky(each.sum(axis=0)))
+    leverage = back @ each @ back.T
+    values, vectors = np.linalg.eigh(np.eye(len(back)) - leverage)
     inverse = np.where(values > SINGULAR, 1 / np.sqrt(np.maximum(values, SINGULAR)), 0.0)
     root = (vectors * inverse[:, None, :]) @ vectors.swapaxes(1, 2)
-    scores = np.einsum("gij,gj->gi", root, one.scores @ back.T)
-    scale = one.to_common @ back.T
-    moved = np.zeros((len(lower), clusters))
-    moved[:, at] = scale @ scores.T
-    double = np.zeros((clusters, *lower.shape))
-    double[at] = root @ leverage
-    single = np.zeros((clusters, *lower.shape))
-    single[at] = double[at] @ root
-    return _Adjusted(moved, one.noise * scale, single, double)
-
-
-def _variance_of_estimate(single: FloatArray, double: FloatArray) -> float:
-    """Return the sum of the variances of all entries of the covariance, in units of its mean.
-
-    With P_gh = [g = h] D_g - K_g K_h', sum (tr P_gh)^2 + tr(P_gh P_gh) over pairs; the second
-    factors: sum |B_ac|^2 + <B_ac, B_ac'>, B_ac the products of rows a and c of K_g over clusters.
-    """
-    size = double.shape[1]
-    pairs = 0.0
-    for a in range(size):
-        for c in range(size):
-            product = double[:, a].T @ double[:, c]
-            pairs += float((product**2).sum() + (product * product.T).sum())
-    own = double @ double.swapaxes(1, 2)
-    return pairs + _both(single - own) - _both(own)
-
-
-def _both(matrices: FloatArray) -> float:
-    traces = np.einsum("gii->g", matrices)
-    return float((traces**2).sum() + np.einsum("gij,gji->", matrices, matrices))
+    scores = np.einsum("gij,gj->gi", root, cluster_scores(fitted, drives)[:, first:] @ back.T)
+    scale = _to_counts(drives, at)[first:, first:] @ back.T
+    double = root @ leverage
+    single = np.einsum("ja,gab,jb->jg", scale, double @ root, scale, optimize=True)
+    pairs = np.einsum("ja,gab->jgb", scale, double)
+    shared = (pairs**2).sum(axis=2)
+    trace = (single - shared).sum(axis=1)
+    square = (single**2 - 2 * single * shared).sum(axis=1)
+    square += ((pairs.swapaxes(1, 2) @ pairs) ** 2).sum(axis=(1, 2))
+    clusters = np.full(len(trace), len(each) - 1.0)
+    degrees = np.divide(trace**2, square, out=clusters, where=square > 0)
+    return ((scale @ scores.T) ** 2).sum(axis=1), degrees
 
 
 INTERCEPT = "intercept"
@@ -234,7 +138,7 @@ def infer_by_clusters(fitted: Fit, drives: DriveMoments, scales: Scales) -> Infe
     differ in size, hold. Raises `DataError` for one cluster, or too few rows.
     """
     clusters = _require_clusters(len(drives.clusters), drives.unit)
-    variances, degrees = variances_of_few(clustered_fit(fitted, drives))
+    variances, degrees = clustered_variances(fitted, drives)
     units = [float(unit) for unit in _units(fitted, scales)]
     errors = [math.sqrt(v) * u for v, u in zip(variances, units, strict=True)]
     sigma2 = noise_variance(fitted)
@@ -247,21 +151,6 @@ def _to_counts(drives: DriveMoments, at: Sequence[int]) -> FloatArray:
     back = np.diag([1.0, *(1 / spread)])
     back[0, 1:] = -centre / spread
     return np.asarray(drives.spread[-1] * back, dtype=np.float64)
-
-
-def clustered_fit(fitted: Fit, drives: DriveMoments) -> ClusteredFit:
-    """Return a fit by clusters, compared in counts. Raises `DataError` for too few rows."""
-    at, first = _columns(fitted, drives), int(not fitted.has_intercept)
-    each = drives.clusters
-    numbers = np.arange(len(each)) if each.cluster is None else each.cluster
-    chosen = at[first:]
-    return ClusteredFit(
-        moments=drives.matrix(each.packed)[:, chosen][:, :, chosen],
-        scores=cluster_scores(fitted, drives)[:, first:],
-        cluster=numbers,
-        to_common=_to_counts(drives, at)[first:, first:],
-        noise=math.sqrt(noise_variance(fitted)) / float(drives.spread[-1]),
-    )
 
 
 def cluster_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
@@ -430,39 +319,3 @@ def _variance(full: Fit) -> Fraction:
             "Leave out the signal that contains the label."
         )
     return variance
-
-
-@dataclass(frozen=True)
-class FTest:
-    """An F test that sets of drives share coefficients; p is of a larger f if they do."""
-
-    f: float
-    numerator: int
-    denominator: float
-    p: float
-
-
-def wald_test(one: Fit, one_drives: DriveMoments, other: Fit, other_drives: DriveMoments) -> FTest:
-    """Compare the coefficients of the same model fitted to two sets of drives.
-
-    Wald's statistic d'V^-1 d of their difference, V clustered and corrected for few of them, judged
-    as Hotelling's T^2 (`few_clusters`); neighbouring rows need not be independent. Clusters of the
-    same number are the same car. Raises `DataError` where clusters are too few.
-    """
-    unit, first = one_drives.unit, int(not one.has_intercept)
-    size = one.size + 1 - first
-    if min(len(one_drives.clusters), len(other_drives.clusters)) <= size:
-        raise DataError(
-            f"comparing {size} coefficients by {unit}s needs more than {size} {unit}s in each "
-            "cohort."
-        )
-    gap = [a - b for a, b in zip(_numbers(one)[first:], _numbers(other)[first:], strict=True)]
-    fits = clustered_fit(one, one_drives), clustered_fit(other, other_drives)
-    if unit == "drive":  # none is in both
-        fits = fits[0], replace(fits[1], cluster=fits[1].cluster + 1 + fits[0].cluster.max())
-    f, degrees = hotelling(np.array([float(x) for x in gap]), fits)
-    return FTest(f, size, degrees, f_upper(f, size, degrees))
-
-
-def _numbers(fitted: Fit) -> list[Fraction]:
-    return [fitted.model.intercept, *fitted.model.coefficients]

@@ -12,7 +12,6 @@ from fleet_slip.regression.inference import (
     Evidence,
     infer_by_clusters,
     infer_classically,
-    wald_test,
 )
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import rank
@@ -87,16 +86,3 @@ def test_the_best_subsets_and_orders_are_those_of_the_rows() -> None:
         assert float(best.rss) == pytest.approx(least, rel=1e-9)
     alone = min(range(4), key=lambda i: rss([i]))
     assert rank("forward", gram, INPUTS, "y")[0] == INPUTS[alone]
-
-
-def test_two_cohorts_of_one_law_are_compared_without_a_constant() -> None:
-    parts = offset_drives(6)
-    halves = parts[:6], parts[6:]
-    grams = [gram_of(np.concatenate(half)) for half in halves]
-    tables = [table_of([gram_of(part) for part in half]).about_origin() for half in halves]
-    moments = [DriveMoments.of(table) for table in tables]
-    fits = [fit(gram, INPUTS, "y", intercept=False) for gram in grams]
-    wald = wald_test(fits[0], moments[0], fits[1], moments[1])
-    assert wald.numerator == 4
-    assert 1 < wald.denominator < 10
-    assert 0 <= wald.p <= 1
