@@ -361,12 +361,17 @@ class FeatureCatalogue(Config):
             )
         return line
 
-    def estimate_in(self, name: str) -> str | None:
-        """Return the estimate in a set that needs a line and has none."""
-        if name == PLAIN or name not in self.sets:
-            return None
-        used = (self.time_columns[w].definition for w in self.feature_set(name).windows)
-        return next((r.of for one in used for r in one.rows() if r.of in self.estimates), None)
+    @cached_property
+    def learning(self) -> Mapping[str, str]:
+        """The sets that need a line and have none, and the estimate in each."""
+        found = {}
+        for name in self.sets:
+            seen = set[int]()
+            used = (self.time_columns[w].definition for w in self.feature_set(name).windows)
+            rows = (row.of for one in used for row in one.rows(seen))
+            if estimate := next((of for of in rows if of in self.estimates), None):
+                found[name] = estimate
+        return found
 
     def feature_set(self, name: str) -> FeatureSet:
         """Return a feature set by name. Raises `QuestionError` for an unknown one.

@@ -352,6 +352,8 @@ def compute_grams(
     `late` is the delay of each car's course in parts of a tick. The work is done here, on all
     cores, or by an executor as tasks of some files and one thread each.
     """
+    if not files:
+        return
     wide = bool(features().feature_set(feature_set).windows)
     if executor is None and not wide:
         total = sum(file.rows for file in files)

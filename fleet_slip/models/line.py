@@ -48,7 +48,7 @@ def with_line_fitted(
     """
     plan = SelectionPlan.of(request)
     named = plan.feature_set
-    if estimate := features().estimate_in(named):
+    if estimate := features().learning.get(named):
         if plan.model_list is None or plan.model_list.line is None:
             raise QuestionError(
                 f"the feature set {named} has the estimate of a line: take a list of models that "

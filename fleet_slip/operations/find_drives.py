@@ -15,10 +15,8 @@ from fleet_slip.catalogue.signals import catalogue, digest_drive
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS
 from fleet_slip.rendering import Remark
-from fleet_slip.resources import read_sql
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, StoredFile
 from fleet_slip.storage.table import Snapshot, Table
-from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -100,9 +98,6 @@ def find_temporary_files(warehouse: Warehouse) -> list[StoredFile]:
 
 _OF_DELTA = re.compile(r"[^/]+/_delta_log/[^/]*#[^/]*")
 """Temporary names of the Delta library, in a file system."""
-
-FILES_PER_QUERY = 256
-"""DuckDB keeps what it read of each file of a query: some 70 KB."""
 
 
 @dataclass(frozen=True)
@@ -267,25 +262,15 @@ def drives_by_file(
     logs: Snapshot, subject: Forgettable, located: Located
 ) -> dict[str, frozenset[str]]:
     """Return the drives concerned by log file, opening only files without Gram rows."""
-    active = [file.path for file in logs.files]
-    found = {path: located.drives[path] for path in active if path in located.drives}
-    unknown = [path for path in active if path not in located.known]
-    if not unknown:
-        return found
-    statement = read_sql("jobs", "find_drives.sql").format(condition=subject.condition)
-    with (
-        open_database(reading=logs.table.folder) as database,
-        reading_files(database, f"looking for drives in {logs.table.folder}"),
-    ):
-        for first in range(0, len(unknown), FILES_PER_QUERY):
-            paths = {
-                logs.table.uri(path): path for path in unknown[first : first + FILES_PER_QUERY]
-            }
-            database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
-            rows = database.execute(statement, {"value": subject.value}).fetchall()
-            for uri in {uri for _, uri in rows}:
-                names = frozenset(drive for drive, other in rows if other == uri)
-                found[paths[uri]] = names
+    found = {}
+    for file in logs.files:
+        drives = located.drives.get(file.path, frozenset())
+        if file.path not in located.known:
+            names = logs.table.read_combinations(file.path, ["drive_id", "vehicle_id"])
+            names = names.append_column("day", pa.repeat(file.day, names.num_rows))
+            drives = frozenset(names.filter(rows_of(names, subject))["drive_id"].to_pylist())
+        if drives:
+            found[file.path] = drives
     return found
 
 

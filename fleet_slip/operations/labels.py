@@ -20,7 +20,7 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.operations.peers import MAD_TO_STD, QualityThresholds, solve
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import read_sql
-from fleet_slip.warehouse.database import open_database
+from fleet_slip.warehouse.database import open_scratch
 
 # Drives whose label has the sign turned, however many they are.
 #
@@ -246,7 +246,7 @@ def find_repeated(drives: pa.Table) -> dict[str, Fault]:
         "least_s": LEAST_OVERLAP_S,
         "sample_time_s": float(SAMPLE_TIME_S),
     }
-    with open_database() as database:
+    with open_scratch() as database:
         database.register("drives", drives)
         found = database.execute(read_sql("jobs", "repeated_drives.sql"), given).fetchall()
     return {

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -256,19 +256,31 @@ SAMPLE = 4
 """Log files whose Gram rows are computed again, evenly chosen, unless all are asked for."""
 
 
-def verify_drives(warehouse: Warehouse, files: Sequence[TableFile], report: Verification) -> None:
-    """Look for drives that are not whole, or stand in several files."""
-    paths = [warehouse.logs.uri(file.path) for file in files]
-    database = open_database(reading=warehouse.logs.folder)
-    with database, database_errors("verifying the drives"):
-        database.execute("SET VARIABLE log_files = $files", {"files": paths})
-        rows = database.execute(read_sql("jobs", "verify_drives.sql")).fetchall()
-    for drive, in_files, beginnings, n, file in rows:
+def verify_rows(
+    warehouse: Warehouse,
+    logs: Sequence[TableFile],
+    grams: Sequence[TableFile],
+    report: Verification,
+) -> None:
+    """Look for drives that are not whole, or stand in several files; for doubled Gram rows."""
+    with open_database(reading=warehouse.root) as database, database_errors("verifying rows"):
+
+        def ask(table: Table, files: Sequence[TableFile], name: str) -> list[tuple[Any, ...]]:
+            paths = [table.uri(file.path) for file in files]
+            database.execute("SET VARIABLE files = $files", {"files": paths})
+            return database.execute(read_sql("jobs", name)).fetchall() if files else []
+
+        cut = ask(warehouse.logs, logs, "verify_drives.sql")
+        twice = ask(warehouse.grams, grams, "verify_grams.sql")
+    for drive, in_files, beginnings, n, file in cut:
         problem = (
             f"{n:,} rows in {number_of(in_files, 'file')} with {number_of(beginnings, 'row')} of "
             f"tick 0; one is {file}"
         )
         report.note("drive", drive, problem)
+    for identity, file, drive, n in twice:
+        problem = f"the Gram row {identity} of drive {drive} stands {n} times"
+        report.note("gram", f"logs/{file}", problem)
 
 
 def verify_grams(
@@ -280,11 +292,10 @@ def verify_grams(
     full: bool,
     executor: Executor | None,
 ) -> None:
-    """Look for Gram rows that are doubled, missing, left over, or wrong (in a sample, or all).
+    """Look for Gram rows that are missing, left over, or wrong (in a sample, or all).
 
     `logs` and `grams` are files whose bytes are sound; `active` are the paths of all log files.
     """
-    _verify_unique(warehouse, grams, report)
     for file in grams:
         rows = warehouse.grams.read(file.path)
         for row, why in impossible_rows(rows.filter(is_received(rows)), counted_sets()):
@@ -314,17 +325,6 @@ def verify_grams(
             "are gone"
         )
         report.note("backlog", "grams", f"{problem}; run: fleet-slip gram")
-
-
-def _verify_unique(warehouse: Warehouse, grams: Sequence[TableFile], report: Verification) -> None:
-    paths = [warehouse.grams.uri(file.path) for file in grams]
-    database = open_database(reading=warehouse.grams.folder)
-    with database, database_errors("verifying the Gram rows"):
-        database.execute("SET VARIABLE gram_files = $files", {"files": paths})
-        twice = database.execute(read_sql("jobs", "verify_grams.sql")).fetchall()
-    for identity, file, drive, n in twice:
-        problem = f"the Gram row {identity} of drive {drive} stands {n} times"
-        report.note("gram", f"logs/{file}", problem)
 
 
 def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:
@@ -412,8 +412,7 @@ def _verify(
     read = {table: verify_files(s, report, progress, executor) for table, s in snapshots.items()}
     logs, grams = ([one.file for one in read.get(table, [])] for table in ("logs", "grams"))
     verify_names(warehouse, read, report, full)
-    if logs:
-        verify_drives(warehouse, logs, report)
+    verify_rows(warehouse, logs, grams, report)
     _report_missing_logs(snapshots, grams, report)
     if grams:
         active = {file.path for file in snapshots["logs"].files} if "logs" in snapshots else set()

@@ -27,6 +27,7 @@ from fleet_slip.warehouse.database import (
     Tree,
     columns_of,
     duckdb_message,
+    open_scratch,
     problems,
     reading_files,
 )
@@ -205,18 +206,9 @@ def _written(tree: Tree) -> str | None:
     return text.removeprefix(_QUERY) if text.startswith(_QUERY) else None
 
 
-_asking = threading.Lock()
-
-
-@functools.cache
-def _parser() -> duckdb.DuckDBPyConnection:
-    """Return a connection that parses and has nothing else."""
-    return duckdb.connect(":memory:", config={"threads": 1, "enable_external_access": False})
-
-
 def _ask(statement: str, text: str) -> tuple[Any, ...]:
-    with _asking:
-        [row] = _parser().execute(statement, {"text": text}).fetchall()
+    with open_scratch() as database:
+        [row] = database.execute(statement, {"text": text}).fetchall()
     return tuple(row)
 
 

@@ -46,13 +46,6 @@ class Forgettable:
         """The column that tells."""
         return {"vehicle": "vehicle_id", "drive": "drive_id", "before": "day"}[self.kind]
 
-    @property
-    def condition(self) -> str:
-        """SQL condition with the parameter `$value`."""
-        if self.kind == "before":
-            return "day < $value::DATE"
-        return f"{self.column} = $value"
-
     def digest(self, key: str) -> str:
         """Return the keyed hash of the name."""
         return _digest(f"{self.kind}:{self.value}", key)

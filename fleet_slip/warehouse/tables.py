@@ -123,16 +123,15 @@ class Warehouse:
     def feature_sets(self) -> tuple[str, ...]:
         """Return the feature sets that Gram rows can be of, those with a line of this root, too."""
         known = features()
-        learning = [name for name in known.sets if known.estimate_in(name)]
-        lines = [self.line(digest) for digest in sorted(self.lines.names())] if learning else []
+        digests = sorted(self.lines.names()) if known.learning else []
+        lines = [line for digest in digests if (line := self.line(digest))]
         fitted = [
             f"{name}_{line.digest}"
-            for name in learning
+            for name, estimate in known.learning.items()
             for line in lines
-            if line and line.estimate == known.estimate_in(name)
-            if line.scale == known.estimates[line.estimate].scale
+            if line.estimate == estimate and line.scale == known.estimates[estimate].scale
         ]
-        return (PLAIN, *(name for name in known.sets if name not in learning), *fitted)
+        return (PLAIN, *(name for name in known.sets if name not in known.learning), *fitted)
 
     def line(self, digest: str) -> FittedLine | None:
         """Return a line by its digest; None if there is none. Raises `StorageError`."""

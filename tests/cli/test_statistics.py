@@ -57,7 +57,7 @@ def test_all_sets_are_up_to_date(run_command: RunCommand, every_set: Path) -> No
     assert [report["feature_set"] for report in reports] == [
         features().identity(name)
         for name in (PLAIN, *features().sets)
-        if not features().estimate_in(name)
+        if name not in features().learning
     ]
 
 

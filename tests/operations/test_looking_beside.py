@@ -79,7 +79,7 @@ def test_a_check_beside_a_job_that_takes_files_away_finds_no_damage(
 @pytest.mark.parametrize(
     "job", [forget_now, pytest.param(compact_and_vacuum, marks=pytest.mark.long)]
 )
-@pytest.mark.parametrize("moment", ["verify_files", "verify_drives", "verify_grams"])
+@pytest.mark.parametrize("moment", ["verify_files", "verify_rows", "verify_grams"])
 def test_a_verification_beside_a_job_that_takes_files_away_finds_no_damage(
     job: Callable[[Warehouse], Any],
     moment: str,
