@@ -66,7 +66,6 @@ GROUPS = {
         "models": "models",
         "promote": "models",
         "pin": "models",
-        "diff": "models",
     },
     "Accuracy": {
         "score": "accuracy",
