@@ -24,14 +24,11 @@ from fleet_slip.regression.choice import (
 )
 from fleet_slip.regression.drives import (
     DriveMoments,
-    bootstrap_correlations,
-    held_out_products,
-    percentile_interval,
     serving_drives,
 )
 from fleet_slip.regression.folds import CohortFolds, by_hash
 from fleet_slip.regression.inference import Evidence, infer_by_clusters, infer_classically
-from fleet_slip.regression.least_squares import correlation_matrix, fit
+from fleet_slip.regression.least_squares import correlation_matrix
 from fleet_slip.regression.orders import RANKINGS, rank
 from fleet_slip.regression.subsets import (
     CRITERIA,
@@ -138,14 +135,6 @@ def subsets(training: TrainingFolds, output: Path) -> None:
     save(figure, output / "statistics_subsets.svg")
 
 
-def uncertainty(training: TrainingFolds, fold: IntArray) -> None:
-    folds = training.folds
-    assert training.drives is not None
-    models = [fit(folds.total - test, NINE, LABEL).model for test in folds.grams]
-    products = held_out_products(training.drives, fold, models)
-    print(" ", percentile_interval(bootstrap_correlations(products, 1000, seed=1)))
-
-
 def save(figure: Figure, file: Path) -> None:
     figure.tight_layout()
     figure.savefig(file, metadata={"Date": None})
@@ -165,7 +154,6 @@ def main() -> None:
     evidence(training, given.output)
     orders(training, fold, given.output)
     subsets(training, given.output)
-    uncertainty(training, fold)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.session import LearnReport, RunReport
 from fleet_slip.base import number_of
-from fleet_slip.cli.options import RESAMPLING, command
+from fleet_slip.cli.options import command
 from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.models.manifest import require_model_name
@@ -30,7 +30,7 @@ from fleet_slip.storage.runs import step
     Fleet.cohort,
     FleetCohort.select,
     arguments=["name"],
-    without=[*RESAMPLING, "condition"],
+    without=["condition"],
 )
 def publish(
     fleet: Fleet,
@@ -192,5 +192,5 @@ def select(everything: All = False) -> None:
 
     Choose among many columns: **fleet-slip select --features windows --search exchange --most 12**
 
-    Search all subsets: **fleet-slip select --all-subsets --criterion cv --bootstrap 1000**
+    Search all subsets: **fleet-slip select --all-subsets --criterion cv**
     """

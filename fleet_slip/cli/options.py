@@ -16,12 +16,10 @@ from fleet_slip.cli.output import Json, print_json, print_parts
 from fleet_slip.storage.runs import recording
 
 DETAILS: dict[str, dict[str, Any]] = {
-    "bootstrap": {"min": 100},
     "days": {"min": 1},
     "folds": {"metavar": "NUMBER|each"},
     "max_age_hours": {"min": 0},
     "most": {"min": 1, "max": 200},
-    "repeat": {"min": 2},
     "retention_hours": {"min": 1, "max": 168},
     "target_rows": {"min": 1},
     "what": {"metavar": "SCENARIO|DRIVE"},
@@ -52,9 +50,6 @@ READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "through": (str | None, last_day),
 }
 """Parameters of other types on the command line, and what reads them."""
-
-RESAMPLING = ("repeat", "bootstrap")
-"""Options that tell more of a winner and choose none."""
 
 _NAMED = re.compile("`([a-z_]+)`")
 _UNIT = re.compile("_(kg|m|s)$")

@@ -156,7 +156,7 @@ class Learner:
         Of cars without the label it learns beside those that it was `trained_on`. Raises as
         `load_cohort`.
         """
-        asked = SelectionPlan.of(replace(request, bootstrap=None))
+        asked = SelectionPlan.of(request)
         mixed = asked.request.label == BOTH
         cohort = asked.load(warehouse, trained_on if mixed else condition)
         return cls(asked, cohort, drives, warehouse)

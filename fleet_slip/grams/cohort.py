@@ -524,13 +524,6 @@ class DriveFolds:
     fold: IntArray
     training: TrainingFolds
 
-    @property
-    def moments(self) -> DriveMoments:
-        """Moments of each drive, for cluster-robust errors and resampling."""
-        if self.training.drives is None:
-            return clustered_moments(self.served)
-        return self.training.drives
-
 
 def clustered_moments(
     served: Served,

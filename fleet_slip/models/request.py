@@ -167,10 +167,6 @@ class SelectionRequest:
             "them: fleet-slip identify --campaign."
         ),
     ] = None
-    bootstrap: Annotated[
-        int | None,
-        Doc("Confidence interval of the winner's correlation by drawing the drives so many times."),
-    ] = None
 
     @property
     def ordered(self) -> bool:
@@ -200,22 +196,21 @@ class SelectionRequest:
             raise UsageError("a search of all subsets needs no order: leave out rank.")
         if self.most and not self.search:
             raise UsageError("most is for a search: say how to search.")
-        evidence = self.ordered or self.bootstrap or self.nested
-        if self.cluster and (self.naive or not evidence):
+        if self.cluster and (self.naive or not (self.ordered or self.nested)):
             raise UsageError(
-                "cluster says what is independent evidence for nested, rank, criterion, "
-                "all_subsets and bootstrap: leave it out, or naive."
+                "cluster says what is independent evidence for nested, rank, criterion and "
+                "all_subsets: leave it out, or naive."
             )
-        if self.label == BOTH and (self.ordered or self.nested or self.bootstrap or self.robust):
+        if self.label == BOTH and (self.ordered or self.nested or self.robust):
             raise UsageError(
                 "course+sideslip compares a list of models, one model or a search: leave out "
-                "nested, rank, criterion, all_subsets, naive, robust and bootstrap."
+                "nested, rank, criterion, all_subsets, naive and robust."
             )
         ranked = self.ordered or (self.nested and not self.search)
-        if self.prior and (self.label or ranked or self.bootstrap):
+        if self.prior and (self.label or ranked):
             raise UsageError(
                 "a prior joins models of a list, one model or a search: leave out label, rank, "
-                "criterion, all_subsets, naive, bootstrap, and nested without search."
+                "criterion, all_subsets, naive, and nested without search."
             )
         if self.half_life is not None and (self.half_life < 1 or self.label == BOTH):
             raise UsageError(

@@ -19,7 +19,6 @@ from fleet_slip.errors import ConfigError, DataError, NotComputedError, Question
 from fleet_slip.grams.cohort import (
     Cohort,
     Served,
-    drive_folds,
     load_cohort,
     load_mixed_labels,
 )
@@ -60,12 +59,7 @@ from fleet_slip.models.summary import summarize
 from fleet_slip.pages.notebook import notebook_table
 from fleet_slip.regression.choice import NestedDistances, Rule, Winner, Worth, fall_short
 from fleet_slip.regression.drives import (
-    ClusterUnit,
     DriveMoments,
-    Interval,
-    bootstrap_correlations,
-    held_out_products,
-    percentile_interval,
 )
 from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.folds import (
@@ -82,32 +76,6 @@ from fleet_slip.regression.orders import METHODS
 from fleet_slip.rendering import Answer, Part
 from fleet_slip.resources import find_config
 from fleet_slip.warehouse.tables import Warehouse
-
-SEED = 1
-"""Resampling is reproducible: the same command prints the same figures."""
-
-
-@dataclass(frozen=True)
-class Uncertainty:
-    """What resampling says of a model's cross-validated correlation."""
-
-    interval: Interval
-    drawn: ClusterUnit
-
-
-def estimate_uncertainty(
-    cohort: Cohort, model: CrossValidation, folding: Folding, draws: int, request: SelectionRequest
-) -> Uncertainty:
-    """Draw drives, or cars of several, so many times.
-
-    Raises `QuestionError` for folds of rows, `DataError` for too few drives.
-    """
-    ready = drive_folds(cohort, model.signals, folding, cluster=request.cluster)
-    refit = least_squares(model.signals, catalogue().label, intercept=request.intercept)
-    models = [refit(training) for training, _ in ready.training.folds.splits()]
-    products = held_out_products(ready.moments, ready.fold, models)
-    interval = percentile_interval(bootstrap_correlations(products, draws, SEED))
-    return Uncertainty(interval, ready.moments.unit)
 
 
 def lost_drives(served: Served, *, intercept: bool) -> dict[str, Weighed]:
@@ -265,7 +233,6 @@ class Selection(Answer):
     skipped: dict[str, str]
     choice: SearchChoice | None = None
     searched: tuple[SearchedModels, ...] = ()
-    uncertainty: Uncertainty | None = None
     distances: NestedDistances | str | None = None
     intercept: bool = True
     model_list: str = ""
@@ -365,7 +332,6 @@ class Selection(Answer):
             "choice": self.choice,
             "search": self.searched_winner or next(iter(self.searched), None),
             "nested": nested,
-            "uncertainty": self.uncertainty,
             "without_label": self.without_label,
             "remark": self.remark,
             "examined": self.examined,
@@ -556,7 +522,7 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
     distances = bool(
         request.nested and not request.ordered and not _searches_of(request, asked.model_list)
     )
-    of_drives = request.ordered or request.bootstrap or request.robust or request.half_life
+    of_drives = request.ordered or request.robust or request.half_life
     if of_drives or distances:
         cohort = asked.load(warehouse, condition)
     else:  # the sum of each fold suffices
@@ -566,15 +532,11 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
 
         cohort = replace(cohort, beside=simulate_prior(request.prior, asked.feature_set))
     answer = asked.choose(cohort)
-    cohort = answer.cohort
     if distances:
-        inputs = inputs_of(cohort, request.nested or WHOLE_SET)
-        answer = replace(answer, distances=try_distances(cohort, inputs, folds, request))
-    if not request.bootstrap:
-        return answer
-    winner = answer.winner.model
-    figures = estimate_uncertainty(cohort, winner, folds, request.bootstrap, request)
-    return replace(answer, uncertainty=figures)
+        inputs = inputs_of(answer.cohort, request.nested or WHOLE_SET)
+        told = try_distances(answer.cohort, inputs, folds, request)
+        answer = replace(answer, distances=told)
+    return answer
 
 
 WEIGHTS = tuple(Fraction(4) ** power for power in range(4, -5, -1))

@@ -90,13 +90,6 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
             "with the whole selection repeated inside every fold: correlation "
             f"{honest.correlation:.4f}, RMSE {honest.pooled.rmse_deg:.4f} deg."
         )
-    if (found := selection.uncertainty) is not None:
-        interval = found.interval
-        yield (
-            f"{interval.level:.0%} interval of the winner's correlation, drawing its "
-            f"{found.drawn}s {interval.replicates:,} times: {interval.low:.4f} to "
-            f"{interval.high:.4f}."
-        )
 
 
 def _shortened(condition: str, everything: bool) -> str:

@@ -133,8 +133,8 @@ def test_a_cohort_answers_from_gram_rows(fleet: Fleet) -> None:
     diagnosis = cohort.diagnose("bent")
     assert diagnosis.fitted.model.signals == fleet.model("bent").manifest.signals
     assert cohort.diagnose(fleet.model("bent")).drives == diagnosis.drives
-    subset = cohort.select(nested="ay,yaw_rate", all_subsets=True, criterion="bic", bootstrap=100)
-    assert subset.uncertainty
+    subset = cohort.select(nested="ay,yaw_rate", all_subsets=True, criterion="bic")
+    assert subset.choice and subset.choice.subsets
     with pytest.raises(UsageError, match="not both"):
         cohort.diagnose("bent", signals="ay")
     with pytest.raises(QuestionError, match="name a published model"):

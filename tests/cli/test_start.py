@@ -16,7 +16,6 @@ from fleet_slip.api.calls import doc_of
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.app import COMMANDS, GROUPS, CommandGroup, load_command
-from fleet_slip.cli.options import RESAMPLING
 from fleet_slip.models.request import SelectionRequest
 from tests.support.commands import COMMAND, run
 
@@ -102,7 +101,7 @@ def test_a_selections_options_stand_once_and_are_those_of_the_api() -> None:
     assert in_python == options
     taken = {name: {one.name for one in load_command(name).params} for name in COMMANDS}
     assert taken["select"] - {"json", "condition", "everything", "unexamined"} == options
-    assert taken["publish"] & options == options - set(RESAMPLING)
+    assert taken["publish"] & options == options
 
 
 @pytest.mark.parametrize(

@@ -66,7 +66,7 @@ def test_a_criterion_chooses_from_a_ranking_and_says_how_sure(
 ) -> None:
     nested = ("--nested", "ax,ay,yaw_rate,steering_wheel,steer_fl")
     arguments = ("select", *nested, "--rank", "backward", "--criterion", "bic")
-    report = run_command(*arguments, "--bootstrap", "200", "--json", root=every_set).json
+    report = run_command(*arguments, "--json", root=every_set).json
     choice = report["choice"]
     assert sorted(choice["order"]) == ["ax", "ay", "steer_fl", "steering_wheel", "yaw_rate"]
     best = min(range(6), key=lambda j: choice["criterion_values"][j])
@@ -74,8 +74,6 @@ def test_a_criterion_chooses_from_a_ranking_and_says_how_sure(
     assert choice["evidence"] == "drives"
     assert choice["effective_rows"] < report["rows"] / 10
     winner = report["models"][best - 1]
-    interval = report["uncertainty"]["interval"]
-    assert interval["low"] < winner["correlation"] < interval["high"]
     assert abs(choice["honest"]["correlation"] - winner["correlation"]) < 0.01
     naive = run_command(*arguments, "--naive", "--json", root=every_set).json
     assert naive["choice"]["effective_rows"] == naive["rows"]
@@ -172,7 +170,6 @@ def test_diagnose_shows_both_kinds_of_errors(run_command: RunCommand, every_set:
         (["select", "--models", "table1", "--rank", "t"], 2, "leave out models"),
         (["select", "--all-subsets", "--rank", "t"], 2, "needs no order"),
         (["select", "--by", "row", "--features", "motion"], 5, "sets that make them: rows"),
-        (["select", "--by", "row", "--bootstrap", "100"], 5, "Fold by drive"),
         (["diagnose", "nothing"], 5, "no model is called"),
         (["diagnose", "smoke", "--signals", "ay"], 2, "not both"),
         (["diagnose", "--signals", "ay,ay"], 2, "stands twice"),

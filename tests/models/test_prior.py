@@ -102,7 +102,6 @@ def test_a_version_names_its_prior_and_is_trained_so_again(own: Path, few: str) 
     [
         ("--nested", "ay,yaw_rate"),
         ("--rank", "tstat"),
-        ("--bootstrap", "100"),
         ("--label", "course"),
     ],
 )
