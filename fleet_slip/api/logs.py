@@ -78,7 +78,6 @@ class LogsAndGrams(Rooted):
         files: Iterable[Path | str] | Path | str,
         mapping: "str | Mapping",
         *,
-        as_one: Annotated[bool, Doc("The files of each folder are parts of one log.")] = False,
         replace: "Replace" = "no",
         workers: Workers = None,
         each: "Callable[[IngestReport], None] | None" = None,
@@ -106,7 +105,7 @@ class LogsAndGrams(Rooted):
         from fleet_slip.ingest.recordings import KnownFiles
         from fleet_slip.operations.rewriting import take_out
 
-        plan, logs, folders = _chosen_logs(files, mapping, as_one=as_one)
+        plan, logs, folders = _chosen_logs(files, mapping)
         count = count_from_start(progress)
         reports: list[IngestReport] = []
         with open_workers(self.root, workers) as executor, step("ingest") as figures:
@@ -115,13 +114,11 @@ class LogsAndGrams(Rooted):
                 logs = [one.absolute() if isinstance(one, Path) else one for one in logs]
             figures.rows = 0
             warehouse = within_reach(self.warehouse, executor)
-            threads = executor if folders and not as_one else elsewhere
+            threads = executor if folders else elsewhere
             out = partial(take_out, self.warehouse)
             remembers = folders or replace == "corrected"
             known = KnownFiles.of(self.warehouse, plan) if remembers else None
-            wanted = logs
-            if known is not None and not as_one:  # what is in a folder its size does not show
-                wanted = known.without_landed(logs, warehouse)
+            wanted = logs if known is None else known.without_landed(logs, warehouse)
             if landed := len(logs) - len(wanted):
                 count(landed, len(logs))
             try:
@@ -167,11 +164,7 @@ class LogsAndGrams(Rooted):
             return take_back(self.warehouse, what)
 
     def preview(
-        self,
-        files: Iterable[Path | str] | Path | str,
-        mapping: "str | Mapping",
-        *,
-        as_one: bool = False,
+        self, files: Iterable[Path | str] | Path | str, mapping: "str | Mapping"
     ) -> "list[Preview]":
         """Read measured files as `ingest` does, and store nothing; raises the same.
 
@@ -180,7 +173,7 @@ class LogsAndGrams(Rooted):
         """
         from fleet_slip.ingest.load import preview_logs
 
-        plan, logs, _ = _chosen_logs(files, mapping, as_one=as_one)
+        plan, logs, _ = _chosen_logs(files, mapping)
         return preview_logs(logs, plan)
 
     @record_call
@@ -251,13 +244,12 @@ class LogsAndGrams(Rooted):
 
 
 def _chosen_logs(
-    files: Iterable[Path | str] | Path | str, mapping: "str | Mapping", *, as_one: bool
+    files: Iterable[Path | str] | Path | str, mapping: "str | Mapping"
 ) -> "tuple[Mapping, list[Log], bool]":
     """Return a mapping, the logs that are meant, and whether these are in folders or patterns."""
-    from fleet_slip.ingest.log_files import find_logs, find_whole_logs, names_several
+    from fleet_slip.ingest.log_files import find_logs, names_several
     from fleet_slip.ingest.mapping import load_mapping
 
     plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
     given = [files] if isinstance(files, Path | str) else list(files)
-    logs = find_whole_logs(given) if as_one else find_logs(given)
-    return plan, logs, any(map(names_several, given))
+    return plan, find_logs(given), any(map(names_several, given))

@@ -34,7 +34,6 @@ def simulate() -> None:
 @command(Fleet.ingest, without=["workers"])
 def ingest(
     fleet: Fleet,
-    as_one: bool,
     files: Annotated[
         list[str] | None,
         typer.Argument(
@@ -84,7 +83,7 @@ def ingest(
     """
     from fleet_slip.ingest.log_files import names_several  # noqa: PLC0415 - takes a while
 
-    others = dry_run or as_one or replace
+    others = dry_run or replace
     if undo is not None:
         if files or mapping or others:
             raise UsageError("--undo only removes drives: give it alone.")
@@ -102,9 +101,9 @@ def ingest(
         else:
             print_parts(part for one in counted for part in one.parts())
     elif dry_run:
-        _show_previews(fleet.preview(files, mapping, as_one=as_one), json)
+        _show_previews(fleet.preview(files, mapping), json)
     else:
-        folders = any(map(names_several, files)) and not as_one
+        folders = any(map(names_several, files))
         seen: set[tuple[str, tuple[str, ...]]] = set()
 
         def tell(report: "IngestReport") -> None:
@@ -119,7 +118,6 @@ def ingest(
             reports = fleet.ingest(
                 files,
                 mapping,
-                as_one=as_one,
                 replace="all" if replace else "no",
                 workers=cluster,
                 each=tell,

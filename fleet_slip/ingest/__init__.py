@@ -4,7 +4,7 @@ The way of a row, in the order of its stations:
 
 1. `log_files` finds the logs in folders and on object stores, and copies those that are elsewhere.
 2. `formats.reading` opens a file; its format yields batches of the columns that the mapping uses.
-3. `time_bases` joins the files and time bases of a log; `log_rows` checks each row by itself:
+3. `time_bases` joins the time bases of a log; `log_rows` checks each row by itself:
    values in SI units, or the reason why it is refused.
 4. `drives` checks the order of time, cuts rows into drives, and brings each to ticks by
    `resampling`, and to counts.

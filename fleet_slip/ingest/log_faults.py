@@ -18,7 +18,6 @@ from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.ingest.drives import DriveRows, MeasuredDrive
 from fleet_slip.ingest.formats.reading import file_errors, open_source
-from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
@@ -137,8 +136,7 @@ def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]
     if mapping.time.own_clock or not wanted:
         return
     used = {name for names in mapping.time_bases().values() for name in names}
-    part = parts_of(file)[0]
-    with file_errors(part), open_source(part, mapping.formats) as source:
+    with file_errors(file), open_source(file, mapping.formats) as source:
         names = [channel.name for channel in source.channels()]
         for key, words in wanted.items():
             for name in names:

@@ -1,4 +1,4 @@
-"""Finds measured logs: files, those of a folder, and folders whose files are parts of one log.
+"""Finds measured logs: files, and those of a folder or a pattern.
 
 They are on this machine, or on an object store. Every format is read where it can be sought in and
 mapped, so that a log on a store is copied as a whole to the temporary folder (`TMPDIR`).
@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import TypeAlias
 
 from fleet_slip.base import needed, shown
-from fleet_slip.errors import FleetSlipError, InputError, UsageError
+from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.storage.folder import StoredFile
 from fleet_slip.storage.storage_errors import storage_errors
 
@@ -44,7 +44,7 @@ class StrayLink(PosixPath):
 
 
 Log: TypeAlias = Path | StoredFile
-"""A measured log: a file, here or on an object store, or a folder whose files are its parts."""
+"""A measured log: a file, here or on an object store."""
 
 OpenCopy: TypeAlias = Callable[[Log], AbstractContextManager[Path]]
 
@@ -65,17 +65,6 @@ def find_logs(given: Iterable[Place]) -> list[Log]:
         else:
             found += find_files(Path(place))
     return found
-
-
-def find_whole_logs(given: Iterable[Place]) -> list[Log]:
-    """Return folders, each as one log in several files. Raises `UsageError` for anything else."""
-    folders = list(given)
-    for place in folders:
-        if is_url(place) or not Path(place).is_dir():
-            raise UsageError(
-                f"{place}: --as-one needs a local folder, which holds the files of one log."
-            )
-    return [Path(place) for place in folders]
 
 
 def find_files(path: Path) -> list[Path]:
@@ -117,23 +106,6 @@ def is_url(place: Place) -> bool:
 def is_pattern(place: Place) -> bool:
     """Whether a path stands for those that match it."""
     return bool(WILDCARDS.intersection(str(place))) and (is_url(place) or not Path(place).exists())
-
-
-def parts_of(log: Path) -> list[Path]:
-    """Return the files that one log is in: itself, or those of its folder. Raises `InputError`."""
-    files = find_files(log)
-    for file in files:
-        require_inside(file)
-    return files
-
-
-def require_inside(file: Path) -> None:
-    """Raise `InputError` for a link that leads out of the folder in which it was found."""
-    if isinstance(file, StrayLink):
-        raise InputError(
-            f"{shown(file)}: a symbolic link out of its folder, not followed. Give the file by "
-            "its own path."
-        )
 
 
 def _stored(url: str) -> list[StoredFile]:
@@ -200,8 +172,12 @@ def local_copies(logs: Iterable[Log]) -> Iterator[OpenCopy]:
         @contextmanager
         def open_copy(log: Log) -> Iterator[Path]:
             """Give the file to read a log from, whose errors name the log. Raises `InputError`."""
+            if isinstance(log, StrayLink):
+                raise InputError(
+                    f"{shown(log)}: a symbolic link out of its folder, not followed. Give the file "
+                    "by its own path."
+                )
             if isinstance(log, Path):
-                require_inside(log)
                 yield log
                 return
             copy = copies[log].result()

@@ -1,5 +1,6 @@
 """From a measured file to drives in counts, piece by piece: few drives are in memory at once."""
 
+import hashlib
 import os
 from collections import Counter
 from collections.abc import Iterator
@@ -29,11 +30,10 @@ from fleet_slip.ingest.drives import (
     sample_intervals_s,
     to_ticks,
 )
-from fleet_slip.ingest.formats.reading import log_digest, require_unchanged_log
+from fleet_slip.ingest.formats.reading import file_errors, require_unchanged_log
 from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.formats.tables import partition_keys
 from fleet_slip.ingest.log_faults import LogFaults
-from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.log_rows import (
     CheckedBlock,
     RowChecker,
@@ -305,14 +305,13 @@ def open_measured(file: Path, mapping: Mapping) -> Iterator[MeasuredStream]:
 
 def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
     """Return the digest of a file and a mapping, and that of the file and its folders' keys."""
-    digest = log_digest(file)
-    content = digest.copy()
+    with file_errors(file), file.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256")
+    content, of_folders = digest.copy(), partition_keys(file)
     used = {name for names in mapping.time_bases().values() for name in names}
-    for part in parts_of(file):
-        of_folders = partition_keys(part)
-        if keys := {key: text for key, text in of_folders.items() if key in used}:
-            digest.update(canonical_ascii(keys).encode())
-        content.update(canonical_ascii(of_folders).encode())
+    if keys := {key: text for key, text in of_folders.items() if key in used}:
+        digest.update(canonical_ascii(keys).encode())
+    content.update(canonical_ascii(of_folders).encode())
     digest.update(mapping.canonical_json().encode())
     return digest.hexdigest(), content.hexdigest()
 

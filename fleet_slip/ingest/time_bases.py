@@ -1,4 +1,4 @@
-"""Reads the rows of a log, which is a file or several in a row, in bounded batches.
+"""Reads the rows of a log in bounded batches.
 
 A batch is a Polars frame with the columns that a mapping uses: text (CSV, text in Parquet), 64-bit
 floats, dates or timestamps. CSV fields stay text, so that what is not a number can be quarantined
@@ -17,7 +17,6 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.reading import file_errors, open_source
 from fleet_slip.ingest.formats.source import BASE, Budget
 from fleet_slip.ingest.formats.tables import BATCH_ROWS
-from fleet_slip.ingest.log_files import parts_of
 from fleet_slip.ingest.mapping import Mapping
 
 _CLOCK = "this file has its own clock: set own_clock = true under [time]"
@@ -27,47 +26,41 @@ _NO_CLOCK = "this file has no clock: set column or rate_hz under [time]"
 def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
     """Yield the columns of a log that a mapping uses, in its order, in bounded batches.
 
-    Rows of several time bases come as `merge_bases` says; files of one log, in the order of their
-    names, have one. Raises `InputError` if a file cannot be read, has a clock and the mapping none
-    or the other way round, or if a column is missing or ambiguous.
+    Rows of several time bases come as `merge_bases` says. Raises `InputError` if the file cannot be
+    read, has a clock and the mapping none or the other way round, or if a column is missing or
+    ambiguous.
     """
-    wanted, parts, time = mapping.time_bases(), parts_of(log), str(mapping.time.key)
-    for part in parts:
-        with file_errors(part), open_source(part, mapping.formats) as source:
-            if source.has_clock != mapping.time.own_clock:
-                raise InputError(
-                    f"{shown(part)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
-                    f"{mapping.name!r}."
-                )
-            metered = Budget.of(part).metered
-            if len(wanted) == 1 and not source.has_clock:
-                yield from metered(source.batches(next(iter(wanted.values()))))
-                continue
-            if source.has_clock:
-                bases = [base for columns in wanted.values() for base in source.bases(columns)]
-            else:
-                bases = [
-                    _with_times(source.batches(columns), part, str(own), time)
-                    for own, columns in wanted.items()
-                ]
-            if len(parts) > 1 and len(bases) > 1:
-                raise InputError(
-                    f"{shown(part)}: its signals have {len(bases)} time bases; --as-one supports "
-                    "one. Ingest each file as a log of its own: they are joined as one trip."
-                )
-            held, split_gap_s = mapping.common_columns(), mapping.time.split_gap_s
-            for rows in merge_bases([*map(metered, bases)], time, held, split_gap_s):
-                yield from rows.iter_slices(BATCH_ROWS)
+    wanted, time = mapping.time_bases(), str(mapping.time.key)
+    with file_errors(log), open_source(log, mapping.formats) as source:
+        if source.has_clock != mapping.time.own_clock:
+            raise InputError(
+                f"{shown(log)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
+                f"{mapping.name!r}."
+            )
+        metered = Budget.of(log).metered
+        if len(wanted) == 1 and not source.has_clock:
+            yield from metered(source.batches(next(iter(wanted.values()))))
+            return
+        if source.has_clock:
+            bases = [base for columns in wanted.values() for base in source.bases(columns)]
+        else:
+            bases = [
+                _with_times(source.batches(columns), log, str(own), time)
+                for own, columns in wanted.items()
+            ]
+        held, split_gap_s = mapping.common_columns(), mapping.time.split_gap_s
+        for rows in merge_bases([*map(metered, bases)], time, held, split_gap_s):
+            yield from rows.iter_slices(BATCH_ROWS)
 
 
 def _with_times(
-    batches: Iterator[pl.DataFrame], part: Path, own: str, time: str
+    batches: Iterator[pl.DataFrame], log: Path, own: str, time: str
 ) -> Iterator[pl.DataFrame]:
     """Yield the rows that have a time of their own, under the name that all times have."""
     for batch in batches:
         if not batch[own].dtype.is_numeric():
             raise InputError(
-                f"{shown(part)}: the time {own!r} is not numeric, as a signal with its own time "
+                f"{shown(log)}: the time {own!r} is not numeric, as a signal with its own time "
                 "needs."
             )
         if own == time:

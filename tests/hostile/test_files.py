@@ -9,7 +9,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.load import ingest_files
 from fleet_slip.ingest.log_files import StrayLink, find_logs
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file, read_measured
+from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file
 
 MIB = 2**20
 
@@ -69,7 +69,9 @@ def test_a_link_out_of_a_folder_is_refused_and_holds_nothing_up(
         (folder / name).symlink_to(target)
     (folder / "below").symlink_to(other)
     reports = []
-    with pytest.raises(InputError, match=r"4 files cannot be used; all others are stored.*b\.csv"):
+    with pytest.raises(
+        InputError, match=r"4 files cannot be used; all others .*b\.csv: a symbolic link"
+    ):
         reports += list(ingest_files(warehouse, find_logs([folder]), a_mapping()))
     assert warehouse.logs.snapshot().rows == 20
 
@@ -84,8 +86,5 @@ def test_a_pattern_does_not_lead_out_of_its_folder(tmp_path: Path) -> None:
     found = find_logs([f"{folder}/**/*.csv"])
     strays = {str(file): isinstance(file, StrayLink) for file in found}
     assert strays == {str(folder / "sound/a.csv"): False, str(folder / "below/secret.csv"): True}
-    (folder / "sound" / "b.csv").symlink_to(other / "secret.csv")
-    with pytest.raises(InputError, match=r"b\.csv: a symbolic link out of its folder"):
-        read_measured(folder / "sound", a_mapping())
     (tmp_path / "link").symlink_to(folder)  # a person's own link to a folder is followed
     assert not isinstance(find_logs([tmp_path / "link" / "sound"])[0], StrayLink)

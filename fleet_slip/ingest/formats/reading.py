@@ -5,7 +5,6 @@ that forks readers (`confined_reader`) is started once, and ends with this one.
 """
 
 import atexit
-import hashlib
 import json
 import os
 import pickle
@@ -41,7 +40,6 @@ from fleet_slip.ingest.formats.csv import (
 )
 from fleet_slip.ingest.formats.source import Budget, Channel, Source, unreadable
 from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, open_parquet
-from fleet_slip.ingest.log_files import parts_of
 
 [_HDF5], _HDF5_AT = FORMATS["mat73"].begins, 512
 """A MATLAB file of version 7.3 becomes HDF5 there: MATLAB's own header is before it."""
@@ -75,39 +73,19 @@ class FileFormats:
 
 @contextmanager
 def require_unchanged_log(log: Path) -> Iterator[None]:
-    """Raise `InputError` if a part of a log is no regular file, or changes while it is read."""
-    parts = parts_of(log)
-    for part in parts:
-        if not part.is_file():
-            what = "is not a regular file" if part.exists() else "no such file"
-            raise InputError(f"{shown(part)}: {what}. Give the path of a file.")
-    before = [_size_and_time(part) for part in parts]
+    """Raise `InputError` if a log is no regular file, or changes while it is read."""
+    if not log.is_file():
+        what = "is not a regular file" if log.exists() else "no such file"
+        raise InputError(f"{shown(log)}: {what}. Give the path of a file.")
+    before = _size_and_time(log)
     yield
-    for part, state in zip(parts, before, strict=True):
-        if _size_and_time(part) != state:
-            raise InputError(
-                f"{shown(part)}: it changed while it was read. Wait until it is complete."
-            )
-    if parts_of(log) != parts:
-        raise InputError(
-            f"{shown(log)}: files came or went while it was read. Wait until it is complete."
-        )
+    if _size_and_time(log) != before:
+        raise InputError(f"{shown(log)}: it changed while it was read. Wait until it is complete.")
 
 
 def _size_and_time(file: Path) -> tuple[int, int]:
     with file_errors(file):
         return file.stat().st_size, file.stat().st_mtime_ns
-
-
-def log_digest(log: Path) -> "hashlib._Hash":
-    """Return the SHA-256 of a file's bytes, or of those of a log's parts. Raises `InputError`."""
-    digests = []
-    for part in parts_of(log):
-        with file_errors(part), part.open("rb") as stream:
-            digests.append(hashlib.file_digest(stream, "sha256"))
-    if not log.is_dir():
-        return digests[0]
-    return hashlib.sha256(b"".join(digest.digest() for digest in digests))
 
 
 def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Source]:
