@@ -24,9 +24,9 @@ from fleet_slip.vehicle.dynamics import (
     braked_spins,
     driven_body,
     driver_brakes,
+    ideal_forces,
     rates_of,
     transferred_loads,
-    wheel_forces,
 )
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
 from fleet_slip.vehicle.parameters import Constants, Controls, State, constants, load_vehicle
@@ -48,7 +48,7 @@ class Moved(NamedTuple):
 def braked_derivative(x: State, u: Controls, brakes: Brakes, c: Constants) -> Derivative:
     """Return the rates of a car with a brake at each wheel."""
     load = transferred_loads(x, c)
-    force = wheel_forces(x, load, c)
+    force = ideal_forces(x, load, c)
     motion = driven_body(x, force, c)
     front, rear = driver_brakes(x, c)
     each = (front + brakes.fl, front + brakes.fr, rear + brakes.rl, rear + brakes.rr)

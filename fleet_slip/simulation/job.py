@@ -99,9 +99,8 @@ def lane_drive(spec: DriveSpec) -> LaneDrive:
         closed=profile.track.closed,
         surface=spec.surface(profile.station_m),
     )
-    felt = spec.distortion() is not None
     road = road_with(road, spec.script)
-    return LaneDrive(spec.vehicle, road, spec.adhesion, spec.laps, spec.flaws.car, felt)
+    return LaneDrive(spec.vehicle, road, spec.adhesion, spec.laps, spec.flaws.car)
 
 
 def check_against_highway_env(drives: Sequence[DriveSpec]) -> None:
@@ -120,7 +119,7 @@ def check_against_highway_env(drives: Sequence[DriveSpec]) -> None:
     rolling = np.maximum(drive.road.speed_mps, SLOWEST_MPS)
     slalom = Manoeuvre("slalom", 0.0, 2.0, 2.0 * spec.adhesion, 1.0)
     road = road_with(drive.road._replace(speed_mps=rolling, surface=None), [slalom])
-    perfect = replace(drive, road=road, flaws=PERFECT, felt=drive.imperfect)
+    perfect = replace(drive, road=road, flaws=PERFECT)
     require_agreement(perfect, spec.drive_id, TOLERANCE)
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +16,9 @@ from fleet_slip.vehicle.batch_kernel import (
     CHANNELS,
     DRIVE,
     FIRST,
-    IMPERFECT_CHANNELS,
     LOST_SPEED_MPS,
     NOBODY,
     ROUTE,
-    empty_blocks,
 )
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
 from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections, traits
@@ -139,13 +137,6 @@ class LaneDrive:
     laps: float
     """Length of the drive in lengths of the road."""
     flaws: CarImperfections = PERFECT
-    felt: bool = False
-    """Whether to record `IMPERFECT_CHANNELS` for its sensors, even of a perfect car and road."""
-
-    @property
-    def imperfect(self) -> bool:
-        """Whether the car, the road or the sensors are not those of the textbook."""
-        return self.felt or self.flaws != PERFECT or self.road.surface is not None
 
 
 @dataclass(frozen=True)
@@ -168,8 +159,8 @@ def simulate_blocks(
     The blocks of a drive come in order, those of different drives in any. A drive ends after its
     laps, at the end of an open road, `AFTER_LOSS` samples after the car was lost, or after
     `PATIENCE` times the planned time. Its bits depend on the drive alone, not on others, threads or
-    machine. Releases the GIL; takes at most 63 MB. Cars and roads with imperfections have a kernel
-    of their own, and `IMPERFECT_CHANNELS` too. Raises `ConfigError` for an unusable road's table.
+    machine. Releases the GIL; takes at most 76 MB. Raises `ConfigError` for an unusable road's
+    table.
     """
     for drive in drives:
         require_usable(drive.road)
@@ -177,85 +168,69 @@ def simulate_blocks(
             raise ConfigError(
                 f"adhesion {drive.adhesion} and laps {drive.laps}: give positive numbers."
             )
-    for imperfect in (False, True):
-        numbers = [i for i, drive in enumerate(drives) if drive.imperfect == imperfect]
-        alike = [drives[number] for number in numbers]
-        for block in _simulate_alike(alike, imperfect, steps_per_sample):
-            yield replace(block, drive=numbers[block.drive])
-
-
-def simulate_samples(drive: LaneDrive, samples: int) -> Iterator[tuple[Controls, State]]:
-    """Yield, sample by sample, what the kernel's driver demands and where that takes the car."""
-    simulate = batch_kernel.simulate_imperfect if drive.imperfect else batch_kernel.simulate
-    routes, roads = _routes([drive])
-    surfaces, cars = surface_table(drive.road), np.array([_car(drive)])
-    memory, book = batch_kernel.empty_lanes()
-    truth, *_ = empty_blocks(drive.imperfect)
-    batch_kernel.begin(memory, book, 0, 0, cars[0], roads[0, batch_kernel.SPEED])
-    column = memory.reshape(batch_kernel.ROWS, batch_kernel.LANES)[:, 0]
-    for sample in range(samples):
-        routes["samples"], ended = sample + 1, np.full((1, 2), NOBODY)
-        book[FIRST, 0] = sample
-        simulate(routes, cars, roads, surfaces, STEPS_PER_SAMPLE, memory, book, truth, ended)
-        demanded = column[batch_kernel.CONTROLS :][: len(Controls._fields)].tolist()
-        moved = column[batch_kernel.STATE :][: len(State._fields)].tolist()
-        yield Controls(*demanded), State(*moved)
-
-
-def _simulate_alike(
-    drives: Sequence[LaneDrive], imperfect: bool, steps_per_sample: int
-) -> Iterator[TruthBlock]:
-    """Yield the blocks of drives that are all with imperfections, or all without."""
     if not drives:
         return
-    simulate = batch_kernel.simulate_imperfect if imperfect else batch_kernel.simulate
-    routes, roads = _routes(drives)
-    surfaces = np.zeros((0, len(Surface._fields)))
-    if imperfect:  # in the order of the table of all roads
-        distinct = {id(drive.road): drive.road for drive in drives}
-        surfaces = np.concatenate([surface_table(road) for road in distinct.values()])
-    cars = np.array([_car(drive) for drive in drives])
+    routes, roads, surfaces = _routes(drives)
     waiting = np.argsort(routes["samples"], kind="stable").tolist()
     ended = np.full((len(drives), 2), NOBODY)
     memory, book = batch_kernel.empty_lanes()
-    truth, usual, further = empty_blocks(imperfect)
+    truth, blocks = batch_kernel.empty_blocks()
     while True:
         for lane in np.flatnonzero(book[DRIVE] == NOBODY)[: len(waiting)]:
-            drive = waiting.pop()
-            speed_mps = roads[routes["first"][drive], batch_kernel.SPEED]
-            batch_kernel.begin(memory, book, lane, drive, cars[drive], speed_mps)
+            number = waiting.pop()
+            speed_mps = roads[routes["first"][number], batch_kernel.SPEED]
+            batch_kernel.begin(memory, book, lane, number, _car(drives[number]), speed_mps)
         if (book[DRIVE] == NOBODY).all():
             return
-        simulate(routes, cars, roads, surfaces, steps_per_sample, memory, book, truth, ended)
-        for lane, (drive, tick, _, first) in enumerate(book.T.tolist()):
-            last = drive != NOBODY and ended[drive, batch_kernel.SAMPLES] != NOBODY
+        batch_kernel.simulate(routes, roads, surfaces, steps_per_sample, memory, book, truth, ended)
+        for lane, (number, tick, _, first) in enumerate(book.T.tolist()):
+            last = number != NOBODY and ended[number, batch_kernel.SAMPLES] != NOBODY
             if last or tick - first == BLOCK:
-                lost = int(ended[drive, batch_kernel.LOST])
-                channels = dict(zip(CHANNELS, usual[lane, :, : tick - first], strict=True))
-                if imperfect:
-                    more = further[lane, :, : tick - first]
-                    channels |= dict(zip(IMPERFECT_CHANNELS, more, strict=True))
-                yield TruthBlock(drive, channels, last, None if lost == NOBODY else lost)
+                lost = int(ended[number, batch_kernel.LOST])
+                channels = dict(zip(CHANNELS, blocks[lane, :, : tick - first], strict=True))
+                yield TruthBlock(number, channels, last, None if lost == NOBODY else lost)
                 book[FIRST, lane] = tick
             if last:
                 batch_kernel.clear(memory, book, lane)
 
 
-def _car(drive: LaneDrive) -> tuple[float, ...]:
-    return (
-        *constants(drive.vehicle, drive.adhesion),
-        *handling(drive.vehicle, math.radians(drive.flaws.steering_compliance_deg_per_kn) / 1000),
-        *traits(drive.vehicle, drive.flaws, SAMPLE_S),
+def simulate_samples(drive: LaneDrive, samples: int) -> Iterator[tuple[Controls, State]]:
+    """Yield, sample by sample, what the kernel's driver demands and where that takes the car."""
+    routes, roads, surfaces = _routes([drive])
+    memory, book = batch_kernel.empty_lanes()
+    truth, _ = batch_kernel.empty_blocks()
+    batch_kernel.begin(memory, book, 0, 0, _car(drive), roads[0, batch_kernel.SPEED])
+    column = memory.reshape(batch_kernel.ROWS, batch_kernel.LANES)[:, 0]
+    for sample in range(samples):
+        routes["samples"], ended = sample + 1, np.full((1, 2), NOBODY)
+        book[FIRST, 0] = sample
+        batch_kernel.simulate(routes, roads, surfaces, STEPS_PER_SAMPLE, memory, book, truth, ended)
+        demanded = column[batch_kernel.CONTROLS :][: len(Controls._fields)].tolist()
+        moved = column[batch_kernel.STATE :][: len(State._fields)].tolist()
+        yield Controls(*demanded), State(*moved)
+
+
+def _car(drive: LaneDrive) -> FloatArray:
+    """Return `Constants`, `Handling` and `Traits` as the kernel has them."""
+    compliance_rad_per_n = math.radians(drive.flaws.steering_compliance_deg_per_kn) / 1000
+    return np.array(
+        [
+            *constants(drive.vehicle, drive.adhesion),
+            *handling(drive.vehicle, compliance_rad_per_n),
+            *traits(drive.vehicle, drive.flaws, SAMPLE_S),
+        ]
     )
 
 
-def _routes(drives: Sequence[LaneDrive]) -> tuple[NDArray[np.void], FloatArray]:
+def _routes(drives: Sequence[LaneDrive]) -> tuple[NDArray[np.void], FloatArray, FloatArray]:
+    """Return the way of each drive, and the tables of all roads and surfaces that it points to."""
     roads = {id(drive.road): drive.road for drive in drives}
     tables = [road_table(road) for road in roads.values()]
     ends = np.cumsum([len(table) for table in tables])
     spans = dict(zip(roads, zip([0, *ends[:-1]], ends - 1, strict=True), strict=True))
     routes = np.array([_route(drive, *spans[id(drive.road)]) for drive in drives], dtype=ROUTE)
-    return routes, np.concatenate(tables)
+    surfaces = [surface_table(road) for road in roads.values()]
+    return routes, np.concatenate(tables), np.concatenate(surfaces)
 
 
 def _route(

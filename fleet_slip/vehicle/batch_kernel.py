@@ -22,16 +22,13 @@ from fleet_slip.vehicle.driver import (
     Handling,
     decide,
 )
-from fleet_slip.vehicle.dynamics import derivative
-from fleet_slip.vehicle.imperfections import (
+from fleet_slip.vehicle.dynamics import (
     Around,
     Give,
     GiveRates,
     Traits,
-    advance_give,
+    front_wheels,
     imperfect_derivative,
-    rack_tangent,
-    wheel_tangent,
 )
 from fleet_slip.vehicle.integration import (
     SECOND_ORDER,
@@ -40,6 +37,7 @@ from fleet_slip.vehicle.integration import (
     PoseSlopes,
     Slopes,
     advance,
+    advance_give,
     advance_pose,
     pose_slopes,
 )
@@ -50,8 +48,6 @@ from fleet_slip.vehicle.tyre import arctan2
 #
 # Every quantity is a row of `LANES` numbers in one flat array, at offsets known when compiling:
 # loops over lanes become vector instructions. Blocks are measured from the processor's cache.
-#
-# The physics of the lane kernel: what is around all cars, and how they move on by a step.
 
 LANES = 8
 """Lanes of the kernel: one or two of a processor's vectors."""
@@ -140,19 +136,18 @@ CONTROLS = POSE_SLOPES + len(PoseSlopes._fields)
 PATH = CONTROLS + len(Controls._fields)
 FORCE = PATH + len(Path._fields)
 """Specific force ax, ay at the sample."""
-ORDER = FORCE + 2
+ANGLES = FORCE + 2
+"""Angles of the front wheels, and the side-slip angle, at the sample."""
+ORDER = ANGLES + 3
 """Extrapolation of the integration: 0 in a drive's first step."""
 CAR = ORDER + 1
 HANDLING = CAR + len(Constants._fields)
 TRAITS = HANDLING + len(Handling._fields)
-"""From here on only cars with imperfections use the memory."""
 AROUND = TRAITS + len(Traits._fields)
 GIVE = AROUND + len(Around._fields)
 GIVE_SLOPES = GIVE + len(Give._fields)
 ROWS = GIVE_SLOPES + len(GiveRates._fields)
 
-STEER = Constants._fields.index("steer_per_wheel")
-ACKERMANN = Constants._fields.index("ackermann")
 INVERSE_RADIUS = Constants._fields.index("inverse_radius")
 
 
@@ -198,11 +193,12 @@ CHANNELS = (
     "vy_mps",
     "station_m",
     "lateral_offset_m",
+    "yaw_acceleration_rad_s2",
+    "leaning_ax_mps2",
+    "leaning_ay_mps2",
 )
-
-IMPERFECT_CHANNELS = ("yaw_acceleration_rad_s2", "leaning_ax_mps2", "leaning_ay_mps2")
-"""What a lane records besides of a car with imperfections, for its sensors: how the body begins to
-turn, and the accelerations as its pitch and roll have followed them."""
+"""What a lane records; the last three for sensors: how the body begins to turn, and the
+accelerations as its pitch and roll have followed them."""
 
 BLOCK = 2**16
 """Samples of a block: 11 minutes of a drive."""
@@ -211,18 +207,11 @@ STRIDE = BLOCK + 8
 """Distance between two channels of a block: with a power of two all channels would share the same
 few lines of the processor's cache."""
 
-BLOCK_SHAPE = (LANES, len(CHANNELS), STRIDE)
 
-
-IMPERFECT_BLOCK_SHAPE = (LANES, len(IMPERFECT_CHANNELS), STRIDE)
-
-
-def empty_blocks(imperfect: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return memory for the blocks of all lanes, flat, and its two parts in their shapes."""
-    usual = LANES * len(CHANNELS) * STRIDE
-    memory = np.empty(usual + (LANES * len(IMPERFECT_CHANNELS) * STRIDE if imperfect else 0))
-    more = memory[usual:].reshape(IMPERFECT_BLOCK_SHAPE if imperfect else (LANES, 0, STRIDE))
-    return memory, memory[:usual].reshape(BLOCK_SHAPE), more
+def empty_blocks() -> tuple[FloatArray, FloatArray]:
+    """Return memory for the blocks of all lanes, flat, and in its shape (lane, channel, sample)."""
+    memory = np.empty(LANES * len(CHANNELS) * STRIDE)
+    return memory, memory.reshape(LANES, len(CHANNELS), STRIDE)
 
 
 @equation
@@ -230,133 +219,6 @@ def at(lane: int, channel: int, sample: int) -> int:
     """Return where a sample of a channel stands in the blocks."""
     return (lane * len(CHANNELS) + channel) * STRIDE + sample
 
-
-@equation
-def further_at(lane: int, channel: int, sample: int) -> int:
-    """Return where a sample of one of `IMPERFECT_CHANNELS` stands in the blocks."""
-    start = LANES * len(CHANNELS) * STRIDE
-    return start + (lane * len(IMPERFECT_CHANNELS) + channel) * STRIDE + sample
-
-
-@equation
-def record(truth: Any, lane: int, sample: int, x: State, pose: Pose) -> None:
-    """Write the sample that begins here, but for the specific force, which the next step gives."""
-    truth[at(lane, 2, sample)] = x.yaw_rate
-    truth[at(lane, 3, sample)] = x.steering_wheel
-    truth[at(lane, 4, sample)] = x.wheel_fl
-    truth[at(lane, 5, sample)] = x.wheel_fr
-    truth[at(lane, 6, sample)] = x.wheel_rl
-    truth[at(lane, 7, sample)] = x.wheel_rr
-    truth[at(lane, 11, sample)] = x.vx
-    truth[at(lane, 12, sample)] = x.vy
-    truth[at(lane, 13, sample)] = pose.station
-    truth[at(lane, 14, sample)] = pose.offset
-
-
-@equation
-def fill_recorded_angles(left: Any, right: Any, vx: Any, vy: Any, slip: Any) -> None:
-    """Fill in the angles of a block in which the wheels' tangents stand instead of their angles."""
-    for tick in range(len(left)):
-        left[tick] = arctan2(left[tick], 1.0)
-    for tick in range(len(right)):
-        right[tick] = arctan2(right[tick], 1.0)
-    for tick in range(len(slip)):
-        slip[tick] = arctan2(vy[tick], vx[tick])
-
-
-@equation
-def fill_angles(wheel: Any, left: Any, right: Any, vx: Any, vy: Any, slip: Any, car: Any) -> None:
-    """Fill in the road wheels' angles and the side-slip angle of a block."""
-    steer, ackermann = car[STEER], car[ACKERMANN]
-    for tick in range(len(wheel)):
-        tangent = steer * wheel[tick]
-        left[tick] = arctan2(tangent, 1.0 - ackermann * tangent)
-    for tick in range(len(wheel)):
-        tangent = steer * wheel[tick]
-        right[tick] = arctan2(tangent, 1.0 + ackermann * tangent)
-    for tick in range(len(wheel)):
-        slip[tick] = arctan2(vy[tick], vx[tick])
-
-
-@equation
-def _wheel_tangents(give: Give, c: Constants, t: Traits) -> tuple[float, float]:
-    tangent = rack_tangent(give, c, t)
-    bend = c.ackermann * tangent
-    along_l, across_l = wheel_tangent(tangent, 1.0 - bend, -t.toe)
-    along_r, across_r = wheel_tangent(tangent, 1.0 + bend, t.toe)
-    return across_l / along_l, across_r / along_r
-
-
-@equation
-def look_around(memory: Any, book: Any, routes: Any, surfaces: Any, truth: Any) -> None:
-    """Look up road and air where all cars are, warm their tyres, and record what sensors feel."""
-    for lane in range(LANES):
-        drive = book[DRIVE, lane]
-        if drive != NOBODY:
-            x = read(memory, STATE, lane, State)
-            pose = read(memory, POSE, lane, Pose)
-            t = read(memory, TRAITS, lane, Traits)
-            near = read(memory, AROUND, lane, Around)
-            here, share = place(routes[drive], pose.station)
-            for column in range(5):
-                before, after = surfaces[here, column], surfaces[here + 1, column]
-                memory[(AROUND + column) * LANES + lane] = before + share * (after - before)
-            memory[(AROUND + 5) * LANES + lane] = 1.0 + (near.stiffness - 1.0) * t.cooling
-            c = read(memory, CAR, lane, Constants)
-            give = read(memory, GIVE, lane, Give)
-            left, right = _wheel_tangents(give, c, t)
-            sample = book[TICK, lane] - book[FIRST, lane]
-            truth[at(lane, 8, sample)] = left
-            truth[at(lane, 9, sample)] = right
-            truth[further_at(lane, 0, sample)] = read(memory, SLOPES, lane, Slopes).yaw_rate
-            truth[further_at(lane, 1, sample)] = x.ax_lag
-            truth[further_at(lane, 2, sample)] = x.ay_lag
-
-
-def _build_integrate(imperfect: bool) -> Callable[[Any, float, bool], None]:
-    @equation
-    def integrate(memory: Any, step_s: float, first_step: bool) -> None:
-        """Move all cars on; keep the specific force at the first step of a sample."""
-        for lane in range(LANES):
-            x = read(memory, STATE, lane, State)
-            u = read(memory, CONTROLS, lane, Controls)
-            c = read(memory, CAR, lane, Constants)
-            pose = read(memory, POSE, lane, Pose)
-            path = read(memory, PATH, lane, Path)
-            order = memory[ORDER * LANES + lane]
-            if imperfect:
-                t = read(memory, TRAITS, lane, Traits)
-                around = read(memory, AROUND, lane, Around)
-                give = read(memory, GIVE, lane, Give)
-                d, give_rates = imperfect_derivative(x, u, give, around, c, t)
-            else:
-                d = derivative(x, u, c)
-            after, slopes = advance(x, d, read(memory, SLOPES, lane, Slopes), c, step_s, order)
-            if imperfect:
-                before = read(memory, GIVE_SLOPES, lane, GiveRates)
-                followed = advance_give(
-                    give, give_rates, before, after.steering_wheel, t, step_s, order
-                )
-            pose_before = read(memory, POSE_SLOPES, lane, PoseSlopes)
-            travel = pose_slopes(x, pose, path)
-            ax = d.ax if first_step else memory[FORCE * LANES + lane]
-            ay = d.ay if first_step else memory[(FORCE + 1) * LANES + lane]
-            write(memory, STATE, lane, after)
-            write(memory, SLOPES, lane, slopes)
-            if imperfect:
-                write(memory, GIVE, lane, followed)
-                write(memory, GIVE_SLOPES, lane, give_rates)
-            write(memory, POSE, lane, advance_pose(pose, travel, pose_before, step_s, order))
-            write(memory, POSE_SLOPES, lane, travel)
-            write(memory, FORCE, lane, (ax, ay))
-            memory[ORDER * LANES + lane] = SECOND_ORDER
-
-    return integrate
-
-
-integrate = _build_integrate(imperfect=False)
-
-integrate_imperfect = _build_integrate(imperfect=True)
 
 AFTER_LOSS = 500
 """Samples that a drive goes on after the driver lost the car: 5 s."""
@@ -373,9 +235,10 @@ SAMPLES, LOST = range(2)
 
 
 @equation
-def _look_up(roads: Any, route: Any, x: State, station: float, lost: bool) -> Path:
-    """Return what the driver sees of the road from a station."""
-    here, share = place(route, station)
+def _look_up(
+    roads: Any, route: Any, x: State, station: float, here: int, share: float, lost: bool
+) -> Path:
+    """Return what the driver sees of the road from a station, `share` of the way after `here`."""
     curvature = roads[here, CURVATURE]
     change = roads[here + 1, CURVATURE] - curvature
     ahead, part = place(route, station + STEERING_PREVIEW_S * x.vx)
@@ -392,16 +255,14 @@ def _look_up(roads: Any, route: Any, x: State, station: float, lost: bool) -> Pa
 
 
 @equation
-def _decide(memory: Any) -> None:
-    """Let all drivers decide."""
-    for lane in range(LANES):
-        x = read(memory, STATE, lane, State)
-        pose = read(memory, POSE, lane, Pose)
-        path = read(memory, PATH, lane, Path)
-        before = read(memory, CONTROLS, lane, Controls)
-        h = read(memory, HANDLING, lane, Handling)
-        c = read(memory, CAR, lane, Constants)
-        write(memory, CONTROLS, lane, decide(x, pose, path, before, h, c))
+def _look_around(memory: Any, lane: int, surfaces: Any, here: int, share: float) -> None:
+    """Look up road and air where a car is, and warm its tyres."""
+    for column in range(5):
+        before, after = surfaces[here, column], surfaces[here + 1, column]
+        memory[(AROUND + column) * LANES + lane] = before + share * (after - before)
+    cooling = read(memory, TRAITS, lane, Traits).cooling
+    stiffness = (AROUND + 5) * LANES + lane
+    memory[stiffness] = 1.0 + (memory[stiffness] - 1.0) * cooling
 
 
 @equation
@@ -415,8 +276,10 @@ def _has_lost(x: State, pose: Pose) -> bool:
 
 
 @equation
-def _look(memory: Any, book: Any, routes: Any, roads: Any, truth: Any, ended: Any) -> None:
-    """Record where all cars are and look up the road before them."""
+def _look(
+    memory: Any, book: Any, routes: Any, roads: Any, surfaces: Any, truth: Any, ended: Any
+) -> None:
+    """Record where all cars are, but for what the next step gives, and look up their roads."""
     for lane in range(LANES):
         drive, tick = book[DRIVE, lane], book[TICK, lane]
         if drive != NOBODY:
@@ -424,9 +287,74 @@ def _look(memory: Any, book: Any, routes: Any, roads: Any, truth: Any, ended: An
             pose = read(memory, POSE, lane, Pose)
             if ended[drive, LOST] == NOBODY and _has_lost(x, pose):
                 ended[drive, LOST] = tick
-            record(truth, lane, tick - book[FIRST, lane], x, pose)
-            lost = ended[drive, LOST] != NOBODY
-            write(memory, PATH, lane, _look_up(roads, routes[drive], x, pose.station, lost))
+            sample = tick - book[FIRST, lane]
+            truth[at(lane, 2, sample)] = x.yaw_rate
+            truth[at(lane, 3, sample)] = x.steering_wheel
+            truth[at(lane, 4, sample)] = x.wheel_fl
+            truth[at(lane, 5, sample)] = x.wheel_fr
+            truth[at(lane, 6, sample)] = x.wheel_rl
+            truth[at(lane, 7, sample)] = x.wheel_rr
+            truth[at(lane, 11, sample)] = x.vx
+            truth[at(lane, 12, sample)] = x.vy
+            truth[at(lane, 13, sample)] = pose.station
+            truth[at(lane, 14, sample)] = pose.offset
+            truth[at(lane, 15, sample)] = read(memory, SLOPES, lane, Slopes).yaw_rate
+            truth[at(lane, 16, sample)] = x.ax_lag
+            truth[at(lane, 17, sample)] = x.ay_lag
+            route, lost = routes[drive], ended[drive, LOST] != NOBODY
+            here, share = place(route, pose.station)
+            path = _look_up(roads, route, x, pose.station, here, share, lost)
+            write(memory, PATH, lane, path)
+            _look_around(memory, lane, surfaces, here, share)
+
+
+@equation
+def decide_all(memory: Any) -> None:
+    """Let all drivers decide, and note the angles at the sample."""
+    for lane in range(LANES):
+        x = read(memory, STATE, lane, State)
+        pose = read(memory, POSE, lane, Pose)
+        path = read(memory, PATH, lane, Path)
+        before = read(memory, CONTROLS, lane, Controls)
+        h = read(memory, HANDLING, lane, Handling)
+        c = read(memory, CAR, lane, Constants)
+        t = read(memory, TRAITS, lane, Traits)
+        give = read(memory, GIVE, lane, Give)
+        (along_l, across_l), (along_r, across_r) = front_wheels(give, c, t)
+        angles = arctan2(across_l, along_l), arctan2(across_r, along_r), arctan2(x.vy, x.vx)
+        write(memory, ANGLES, lane, angles)
+        write(memory, CONTROLS, lane, decide(x, pose, path, before, h, c))
+
+
+@equation
+def integrate(memory: Any, step_s: float, first_step: bool) -> None:
+    """Move all cars on; keep the specific force at the first step of a sample."""
+    for lane in range(LANES):
+        x = read(memory, STATE, lane, State)
+        u = read(memory, CONTROLS, lane, Controls)
+        c = read(memory, CAR, lane, Constants)
+        t = read(memory, TRAITS, lane, Traits)
+        pose = read(memory, POSE, lane, Pose)
+        path = read(memory, PATH, lane, Path)
+        around = read(memory, AROUND, lane, Around)
+        give = read(memory, GIVE, lane, Give)
+        order = memory[ORDER * LANES + lane]
+        d, rates = imperfect_derivative(x, u, give, around, c, t)
+        after, slopes = advance(x, d, read(memory, SLOPES, lane, Slopes), c, step_s, order)
+        before = read(memory, GIVE_SLOPES, lane, GiveRates)
+        given = advance_give(give, rates, before, after.steering_wheel, t, step_s, order)
+        pose_before = read(memory, POSE_SLOPES, lane, PoseSlopes)
+        travel = pose_slopes(x, pose, path)
+        ax = d.ax if first_step else memory[FORCE * LANES + lane]
+        ay = d.ay if first_step else memory[(FORCE + 1) * LANES + lane]
+        write(memory, STATE, lane, after)
+        write(memory, SLOPES, lane, slopes)
+        write(memory, GIVE, lane, given)
+        write(memory, GIVE_SLOPES, lane, rates)
+        write(memory, POSE, lane, advance_pose(pose, travel, pose_before, step_s, order))
+        write(memory, POSE_SLOPES, lane, travel)
+        write(memory, FORCE, lane, (ax, ay))
+        memory[ORDER * LANES + lane] = SECOND_ORDER
 
 
 @equation
@@ -440,6 +368,8 @@ def _move_on(memory: Any, book: Any, routes: Any, truth: Any, ended: Any) -> int
             sample = tick - book[FIRST, lane]
             truth[at(lane, 0, sample)] = memory[FORCE * LANES + lane]
             truth[at(lane, 1, sample)] = memory[(FORCE + 1) * LANES + lane]
+            for angle in range(3):
+                truth[at(lane, 8 + angle, sample)] = memory[(ANGLES + angle) * LANES + lane]
             station = memory[POSE * LANES + lane]
             gone = book[LAP, lane] * route.length_m + station
             if route.closed:
@@ -457,63 +387,26 @@ def _move_on(memory: Any, book: Any, routes: Any, truth: Any, ended: Any) -> int
     return complete
 
 
-@equation
-def _finish(truth: Any, book: Any, ended: Any, cars: Any, imperfect: bool) -> None:
-    """Fill in what follows from the recorded in the blocks that are complete."""
-    for lane in range(LANES):
-        drive, samples = book[DRIVE, lane], book[TICK, lane] - book[FIRST, lane]
-        if drive != NOBODY and (samples == BLOCK or ended[drive, SAMPLES] != NOBODY):
-            wheel = truth[at(lane, 3, 0) :][:samples]
-            left, right = truth[at(lane, 8, 0) :][:samples], truth[at(lane, 9, 0) :][:samples]
-            slip = truth[at(lane, 10, 0) :][:samples]
-            vx, vy = truth[at(lane, 11, 0) :][:samples], truth[at(lane, 12, 0) :][:samples]
-            if imperfect:
-                fill_recorded_angles(left, right, vx, vy, slip)
-            else:
-                fill_angles(wheel, left, right, vx, vy, slip, cars[drive])
+@kernel
+def simulate(
+    routes: Any,
+    roads: Any,
+    surfaces: Any,
+    steps: int,
+    memory: Any,
+    book: Any,
+    truth: Any,
+    ended: Any,
+) -> None:
+    """Drive on, from sample to sample, until a lane's block is complete; some lane has a drive.
 
-
-def build_kernel(imperfect: bool = False) -> Callable[..., None]:
-    """Return the kernel, not yet compiled: of cars as in the textbook, or with imperfections.
-
-    Its closure is part of numba's key on disk. A compiled function in it would have another
-    identity in each process, and never be found.
+    `routes` (`ROUTE`) point into `roads` and `surfaces`; a sample takes `steps` steps; `truth` is
+    of `empty_blocks`; `ended` gets each drive's number of samples and tick of loss.
     """
-
-    def simulate(
-        routes: Any,
-        cars: Any,
-        roads: Any,
-        surfaces: Any,
-        steps: int,
-        memory: Any,
-        book: Any,
-        truth: Any,
-        ended: Any,
-    ) -> None:
-        """Drive on, from sample to sample, until a lane's block is complete; some lane has a drive.
-
-        `routes` (`ROUTE`) point into `roads` and `surfaces`; `cars` has `Constants`, `Handling` and
-        `Traits` in rows; a sample takes `steps` steps; `truth` is of `empty_blocks`; `ended` gets
-        each drive's number of samples and tick of loss.
-        """
-        complete = 0
-        while complete == 0:
-            _look(memory, book, routes, roads, truth, ended)
-            if imperfect:
-                look_around(memory, book, routes, surfaces, truth)
-            _decide(memory)
-            for step in range(steps):
-                if imperfect:
-                    integrate_imperfect(memory, SAMPLE_S / steps, step == 0)
-                else:
-                    integrate(memory, SAMPLE_S / steps, step == 0)
-            complete = _move_on(memory, book, routes, truth, ended)
-        _finish(truth, book, ended, cars, imperfect)
-
-    return simulate
-
-
-simulate = kernel(build_kernel())
-
-simulate_imperfect = kernel(build_kernel(imperfect=True))
+    complete = 0
+    while complete == 0:
+        _look(memory, book, routes, roads, surfaces, truth, ended)
+        decide_all(memory)
+        for step in range(steps):
+            integrate(memory, SAMPLE_S / steps, step == 0)
+        complete = _move_on(memory, book, routes, truth, ended)

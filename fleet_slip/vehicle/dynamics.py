@@ -1,8 +1,8 @@
-"""Equations of motion of a car with four wheels, for highway-env's class and the lane kernel.
+"""Equations of motion of a car with four wheels, on a road that need not be flat, even and calm.
 
-Symbols, sources and limits: `docs/vehicle.md`.
-
-The four wheels: where they point, what they carry, their forces on the car and their spin.
+Steering may give way, wheels differ and tyres lag; weight and wind act along the road. Symbols,
+sources and limits: `docs/vehicle.md`; of what a real car has beyond the textbook's,
+`docs/simulator.md`.
 """
 
 import math
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from fleet_slip.compiling import equation
 from fleet_slip.vehicle.parameters import Constants, Controls, State
-from fleet_slip.vehicle.tyre import TyreForce, brush_force
+from fleet_slip.vehicle.tyre import CREEP_SPEED_MPS, TyreForce, brush_force
 
 SMALLEST_LOAD_N = 1.0
 """Load of a wheel that has lifted: it gives no force and divides nothing by zero."""
@@ -20,6 +20,75 @@ STICTION_RAD_S = 0.1
 
 SLOWEST_DRIVE_MPS = 1.0
 """Speed below which the engine's power no longer limits its force."""
+
+
+class Traits(NamedTuple):
+    """The imperfections of a car as its equations take them, in SI units."""
+
+    half_lash: float
+    compliance: float
+    """Tangent of the road wheels' angle lost per lateral force of the front axle."""
+    toe: float
+    """Tangent of the front wheels' toe-in."""
+    rear_left: float
+    """Tangent of the rear left wheel's angle."""
+    rear_right: float
+    radius_fl: float
+    """At the load at rest."""
+    radius_fr: float
+    radius_rl: float
+    radius_rr: float
+    radius_loss: float
+    relaxes: float
+    """1 where the tyres have a relaxation length, else 0."""
+    inverse_relaxation: float
+    cold_stiffness: float
+    cooling: float
+    """Share of the cold tyres' excess of stiffness that is left after a sample."""
+    wind_force: float
+    """Lateral acceleration per speed and cross-wind, in 1/m."""
+    wind_moment: float
+    """Yaw acceleration per speed and cross-wind, in 1/m²."""
+
+
+class Around(NamedTuple):
+    """The road and the air where the car is, and how warm its tyres are."""
+
+    gravity_x: float
+    """Weight per mass along the road, in m/s²; negative uphill."""
+    gravity_y: float
+    """Weight per mass across the road to the left, in m/s²."""
+    grip_left: float
+    """Adhesion under the left wheels over that of the drive."""
+    grip_right: float
+    wind: float
+    """Speed of the air across the car to the left, in m/s."""
+    stiffness: float
+    """Cornering stiffness over that of warm tyres."""
+
+
+class Give(NamedTuple):
+    """What follows the car with a delay of its own."""
+
+    rack: float
+    """Angle of the steering wheel that the rack has followed, in rad."""
+    rack_force: float
+    """Lateral force of the front axle as the steering has given way to it, in N."""
+    side_fl: float
+    """Lateral velocity of a wheel as its tyre has followed it, in m/s."""
+    side_fr: float
+    side_rl: float
+    side_rr: float
+
+
+class GiveRates(NamedTuple):
+    """Rates of `Give`; the rack has none, its play is taken up at once."""
+
+    rack_force: float
+    side_fl: float
+    side_fr: float
+    side_rl: float
+    side_rr: float
 
 
 class Loads(NamedTuple):
@@ -88,10 +157,6 @@ class Direction(NamedTuple):
     sine: float
 
 
-AHEAD = Direction(1.0, 0.0)
-"""Where a wheel points that is not steered."""
-
-
 @equation
 def direction_of(along: float, across: float) -> Direction:
     """Return the direction of a vector with `along` > 0."""
@@ -100,14 +165,21 @@ def direction_of(along: float, across: float) -> Direction:
 
 
 @equation
-def ackermann(x: State, c: Constants) -> tuple[Direction, Direction]:
-    """Return where the left and right front wheel point: tangents t / (1 ∓ t w / (2 L)).
+def front_wheels(
+    give: Give, c: Constants, t: Traits
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return (along, across) of the left and right front wheel: tangents t / (1 ∓ t w / (2 L)).
 
-    t is the tangent of the steering wheel's angle over the ratio; both stand square to one centre.
+    t is the tangent of the rack's angle over the ratio, less where the steering gives way; without
+    their toe both stand square to one centre.
     """
-    tangent = c.steer_per_wheel * x.steering_wheel
+    tangent = c.steer_per_wheel * give.rack - t.compliance * give.rack_force
     nearer = c.ackermann * tangent
-    return direction_of(1.0 - nearer, tangent), direction_of(1.0 + nearer, tangent)
+    left, right = 1.0 - nearer, 1.0 + nearer
+    return (
+        (left + t.toe * tangent, tangent - t.toe * left),
+        (right - t.toe * tangent, tangent + t.toe * right),
+    )
 
 
 @equation
@@ -140,27 +212,71 @@ def in_car_frame(force: TyreForce, to: Direction) -> WheelForce:
 
 @equation
 def _wheel_force(
-    vx: float, vy: float, to: Direction, spin: float, load: float, peak: float, c: Constants
-) -> WheelForce:
+    vx: float,
+    vy: float,
+    followed_side: float,
+    to: Direction,
+    rolling: float,
+    load: float,
+    peak: float,
+    grip: float,
+    c: Constants,
+    t: Traits,
+) -> tuple[WheelForce, float]:
+    """Return the force of a wheel, and how its tyre follows by its relaxation length.
+
+    Pacejka 2012, 7.2.
+    """
     cosine, sine = to
     along = cosine * vx + sine * vy
     across = cosine * vy - sine * vx
-    return in_car_frame(brush_force(along, across, c.radius * spin, load, peak, c), to)
+    felt = across + t.relaxes * (followed_side - across)
+    force = brush_force(along, felt, rolling, load, peak, c, grip)
+    speed = max(abs(rolling), CREEP_SPEED_MPS)
+    return in_car_frame(force, to), speed * t.inverse_relaxation * (across - followed_side)
 
 
 @equation
-def wheel_forces(x: State, load: Loads, c: Constants) -> WheelForces:
-    """Return the forces of the wheels: brush tyres in the frame of each."""
-    left, right = ackermann(x, c)
+def wheel_forces(
+    x: State, give: Give, around: Around, load: Loads, c: Constants, t: Traits
+) -> tuple[WheelForces, GiveRates]:
+    """Return the forces of the wheels, brush tyres in the frame of each, and how the car gives."""
+    to_left, to_right = front_wheels(give, c, t)
+    left, right = direction_of(*to_left), direction_of(*to_right)
+    rear_left, rear_right = direction_of(1.0, t.rear_left), direction_of(1.0, t.rear_right)
     front, rear = x.vy + c.front * x.yaw_rate, x.vy - c.rear * x.yaw_rate
     turn_f, turn_r = c.half_track_front * x.yaw_rate, c.half_track_rear * x.yaw_rate
-    peak_f, peak_r = c.stiffness_front, c.stiffness_rear
-    return WheelForces(
-        _wheel_force(x.vx - turn_f, front, left, x.wheel_fl, load.fl, peak_f, c),
-        _wheel_force(x.vx + turn_f, front, right, x.wheel_fr, load.fr, peak_f, c),
-        _wheel_force(x.vx - turn_r, rear, AHEAD, x.wheel_rl, load.rl, peak_r, c),
-        _wheel_force(x.vx + turn_r, rear, AHEAD, x.wheel_rr, load.rr, peak_r, c),
+    peak_f, peak_r = around.stiffness * c.stiffness_front, around.stiffness * c.stiffness_rear
+    roll_fl = (t.radius_fl - t.radius_loss * (load.fl - c.static_front)) * x.wheel_fl
+    roll_fr = (t.radius_fr - t.radius_loss * (load.fr - c.static_front)) * x.wheel_fr
+    roll_rl = (t.radius_rl - t.radius_loss * (load.rl - c.static_rear)) * x.wheel_rl
+    roll_rr = (t.radius_rr - t.radius_loss * (load.rr - c.static_rear)) * x.wheel_rr
+    grip_l, grip_r = around.grip_left, around.grip_right
+    fl, side_fl = _wheel_force(
+        x.vx - turn_f, front, give.side_fl, left, roll_fl, load.fl, peak_f, grip_l, c, t
     )
+    fr, side_fr = _wheel_force(
+        x.vx + turn_f, front, give.side_fr, right, roll_fr, load.fr, peak_f, grip_r, c, t
+    )
+    rl, side_rl = _wheel_force(
+        x.vx - turn_r, rear, give.side_rl, rear_left, roll_rl, load.rl, peak_r, grip_l, c, t
+    )
+    rr, side_rr = _wheel_force(
+        x.vx + turn_r, rear, give.side_rr, rear_right, roll_rr, load.rr, peak_r, grip_r, c, t
+    )
+    yielding = (fl.y + fr.y - give.rack_force) * c.inverse_steering_lag
+    return WheelForces(fl, fr, rl, rr), GiveRates(yielding, side_fl, side_fr, side_rl, side_rr)
+
+
+@equation
+def ideal_forces(x: State, load: Loads, c: Constants) -> WheelForces:
+    """Return the forces of the wheels of the textbook's car on a flat, even and calm road."""
+    rigid = Give(x.steering_wheel, 0.0, 0.0, 0.0, 0.0, 0.0)
+    calm = Around(0.0, 0.0, 1.0, 1.0, 0.0, 1.0)
+    r = c.radius
+    ideal = Traits(0.0, 0.0, 0.0, 0.0, 0.0, r, r, r, r, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    forces, _ = wheel_forces(x, rigid, calm, load, c, ideal)
+    return forces
 
 
 @equation
@@ -275,8 +391,27 @@ def rates_of(
 
 @equation
 def derivative(x: State, u: Controls, c: Constants) -> Derivative:
-    """Return the equations of motion, a pure function of (state, controls, constants)."""
+    """Return the equations of motion of the textbook's car, a pure function of its arguments."""
     load = transferred_loads(x, c)
-    force = wheel_forces(x, load, c)
+    force = ideal_forces(x, load, c)
     motion = driven_body(x, force, c)
     return rates_of(x, u, motion, driven_spins(x, force, load, c), c)
+
+
+@equation
+def imperfect_derivative(
+    x: State, u: Controls, give: Give, around: Around, c: Constants, t: Traits
+) -> tuple[Derivative, GiveRates]:
+    """Return the rates of a car with imperfections; accelerometers feel wind, not weight."""
+    load = transferred_loads(x, c)
+    force, give_rates = wheel_forces(x, give, around, load, c, t)
+    still = driven_body(x, force, c)
+    push = x.vx * around.wind
+    motion = Acceleration(
+        still.ax,
+        still.ay + t.wind_force * push,
+        still.vx + around.gravity_x,
+        still.vy + t.wind_force * push + around.gravity_y,
+        still.yaw_rate + t.wind_moment * push,
+    )
+    return rates_of(x, u, motion, driven_spins(x, force, load, c), c), give_rates

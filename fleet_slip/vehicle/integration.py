@@ -8,7 +8,7 @@ its heading a unit vector: no search, no angle.
 from typing import NamedTuple
 
 from fleet_slip.compiling import equation
-from fleet_slip.vehicle.dynamics import Derivative, WheelRate
+from fleet_slip.vehicle.dynamics import Derivative, Give, GiveRates, Traits, WheelRate
 from fleet_slip.vehicle.parameters import Constants, State
 
 STEP_S = 0.002
@@ -104,6 +104,27 @@ def advance(
         rr,
     )
     return after, slopes
+
+
+@equation
+def advance_give(
+    give: Give,
+    d: GiveRates,
+    before: GiveRates,
+    column: float,
+    t: Traits,
+    step: float,
+    extrapolation: float,
+) -> Give:
+    """Return what follows the car after a step; the rack rests within the play, else goes along."""
+    return Give(
+        min(max(give.rack, column - t.half_lash), column + t.half_lash),
+        give.rack_force + step * extrapolate(d.rack_force, before.rack_force, extrapolation),
+        give.side_fl + step * extrapolate(d.side_fl, before.side_fl, extrapolation),
+        give.side_fr + step * extrapolate(d.side_fr, before.side_fr, extrapolation),
+        give.side_rl + step * extrapolate(d.side_rl, before.side_rl, extrapolation),
+        give.side_rr + step * extrapolate(d.side_rr, before.side_rr, extrapolation),
+    )
 
 
 LEAST_RADIUS_SHARE = 0.2

@@ -6,7 +6,7 @@ import pytest
 from fleet_slip.arrays import FloatArray
 from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
 from fleet_slip.simulation.sensors import Delay, Distortion, LowPass, Pulses, Wander
-from fleet_slip.vehicle.batch_kernel import CHANNELS, IMPERFECT_CHANNELS
+from fleet_slip.vehicle.batch_kernel import CHANNELS
 from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections
 
 TICKS = 3000
@@ -15,7 +15,7 @@ TIME_S = np.arange(TICKS) / 100
 
 def truth(**changes: FloatArray | float) -> dict[str, FloatArray]:
     """Return a straight drive at 20 m/s, with changes."""
-    usual = {name: np.zeros(TICKS) for name in (*CHANNELS, *IMPERFECT_CHANNELS)}
+    usual = {name: np.zeros(TICKS) for name in CHANNELS}
     usual |= {"vx_mps": np.full(TICKS, 20.0)}
     usual |= {f"wheel_{w}_rad_s": np.full(TICKS, 60.0) for w in ("fl", "fr", "rl", "rr")}
     return usual | {name: np.zeros(TICKS) + value for name, value in changes.items()}

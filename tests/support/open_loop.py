@@ -7,17 +7,16 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.vehicle.driver import SAMPLE_S, SPEED_GAIN_1PS
-from fleet_slip.vehicle.dynamics import Derivative
-from fleet_slip.vehicle.imperfections import (
-    Around,
-    CarImperfections,
-    Give,
-    GiveRates,
+from fleet_slip.vehicle.dynamics import Around, Give, GiveRates, imperfect_derivative
+from fleet_slip.vehicle.imperfections import CarImperfections, traits
+from fleet_slip.vehicle.integration import (
+    FIRST_ORDER,
+    SECOND_ORDER,
+    STEP_S,
+    Slopes,
+    advance,
     advance_give,
-    imperfect_derivative,
-    traits,
 )
-from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
 from fleet_slip.vehicle.parameters import (
     GRAVITY_MPS2,
     Controls,
@@ -39,13 +38,6 @@ class Response(NamedTuple):
     sideslip_rad: FloatArray
     ay_mps2: FloatArray
     vx_mps: FloatArray
-
-
-@kernel
-def imperfect_rates(
-    x: State, u: Controls, give: Give, around: Around, c: Any, t: Any
-) -> tuple[Derivative, GiveRates]:
-    return imperfect_derivative(x, u, give, around, c, t)
 
 
 @kernel

@@ -32,6 +32,9 @@ class Truth:
     station_m: FloatArray
     """Distance along the road within the lap."""
     lateral_offset_m: FloatArray
+    yaw_acceleration_rad_s2: FloatArray
+    leaning_ax_mps2: FloatArray
+    leaning_ay_mps2: FloatArray
     lost_control_tick: int | None
     """First tick at which the driver had lost the car; None where he never did."""
 

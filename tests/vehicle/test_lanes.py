@@ -247,7 +247,7 @@ def test_the_inner_loop_is_vector_instructions_without_fused_operations() -> Non
     """On x86-64 with AVX: the physics divides in whole vectors, and no operation is fused."""
 
     def loops(memory: Any) -> None:  # those of the kernel over all lanes
-        batch_kernel._decide(memory)
+        batch_kernel.decide_all(memory)
         batch_kernel.integrate(memory, 0.002, True)
 
     fresh = inner_loop(loops)
