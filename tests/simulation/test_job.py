@@ -99,7 +99,7 @@ def broken_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def skewed(*arguments: Any) -> None:
         simulate(*arguments)
-        arguments[5][batch_kernel.STATE * batch_kernel.LANES] *= 1 + 1e-8  # vx of the first lane
+        arguments[4][batch_kernel.STATE * batch_kernel.LANES] *= 1 + 1e-8  # vx of the first lane
 
     monkeypatch.setattr(batch_kernel, "simulate", skewed)
 
