@@ -37,7 +37,6 @@ from fleet_slip.ingest.columns import (
     TimeBase,
     require_satellites,
     split_components,
-    text_conditions,
 )
 from fleet_slip.ingest.formats.can import CanBus, read_can_database
 from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers
@@ -173,17 +172,15 @@ class Mapping(Config):
     label: LabelSensor | None = added(None)
     """Where the label's sensor is, and whether it measures two velocities instead of an angle."""
     where: tuple[RowCondition, ...] = added(())
-    """Conditions that a row meets, all of them, or is left out and only counted; also as text."""
+    """Conditions that a row meets, all of them, or is left out and only counted."""
 
     @field_validator("where", mode="before")
     @classmethod
-    def _texts_are_read(cls, where: Any, info: ValidationInfo) -> Any:
-        texts = [where] if isinstance(where, str) else where
-        if not isinstance(texts, list | tuple):
-            return where
-        signals = info.data.get("signals", {})
-        read = [text_conditions(t, signals) if isinstance(t, str) else [t] for t in texts]
-        return [condition for conditions in read for condition in conditions]
+    def _is_no_text(cls, where: Any) -> Any:
+        if isinstance(where, str):
+            example = '[{ column = "fix", one_of = ["4", "5"] }]'
+            raise ValueError(f"write it as tables: {example}")  # noqa: TRY004 - as of pydantic
+        return where
 
     @model_validator(mode="after")
     def _consistent(self) -> "Mapping":

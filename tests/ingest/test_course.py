@@ -153,7 +153,7 @@ def test_a_course_comes_with_speed_and_yaw_rate() -> None:
     with pytest.raises(ValidationError, match="give the speed too"):
         a_mapping(signals={**VELOCITIES, "satellite_speed": ANGLE["satellite_speed"]})
     with pytest.raises(ValidationError, match="name the column of the file"):
-        a_mapping(signals=VELOCITIES, where="satellite_speed > 5 m/s")
+        a_mapping(signals=VELOCITIES, where=[{"signal": "satellite_speed", "above": 5}])
 
 
 def test_a_course_that_turns_the_other_way_is_suspicious() -> None:

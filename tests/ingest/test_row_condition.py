@@ -12,6 +12,8 @@ from pydantic import ValidationError
 from fleet_slip.errors import InputError
 from tests.support.measured import a_mapping, good_columns, read_columns, read_measured, ticks
 
+IGNITION = [{"column": "KL15", "one_of": ["1"]}]
+
 
 def columns() -> dict[str, Any]:
     speed = [4, 5, 5.5, None, "n/a", *[20] * 15]
@@ -22,18 +24,17 @@ def columns() -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("where", "kept"),
     [
-        ("speed >= 5", [1, 2, *range(5, 20)]),
-        ("speed > 5", [2, *range(5, 20)]),
-        ("speed = 20", list(range(5, 20))),
-        ("speed != 20", [0, 1, 2]),
-        ("speed < 6 and speed >= 5", [1, 2]),
-        ("fix = 'RTK'", list(range(18))),
-        ("fix in ('RTK', 'float') and speed > 5.5", list(range(5, 18))),
-        ([{"column": "speed", "at_least": 5, "at_most": 6}], [1, 2]),
-        (["speed > 5", {"column": "fix", "one_of": ["RTK"]}], [2, *range(5, 18)]),
-        ('"speed" <= 5e0', [0, 1]),
-        ("vehicle_speed > 5.1 m/s", [2, *range(5, 20)]),
-        ("vehicle_speed > 17 km/h and vehicle_speed < 25 km/h", [1, 2, 3]),
+        ([{"column": "speed", "at_least": 5}], [1, 2, *range(5, 20)]),
+        ([{"column": "speed", "above": 5}], [2, *range(5, 20)]),
+        ([{"column": "speed", "other_than": 20}], [0, 1, 2]),
+        ([{"column": "speed", "at_least": 5, "below": 5.6}], [1, 2]),
+        ([{"column": "speed", "at_least": 5, "at_most": 5.5}], [1, 2]),
+        ([{"column": "fix", "one_of": ["RTK", "float"]}], list(range(18))),
+        (
+            [{"column": "speed", "above": 5}, {"column": "fix", "one_of": ["RTK"]}],
+            [2, *range(5, 18)],
+        ),
+        ([{"signal": "vehicle_speed", "above": 5.1}], [2, *range(5, 20)]),
     ],
 )
 def test_rows_that_do_not_meet_the_conditions_are_counted(
@@ -55,16 +56,7 @@ def test_rows_that_do_not_meet_the_conditions_are_counted(
 @pytest.mark.parametrize(
     ("where", "message"),
     [
-        ("", "is not a condition. Write NAME"),
-        ("speed", "is not a condition"),
-        ("speed > 5 or speed < 2", "is not a condition"),
-        ("speed > 5 m/s", "'speed' is no signal of this mapping but a column"),
-        ("ax > 5", "add the unit: m/s"),
-        ("ax > 5 km/h", "ax needs an acceleration"),
-        ("ax = 'much'", "compared with a number"),
-        ("fix > 'RTK'", "a text can only be ="),
-        ("speed > 5; DROP TABLE x", "is not a condition"),
-        ("speed > " + "9" * 3000, "is longer than 2,000 characters"),
+        ("speed > 5", "write it as tables"),
         ([{"signal": "ay", "above": 1}], "'ay' is no signal of this mapping"),
         ([{"signal": "ax", "one_of": ["1"]}], "'one_of' is for a column"),
         ([{"at_least": 1}], "needs either 'column' or 'signal'"),
@@ -106,12 +98,12 @@ def test_a_drive_ends_where_the_ignition_is_off(tmp_path: Path) -> None:
     on = [0] * 5 + [1] * 40 + [0] * 15 + [1] * 40
     rows["KL15"] = on
     time = {"longest_gap_s": 0.2, "split_gap_s": 1}
-    log = read_columns(tmp_path, rows, a_mapping(where="KL15 = 1", time=time))
+    log = read_columns(tmp_path, rows, a_mapping(where=IGNITION, time=time))
     assert log.counts.rows_left_out == on.count(0)
     first, second = sorted(set(log.drives["drive_id"].to_pylist()))
     assert second == f"{first}-2"
     assert log.counts.ticks == 2 * 391
     assert log.counts.quarantined == {}
     short = {"longest_gap_s": 0.2, "split_gap_s": 2}
-    whole = read_columns(tmp_path, rows, a_mapping(where="KL15 = 1", time=short))
+    whole = read_columns(tmp_path, rows, a_mapping(where=IGNITION, time=short))
     assert whole.counts.drives == 1

@@ -160,7 +160,7 @@ def test_a_column_of_cars_that_no_mapping_uses_is_told(tmp_path: Path) -> None:
     (found,) = said_of(rows, tmp_path, a_mapping(tmp_path, TABLE))
     assert (found.kind, found.signals) == ("cars", ("vehicle",))
     assert 'vehicle_id = { column = "vehicle" }' in found.remedy
-    used = "where = \"vehicle = 'A'\""
+    used = 'where = [{ column = "vehicle", one_of = ["A"] }]'
     assert said_of(rows, tmp_path, a_mapping(tmp_path, TABLE, more=used)) == []
     assert said_of(convoy[0], tmp_path, a_mapping(tmp_path, TABLE)) == []
     command = ("ingest", str(tmp_path / "log.parquet"), "--mapping", str(tmp_path / "m.toml"))

@@ -186,7 +186,10 @@ def test_the_mapping_of_the_page_is_one(tmp_path: Path) -> None:
 
 def test_rows_may_be_chosen_by_the_time_and_the_satellites(tmp_path: Path) -> None:
     write(tmp_path / "a.vbo")
-    log = read_measured(tmp_path / "a.vbo", mapping(where="time > 91430.5 and sats < 10"))
+    log = read_measured(
+        tmp_path / "a.vbo",
+        mapping(where=[{"column": "time", "above": 91430.5}, {"column": "sats", "below": 10}]),
+    )
     assert log.counts.rows_kept == ROWS // 2 - 1
 
 
