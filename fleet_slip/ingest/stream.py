@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
@@ -33,7 +33,7 @@ from fleet_slip.ingest.drives import (
 from fleet_slip.ingest.formats.reading import file_errors, require_unchanged_log
 from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.formats.tables import partition_keys
-from fleet_slip.ingest.log_faults import LogFaults
+from fleet_slip.ingest.log_faults import find_log_faults, find_refusals
 from fleet_slip.ingest.log_rows import (
     CheckedBlock,
     RowChecker,
@@ -104,7 +104,8 @@ class MeasuredStream:
         self._stretches: Counter[int] = Counter()
         self._trips: dict[int, tuple[str, float]] = {}
         """The trip of each group's last drive, and when that ended."""
-        self._faults = LogFaults(file, mapping)
+        self._under_way: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        """The first and the last time of the drives of each car, where they are dated."""
         self.name = os.fsencode(file.name).decode("utf-8", "replace")
         self._stem = self.name.split(".", 1)[0] or self.name
 
@@ -213,7 +214,9 @@ class MeasuredStream:
             self._values[signal] += len(values) - values.null_count
         if self.longest is None or drive.ticks.size > self.longest.ticks.size:
             self.longest = drive
-        self._faults.add(rows, drive)
+        if drive.metadata["started_at"] is not None:
+            car = str(drive.metadata["vehicle_id"])
+            self._under_way[car].append((rows.start_s, rows.end_s))
         self._require_sane_drives()
         return drive
 
@@ -292,7 +295,9 @@ class MeasuredStream:
     def suspicions(self) -> tuple[Fault, ...]:
         """Return what looks wrong in the file as a whole, once all drives were taken."""
         counts = self.counts
-        return tuple(self._faults.find(self._refused, counts.rows_read, counts.quarantined))
+        refusals = find_refusals(self._refused, counts.rows_read, counts.quarantined)
+        others = find_log_faults(self.file, self.mapping, counts.drives, self._under_way)
+        return (*refusals, *others)
 
 
 @contextmanager
