@@ -9,6 +9,7 @@ import pytest
 from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.sql import column_query
+from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.ingest.mapping import load_mapping
@@ -17,7 +18,6 @@ from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.commands import RunCommand
 from tests.support.measured import csv_text, ingest_file
 from tests.support.reported import call
 
@@ -138,6 +138,9 @@ def test_what_a_log_remembers_is_found_and_carries_to_speeds_it_was_not_fitted_a
     assert fast["rmse_deg"] == pytest.approx(slow_to_fast_deg(root), rel=1e-9)
     shown = call(root, *asked[:5], "--features", "bands")
     assert f"{fast['rmse_deg']:.4f}" in next(row for row in shown.splitlines() if names[-1] in row)
+    call(root, "gram")
+    with pytest.raises(QuestionError, match=r"does not divide the rows of a drive.*bands, blocks"):
+        call(root, "select", "--by", "part")
 
 
 def slow_to_fast_deg(root: Path) -> float:
@@ -167,12 +170,3 @@ signals = ["curvature", "ay_signed_square"]
 name = "remembering"
 signals = ["curvature_mean_16", "ay_mean_16"]
 """
-
-
-def test_parts_are_told_where_a_set_has_none(
-    root_to_fail_in: Path, run_command: RunCommand
-) -> None:
-    done = run_command("select", "--by", "part", root=root_to_fail_in)
-    assert done.exit_code == 5
-    assert "does not divide the rows of a drive" in done.stderr
-    assert "bands, blocks" in done.stderr

@@ -147,7 +147,7 @@ def test_a_line_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_paths_that_are_no_files_are_refused(tmp_path: Path) -> None:
     assert "no such file" in failure(tmp_path / "absent.csv")
-    assert "no file in this folder has the suffix of a log" in failure(tmp_path)
+    assert "not a regular file" in failure(tmp_path)
     os.mkfifo(tmp_path / "pipe.csv")
     assert "not a regular file" in failure(tmp_path / "pipe.csv")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
