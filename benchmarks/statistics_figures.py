@@ -62,7 +62,6 @@ def evidence(training: TrainingFolds, output: Path) -> None:
     total = training.folds.total
     order = rank("backward", total, NINE, LABEL)
     fits = nested_fits(total, order, LABEL)
-    assert training.drives is not None
     rows, drives = Evidence.naive(fits), Evidence.clustered(fits, training.drives)
     print(f"rows {rows.rows:.0f}, effective {drives.rows:.0f}, effect {drives.design_effect:.0f}")
     for name, a, b in zip(order, rows.contributions, drives.contributions, strict=True):
@@ -119,7 +118,6 @@ def subsets(training: TrainingFolds, output: Path) -> None:
         names = " ".join(result.best.model.signals)
         print(f"  {result.best.size} R2 {result.best.r_squared:.5f} gap {gap:>8} {names}")
     fits = nested_fits(total, NINE, LABEL)
-    assert training.drives is not None
     print(" ", pick_sizes(results, Evidence.clustered(fits, training.drives)))
     rss = all_rss(correlation_matrix(total.restrict([*NINE, LABEL])))
     size = subset_sizes(len(NINE)).astype(np.float64)

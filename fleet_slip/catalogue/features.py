@@ -6,6 +6,7 @@ from fractions import Fraction
 from functools import cache, cached_property, partial
 from importlib.resources.abc import Traversable
 from itertools import pairwise
+from typing import Any
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
@@ -87,7 +88,6 @@ class FeatureSet(Config):
     calibrated: tuple[Identifier, ...] = ()
     regimes: tuple[Identifier, ...] = ()
     block_s: Decimal | None = Field(default=None, gt=0, le=100_000)
-    row_folds: int | None = Field(default=None, ge=2, le=1000)
     change_s: tuple[Decimal, ...] = ()
     """Instead of the columns, what they change by in so much time, with the course as the label;
     of several times, each is a part of the drive."""
@@ -104,8 +104,7 @@ class FeatureSet(Config):
         inputs = catalogue().feature_inputs
         unknown = ", ".join(name for name in self.signals if name not in inputs)
         ticks = self.change_ticks
-        ways = bool(self.regimes) + bool(self.block_s) + bool(self.row_folds)
-        windowed = self.windows or self.calibrated
+        ways = bool(self.regimes) + bool(self.block_s)
         out_of_range = any(not 0 < n <= LONGEST_TICKS for n in ticks)
         longest = f"{LONGEST_TICKS * float(SAMPLE_TIME_S):g}"
         for wrong, what in (
@@ -113,8 +112,7 @@ class FeatureSet(Config):
             (self.of is not None and not self.change_s, "a set of another has change_s"),
             (unknown, f"not input signals: {unknown}"),
             (len(set(self.columns)) < len(self.columns), "a column stands twice"),
-            (ways > 1, "a set has regimes, block_s or row_folds, not several of them"),
-            (windowed and self.row_folds, "a set with windows has no row_folds"),
+            (ways > 1, "a set has regimes or block_s, not both"),
             (ticks and ways, "a set with change_s does not divide rows"),
             (ticks and not (self.windows or self.of), "a set with change_s has windows"),
             (self.as_logged and not ticks, "only a set with change_s is as_logged"),
@@ -473,13 +471,13 @@ class FeatureCatalogue(Config):
     def _identity(self, name: str) -> str:
         one = self.feature_set(name)
         used = [*one.features, *(self.regimes[r].of for r in one.regimes)]
-        content = {
+        content: dict[str, Any] = {
             "columns": list(one.columns),
             "signals": {s: str(catalogue()[s].scale) for s in catalogue().inputs},
             "features": {f: self._definition(f) for f in used if f in self.features},
             "regimes": {r: self.regimes[r].model_dump(mode="json") for r in one.regimes},
-            "row_folds": one.row_folds,
-            "lagged": False,  # of sets that earlier releases had: identities stay
+            "row_folds": None,  # of sets that earlier releases had: identities stay
+            "lagged": False,
         }
         if line := self.line_of(name):
             content["line"] = {"sha256": line.sha256}

@@ -24,7 +24,7 @@ from fleet_slip.evaluation.single_track import LabelledDrive, read_drive
 from fleet_slip.grams.cohort import Cohort, with_gram_rows
 from fleet_slip.grams.compute import Parts, counts_of, drive_sums, gram_rows
 from fleet_slip.grams.expansion import CarCounts
-from fleet_slip.grams.folding import FOLD_KEYS, ROW_FOLDS, Folding
+from fleet_slip.grams.folding import FOLD_KEYS, Folding
 from fleet_slip.grams.gram_files import hash_numbers
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import manifest_of, with_straight_intercept
@@ -169,7 +169,6 @@ class Learner:
             raise DataError("changes of the course are not divided: choose three drives or more.")
         workspace = Workspace(ColumnPlan.of_set(features(), name))
         parts = Parts.of_set(features(), features().feature_set(name))
-        parts = replace(parts, row_folds=None)
         lines = {line["drive_id"]: line for line in self.cohort.drives.to_pylist()}
         found = [
             row
@@ -195,7 +194,7 @@ class Learner:
             names = {_quarter_of(self.drives[i].drive.drive_id, quarter) for i, quarter in seen}
         cohort = cohort.part(np.isin(cohort.drives["drive_id"].to_pylist(), [*names]))
         values = cohort.drives[FOLD_KEYS[asked.folds.by]].unique()
-        if len(values) < 2 or (divided and asked.folds.by == ROW_FOLDS):
+        if len(values) < 2:
             asked = replace(asked, folds=Folding(by="drive", count=asked.folds.count))
         return asked.choose(replace(cohort, beside=prior) if prior else cohort)
 

@@ -26,7 +26,6 @@ from fleet_slip.grams.folding import (
     EACH,
     FOLD_KEYS,
     PARTS,
-    ROW_FOLDS,
     FoldCount,
     Folding,
     FoldKey,
@@ -43,7 +42,7 @@ from fleet_slip.regression.drives import (
     missing_signals_error,
     serving_drives,
 )
-from fleet_slip.regression.folds import CohortFolds, Folds
+from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.rendering import Remark
 from fleet_slip.warehouse.condition import Condition, parse_cohort
@@ -173,10 +172,10 @@ class Cohort:
         return pa.concat_tables(_lines_with(one.drives, signals).select(names) for one in every)
 
     def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
-        """Divide the cohort into folds, of whole drives unless by `row`.
+        """Divide the cohort into folds, of whole drives unless by `part`.
 
         By a key of `FOLD_KEYS`: a fold for each value, or hashed into `count` if there are more
-        (`EACH`: never); by `speed` in bands; by `part` or `row` as the feature set has them. Raises
+        (`EACH`: never); by `speed` in bands; by `part` as the feature set has them. Raises
         `QuestionError` if it has none. Where only sums were kept the Gram rows are read again.
         """
         folds = self._own_folds(by, count)
@@ -192,7 +191,7 @@ class Cohort:
         if self.sums is not None and self.source is not None:
             again = load_cohort(self.source, self.condition, self.feature_set, folding)
             return again._own_folds(by, count)
-        require_divided(self.feature_set, by, count)
+        require_divided(self.feature_set, by)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
         if self.unlabelled and by == "vehicle" and len(set(values)) == 1:
             by, values = "drive", self.drives[FOLD_KEYS["drive"]].to_pylist()
@@ -258,7 +257,7 @@ def load_cohort(
     """
     condition = parse_cohort(condition)
     if folding is not None:
-        require_divided(feature_set, folding.by, folding.count)
+        require_divided(feature_set, folding.by)
     with open_grams(source, feature_set, condition) as opened:
         if folding is None:
             rows = opened.rows(condition)
@@ -516,15 +515,6 @@ def sum_days(
 # A cohort made ready for one set of inputs: folds, and moments of each drive.
 
 
-@dataclass(frozen=True)
-class DriveFolds:
-    """The drives that have all of some inputs, the fold of each, and what is computed from."""
-
-    served: Served
-    fold: IntArray
-    training: TrainingFolds
-
-
 def clustered_moments(
     served: Served,
     cluster: ClusterUnit | None = None,
@@ -551,15 +541,14 @@ def drive_folds(
     inputs: Sequence[str],
     folding: Folding,
     *,
-    naive: bool = False,
     cluster: ClusterUnit | None = None,
     intercept: bool = True,
-) -> DriveFolds:
-    """Divide the drives with all the inputs into folds; `naive` takes rows for independent.
+) -> tuple[TrainingFolds, IntArray]:
+    """Divide the drives with all the inputs into folds; return the fold of each, too.
 
-    Raises `DataError` if no drive has them all, and `QuestionError` for folds of rows.
+    Raises `DataError` if no drive has them all, and `QuestionError` for folds of parts of drives.
     """
-    if folding.by in (ROW_FOLDS, PARTS):
+    if folding.by == PARTS:
         raise QuestionError(
             f"with folds by {folding.by} there are no drives to hold out. Fold by drive for this."
         )
@@ -568,14 +557,5 @@ def drive_folds(
         served.drives[FOLD_KEYS[folding.by]].to_pylist(), folding.by, folding.count
     )
     folds = CohortFolds.of([served.table], assignment).serving(inputs, catalogue().label)
-    moments = None if naive else clustered_moments(served, cluster, intercept=intercept)
-    training = TrainingFolds(folds, moments, input_scales(), intercept)
-    return DriveFolds(served, assignment.fold, training)
-
-
-def row_training(
-    cohort: Cohort, inputs: Sequence[str], folding: Folding, *, intercept: bool = True
-) -> TrainingFolds:
-    """Return folds of rows; rows then count as independent. Raises `DataError`."""
-    folds: Folds = cohort.folds(folding.by, folding.count).serving(inputs, catalogue().label)
-    return TrainingFolds(folds, None, input_scales(), intercept)
+    moments = clustered_moments(served, cluster, intercept=intercept)
+    return TrainingFolds(folds, moments, input_scales(), intercept), assignment.fold

@@ -114,7 +114,7 @@ def rows_by_drive(rows: pa.Table) -> Iterator[pa.Table]:
         yield rows.slice(start, stop - start)
 
 
-# What divides a drive into several Gram rows, in SQL and for arrays: bands, blocks, row folds.
+# What divides a drive into several Gram rows, in SQL and for arrays: bands, blocks.
 
 UNKNOWN_PART = "unknown"
 """Part of the rows whose regime is not known because a signal is absent."""
@@ -149,7 +149,7 @@ class Bands:
 
 @dataclass(frozen=True)
 class Parts:
-    """How the rows of a drive are divided: by at most one of bands, blocks, folds and times.
+    """How the rows of a drive are divided: by at most one of bands, blocks and times.
 
     Combined bands run with the last fastest. `times` are what columns change over, if several; each
     has all rows.
@@ -157,7 +157,6 @@ class Parts:
 
     bands: tuple[Bands, ...] = ()
     block_ticks: int | None = None
-    row_folds: int | None = None
     times: tuple[str, ...] = ()
 
     @classmethod
@@ -171,10 +170,10 @@ class Parts:
             bounds = tuple(math.ceil(Fraction(bound) / scale) for bound in regime.bounds)
             bands.append(Bands(regime.of, regime.absolute, bounds, regime.bands))
         times = tuple(f"{time_s:f} s" for time_s in one.change_s)
-        return cls(tuple(bands), one.block_ticks, one.row_folds, times if len(times) > 1 else ())
+        return cls(tuple(bands), one.block_ticks, times if len(times) > 1 else ())
 
     def __bool__(self) -> bool:
-        return bool(self.bands or self.block_ticks or self.row_folds or self.times)
+        return bool(self.bands or self.block_ticks or self.times)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -189,8 +188,6 @@ class Parts:
     @property
     def number_sql(self) -> str:
         """SQL of a row's part, a number from 0; null where it is not known."""
-        if self.row_folds:
-            return _row_fold_sql(self.row_folds)
         if self.block_ticks:
             return f"tick // {self.block_ticks}"
         number = "0"
@@ -200,8 +197,6 @@ class Parts:
 
     def name_sql(self, number: str) -> str:
         """Return the SQL of a part's name, given that of its number."""
-        if self.row_folds:
-            return f"({number} + 1)::VARCHAR"
         if self.block_ticks:
             return f"printf('{BLOCK_FORMAT}', {number} + 1)"
         names = ", ".join(f"'{name}'" for name in self.names)
@@ -209,8 +204,6 @@ class Parts:
 
     def numbers(self, ticks: NDArray[Any], counts: Mapping[str, FloatArray]) -> IntArray:
         """Return each row's part, (rows,), or `UNKNOWN`; `columns` are what the bands are of."""
-        if self.row_folds:
-            raise ValueError("rows are dealt into folds by SQL alone")
         if self.block_ticks:
             return ticks.astype(np.int64) // self.block_ticks
         number: FloatArray = np.zeros(len(ticks))
@@ -225,14 +218,6 @@ class Parts:
         if not (self.bands or self.times):
             return None
         return UNKNOWN_PART if number == UNKNOWN else self.names[number]
-
-
-def _row_fold_sql(count: int) -> str:
-    """Number the folds by MD5 of the drive and the 32-bit hash of Thomas Mueller of the tick."""
-    value = "((md5_number_lower(drive_id) % 4294967296)::BIGINT + tick) % 4294967296"
-    for _ in range(2):
-        value = f"xor({value}, ({value}) >> 16) * 73244475 % 4294967296"
-    return f"({value}) % {count}"
 
 
 # Fills in `jobs/gram.sql` for a feature set: its columns, and what divides a drive's rows.

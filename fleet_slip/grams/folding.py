@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from fleet_slip.catalogue.features import features
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError, QuestionError, UsageError
 from fleet_slip.regression.folds import FoldAssignment, by_band, by_hash, by_value
 
-FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "speed", "part", "row"]
+FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "speed", "part"]
 
 FOLD_KEYS: dict[str, str] = {
     "drive": "trip",
@@ -21,7 +21,6 @@ FOLD_KEYS: dict[str, str] = {
     "adhesion": "adhesion",
     "speed": "speed_factor",
     "part": "part",
-    "row": "part",
 }
 """What a fold may be made of, and its column. Drives of a trip are pieces, and share a fold."""
 
@@ -30,9 +29,6 @@ BANDS: FoldKey = "speed"
 
 PARTS: FoldKey = "part"
 """Parts of drives that the feature set divides rows into: bands of a signal, or blocks of time."""
-
-ROW_FOLDS: FoldKey = "row"
-"""Folds of single rows, as WEKA makes them. They leak: a test row's neighbours train the model."""
 
 
 EACH: Literal["each"] = "each"
@@ -50,12 +46,6 @@ class Folding(Config):
     by: FoldKey = "drive"
     count: FoldCount = 5
 
-    @model_validator(mode="after")
-    def _rows_are_dealt(self) -> "Folding":
-        if self.by == ROW_FOLDS and self.count == EACH:
-            raise ValueError("folds of rows were dealt when the logs were read: say how many.")
-        return self
-
 
 def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Folding:
     """Return a folding, by default of the usual count, or each part. Raises `UsageError`."""
@@ -64,34 +54,20 @@ def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Fold
     try:
         return Folding.model_validate({"by": by, "count": count if count == EACH else int(count)})
     except ValueError:
-        each = "" if by == ROW_FOLDS else f", or each: every {by} a fold of its own"
-        raise UsageError(f"folds = {count}: choose a number from 2 to 1000{each}.") from None
+        raise UsageError(
+            f"folds = {count}: choose a number from 2 to 1000, or each: every {by} a fold of its "
+            "own."
+        ) from None
 
 
-def require_divided(feature_set: str, by: str, count: FoldCount) -> None:
+def require_divided(feature_set: str, by: str) -> None:
     """Raise `QuestionError` if a feature set has not divided the rows of drives as folds need."""
-    if by == ROW_FOLDS:
-        _require_row_folds(feature_set, count)
     one = features().feature_set(feature_set)
     if by == PARTS and not (one.regimes or one.block_s):
         known = ", ".join(n for n, s in features().sets.items() if s.regimes or s.block_s)
         raise QuestionError(
             f"the feature set {feature_set} does not divide the rows of a drive. Feature sets with "
             f"bands or blocks: {known}."
-        )
-
-
-def _require_row_folds(feature_set: str, count: FoldCount) -> None:
-    made = features().feature_set(feature_set).row_folds
-    if made is None:
-        known = ", ".join(name for name, one in features().sets.items() if one.row_folds)
-        raise QuestionError(
-            f"the Gram rows of the feature set {feature_set} are of whole drives: folds of rows "
-            f"are made when the logs are read. Feature sets that make them: {known}."
-        )
-    if count == EACH or count > made:
-        raise QuestionError(
-            f"the feature set {feature_set} made {made} folds of rows; choose no more."
         )
 
 
@@ -106,8 +82,6 @@ def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssign
         return by_value(values)
     if by == BANDS:
         return by_band(values, count)
-    if by == ROW_FOLDS:
-        return by_value([(int(value) - 1) % count + 1 for value in values])
     if len(set(values)) > count:
         return by_hash([str(value) for value in values], count)
     return by_value(values)

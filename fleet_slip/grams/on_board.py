@@ -115,7 +115,7 @@ def counted_sets() -> dict[str, CountedSet]:
     found = {}
     for name in (PLAIN, *known.sets):
         one = known.feature_set(name)
-        divided = one.regimes or one.block_ticks or one.row_folds
+        divided = one.regimes or one.block_ticks
         if not divided and len(one.columns) <= MOST_COLUMNS:
             found[known.identity(name)] = _counted(name, known.identity(name))
     return found

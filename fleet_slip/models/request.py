@@ -48,10 +48,6 @@ WORTH = Doc(
     "the rule of the list."
 )
 
-NAIVE = Doc(
-    "Take rows for independent evidence, not drives or cars. At 100 Hz they are not: then every "
-    "criterion keeps nearly everything."
-)
 CLUSTER = Doc(
     "What is independent evidence: vehicle, since a car's drives share its biases and tyres, or "
     "drive. Default: vehicle where there are several, else drive."
@@ -104,7 +100,7 @@ class SelectionRequest:
     ] = None
     by: Annotated[
         FoldKey | None,
-        Doc("What a fold is made of. Default: what the list says. By row is WEKA's way and leaks."),
+        Doc("What a fold is made of. Default: what the list says."),
     ] = None
     folds: Annotated[
         int | str | None,
@@ -135,7 +131,6 @@ class SelectionRequest:
             "and say which; diagnose says it before."
         ),
     ] = False
-    naive: Annotated[bool, NAIVE] = False
     cluster: Annotated[ClusterUnit | None, CLUSTER] = None
     intercept: Annotated[
         bool,
@@ -171,7 +166,7 @@ class SelectionRequest:
     @property
     def ordered(self) -> bool:
         """Whether inputs are ranked or searched, rather than given models compared."""
-        return bool(self.rank or self.criterion or self.all_subsets or self.naive)
+        return bool(self.rank or self.criterion or self.all_subsets)
 
     @property
     def chosen_by_inputs(self) -> bool:
@@ -184,33 +179,33 @@ class SelectionRequest:
         if self.ordered and self.models:
             raise UsageError(
                 "a list of models is compared by cross-validation as it stands: leave out "
-                "models, or rank, criterion, all_subsets and naive, which search among the inputs "
-                "of nested."
+                "models, or rank, criterion and all_subsets, which search among the inputs of "
+                "nested."
             )
         if self.model and (self.models or self.nested or self.ordered or self.search):
             raise UsageError(
                 "model says which inputs to take: leave it out, or models, nested, rank, "
-                "criterion, all_subsets, naive and search, which choose."
+                "criterion, all_subsets and search, which choose."
             )
         if self.rank and self.all_subsets:
             raise UsageError("a search of all subsets needs no order: leave out rank.")
         if self.most and not self.search:
             raise UsageError("most is for a search: say how to search.")
-        if self.cluster and (self.naive or not (self.ordered or self.nested)):
+        if self.cluster and not (self.ordered or self.nested):
             raise UsageError(
                 "cluster says what is independent evidence for nested, rank, criterion and "
-                "all_subsets: leave it out, or naive."
+                "all_subsets: leave it out."
             )
         if self.label == BOTH and (self.ordered or self.nested or self.robust):
             raise UsageError(
                 "course+sideslip compares a list of models, one model or a search: leave out "
-                "nested, rank, criterion, all_subsets, naive and robust."
+                "nested, rank, criterion, all_subsets and robust."
             )
         ranked = self.ordered or (self.nested and not self.search)
         if self.prior and (self.label or ranked):
             raise UsageError(
                 "a prior joins models of a list, one model or a search: leave out label, rank, "
-                "criterion, all_subsets, naive, and nested without search."
+                "criterion, all_subsets, and nested without search."
             )
         if self.half_life is not None and (self.half_life < 1 or self.label == BOTH):
             raise UsageError(
@@ -219,7 +214,7 @@ class SelectionRequest:
         if self.search and self.ordered:
             raise UsageError(
                 "a search is made again in every fold, and looks at folds alone: leave out rank, "
-                "criterion, all_subsets and naive."
+                "criterion and all_subsets."
             )
 
 

@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from fleet_slip.base import Record
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohort import Cohort, drive_folds, row_training
-from fleet_slip.grams.folding import ROW_FOLDS, Folding
+from fleet_slip.grams.cohort import Cohort, drive_folds
+from fleet_slip.grams.folding import Folding
 from fleet_slip.models.request import Search, SelectionRequest
 from fleet_slip.regression.choice import (
     ANY_WORTH,
@@ -99,19 +97,8 @@ def select_inputs(
     for an unknown rule.
     """
     label = catalogue().label
-    if folding.by == ROW_FOLDS:
-        training = row_training(cohort, inputs, folding, intercept=request.intercept)
-        fold = np.empty(0, dtype=np.int64)
-    else:
-        ready = drive_folds(
-            cohort,
-            inputs,
-            folding,
-            naive=request.naive,
-            cluster=request.cluster,
-            intercept=request.intercept,
-        )
-        training, fold = ready.training, ready.fold
+    unit, intercept = request.cluster, request.intercept
+    training, fold = drive_folds(cohort, inputs, folding, cluster=unit, intercept=intercept)
     if rule.ranking == ALL_SUBSETS:
         results = best_subsets(training.total, inputs, label)
         evidence = training.evidence(training.nested_fits(inputs, label))
@@ -145,8 +132,8 @@ def try_distances(
     """Return the distances of the nested models of an order as given, or why there are none."""
     try:
         unit, intercept = request.cluster, request.intercept
-        ready = drive_folds(cohort, inputs, folding, cluster=unit, intercept=intercept)
-        return measure_distances(ready.training, inputs, catalogue().label)
+        training, _ = drive_folds(cohort, inputs, folding, cluster=unit, intercept=intercept)
+        return measure_distances(training, inputs, catalogue().label)
     except (DataError, QuestionError) as error:
         return str(error)
 

@@ -22,7 +22,7 @@ from fleet_slip.grams.cohort import (
     load_cohort,
     load_mixed_labels,
 )
-from fleet_slip.grams.folding import PARTS, ROW_FOLDS, Folding, make_folding
+from fleet_slip.grams.folding import PARTS, Folding, make_folding
 from fleet_slip.grams.gram_files import by_signals, gram_table
 from fleet_slip.grams.reader import open_grams
 from fleet_slip.grams.weights import FULL, Weighed, age_weights, robust_weights
@@ -319,7 +319,6 @@ class Selection(Answer):
             "folds": {
                 "by": self.folds.by,
                 "count": len(self.models[0].folds),
-                "leaking": self.folds.by == ROW_FOLDS,
             },
             "skipped": self.skipped,
             "drives_weighed": document_of(self.weighed),
@@ -383,7 +382,7 @@ def select(
             skipped[f"{search.name or search.method} (search)"] = few
         elif among := search.among(inputs):
             most = search.most
-            if search.columns_per_drive and folds.by not in (PARTS, ROW_FOLDS):
+            if search.columns_per_drive and folds.by != PARTS:
                 most = min(most, search.columns_per_drive * cohort.drive_count)
             bounded = search.model_copy(update={"most": most})
             try:
@@ -443,7 +442,7 @@ def answer_request(
 
 def usual_list(request: SelectionRequest) -> str:
     """Return the list that a request without one stands for, where its columns are computed."""
-    logged = request.features or request.by in (ROW_FOLDS, PARTS)
+    logged = request.features or request.by == PARTS
     return LOGGED_MODELS if logged else DEFAULT_MODELS
 
 
@@ -657,8 +656,6 @@ def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str
             f"the feature set {named} has no changes of the course. Feature sets that have: "
             f"{known}."
         )
-    if request.by == ROW_FOLDS and named == PLAIN:
-        return next(name for name, one in features().sets.items() if one.row_folds)
     if model_list and (absent := model_list.absent_from(named)):
         raise QuestionError(
             f"the feature set {named} lacks columns of {request.models}: {name_inputs(absent)}. "

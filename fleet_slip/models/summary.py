@@ -7,7 +7,7 @@ from fleet_slip.base import number_of
 from fleet_slip.catalogue.facts import TRAINING_DRIVES
 from fleet_slip.catalogue.features import features
 from fleet_slip.grams.cohort import remark_left_out
-from fleet_slip.grams.folding import BANDS, PARTS, ROW_FOLDS
+from fleet_slip.grams.folding import BANDS, PARTS
 from fleet_slip.regression.choice import CROSS_VALIDATION, NestedDistances
 from fleet_slip.regression.inference import Evidence
 from fleet_slip.rendering import Part, Remark, TextTable
@@ -73,11 +73,6 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
             zip(model.fold_names, model.folds, strict=True),
             "{0}|{1.rows:,}|{1.correlation:.4f}|{1.rmse_deg:.4f}|{1.error_mean_deg:+.4f}|"
             "{1.error_std_deg:.4f}",
-        )
-    if selection.folds.by == ROW_FOLDS:
-        yield Remark(
-            "folds of rows leak: neighbours of each test row at 100 Hz are training rows, so "
-            "these are errors of the fit, not of prediction. Compare with --by drive."
         )
     if isinstance(selection.distances, str):
         yield Remark(f"distances of the nested models unknown: {selection.distances}")

@@ -303,14 +303,14 @@ class NestedDistances(Record):
 
 @dataclass(frozen=True)
 class TrainingFolds:
-    """The rows to choose on: their folds, and per-drive moments of them (None: rows independent).
+    """The rows to choose on: their folds, and the moments of each drive of them.
 
     `scales` is the physical value of a count of each signal. Without `intercept` moments are about
     zero.
     """
 
     folds: Folds
-    drives: DriveMoments | None
+    drives: DriveMoments
     scales: Scales
     intercept: bool = True
 
@@ -325,8 +325,6 @@ class TrainingFolds:
 
     def evidence(self, fits: Sequence[Fit]) -> Evidence:
         """Return what the rows say of the nested models of an order; raises like `Evidence`."""
-        if self.drives is None:
-            return Evidence.naive(fits)
         return Evidence.clustered(fits, self.drives)
 
     def cross_validate(self, name: str, inputs: Sequence[str], label: str) -> CrossValidation:
@@ -391,8 +389,5 @@ def cross_validate_selection(
 def _without(training: TrainingFolds, fold: IntArray, number: int) -> TrainingFolds:
     if len(training.folds.grams) < FEWEST_FOLDS:
         raise QuestionError("choosing inside the training folds needs at least three folds.")
-    drives = training.drives
     rest = training.folds.without(number, int(np.count_nonzero(fold != number)))
-    return replace(
-        training, folds=rest, drives=drives.take(fold != number) if drives is not None else None
-    )
+    return replace(training, folds=rest, drives=training.drives.take(fold != number))

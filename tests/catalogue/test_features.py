@@ -1,6 +1,5 @@
 """Features against their physical definitions, and kinds of Gram rows against plain integers."""
 
-import hashlib
 from collections.abc import Callable
 from fractions import Fraction
 from math import ceil, floor
@@ -20,7 +19,7 @@ from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.columns.sql import with_columns
 from fleet_slip.config import load_config
-from fleet_slip.errors import ConfigError, DataError, QuestionError
+from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.grams import compute as aggregation
 from fleet_slip.grams import compute as gram_statement
 from fleet_slip.grams import job
@@ -199,9 +198,8 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
         ('column = "speed_mps"', 'column = "ay_mps2"', "names must differ"),
         ('divided_by = "50000"', 'divided_by = "0"', "divided_by is zero"),
         ('regimes = ["speed", "ay"]', 'regimes = ["mood"]', "unknown mood"),
-        ("block_s = 60", "block_s = 60\nregimes = ['speed']", "not several of them"),
+        ("block_s = 60", "block_s = 60\nregimes = ['speed']", "regimes or block_s, not both"),
         ("block_s = 60", "block_s = 0.005", "block_s must be a multiple of 0.01"),
-        ("block_s = 60", "row_folds = 5", "a set with windows has no row_folds"),
     ],
 )
 def test_a_feature_that_is_not_integer_arithmetic_on_inputs_is_refused(
@@ -266,7 +264,7 @@ def test_a_changed_definition_never_mixes_with_the_old_rows(
     (tmp_path / "features.toml").write_text(changed_text, encoding="utf-8")
     changed = load_config(tmp_path / "features.toml", FeatureCatalogue)
     assert changed.identity("motion") != before.identity("motion")
-    assert changed.identity("rows") == before.identity("rows")
+    assert changed.identity("delay") == before.identity("delay")
     for module in (features_module, aggregation, job, gram_statement):
         monkeypatch.setattr(module, "features", lambda: changed)
     assert update_grams(warehouse, feature_set="motion").rows_read == 300
@@ -283,37 +281,6 @@ def test_a_changed_definition_never_mixes_with_the_old_rows(
     }
     old, new = with_curvature.values()
     assert 0 < new < old < 300
-
-
-def test_rows_fall_into_folds_by_a_hash_that_never_changes(warehouse: Warehouse) -> None:
-    rows = drive("drive-x", 500, 4)
-    land(warehouse, "one", rows)
-    update_grams(warehouse, feature_set="rows")
-    seed = int.from_bytes(hashlib.md5(b"drive-x").digest()[8:], "little")  # noqa: S324
-    cohort = load_cohort(warehouse, "true", "rows")
-    found = dict(
-        zip(cohort.drives["part"].to_pylist(), cohort.drives["n"].to_pylist(), strict=True)
-    )
-    assert found == _fold_sizes(seed % 2**32, 500)
-    assert all(30 < n < 70 for n in found.values())
-    update_grams(warehouse)
-    signals = [*INPUTS, LABEL]
-    assert cohort_gram(warehouse, "rows", signals) == cohort_gram(warehouse, "signals", signals)
-    assert len(cohort.folds("row", 5).serving(["ax", "ay"], LABEL).grams) == 5
-    assert cohort.folds("row", 5).serving(["ax", "ay"], LABEL).drives == 1
-    with pytest.raises(QuestionError, match="Feature sets that make them: rows"):
-        load_cohort(warehouse, "true").folds("row", 5)
-
-
-def _fold_sizes(seed: int, rows: int) -> dict[str, int]:
-    sizes: dict[str, int] = {}
-    for tick in range(rows):
-        value = (seed + tick) % 2**32
-        for _ in range(2):
-            value = ((value >> 16) ^ value) * 73244475 % 2**32
-        fold = str(value % 10 + 1)
-        sizes[fold] = sizes.get(fold, 0) + 1
-    return sizes
 
 
 def test_rows_are_divided_by_regime(warehouse: Warehouse) -> None:

@@ -75,8 +75,6 @@ def test_a_criterion_chooses_from_a_ranking_and_says_how_sure(
     assert choice["effective_rows"] < report["rows"] / 10
     winner = report["models"][best - 1]
     assert abs(choice["honest"]["correlation"] - winner["correlation"]) < 0.01
-    naive = run_command(*arguments, "--naive", "--json", root=every_set).json
-    assert naive["choice"]["effective_rows"] == naive["rows"]
     table = run_command(*arguments, root=every_set).stdout
     assert "order by backward" in table
     assert "selection repeated inside every fold" in table
@@ -107,17 +105,6 @@ def test_a_model_names_the_rows_that_it_was_made_of(
             f"SELECT count(DISTINCT drive_id), sum(n) FROM grams WHERE {model['gram_rows']}"
         ).fetchone()
     assert row == (model["drives"], model["rows"])
-
-
-def test_folds_of_rows_are_labelled_as_leaking(run_command: RunCommand, every_set: Path) -> None:
-    leaking = run_command("select", "--by", "row", root=every_set)
-    assert "leak" in leaking.stderr
-    by_row = run_command("select", "--by", "row", "--json", root=every_set).json
-    by_drive = run_command("select", "--models", "table1", "--json", root=every_set).json
-    assert by_row["folds"] == {"by": "row", "count": 5, "leaking": True}
-    for leaky, honest in zip(by_row["models"], by_drive["models"], strict=True):
-        assert leaky["rows"] == honest["rows"]
-        assert leaky["rmse_deg"] < honest["rmse_deg"]
 
 
 def test_a_published_model_with_features_explains_and_evaluates_them(
@@ -169,7 +156,6 @@ def test_diagnose_shows_both_kinds_of_errors(run_command: RunCommand, every_set:
         (["select", "--criterion", "luck"], 5, "Known criteria: cv, cp"),
         (["select", "--models", "table1", "--rank", "t"], 2, "leave out models"),
         (["select", "--all-subsets", "--rank", "t"], 2, "needs no order"),
-        (["select", "--by", "row", "--features", "motion"], 5, "sets that make them: rows"),
         (["diagnose", "nothing"], 5, "no model is called"),
         (["diagnose", "smoke", "--signals", "ay"], 2, "not both"),
         (["diagnose", "--signals", "ay,ay"], 2, "stands twice"),
@@ -195,7 +181,7 @@ def test_features_are_listed(run_command: RunCommand) -> None:
     "words",
     [
         *(f"{command} --folds 1001" for command in ("select", "publish m")),
-        *(f"select --folds {folds}" for folds in ("1", "-3", "few", "each --by row")),
+        *(f"select --folds {folds}" for folds in ("1", "-3", "few")),
     ],
 )
 def test_a_number_of_folds_that_cannot_be_is_named(
@@ -258,8 +244,10 @@ def test_nested_models_have_their_distances_from_the_null_one_on(
     assert re.search(r"^0 +\(none\)", table, re.MULTILINE)
     by_cars = run_command(*arguments, "--cluster", "vehicle", root=every_set)
     assert "cluster-robust errors need at least two vehicles" in by_cars.stderr
-    leaking = run_command(*arguments, "--by", "row", "--json", root=every_set).json
-    assert "Fold by drive" in leaking["nested"]["left_out"]
+    parts = run_command(
+        *arguments, "--features", "blocks", "--by", "part", "--json", root=every_set
+    )
+    assert "Fold by drive" in parts.json["nested"]["left_out"]
 
 
 def test_a_model_through_the_origin_is_published_as_one(

@@ -85,7 +85,7 @@ def test_the_honest_figures_are_of_the_choice_itself_and_need_three_folds() -> N
     errors, choices = [], set()
     for number in set(fold):
         rest = [one for one, mine in zip(drives, fold, strict=True) if mine != number]
-        training = drive_folds(cohort_of(rest), INPUTS, two, cluster="drive").training
+        training, _ = drive_folds(cohort_of(rest), INPUTS, two, cluster="drive")
         chosen = select_nested(training, INPUTS, LABEL, rule).signals
         at = [INPUTS.index(name) for name in chosen]
         b, _ = dense_fit(rows_of(rest)[:, [*at, -1]])
@@ -99,18 +99,14 @@ def test_the_honest_figures_are_of_the_choice_itself_and_need_three_folds() -> N
     assert select_inputs(cohort_of(drives), INPUTS, two, rule, USUAL).choice.honest is None
 
 
-@pytest.mark.parametrize(
-    ("naive", "cluster", "kind"),
-    [(True, None, "rows"), (False, "drive", "drives"), (False, None, "vehicles")],
-)
+@pytest.mark.parametrize(("cluster", "kind"), [("drive", "drives"), (None, "vehicles")])
 def test_what_counts_as_independent_is_what_was_asked_for(
-    drives: list[Driven], naive: bool, cluster: ClusterUnit | None, kind: str
+    drives: list[Driven], cluster: ClusterUnit | None, kind: str
 ) -> None:
     rule = Rule("forward", "bic")
-    cohort, asked = cohort_of(drives), SelectionRequest(naive=naive, cluster=cluster)
+    cohort, asked = cohort_of(drives), SelectionRequest(cluster=cluster)
     choice = select_inputs(cohort, INPUTS, FIVE, rule, asked).choice
     assert choice.evidence.kind == kind
-    assert (choice.evidence.rows == 30 * 80) is naive
     assert choice.as_dict()["evidence"] == choice.evidence.kind
     subsets = select_inputs(cohort_of(drives), INPUTS, FIVE, Rule(ALL_SUBSETS, "bic"), asked).choice
     assert subsets.evidence.kind == choice.evidence.kind
@@ -209,27 +205,6 @@ def test_few_drives_allow_few_columns() -> None:
 
 
 ALL_SIZES = [f"all {size}" for size in range(1, 5)]
-
-
-def test_rows_can_be_the_folds() -> None:
-    """Ten Gram rows a drive, as the feature set `rows` makes them."""
-    parts = [
-        Driven(one.drive, one.counts[part::10], part=str(part + 1))
-        for one in driven(4, STRONG_FIRST, drives=6)
-        for part in range(10)
-    ]
-    cohort = cohort_of(parts, feature_set="rows")
-    rows = Folding(by="row", count=10)
-    ranked = select_inputs(cohort, INPUTS, rows, Rule("forward", "bic"), USUAL)
-    subsets = select_inputs(cohort, INPUTS, rows, Rule(ALL_SUBSETS, "bic"), USUAL)
-    assert set(ranked.winner.model.signals) == set(subsets.winner.model.signals)
-    assert ranked.choice.evidence.kind == subsets.choice.evidence.kind == "rows"
-    assert len(ranked.winner.model.folds) == 10
-    assert ranked.winner.model.pooled.rows == 6 * 80
-    with pytest.raises(QuestionError, match="whole drives"):
-        select_inputs(
-            cohort_of(driven(4, STRONG_FIRST)), INPUTS, rows, Rule("forward", "bic"), USUAL
-        )
 
 
 def test_a_signal_that_repeats_another_is_named() -> None:

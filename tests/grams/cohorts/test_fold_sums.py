@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.errors import DataError, FleetSlipError, QuestionError
+from fleet_slip.errors import DataError, FleetSlipError
 from fleet_slip.grams import reader as gram_reader
 from fleet_slip.grams.cohort import Cohort, load_cohort, sum_days
 from fleet_slip.grams.folding import FoldCount, Folding, FoldKey
@@ -122,11 +122,6 @@ def test_sums_over_other_folds_are_read_again(fleet: Warehouse) -> None:
     again = load_cohort(fleet, folding=Folding()).folds("drive", 7)
     at_once = load_cohort(fleet, folding=Folding(count=7)).folds("drive", 7)
     assert (again.names, again.tables) == (at_once.names, at_once.tables)
-
-
-def test_folds_of_rows_need_a_set_that_made_them(fleet: Warehouse) -> None:
-    with pytest.raises(QuestionError, match="of whole drives"):
-        load_cohort(fleet, folding=Folding(by="row"))
 
 
 def test_gram_job_takes_the_made_history_for_its_own(fleet: Warehouse) -> None:

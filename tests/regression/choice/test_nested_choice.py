@@ -15,8 +15,9 @@ from fleet_slip.regression.choice import (
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import CohortFolds, by_value, cross_validate, least_squares
+from fleet_slip.regression.inference import Evidence
 from fleet_slip.regression.least_squares import fit
-from fleet_slip.regression.subsets import best_subsets, pick_sizes
+from fleet_slip.regression.subsets import best_size, best_subsets, pick_sizes
 from tests.support.counts import gram_of, names, table_of, unit_scales
 
 INPUTS = names(5)[:-1]
@@ -33,18 +34,17 @@ def sparse_drives(seed: int, drives: int = 40) -> list[np.ndarray]:
     return result
 
 
-def training_of(drives: list[np.ndarray], *, clustered: bool) -> tuple[TrainingFolds, np.ndarray]:
+def training_of(drives: list[np.ndarray]) -> tuple[TrainingFolds, np.ndarray]:
     table = table_of([gram_of(counts) for counts in drives])
     assignment = by_value([i % 5 for i in range(len(drives))])
     folds = CohortFolds.of([table], assignment).serving(INPUTS, "y")
-    moments = DriveMoments.of(table) if clustered else None
-    return TrainingFolds(folds, moments, unit_scales(5)), assignment.fold
+    return TrainingFolds(folds, DriveMoments.of(table), unit_scales(5)), assignment.fold
 
 
 @pytest.mark.parametrize("ranking", ["forward", "backward", "t"])
 @pytest.mark.parametrize("criterion", ["bic", CROSS_VALIDATION])
 def test_the_signals_that_matter_are_found(ranking: str, criterion: str) -> None:
-    training, _ = training_of(sparse_drives(1), clustered=True)
+    training, _ = training_of(sparse_drives(1))
     selection = select_nested(training, INPUTS, "y", Rule(ranking, criterion))
     assert set(selection.order[: selection.size]) == {"x2", "x4"}
     assert selection.fit == fit(training.folds.total, selection.order[:2], "y")
@@ -56,19 +56,19 @@ def test_the_signals_that_matter_are_found(ranking: str, criterion: str) -> None
 
 
 def test_rows_taken_for_independent_keep_signals_that_drives_do_not_support() -> None:
-    kept = {True: 0, False: 0}
+    by_drives = by_rows = 0
     for seed in range(8):
-        for clustered in kept:
-            training, _ = training_of(sparse_drives(seed), clustered=clustered)
-            rule = Rule("backward", "bic")
-            kept[clustered] += select_nested(training, INPUTS, "y", rule).size
-    assert kept[True] < 8 * 2.5
-    assert kept[False] > 8 * 3.5
+        training, _ = training_of(sparse_drives(seed))
+        chosen = select_nested(training, INPUTS, "y", Rule("backward", "bic"))
+        by_drives += chosen.size
+        by_rows += best_size("bic", Evidence.naive(training.nested_fits(chosen.order, "y")))
+    assert by_drives < 8 * 2.5
+    assert by_rows > 8 * 3.5
 
 
 def test_the_choice_is_made_again_inside_every_training_fold() -> None:
     drives = sparse_drives(3, drives=20)
-    training, fold = training_of(drives, clustered=True)
+    training, fold = training_of(drives)
     rule = Rule("forward", "aic")
     result = cross_validate_selection("rule", training, fold, INPUTS, "y", rule)
     tests = []
@@ -86,7 +86,7 @@ def test_the_choice_is_made_again_inside_every_training_fold() -> None:
 
 
 def test_nested_models_are_cross_validated_in_order() -> None:
-    training, _ = training_of(sparse_drives(2), clustered=False)
+    training, _ = training_of(sparse_drives(2))
     order = ("x4", "x2", "x1", "x3", "x5")
     models = cross_validate_nested(training, order, "y")
     assert [model.signals for model in models] == [order[:j] for j in range(6)]
@@ -99,7 +99,7 @@ def test_inner_cross_validation_needs_folds() -> None:
     table = table_of([gram_of(counts) for counts in drives])
     assignment = by_value([0, 0, 0, 1, 1, 1])
     folds = CohortFolds.of([table], assignment).serving(INPUTS, "y")
-    training = TrainingFolds(folds, None, unit_scales(5))
+    training = TrainingFolds(folds, DriveMoments.of(table), unit_scales(5))
     with pytest.raises(QuestionError, match="at least three folds"):
         cross_validate_selection(
             "x", training, assignment.fold, INPUTS, "y", Rule("t", CROSS_VALIDATION)
@@ -107,7 +107,7 @@ def test_inner_cross_validation_needs_folds() -> None:
 
 
 def test_criteria_choose_among_the_best_subsets() -> None:
-    training, _ = training_of(sparse_drives(5), clustered=True)
+    training, _ = training_of(sparse_drives(5))
     selection = select_nested(training, INPUTS, "y", Rule("t", "cp"))
     results = best_subsets(training.folds.total, INPUTS, "y")
     picked = pick_sizes(results, selection.evidence)
