@@ -1,8 +1,9 @@
-"""Finds the drives of a car, or of a time: in log files, and in files that no version refers to."""
+"""Finds the drives of a car, or of a time, in log files; and files that nothing refers to."""
 
 import re
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 from datetime import date
 
 import polars as pl
@@ -12,7 +13,7 @@ import pyarrow.compute as pc
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue, digest_drive
-from fleet_slip.errors import FleetSlipError
+from fleet_slip.errors import StorageError
 from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS
 from fleet_slip.rendering import Remark
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, StoredFile
@@ -22,8 +23,9 @@ from fleet_slip.warehouse.tables import Warehouse
 
 # Removes files that nothing refers to any more: replaced ones, and leftovers of killed jobs.
 #
-# A file stays while a version of the last `retention_hours` refers to it, for queries, and while it
-# is younger, for jobs about to commit; and where a table has no Delta log.
+# A file stays while a version of the last `retention_hours` refers to it, for queries; while it is
+# younger; an hour at least if no version had it, for jobs about to commit; and where a table has no
+# Delta log.
 
 RETENTION_HOURS = 168
 """Also the longest that can be kept: Delta checkpoints forget removed files after a week."""
@@ -36,6 +38,8 @@ class VacuumReport:
     files: tuple[str, ...]
     size_bytes: int
     dry_run: bool
+    young: tuple[str, ...] = ()
+    """What no version has had and jobs may be about to commit: it stays."""
 
     @property
     def remark(self) -> Remark:
@@ -49,28 +53,32 @@ def vacuum(
 ) -> VacuumReport:
     """Remove what nothing has referred to for some hours."""
     warehouse.require()
-    found = find_expired(warehouse, retention_hours)
+    found, young = find_expired(warehouse, retention_hours)
     if not dry_run:
         found = [file for file in found if file.folder.remove(file)]
-    return VacuumReport(
-        files=tuple(str(file).removeprefix(f"{warehouse.root}/") for file in found),
-        size_bytes=sum(file.size_bytes for file in found),
-        dry_run=dry_run,
+    removed, left = (
+        tuple(str(file).removeprefix(f"{warehouse.root}/") for file in some)
+        for some in (found, young)
     )
+    return VacuumReport(removed, sum(file.size_bytes for file in found), dry_run, left)
 
 
-def find_expired(warehouse: Warehouse, retention_hours: float) -> list[StoredFile]:
-    """Return the files that `vacuum` removes: of no version of so many hours, and as old."""
-    found = []
+def find_expired(
+    warehouse: Warehouse, retention_hours: float
+) -> tuple[list[StoredFile], list[StoredFile]]:
+    """Return the files that `vacuum` removes, and those that may be about to be committed."""
+    replaced, uncommitted = [], find_temporary_files(warehouse)
     for table in warehouse.tables:
         files = find_unreferenced(table)
         snapshot = table.snapshot()
         if snapshot.version is None:  # its Delta log may have been lost, and these be its data
             continue
-        kept = snapshot.removed() - snapshot.removed(retention_hours)
-        found += [file for file in files if file.path not in kept]
-    found += find_temporary_files(warehouse)
-    return [file for file in found if file.age_hours >= retention_hours]
+        removed, expired = snapshot.removed(), snapshot.removed(retention_hours)
+        replaced += [file for file in files if file.path in expired]
+        uncommitted += [file for file in files if file.path not in removed]
+    young = [file for file in uncommitted if file.age_hours < BEING_WRITTEN_HOURS]
+    found = [*replaced, *(file for file in uncommitted if file not in young)]
+    return [file for file in found if file.age_hours >= retention_hours], young
 
 
 def find_unreferenced(table: Table) -> list[StoredFile]:
@@ -98,111 +106,6 @@ def find_temporary_files(warehouse: Warehouse) -> list[StoredFile]:
 
 _OF_DELTA = re.compile(r"[^/]+/_delta_log/[^/]*#[^/]*")
 """Temporary names of the Delta library, in a file system."""
-
-
-@dataclass(frozen=True)
-class OldFiles:
-    """What became of the files that no version refers to and that have some drives."""
-
-    deleted: int
-    kept: int
-    """Replaced files, which readers of the last week may need."""
-    pending: tuple[str, ...]
-    """Files that may be being written, and may have the drives: they are left alone."""
-
-
-def remove_old_files(warehouse: Warehouse, subject: Forgettable, *, replaced: bool) -> OldFiles:
-    """Delete the files with the drives that no version refers to; `replaced` ones if asked to.
-
-    Uncommitted ones go at once: since the fence none can land. Drives before a day are not barred:
-    there a file younger than an hour is left to its writer.
-    """
-    deleted = kept = 0
-    pending: list[str] = []
-    old = find_old_files(warehouse, subject)
-    for one in old:
-        if one.replaced and not replaced:
-            kept += 1
-        elif (one.is_young and subject.kind == "before") or not one.file.folder.remove(one.file):
-            pending.append(str(one.file))
-        else:
-            deleted += 1
-    gone, left = _remove_half_written(warehouse)
-    names = [name.removeprefix(f"{warehouse.root}/") for name in (*pending, *left)]
-    return OldFiles(deleted + gone, kept, tuple(names))
-
-
-def find_old_files(warehouse: Warehouse, subject: Forgettable) -> list["OldFile"]:
-    """Return unreferenced files with the drives; logs last, which may alone tell a car's drives."""
-    logs = list(_with_subject(warehouse.logs.snapshot(), subject))
-    drives = {drive for one in logs for drive in one.drives}
-    old = [
-        one
-        for one in read_old_files(warehouse.quarantine.snapshot())
-        if pc.any(quarantined_of(one.rows, subject, drives)).as_py()
-    ]
-    return [*old, *_with_subject(warehouse.grams.snapshot(), subject), *logs]
-
-
-def _remove_half_written(warehouse: Warehouse) -> tuple[int, list[str]]:
-    """Delete what killed writers left under temporary names, but for what may be being written."""
-    gone, left = 0, []
-    tables = {table.folder.name for table in warehouse.tables}
-    for file in find_temporary_files(warehouse):
-        table, *folders, _ = file.path.split("/")
-        if table not in tables or "_delta_log" in folders:
-            continue
-        if file.age_hours < BEING_WRITTEN_HOURS:
-            left.append(str(file))
-        else:
-            gone += file.folder.remove(file)
-    return gone, left
-
-
-@dataclass(frozen=True)
-class OldFile:
-    """A file that no version refers to: whether a commit removed it, and the drives concerned."""
-
-    file: StoredFile
-    replaced: bool
-    rows: pa.Table
-    drives: frozenset[str] = frozenset()
-    has_unused_names: bool = False
-    """Whether it was replaced because of names of other files in it: they may be the subject's."""
-
-    @property
-    def is_young(self) -> bool:
-        """Whether it may belong to a job that is running."""
-        return not self.replaced and self.file.age_hours < BEING_WRITTEN_HOURS
-
-
-def read_old_files(snapshot: Snapshot) -> Iterator[OldFile]:
-    """Yield replaced files and leftovers, with what tells the drives."""
-    known = snapshot.removed()
-    wanted = {"drive_id", "vehicle_id", "day"}
-    for file in find_unreferenced(snapshot.table):
-        try:
-            names = snapshot.table.read_metadata(file.path).schema.to_arrow_schema().names
-            rows = snapshot.table.read(file.path, [name for name in names if name in wanted])
-            replaced = file.path in known
-            others = replaced and snapshot.table.has_unused_names(file.path)
-        except FleetSlipError:
-            continue  # half a file, or just deleted
-        yield OldFile(file, replaced, _with_day(file, rows), has_unused_names=others)
-
-
-def _with_day(file: StoredFile, rows: pa.Table) -> pa.Table:
-    key, _, day = file.path.partition("/")[0].partition("=")
-    if key != "day":
-        return rows
-    return rows.append_column("day", pa.repeat(date.fromisoformat(day), rows.num_rows))
-
-
-def _with_subject(snapshot: Snapshot, subject: Forgettable) -> Iterator[OldFile]:
-    for one in read_old_files(snapshot):
-        names = one.rows.filter(rows_of(one.rows, subject))["drive_id"].unique().to_pylist()
-        if names or one.has_unused_names:
-            yield replace(one, drives=frozenset(names))
 
 
 def rows_of(rows: pa.Table, subject: Forgettable) -> pa.ChunkedArray:
@@ -266,12 +169,30 @@ def drives_by_file(
     for file in logs.files:
         drives = located.drives.get(file.path, frozenset())
         if file.path not in located.known:
-            names = logs.table.read_combinations(file.path, ["drive_id", "vehicle_id"])
-            names = names.append_column("day", pa.repeat(file.day, names.num_rows))
-            drives = frozenset(names.filter(rows_of(names, subject))["drive_id"].to_pylist())
+            drives = _drives_in(logs.table, file.path, subject)
         if drives:
             found[file.path] = drives
     return found
+
+
+def _drives_in(logs: Table, path: str, subject: Forgettable) -> frozenset[str]:
+    names = logs.read_combinations(path, ["drive_id", "vehicle_id"])
+    day = date.fromisoformat(path.partition("/")[0].removeprefix("day="))
+    names = names.append_column("day", pa.repeat(day, names.num_rows))
+    return frozenset(names.filter(rows_of(names, subject))["drive_id"].to_pylist())
+
+
+def remove_uncommitted(warehouse: Warehouse, subject: Forgettable) -> None:
+    """Delete log files with a car or drive that no version has had: since the fence none can land.
+
+    Gram rows that landed ahead of them are then of a file that is gone.
+    """
+    removed = warehouse.logs.snapshot().removed()
+    for file in find_unreferenced(warehouse.logs) if subject.kind != "before" else ():
+        if file.path not in removed:
+            with suppress(StorageError):  # half a file, or just deleted
+                if _drives_in(warehouse.logs, file.path, subject):
+                    file.folder.remove(file)
 
 
 def digests_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> Iterator[str]:

@@ -4,7 +4,7 @@ Rows leave `quarantine`, `logs` (files are written again, in one commit) and `gr
 this order, so that what is left tells an interrupted job what to do. The record
 (`warehouse/forgotten.py`) is written first, then quarantine and logs are fenced: commits
 that have not seen it conflict. Then Gram rows are fenced, against those that have not seen the new
-logs. What such jobs have written is deleted by them or here.
+logs. What such jobs have written is deleted by them, or by `vacuum` if they were killed.
 """
 
 from collections.abc import Collection, Iterator
@@ -16,8 +16,8 @@ from pydantic import Field
 
 from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.config import Config, load_config
-from fleet_slip.errors import ConfigError, PendingError, QuestionError, RefusedError
-from fleet_slip.grams.gram_files import is_of_received
+from fleet_slip.errors import ConfigError, PendingError, QuestionError, RefusedError, StorageError
+from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS, is_of_received
 from fleet_slip.grams.job import reconcile
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import (
@@ -26,10 +26,10 @@ from fleet_slip.operations.find_drives import (
     VacuumReport,
     digests_of,
     drives_by_file,
-    find_old_files,
+    find_unreferenced,
     locate,
     quarantined_of,
-    remove_old_files,
+    remove_uncommitted,
     vacuum,
 )
 from fleet_slip.operations.marked_models import models_trained_on
@@ -64,7 +64,7 @@ class ForgetReport(Answer):
     """Model versions, NAME@VERSION, that were trained on the drives."""
     old_files_deleted: int
     old_files_left: int
-    """Files with the drives that no version refers to, kept for readers of the last week."""
+    """Replaced files, which may have the drives, kept for readers of the last week."""
     pending: tuple[str, ...] = ()
     """Files below the root, and runs, that may still have the drives: repeat it when they ended."""
 
@@ -84,11 +84,11 @@ class ForgetReport(Answer):
             f"{self.files_removed} removed"
         )
         if self.old_files_deleted:
-            yield Remark(f"{self.old_files_deleted} old files with them deleted")
+            yield Remark(f"{self.old_files_deleted} old files deleted")
         if self.old_files_left:
             yield Remark(
-                f"{self.old_files_left} old files keep them until the next fleet-slip compact; to "
-                "delete these now: --now"
+                f"{self.old_files_left} old files may keep them until the next fleet-slip compact. "
+                "To delete these now: --now"
             )
         if self.models:
             names = dict.fromkeys(one.partition("@")[0] for one in self.models)
@@ -112,26 +112,23 @@ def forget(
     now: bool = False,
     progress: Progress = no_progress,
 ) -> ForgetReport:
-    """Forget drives; with `now`, delete the replaced files at once instead of by `vacuum`.
+    """Forget drives; with `now`, delete all replaced files at once instead of by `vacuum`.
 
-    It can be repeated after interruptions. `progress` counts files. What was superseded is no
-    drive: of it, `now` deletes the old files. Raises `QuestionError` for no such drive,
-    `StorageError`, `ConflictError`.
+    It can be repeated after interruptions. `progress` counts files. Raises `QuestionError` for no
+    such drive, `StorageError`, `ConflictError`.
     """
+    _require_delta_logs(warehouse)
     audit = Audit(warehouse.root)
     located = locate(warehouse.grams.snapshot(), subject)
     drives = _drives_of(warehouse, subject, located)
     state = audit.state(subject)
-    superseded = False
     if not drives and state is None and subject.kind != "before":
-        superseded = now and any(one.drives for one in find_old_files(warehouse, subject))
-        if not superseded:
-            raise QuestionError(
-                f"no drive has {subject.column} {subject.value!r}. See: "
-                'fleet-slip sql "SELECT drive_id, vehicle_id, day FROM drives"'
-            )
+        raise QuestionError(
+            f"no drive has {subject.column} {subject.value!r}. See: "
+            'fleet-slip sql "SELECT drive_id, vehicle_id, day FROM drives"'
+        )
     models = audit.models_of(subject)
-    if state == ALLOWED or superseded or (drives and state != "begun"):
+    if state == ALLOWED or (drives and state != "begun"):
         models = _begin(warehouse, audit, subject, drives, located)
     for name in (cleared := warehouse.root / "cleared").names():
         cleared.delete(name)  # releases up to 0.2 listed cars there that were not forgotten
@@ -150,10 +147,10 @@ def forget(
     if drives or state:
         warehouse.grams.fence()
     rows += forget_received(warehouse, subject)
-    uncommitted = remove_old_files(warehouse, subject, replaced=False)
+    remove_uncommitted(warehouse, subject)
     reconcile(warehouse)
-    old = remove_old_files(warehouse, subject, replaced=now)
-    if drives or superseded or state in ("begun", ALLOWED):
+    old = vacuum(warehouse, 0, dry_run=not now)
+    if drives or state in ("begun", ALLOWED):
         audit.end(subject, warehouse.grams.snapshot().version)
     under_way = [f"the run {run}" for run in runs_under_way(warehouse.root)] if now else []
     return ForgetReport(
@@ -162,10 +159,22 @@ def forget(
         files_rewritten=rewritten,
         files_removed=removed,
         models=tuple(models),
-        old_files_deleted=uncommitted.deleted + old.deleted,
-        old_files_left=old.kept,
-        pending=(*old.pending, *under_way) if drives or state else (),
+        old_files_deleted=len(old.files) if now else 0,
+        old_files_left=0 if now else len(old.files),
+        pending=(*old.young, *under_way) if drives or state else (),
     )
+
+
+def _require_delta_logs(warehouse: Warehouse) -> None:
+    """Raise `StorageError` if a Delta log was lost: a fence would begin one without the files."""
+    for table in warehouse.tables:
+        files = find_unreferenced(table)
+        old = any(file.age_hours >= BEING_WRITTEN_HOURS for file in files)
+        if old and table.snapshot().version is None:
+            raise StorageError(
+                f"{table.folder}: files without a Delta log. Restore the log from a backup; if a "
+                "killed job left the files, delete them."
+            )
 
 
 def _begin(

@@ -1,6 +1,7 @@
 """Forgetting: nothing of the drives is left, and the models are those of a world without them."""
 
 import json
+import os
 import shutil
 from datetime import date
 from fractions import Fraction
@@ -21,7 +22,7 @@ from fleet_slip.grams import job
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import compute_grams
 from fleet_slip.grams.job import update_grams
-from fleet_slip.operations.find_drives import Located, drives_by_file, locate
+from fleet_slip.operations.find_drives import Located, drives_by_file, locate, quarantined_of
 from fleet_slip.operations.forget import Retention, forget, retain
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.regression.least_squares import fit
@@ -120,6 +121,42 @@ def test_with_now_no_byte_below_the_root_names_the_car_not_even_in_older_version
     assert again.old_files_deleted == report.old_files_left
     assert not mentions(tmp_path, "beta")
     assert mentions(tmp_path, "gamma")
+
+
+def test_what_a_killed_job_left_is_pending_for_an_hour_and_then_goes(tmp_path: Path) -> None:
+    warehouse = fill(tmp_path, "alfa", "beta")
+    compact(warehouse)
+    left = warehouse.logs.write_file("left", drive("beta", 7), date(2024, 5, 1)).path
+    (rows, *_) = (warehouse.grams.read(file.path) for file in warehouse.grams.snapshot().files)
+    action = warehouse.grams.write_file("left", rows)
+    beta = Forgettable("vehicle", "beta")
+    assert forget(warehouse, beta, now=True).pending == (f"grams/{action.path}",)
+    assert not (tmp_path / "logs" / left).exists()
+    assert mentions(tmp_path, "beta") == [tmp_path / "grams" / action.path]
+    os.utime(tmp_path / "grams" / action.path, (0, 0))
+    assert not forget(warehouse, beta, now=True).pending
+    assert not mentions(tmp_path, "beta")
+
+
+@pytest.mark.parametrize("table", ["logs", "grams"])
+def test_where_a_delta_log_was_lost_nothing_is_deleted(tmp_path: Path, table: str) -> None:
+    warehouse = fill(tmp_path, "alfa", "beta")
+    shutil.rmtree(tmp_path / table / "_delta_log")
+    files = sorted(tmp_path.rglob("*.parquet"))
+    for file in files:
+        os.utime(file, (0, 0))
+    with pytest.raises(StorageError, match="files without a Delta log"):
+        forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+    assert sorted(tmp_path.rglob("*.parquet")) == files
+
+
+def test_refused_rows_are_of_a_drive_or_of_the_whole_that_it_was_cut_from() -> None:
+    ids = ["log", "log-1", "log-10", "log2", None]
+    rows = pa.table({"drive_id": ids, "vehicle_id": ["a", None, "b", "a", "a"]})
+    drive = Forgettable("drive", "log-1")
+    assert quarantined_of(rows, drive, set()).to_pylist() == [True, True, False, False, False]
+    by_car = quarantined_of(rows, Forgettable("vehicle", "a"), {"log-10"}).to_pylist()
+    assert by_car == [True, False, True, True, True]
 
 
 def test_the_record_names_nobody_and_can_be_asked(tmp_path: Path) -> None:
