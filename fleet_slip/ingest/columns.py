@@ -84,7 +84,7 @@ WHEELS = "wheel_"
 """How the names of wheel speeds begin."""
 VELOCITY = "m/s"
 CHOOSE = "choose"
-"""What a draft has for a unit that the file does not say, where several are possible."""
+"""What a draft has for a unit that the file does not say."""
 
 Component: TypeAlias = Literal["north", "east"]
 
@@ -149,7 +149,7 @@ class SignalColumn(Config):
     def require_unit_of(self, signal: str, si_unit: str) -> None:
         """Raise `ValueError` if the column cannot be this signal."""
         if self.unit == CHOOSE:
-            raise ValueError("has no unit in the file, and several fit: write the right one")
+            raise ValueError("has no unit in the file: write the right one")
         is_wheel = signal.startswith(WHEELS)
         if self.radius_m is not None and not is_wheel:
             raise ValueError("has radius_m, which is for wheel speeds only")

@@ -1,8 +1,8 @@
-"""Drafts a mapping for a file: guesses by name, unit and values, each with its reasons.
+"""Drafts a mapping for a file: guesses by name and unit, each with its reasons.
 
 What is doubtful stays a question, as a comment. A unit that the file does not say is chosen by a
-person where several are possible: until then the draft does not load. Signs, and which wheel is
-which, a dry run of the ingest shows.
+person: until then the draft does not load. Signs, and which wheel is which, a dry run of the ingest
+shows.
 """
 
 import json
@@ -18,7 +18,7 @@ from fleet_slip.base import shown
 from fleet_slip.catalogue.course import COURSE
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.columns import CHOOSE, TimeBase
+from fleet_slip.ingest.columns import TimeBase
 from fleet_slip.ingest.guess import (
     Guess,
     TimeGuess,
@@ -76,7 +76,7 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
 def _doubted(guess: Guess, guesses: dict[str, Guess]) -> Guess:
     """Return a guess, doubted if a weak name without a unit has nothing beside it that agrees."""
     agreeing = {"yaw_rate", "ay", "steering_wheel"} & set(guesses) - {guess.signal}
-    if guess.is_weak and guess.is_without_unit and not agreeing:
+    if guess.is_weak and guess.readings and not agreeing:
         return guess.doubted("name and unit are ambiguous")
     return guess
 
@@ -220,8 +220,6 @@ def _choices(guess: Guess) -> str:
 
 def _line(name: str, guess: Guess, guesses: dict[str, Guess]) -> str:
     keys = signal_keys(guess)
-    if guess.readings:
-        keys = {key: value for key, value in keys.items() if key != "radius_m"} | {"unit": CHOOSE}
     if guess.component:
         east = guesses[SPEED].column
         keys = {"north": keys["column"], "east": east, "unit": keys["unit"]}

@@ -17,6 +17,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.course import COURSE
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.columns import (
+    CHOOSE,
     VELOCITY,
     Component,
     conversion_factor,
@@ -36,7 +37,6 @@ from fleet_slip.ingest.vocabulary import (
     vocabulary,
 )
 
-NO_UNIT = "the file has no unit"
 _WEAK = 0.5
 """What a word that may mean something else counts against one that does not."""
 _UNIT_FITS = 4.0
@@ -57,7 +57,7 @@ class Guess:
         is_weak: whether its name may as well mean something else.
         doubts: what speaks against it.
         rivals: others that its name and unit fit as well.
-        readings: the units that are possible, where the file has none and several are.
+        readings: the units that are possible, where the file has none.
     """
 
     signal: str
@@ -78,11 +78,6 @@ class Guess:
     def component(self) -> Component | None:
         """Which one of the velocity over ground it is."""
         return self.keys.get("component")
-
-    @property
-    def is_without_unit(self) -> bool:
-        """Whether the unit is inferred from the values alone."""
-        return any(reason.startswith(NO_UNIT) for reason in self.reasons)
 
     def because(self, reason: str, **keys: Any) -> "Guess":
         """Return the guess with more keys, and one more reason."""
@@ -110,7 +105,7 @@ def guess_signals(profiles: tuple[Profile, ...]) -> dict[str, Guess]:
         elif score == best[signal] and not _same_values(guess, guesses[signal]):
             first = guesses[signal]
             guesses[signal] = replace(first, rivals=(*first.rivals, guess))
-    guesses = _agreed(_satellites(guesses))
+    guesses = _satellites(guesses)
     signed = {name: _with_sign(guess, profiles) for name, guess in guesses.items()}
     return {name: signed[name] for name in catalogue().signals if name in signed}
 
@@ -128,7 +123,7 @@ def _scored(profile: Profile) -> Iterator[tuple[float, Guess]]:
             score *= _WEAK
         if not score or (guess := _guess(signal, profile, words)) is None:
             continue
-        fits = 0.0 if guess.is_without_unit else _UNIT_FITS
+        fits = 0.0 if guess.readings else _UNIT_FITS
         yield score + fits, replace(guess, is_weak=weak)
 
 
@@ -193,102 +188,55 @@ def headings(profiles: tuple[Profile, ...], taken: set[str]) -> list[str]:
 def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
     """Return a guess with a unit that the signal can have, or None."""
     name, in_brackets = split_unit(profile.channel.name)
-    several: tuple[Keys, ...] = ()
     largest = float(np.nanquantile(np.abs(profile.values), 0.999))  # but for outliers
     text = profile.channel.unit.strip() or in_brackets
-    unit = unit_called(text) or unit_behind(name)
+    unit = unit_called(text) or unit_behind(name) or ("1" if signal == "gear" else None)
+    how = "the format calls it" if profile.channel.title else "its name contains"
+    named = f"{how} {words!r}"
     if unit is None:
-        several = unit_readings(signal, largest)
-        keys = dict(several[0])
+        several: tuple[Keys, ...] = tuple({"unit": u} for u in _UNITS_OF[_si_unit(signal)])
         unknown = f" that is known: {text!r}" if text else ""
-        likely = f" look like {keys['unit']}" if len(several) == 1 else ""
-        reason = f"{NO_UNIT}{unknown}; values up to {largest:.3g}{likely}"
-    else:
-        reason = f"its unit is {unit}"
-        radii = [{}, {"radius_m": RADIUS_M}] if signal.startswith("wheel_") else [{}]
-        fitting = [radius for radius in radii if measures(unit, _si_unit(signal, **radius))]
-        if not fitting:
-            return None
-        keys = {"unit": unit, **fitting[0]}
-    named = (
-        f"the format calls it {words!r}"
-        if profile.channel.title
-        else f"its name contains {words!r}"
-    )
-    readings = several if len(several) > 1 else ()
-    guess = Guess(signal, profile, keys, (named, reason), readings=readings)
+        reason = f"the file has no unit{unknown}; values up to {largest:.3g}"
+        readings = _OF_WHEELS if signal in WHEELS else several
+        return Guess(signal, profile, {"unit": CHOOSE}, (named, reason), readings=readings)
+    radii = (None, RADIUS_M) if signal in WHEELS else (None,)
+    fitting = [radius for radius in radii if measures(unit, _si_unit(signal, radius))]
+    if not fitting:
+        return None
+    keys: Keys = {"unit": unit} | ({"radius_m": fitting[0]} if fitting[0] else {})
+    guess = Guess(signal, profile, keys, (named, f"its unit is {unit}"))
     if signal not in catalogue().signals or catalogue()[signal].cyclic:
         return guess
-    known, in_si = catalogue()[signal], largest * si_factor(signal, **keys)
+    factor = conversion_factor(unit, _si_unit(signal, fitting[0])) / (fitting[0] or 1.0)
+    known, in_si = catalogue()[signal], largest * factor
     most = float(max(-known.min, known.max))
     if in_si <= most:
         return guess
     return guess.doubted(
-        f"in {keys['unit']} it would reach {in_si:.3g} {known.unit}; the limit of the catalogue is "
-        f"{most:g}"
+        f"in {unit} it would reach {in_si:.3g} {known.unit}; the limit of the catalogue is {most:g}"
     )
-
-
-def si_factor(signal: str, unit: str, radius_m: float | None = None) -> float:
-    """Return what one of a unit is of a signal in SI units. Raises `ValueError`."""
-    return conversion_factor(unit, _si_unit(signal, radius_m)) / (radius_m or 1.0)
 
 
 def _si_unit(signal: str, radius_m: float | None = None) -> str:
     return VELOCITY if signal in {"north", "east"} or radius_m else catalogue()[signal].unit
 
 
-# Units that a file does not say: those in which its largest value is one of a car on a road.
+# Units that a file does not say: a person chooses among those of other files.
 
-_USUAL = {
-    "m/s^2": (0.7, 15.0, ("m/s^2", "g")),
-    "rad/s": (0.05, 2.86, ("deg/s", "rad/s")),
-    "rad": (0.01, 0.9, ("deg", "rad")),
-    "m/s": (0.05, 70.0, ("m/s", "km/h", "mph")),
-    "Pa": (1e5, 4e7, ("bar", "kPa")),
-    "1": (0.02, 1.3, ("1", "%")),
+_UNITS_OF = {
+    "m/s^2": ("m/s^2", "g"),
+    "rad/s": ("deg/s", "rad/s"),
+    "rad": ("deg", "rad"),
+    "m/s": ("m/s", "km/h", "mph"),
+    "Pa": ("bar", "kPa"),
+    "1": ("1", "%"),
 }
-"""Between which values in SI units the largest of a drive is, and the units of files."""
-_USUAL_OF = {"steering_wheel": (0.2, 14.0), COURSE: (1.0, 6.4)}
 _OF_WHEELS: tuple[Keys, ...] = (
-    {"unit": "rad/s"},
     {"unit": "km/h", "radius_m": RADIUS_M},
     {"unit": "m/s", "radius_m": RADIUS_M},
+    {"unit": "rad/s"},
     {"unit": "rpm"},
 )
-_WHEELS_RAD_S = (3.0, 226.0)
-_GROUPS = (("ax", "ay"), ("vx", "vy"), WHEELS, ("steer_fl", "steer_fr"))
-"""Signals of one sensor, which have one unit."""
-
-
-def unit_readings(signal: str, largest: float) -> tuple[Keys, ...]:
-    """Return the units that values up to some size may have, at least one."""
-    if signal == "gear":
-        return ({"unit": "1"},)
-    if signal in WHEELS:
-        choices, (low, high) = _OF_WHEELS, _WHEELS_RAD_S
-    else:
-        low, high, units = _USUAL[_si_unit(signal)]
-        low, high = _USUAL_OF.get(signal, (low, high))
-        choices = tuple({"unit": unit} for unit in units)
-    in_si = [largest * si_factor(signal, **keys) for keys in choices]
-    possible = [k for k, value in zip(choices, in_si, strict=True) if low <= value <= high]
-    off = [abs(np.log(max(value, 1e-9) / np.sqrt(low * high))) for value in in_si]
-    return tuple(possible) or (choices[int(np.argmin(off))],)
-
-
-def _agreed(guesses: dict[str, Guess]) -> dict[str, Guess]:
-    """Return the guesses with only those units that all signals of a sensor may have."""
-    found = dict(guesses)
-    for group in _GROUPS:
-        names = [name for name in group if name in found and found[name].is_without_unit]
-        readings = [found[name].readings or (found[name].keys,) for name in names]
-        first = readings[0] if readings else ()
-        common = tuple(keys for keys in first if all(keys in of for of in readings))
-        for name in names if common else ():
-            keys, several = {**found[name].keys, **common[0]}, common if common[1:] else ()
-            found[name] = replace(found[name], keys=keys, readings=several)
-    return found
 
 
 # Guesses where the times of a log are, and which columns identify its cars and trips.

@@ -219,7 +219,7 @@ def test_strangers_call_velocities_otherwise(tmp_path: Path, north: str, east: s
 def test_strangers_call_a_course_otherwise(tmp_path: Path, course: str, speed: str) -> None:
     columns = on_time()
     found = tomllib.loads(suggested(tmp_path, {course: columns["cog"], speed: columns["sog"]}))
-    expected = {"column": course, "unit": "deg", "clockwise_from_north": True}
+    expected = {"column": course, "unit": "choose", "clockwise_from_north": True}
     assert found["signals"]["course"] == expected
     assert found["signals"]["satellite_speed"]["column"] == speed
 

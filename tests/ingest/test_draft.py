@@ -3,7 +3,6 @@
 import re
 import shlex
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,30 +11,23 @@ import polars as pl
 import pytest
 
 from fleet_slip.errors import ConfigError, InputError, UsageError
-from fleet_slip.ingest.guess import unit_readings
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
 from tests.support.measured import read_measured
 from tests.support.reported import call
-from tests.support.suggested import DEGREES, ENGLISH, KMH, LOGS, wrong_guesses
+from tests.support.suggested import DEGREES, ENGLISH, KMH, LOGS, with_first_units, wrong_guesses
 from tests.support.suggested import suggest as suggest_of
 from tests.support.textbook_car import Car, a_car
 
 
 def suggest(folder: Path, file: Path, *options: str) -> dict[str, Any]:
-    """Return the draft as it stands in its file, which is filled in and loads.
-
-    Of units that it asks for, the last one is taken.
-    """
+    """Return the draft as it stands in its file, which is filled in and loads."""
     written = folder / "draft.toml"
     call(folder / "root", "mapping", "suggest", str(file), "--output", str(written), *options)
     text = written.read_text()
     for line in ("day = 2024-05-31  #", 'vehicle_id = ""', 'vehicle_model = ""'):
         text = text.replace(f"# {line}", line.replace('""', '"A7"'))
-    asked = re.compile(
-        r"# Choose the unit: .*?([^ ]+)( with (radius_m = [.\d]+))?\.\n(.*)\"choose\""
-    )
-    text = asked.sub(lambda m: m[4] + m[1] + (f", {m[3]}" if m[3] else ""), text)
+    text = with_first_units(text)
     written.write_text(text)
     log = read_measured(file, load_mapping(str(written)))
     assert log.counts.quarantined == {}
@@ -51,15 +43,6 @@ def test_files_of_every_format_are_guessed_right(tmp_path: Path, name: str) -> N
     assert wrong_guesses(LOGS[name], suggest_of(LOGS[name], tmp_path)) == []
 
 
-def test_wheels_of_a_ros_topic_may_be_in_any_unit(tmp_path: Path) -> None:
-    """Of a slow car 1 rad/s is as likely as 1 km/h, which is 1.1 times as fast."""
-    name = "MCAP, sensor_msgs/Imu and a message of the car"
-    draft = suggest_of(replace(LOGS[name], least_mps=2.5), tmp_path)
-    assert "ay" in draft.guesses
-    for one in WHEELS:
-        assert {"rad/s", "km/h"} <= {keys["unit"] for keys in draft.guesses[one].readings}
-
-
 def test_a_draft_does_not_load_until_its_units_are_chosen(tmp_path: Path) -> None:
     car = a_car()
     rows = as_logged(car, ENGLISH, {**DEGREES, **KMH})
@@ -69,7 +52,7 @@ def test_a_draft_does_not_load_until_its_units_are_chosen(tmp_path: Path) -> Non
     rows.insert_column(0, pl.Series("t", np.arange(rows.height) / 100))
     rows.write_csv(tmp_path / "log.csv")
     signals = suggest(tmp_path, tmp_path / "log.csv")["signals"]
-    assert signals["vehicle_speed"] == {"column": "speedo", "unit": "mph"}, "the last one"
+    assert signals["vehicle_speed"] == {"column": "speedo", "unit": "m/s"}
     assert signals["brake_pressure"] == {"column": "brake_pressure", "unit": "bar"}
     assert signals["gear"] == {"column": "gear", "unit": "1"}
     assert signals["yaw_rate"]["unit"] == "deg/s"
@@ -80,28 +63,8 @@ def test_a_draft_does_not_load_until_its_units_are_chosen(tmp_path: Path) -> Non
     for line in ("day = 2024-05-31  #", 'vehicle_id = ""', 'vehicle_model = ""'):
         draft = draft.replace(f"# {line}", line.replace('""', '"A7"'))
     (tmp_path / "draft.toml").write_text(draft)
-    with pytest.raises(ConfigError, match="no unit in the file, and several fit"):
+    with pytest.raises(ConfigError, match="no unit in the file: write the right one"):
         load_mapping(str(tmp_path / "draft.toml"))
-
-
-@pytest.mark.parametrize(
-    ("signal", "largest", "units"),
-    [
-        ("yaw_rate", 0.6, ["rad/s"]),
-        ("yaw_rate", 40, ["deg/s"]),
-        ("ay", 0.6, ["g"]),
-        ("ay", 1.2, ["m/s^2", "g"]),
-        ("ay", 7, ["m/s^2"]),
-        ("sideslip", 0.7, ["deg", "rad"]),
-        ("wheel_fl", 900, ["rpm"]),
-        ("vx", 200, ["km/h"]),
-        ("vehicle_speed", 30, ["m/s", "km/h", "mph"]),
-        ("steering_wheel", 1.9, ["rad"]),
-        ("throttle", 98, ["%"]),
-    ],
-)
-def test_the_units_that_values_may_have(signal: str, largest: float, units: list[str]) -> None:
-    assert [keys["unit"] for keys in unit_readings(signal, largest)] == units
 
 
 _AXLE = "Vehicle.Chassis.Axle.Row"

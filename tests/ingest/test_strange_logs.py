@@ -15,6 +15,7 @@ from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_one_sided, find_suspicions
 from tests.support.reported import call
+from tests.support.suggested import with_first_units
 from tests.support.textbook_car import Car, a_car
 
 TO_DEG = 180 / np.pi
@@ -107,10 +108,9 @@ def test_a_strangers_log_becomes_the_drives_that_it_has(tmp_path: Path, name: st
         '# vehicle_id = ""': 'vehicle_id = "A"',
     }
     filled['# vehicle_model = ""'] = 'vehicle_model = "m"'
-    filled['"choose"'] = '"m/s"' if name == "student.csv" else '"km/h", radius_m = 0.31'
     for absent, present in filled.items():
         text = text.replace(absent, present)
-    mapping.write_text(f"# {text}", encoding="utf-8")
+    mapping.write_text(f"# {with_first_units(text)}", encoding="utf-8")
     found, counts = read(tmp_path / name, load_mapping(str(mapping)))
     assert counts.quarantined == {}
     assert len(found) == drives

@@ -1,5 +1,6 @@
 """Logs of a car by the textbook, as other programs write them, and the mapping that is right."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -194,6 +195,14 @@ def suggest(one: Suggested, folder: Path) -> Draft:
     file = folder / f"log{one.suffix}"
     one.write(file, a_car(one.least_mps))
     return draft_mapping(file, profile_file(file, one.bus))
+
+
+def with_first_units(draft: str) -> str:
+    """Return a draft with the first of the units that it asks for."""
+    asked = re.compile(
+        r'# Choose the unit: "(.+?)"( with ([^ ]+ = [^ ]+))?( or .*)?\.\n(.*)"choose"'
+    )
+    return asked.sub(lambda m: f'{m[5]}"{m[1]}"' + (f", {m[3]}" if m[3] else ""), draft)
 
 
 def wrong_guesses(one: Suggested, draft: Draft) -> list[str]:
