@@ -1,8 +1,8 @@
 """A published model on a data frame: side-slip angles from columns in SI units.
 
-Terms are added from left to right, to the bits of a dot product in SQL. Features are arithmetic of
-rounded counts, as the manifest has it; what is out of its valid range is missing. Models with
-columns over time look back within a drive.
+Signals are rounded to counts, as the sensors do; what is out of its valid range is missing. Terms
+are added from left to right, to the bits of a dot product in SQL. Models with columns over time
+look back within a drive.
 """
 
 import contextlib
@@ -19,10 +19,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.catalogue.definitions import plain_column
 from fleet_slip.catalogue.facts import round_number
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue, round_chunks, valid_values
-from fleet_slip.columns.drive_columns import DriveCounts, Workspace, row_counts
+from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError, InputError
@@ -205,42 +204,28 @@ def _pandas(values: pa.Array, name: str, index: Any) -> Any:
 
 def predict(manifest: Manifest, frame: Any, predictor: Predictor | None = None) -> Any:
     """Return the angle of each row in rad; see `ModelVersion.predict`."""
-    opened = open_frame(frame)
+    predictor = predictor or Predictor.of(manifest)
+    opened, signals, plan = open_frame(frame), catalogue(), predictor.plan
+    if not plan.signals:
+        raise DataError(f"the columns of {manifest.name} are of no signal. Publish it again.")
     columns = opened.numbers(manifest.columns, f"the model {manifest.name}")
-    for signal in catalogue().signals.values():
-        if signal.column in columns:
-            columns[signal.column] = valid_values(columns[signal.column], signal)
-    if manifest.definitions:
-        angle = _over_time(manifest, opened, columns, predictor or Predictor.of(manifest))
-        return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
-    physical = columns | _features(manifest, columns)
-    angle = np.asarray(manifest.intercept)
-    with np.errstate(over="ignore", invalid="ignore"):  # what is beyond float64 is infinite, or NaN
-        for term in manifest.terms:
-            angle = angle + term.coefficient * physical[term.column]
-    return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
-
-
-def _over_time(
-    manifest: Manifest, frame: Frame, columns: dict[str, FloatArray], predictor: Predictor
-) -> FloatArray:
-    """Return the angles of a model that looks back, drive by drive in the order of time."""
-    signals = catalogue()
     counts = {
-        name: round_chunks([columns[signals[name].column]], signals[name])
-        for name in predictor.plan.signals
+        name: round_chunks(
+            [valid_values(columns[signals[name].column], signals[name])], signals[name]
+        )
+        for name in plan.signals
     }
-    if missing := [name for name in predictor.plan.facts if name not in frame.names]:
+    if missing := [name for name in plan.facts if name not in opened.names]:
         raise InputError(f"{manifest.name} needs what the car knows: {', '.join(missing)}.")
-    facts = {name: _column(frame, name) for name in predictor.plan.facts}
-    numbers = _numbers(manifest, frame)
-    ticks = _ticks(frame, len(next(iter(counts.values()))))
-    if not len(ticks):
-        return np.empty(0)
-    rows = counts_of(pa.table({"tick": ticks, **counts}), predictor.plan, {})
-    angle = np.empty(len(ticks))
+    facts = {name: _column(opened, name) for name in plan.facts}
+    numbers = _numbers(manifest, opened)
+    rows = len(next(iter(counts.values())))
+    ticks = _ticks(opened, rows) if plan.windows else np.arange(rows)
+    drives = _rows_of_each_drive(opened, rows) if plan.windows else [slice(0, rows)]
+    drive = counts_of(pa.table({"tick": ticks, **counts}), plan, {})
+    angle = np.empty(rows)
     with predictor.lend_workspace() as workspace:
-        for at in _rows_of_each_drive(frame, len(ticks)):
+        for at in drives if rows else ():
             first = at.start if isinstance(at, slice) else at[0]
             own = {
                 name: count
@@ -249,8 +234,8 @@ def _over_time(
                 and (count := round_number(Fraction(float(values[first])), grain)) is not None
             }
             known = {name: values[first].as_py() for name, values in facts.items()}
-            angle[at] = predictor(rows.part(at, known, own), workspace)
-    return angle
+            angle[at] = predictor(drive.part(at, known, own), workspace)
+    return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
 
 
 def _rows_of_each_drive(frame: Frame, rows: int) -> list[slice] | list[IntArray]:
@@ -295,26 +280,3 @@ def _ticks(frame: Frame, rows: int) -> IntArray:
                 raise InputError(f"the column {name} has missing values.")
             return np.rint(values * per_tick).astype(np.int64)
     return np.arange(rows)
-
-
-def _features(manifest: Manifest, columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
-    """Return the features in SI units by column, NaN where one has no value."""
-    terms = [term for term in manifest.terms if term.sql]
-    made = [(term, plain_column(term.signal, term.sql)) for term in terms]
-    if not all(one.signals for _, one in made):
-        raise DataError(f"the features of {manifest.name} are of no signal. Publish it again.")
-    signals = catalogue()
-    counts, present = {}, {}
-    for name in {name for _, one in made for name in one.signals}:
-        rounded = round_chunks([columns[signals[name].column]], signals[name])
-        present[name] = rounded.is_valid().to_numpy(zero_copy_only=False)
-        counts[name] = rounded.fill_null(0).to_numpy().astype(np.int64)
-    found = {}
-    for term, one in made:
-        given = np.logical_and.reduce([present[name] for name in one.signals])
-        values, there = row_counts(one, counts, given)
-        found[term.column] = np.where(there, values * float(term.scale), np.nan)
-    return found
-
-
-# A published model as one of counts, so that Gram rows can tell its error.

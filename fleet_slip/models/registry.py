@@ -224,9 +224,9 @@ class ModelVersion:
         """Estimate the side-slip angle in rad for each row of a frame.
 
         The frame has the columns of `columns` in SI units, as the view `log` has them; others are
-        left alone. A model with features rounds the signals that they are made of to counts, half
-        to even, and clips them to their valid range, as the sensors do. On the rows of the logs the
-        angles have the bits that `score` computes.
+        left alone. Signals are rounded to counts, half to even, as the sensors do, and are missing
+        beyond their valid range. On the rows of the logs the angles have the bits that `score`
+        computes.
 
         | frame | returned, one float64 for each row | no angle |
         | --- | --- | --- |
@@ -247,7 +247,7 @@ class ModelVersion:
         """
         from fleet_slip.models.predict import predict  # noqa: PLC0415 - DuckDB, not for show
 
-        return predict(self.manifest, frame, self._predictor if self.manifest.definitions else None)
+        return predict(self.manifest, frame, self._predictor)
 
     @cached_property
     def _predictor(self) -> "Predictor":

@@ -17,7 +17,7 @@ from fleet_slip.grams.compute import counts_of, drives_of_stream
 from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.grams.gram_files import hash_numbers
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.predict import Predictor, predict
+from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.summary import remark_without_information
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
@@ -141,7 +141,6 @@ def _estimate_rows(
     label = manifest.label.signal
     needed = [*predictor.plan.signals, label, *predictor.plan.facts, "vehicle_id"]
     cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
-    needed += () if manifest.definitions else manifest.columns
     counts = ", ".join(dict.fromkeys(needed))
     text = read_sql("jobs", "drives_in_time.sql").format(
         columns=counts, rows=_si_rows(), condition=condition.sql
@@ -158,10 +157,7 @@ def _estimate_rows(
         stream = database.sql(text).to_arrow_reader(BATCH_ROWS)
         for rows in drives_of_stream(stream):
             numbers = cars.get(rows["vehicle_id"][0].as_py())
-            if manifest.definitions:
-                estimate = predictor(counts_of(rows, predictor.plan, None, numbers), workspace)
-            else:  # needs no compiled code
-                estimate = predict(manifest, rows).to_numpy(zero_copy_only=False)
+            estimate = predictor(counts_of(rows, predictor.plan, None, numbers), workspace)
             truth = rows[label].to_numpy(zero_copy_only=False).astype(np.float64) * unit
             chosen = rows["chosen"].to_numpy(zero_copy_only=False).astype(np.bool_)
             asked += int(chosen.sum())
