@@ -6,15 +6,15 @@ from pathlib import Path
 import pytest
 
 from tests.support.once import made_once
-from tests.support.reported import call
+from tests.support.reported import SCENARIOS, call
 
 
 @pytest.fixture(scope="session")
-def tuned(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
-    """The folder `tuned` of a copy of `smoke_root`, to be copied into others."""
+def evaluated(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
+    """A copy of `smoke_root` with an evaluation. Nothing may change it: copy it first."""
 
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
-        call(root, "evaluate", "smoke", "--scenario", "nominal")
+        call(root, "evaluate", "smoke", *SCENARIOS)
 
-    return made_once(tmp_path_factory, "tuned", make) / "tuned"
+    return made_once(tmp_path_factory, "evaluated", make)

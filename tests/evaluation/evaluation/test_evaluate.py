@@ -25,35 +25,24 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.reported import LITTLE_S, answer
-
-SCENARIOS = ("nominal", "adhesion_0_4", "wheel_missing")
-
-
-def evaluate(root: Path, *scenarios: str) -> Any:
-    options = [word for name in scenarios for word in ("--scenario", name)]
-    return answer(root, "evaluate", "smoke", *options)
+from tests.support.reported import LITTLE_S, SCENARIOS, answer
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, tuned: Path) -> Path:
-    folder = tmp_path_factory.mktemp("evaluated") / "data"
-    shutil.copytree(smoke_root, folder)
-    shutil.copytree(tuned, folder / "tuned")
-    evaluate(folder, *SCENARIOS)
-    return folder
+def root(tmp_path_factory: pytest.TempPathFactory, evaluated: Path) -> Path:
+    return shutil.copytree(evaluated, tmp_path_factory.mktemp("evaluated") / "data")
 
 
 @pytest.fixture(scope="module")
-def evaluated(root: Path) -> Any:
+def again(root: Path) -> Any:
     """What an evaluation says that was done before."""
-    return evaluate(root, *SCENARIOS)
+    return answer(root, "evaluate", "smoke", *SCENARIOS)
 
 
-def test_evaluating_again_changes_nothing(root: Path) -> None:
-    logs_version = Warehouse(LocalFolder(root)).logs.snapshot().version
-    assert evaluate(root, *SCENARIOS)["number"] == 1
-    assert Warehouse(LocalFolder(root)).logs.snapshot().version == logs_version
+def test_evaluating_again_changes_nothing(root: Path, evaluated: Path, again: Any) -> None:
+    assert again["number"] == 1
+    before, after = (Warehouse(LocalFolder(one)).logs.snapshot() for one in (evaluated, root))
+    assert after.version == before.version
 
 
 def test_an_evaluation_that_another_process_has_just_kept_is_not_kept_twice(
@@ -103,10 +92,10 @@ def test_a_changed_scenario_is_refused(root: Path, tmp_path: Path) -> None:
     file.write_text('name = "mine"\ndescription = "x"\nbase = "nominal"\nlaps = 0.1\n')
     copy = tmp_path / "data"
     shutil.copytree(root, copy)
-    evaluate(copy, str(file))
+    answer(copy, "evaluate", "smoke", "--scenario", str(file))
     file.write_text(file.read_text().replace("0.1", "0.2"))
     with pytest.raises(RefusedError, match="was changed"):
-        evaluate(copy, str(file))
+        answer(copy, "evaluate", "smoke", "--scenario", str(file))
 
 
 def test_views_show_test_drives_to_those_who_ask(root: Path) -> None:
@@ -129,11 +118,11 @@ def test_views_show_test_drives_to_those_who_ask(root: Path) -> None:
     assert answer(root, "sql", "--scenarios", count) == [{"count_star()": 8 + asked[0][0]}]
 
 
-def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path, evaluated: Any) -> None:
+def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path, again: Any) -> None:
     """SQL measures against the noisy label, here the truth counts: 0.03 degrees between them."""
     manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
     in_sql = score(Warehouse(LocalFolder(root)), manifest, "drive_id = 'scenario-nominal'")
-    one = evaluated["scenarios"][0]
+    one = again["scenarios"][0]
     here = one["results"]["smoke@1"]
     assert here["rows"] == in_sql.rows == one["truth"]["rows"]
     assert here["error_mean_deg"] == pytest.approx(in_sql.error_mean_deg, abs=0.001)
@@ -142,8 +131,8 @@ def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path, evalu
     assert in_sql.error_std_deg == pytest.approx(expected, rel=0.01)
 
 
-def test_stability_is_lost_on_the_slippery_road_alone(evaluated: Any) -> None:
-    content = {one["name"]: one for one in evaluated["scenarios"]}
+def test_stability_is_lost_on_the_slippery_road_alone(again: Any) -> None:
+    content = {one["name"]: one for one in again["scenarios"]}
     sections = {
         name: [section["name"] for section in one["sections"]] for name, one in content.items()
     }
@@ -155,8 +144,8 @@ def test_stability_is_lost_on_the_slippery_road_alone(evaluated: Any) -> None:
     assert inside["error_std_deg"] > 3 * outside["error_std_deg"]
 
 
-def test_a_missing_signal_costs_the_models_that_need_it(evaluated: Any) -> None:
-    one = next(one for one in evaluated["scenarios"] if one["name"] == "wheel_missing")
+def test_a_missing_signal_costs_the_models_that_need_it(again: Any) -> None:
+    one = next(one for one in again["scenarios"] if one["name"] == "wheel_missing")
     assert one["results"]["smoke@1/1"]["coverage"] == 1
     expected = 60 / one["truth"]["duration_s"]
     assert one["results"]["smoke@1/4"]["coverage"] == pytest.approx(expected, abs=0.001)
@@ -184,10 +173,10 @@ def test_the_filters_are_tuned_once(root: Path) -> None:
     assert all(mass_kg is None for _, _, mass_kg in drives), "the model does not know it"
 
 
-def test_a_car_identified_from_the_same_drives_competes(evaluated: Any) -> None:
-    about = evaluated["estimators"]["ekf_identified"]
+def test_a_car_identified_from_the_same_drives_competes(again: Any) -> None:
+    about = again["estimators"]["ekf_identified"]
     assert (about["kind"], about["gps"], about["told"]) == ("filter", False, "labelled drives")
-    results = evaluated["scenarios"][0]["results"]
+    results = again["scenarios"][0]["results"]
     assert results["ekf_identified"]["rmse_deg"] < 1.5 * results["ekf_class_tuned"]["rmse_deg"]
 
 

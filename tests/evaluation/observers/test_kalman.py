@@ -94,8 +94,8 @@ def stacked(found: kalman.KalmanEstimate) -> FloatArray:
 
 
 def test_agrees_with_the_textbook_filter_to_1e_10() -> None:
-    drive, yaw_rate, _ = generate(20_000, NOISE, seed=1)
-    drive = without_fixes(drive, tunnel(len(drive), 60.0))
+    drive, yaw_rate, _ = generate(8000, NOISE, seed=1)
+    drive = without_fixes(drive, tunnel(len(drive), 40.0))
     expected = textbook_filter(drive, yaw_rate, NOISE)
     np.testing.assert_allclose(stacked(fuse(drive, yaw_rate, NOISE)), expected, rtol=0, atol=1e-10)
 
@@ -160,7 +160,7 @@ def normalised_innovations(
 
 @cache
 def generated() -> tuple[DriveSignals, FloatArray]:
-    return generate(50_000, NOISE, seed=3)[:2]
+    return generate(20_000, NOISE, seed=3)[:2]
 
 
 def innovations(assumed: FilterNoise) -> FloatArray:

@@ -12,22 +12,11 @@ from fleet_slip.warehouse.tables import Warehouse
 from tests.support.once import made_once
 from tests.support.reported import Reported, call
 
-SCENARIOS = (
-    "nominal",
-    "noise_doubled",
-    "adhesion_0_4",
-    "adhesion_0_7",
-    "gps_tunnel",
-)
-
 
 @pytest.fixture(scope="session")
-def reported(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, tuned: Path) -> Reported:
+def reported(tmp_path_factory: pytest.TempPathFactory, evaluated: Path) -> Reported:
     def make(root: Path) -> None:
-        shutil.copytree(smoke_root, root)
-        shutil.copytree(tuned, root / "tuned")
-        options = [word for name in SCENARIOS for word in ("--scenario", name)]
-        call(root, "evaluate", "smoke", *options)
+        shutil.copytree(evaluated, root)
         call(root, "report", "smoke")
 
     return Reported(made_once(tmp_path_factory, "reported", make))

@@ -108,8 +108,15 @@ def test_what_cannot_be_shown_is_told(root_to_fail_in: Path, tmp_path: Path) -> 
         fleet.watch("nobody's", "smoke", tmp_path / "page.html")
 
 
-def test_other_cars_of_traffic_are_drawn_and_move_without_jumps(smoke_root: Path) -> None:
-    frames = scenario_frames("traffic", fleet_slip.open(smoke_root).model("smoke")).part(1.0, 12.0)
+def test_other_cars_of_traffic_are_drawn_and_move_without_jumps(
+    smoke_root: Path, tmp_path: Path
+) -> None:
+    scenario = tmp_path / "brief.toml"
+    scenario.write_text(
+        'name = "brief"\ndescription = "x"\nbase = "traffic"\ntraffic.duration_s = 13'
+    )
+    model = fleet_slip.open(smoke_root).model("smoke")
+    frames = scenario_frames(str(scenario), model).part(1.0, 12.0)
     data = data_of(render_watch(frames))
     assert len(data["others"]) == len(data["t"])
     assert max(len(cars[0]) for cars in data["others"] if cars) >= 3
