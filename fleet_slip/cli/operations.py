@@ -8,7 +8,7 @@ import typer
 
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.cli.options import command
-from fleet_slip.cli.output import Json, print_answer, print_json, print_parts, say
+from fleet_slip.cli.output import Json, print_answer, print_json, say
 from fleet_slip.cli.progress import progress
 from fleet_slip.errors import UsageError
 
@@ -19,28 +19,14 @@ if TYPE_CHECKING:
 
 
 @command(Fleet.status)
-def status(
-    found: "WarehouseStatus",
-    prometheus: Annotated[
-        bool,
-        typer.Option("--prometheus", help="Print metrics, for the textfile collector of a node."),
-    ] = False,
-    json: Json = False,
-) -> None:
+def status(found: "WarehouseStatus", json: Json = False) -> None:
     """Tell the warehouse's health: freshness, backlog, last runs, disk, champions.
 
     Exit code 10 if something calls for attention.
 
     Example: **fleet-slip status --max-age-hours 26**
     """
-    if json and prometheus:
-        raise UsageError("give one of --json and --prometheus.")
-    if prometheus:
-        from fleet_slip.operations.status import as_openmetrics  # noqa: PLC0415 - seldom asked
-
-        print_parts([as_openmetrics(found).removesuffix("\n")])
-    else:
-        print_answer(found, json)
+    print_answer(found, json)
     for problem in found.problems:
         say(f"- {problem}", logging.ERROR)
 

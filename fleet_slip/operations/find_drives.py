@@ -38,8 +38,6 @@ class VacuumReport:
     files: tuple[str, ...]
     size_bytes: int
     dry_run: bool
-    young: tuple[str, ...] = ()
-    """What no version has had and jobs may be about to commit: it stays."""
 
     @property
     def remark(self) -> Remark:
@@ -53,32 +51,29 @@ def vacuum(
 ) -> VacuumReport:
     """Remove what nothing has referred to for some hours."""
     warehouse.require()
-    found, young = find_expired(warehouse, retention_hours)
+    found = find_expired(warehouse, retention_hours)
     if not dry_run:
         found = [file for file in found if file.folder.remove(file)]
-    removed, left = (
-        tuple(str(file).removeprefix(f"{warehouse.root}/") for file in some)
-        for some in (found, young)
+    return VacuumReport(
+        files=tuple(str(file).removeprefix(f"{warehouse.root}/") for file in found),
+        size_bytes=sum(file.size_bytes for file in found),
+        dry_run=dry_run,
     )
-    return VacuumReport(removed, sum(file.size_bytes for file in found), dry_run, left)
 
 
-def find_expired(
-    warehouse: Warehouse, retention_hours: float
-) -> tuple[list[StoredFile], list[StoredFile]]:
-    """Return the files that `vacuum` removes, and those that may be about to be committed."""
-    replaced, uncommitted = [], find_temporary_files(warehouse)
+def find_expired(warehouse: Warehouse, retention_hours: float) -> list[StoredFile]:
+    """Return the files that `vacuum` removes: of no version of so many hours, and as old."""
+    found, uncommitted = [], find_temporary_files(warehouse)
     for table in warehouse.tables:
         files = find_unreferenced(table)
         snapshot = table.snapshot()
         if snapshot.version is None:  # its Delta log may have been lost, and these be its data
             continue
         removed, expired = snapshot.removed(), snapshot.removed(retention_hours)
-        replaced += [file for file in files if file.path in expired]
+        found += [file for file in files if file.path in expired]
         uncommitted += [file for file in files if file.path not in removed]
-    young = [file for file in uncommitted if file.age_hours < BEING_WRITTEN_HOURS]
-    found = [*replaced, *(file for file in uncommitted if file not in young)]
-    return [file for file in found if file.age_hours >= retention_hours], young
+    found += [file for file in uncommitted if file.age_hours >= BEING_WRITTEN_HOURS]
+    return [file for file in found if file.age_hours >= retention_hours]
 
 
 def find_unreferenced(table: Table) -> list[StoredFile]:
@@ -169,30 +164,40 @@ def drives_by_file(
     for file in logs.files:
         drives = located.drives.get(file.path, frozenset())
         if file.path not in located.known:
-            drives = _drives_in(logs.table, file.path, subject)
+            names = logs.table.read_combinations(file.path, ["drive_id", "vehicle_id"])
+            names = names.append_column("day", pa.repeat(file.day, names.num_rows))
+            drives = frozenset(names.filter(rows_of(names, subject))["drive_id"].to_pylist())
         if drives:
             found[file.path] = drives
     return found
 
 
-def _drives_in(logs: Table, path: str, subject: Forgettable) -> frozenset[str]:
-    names = logs.read_combinations(path, ["drive_id", "vehicle_id"])
-    day = date.fromisoformat(path.partition("/")[0].removeprefix("day="))
-    names = names.append_column("day", pa.repeat(day, names.num_rows))
-    return frozenset(names.filter(rows_of(names, subject))["drive_id"].to_pylist())
+def remove_uncommitted(warehouse: Warehouse, subject: Forgettable, drives: Collection[str]) -> None:
+    """Delete files with a car, or drives of it, that no version has had: none can land any more.
 
-
-def remove_uncommitted(warehouse: Warehouse, subject: Forgettable) -> None:
-    """Delete log files with a car or drive that no version has had: since the fence none can land.
-
-    Gram rows that landed ahead of them are then of a file that is gone.
+    Gram rows that landed ahead of a log file are then of one that is gone. Log files go last: they
+    may alone tell a car's drives. Drives before a day are not barred, and may be landing.
     """
-    removed = warehouse.logs.snapshot().removed()
-    for file in find_unreferenced(warehouse.logs) if subject.kind != "before" else ():
-        if file.path not in removed:
+    found: list[StoredFile] = []
+    for table in (warehouse.logs, warehouse.grams, warehouse.quarantine):
+        removed = table.snapshot().removed()
+        for file in find_unreferenced(table) if subject.kind != "before" else ():
             with suppress(StorageError):  # half a file, or just deleted
-                if _drives_in(warehouse.logs, file.path, subject):
-                    file.folder.remove(file)
+                rows = table.read(file.path, ["drive_id", "vehicle_id"])
+                refused = table is warehouse.quarantine
+                mine = quarantined_of(rows, subject, drives) if refused else rows_of(rows, subject)
+                if file.path not in removed and pc.any(mine).as_py():
+                    drives = {*drives, *rows.filter(mine)["drive_id"].to_pylist()}
+                    found.append(file)
+    for file in reversed(found):
+        file.folder.remove(file)
+
+
+def half_written(warehouse: Warehouse) -> list[str]:
+    """Return the files below tables, by path, that may be being written and may have any drive."""
+    tables = {table.folder.name for table in warehouse.tables}
+    files = [file.path for file in find_temporary_files(warehouse)]
+    return [path for path in files if path.split("/")[0] in tables and "_delta_log" not in path]
 
 
 def digests_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> Iterator[str]:

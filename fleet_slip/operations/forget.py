@@ -4,7 +4,7 @@ Rows leave `quarantine`, `logs` (files are written again, in one commit) and `gr
 this order, so that what is left tells an interrupted job what to do. The record
 (`warehouse/forgotten.py`) is written first, then quarantine and logs are fenced: commits
 that have not seen it conflict. Then Gram rows are fenced, against those that have not seen the new
-logs. What such jobs have written is deleted by them, or by `vacuum` if they were killed.
+logs. What such jobs have written is deleted by them or here.
 """
 
 from collections.abc import Collection, Iterator
@@ -27,6 +27,7 @@ from fleet_slip.operations.find_drives import (
     digests_of,
     drives_by_file,
     find_unreferenced,
+    half_written,
     locate,
     quarantined_of,
     remove_uncommitted,
@@ -147,7 +148,7 @@ def forget(
     if drives or state:
         warehouse.grams.fence()
     rows += forget_received(warehouse, subject)
-    remove_uncommitted(warehouse, subject)
+    remove_uncommitted(warehouse, subject, drives)
     reconcile(warehouse)
     old = vacuum(warehouse, 0, dry_run=not now)
     if drives or state in ("begun", ALLOWED):
@@ -161,7 +162,7 @@ def forget(
         models=tuple(models),
         old_files_deleted=len(old.files) if now else 0,
         old_files_left=0 if now else len(old.files),
-        pending=(*old.young, *under_way) if drives or state else (),
+        pending=(*half_written(warehouse), *under_way) if drives or state else (),
     )
 
 

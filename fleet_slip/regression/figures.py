@@ -7,6 +7,7 @@ import math
 import operator
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 
 import numpy as np
 
@@ -149,6 +150,7 @@ def student_t_two_sided(t: float, degrees: float) -> float:
     return incomplete_beta(degrees / 2, 0.5, degrees / (degrees + t * t))
 
 
+@lru_cache(1000)
 def student_t_quantile(p: float, degrees: float) -> float:
     """Return the t exceeded with probability 1 - p, p > 1/2, by bisection to adjacent numbers."""
     low, high = 0.0, 1.0

@@ -377,7 +377,7 @@ def describe_columns(database: duckdb.DuckDBPyConnection) -> pa.Table:
         "WHERE NOT internal AND NOT starts_with(table_name, 'empty_') "
         "ORDER BY table_name, column_index"
     ).fetchall()
-    rows = []
+    rows, comments = [], []
     for view, column, data_type in found:
         described = by_view.get(view, {}).get(column) or common.get(column)
         unit, description = (described.unit, described.description) if described else ("", "")
@@ -385,5 +385,6 @@ def describe_columns(database: duckdb.DuckDBPyConnection) -> pa.Table:
         rows.append(row | {"unit": unit, "description": description})
         if description:
             text = f"{description} [{unit}]" if unit else description
-            database.execute(f"COMMENT ON COLUMN {view}.{column} IS {sql_text(text)}")
+            comments.append(f"COMMENT ON COLUMN {view}.{column} IS {sql_text(text)}")
+    database.execute(";".join(comments))
     return pa.Table.from_pylist(rows)

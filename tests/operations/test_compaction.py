@@ -159,7 +159,7 @@ def test_vacuum_puts_back_a_file_that_was_written_again_meanwhile(six: Warehouse
     rows = log_rows("g", random_counts(np.random.default_rng(2), 9))
     path = path_of(six.logs.folder) / six.logs.write_file("again", rows, DAY).path
     os.utime(path, (0, 0))
-    ((judged,), _) = find_expired(six, 1)
+    (judged,) = find_expired(six, 1)
     content = path.read_bytes()
     assert six.logs.write_file("again", rows, DAY).path != judged.path  # a name has one writer
     six.logs.folder.put(judged.path, content)  # as a repair does

@@ -123,19 +123,25 @@ def test_with_now_no_byte_below_the_root_names_the_car_not_even_in_older_version
     assert mentions(tmp_path, "gamma")
 
 
-def test_what_a_killed_job_left_is_pending_for_an_hour_and_then_goes(tmp_path: Path) -> None:
+def test_what_a_killed_job_left_goes_at_once_and_what_of_others_stays_for_an_hour(
+    tmp_path: Path,
+) -> None:
     warehouse = fill(tmp_path, "alfa", "beta")
-    compact(warehouse)
-    left = warehouse.logs.write_file("left", drive("beta", 7), date(2024, 5, 1)).path
-    (rows, *_) = (warehouse.grams.read(file.path) for file in warehouse.grams.snapshot().files)
-    action = warehouse.grams.write_file("left", rows)
-    beta = Forgettable("vehicle", "beta")
-    assert forget(warehouse, beta, now=True).pending == (f"grams/{action.path}",)
-    assert not (tmp_path / "logs" / left).exists()
-    assert mentions(tmp_path, "beta") == [tmp_path / "grams" / action.path]
-    os.utime(tmp_path / "grams" / action.path, (0, 0))
-    assert not forget(warehouse, beta, now=True).pending
-    assert not mentions(tmp_path, "beta")
+    refused = pa.Table.from_pylist(
+        [{"drive_id": "beta-7"}], schema=warehouse.quarantine.schema
+    )  # that it is of the car, the log alone tells
+    left = [
+        warehouse.logs.write_file("left", drive("beta", 7), date(2024, 5, 1)),
+        warehouse.quarantine.write_file("left", refused),
+    ]
+    warehouse.quarantine.fence()
+    other = warehouse.logs.write_file("other", drive("alfa", 7), date(2024, 5, 1))
+    assert not forget(warehouse, Forgettable("vehicle", "beta"), now=True).pending
+    assert not mentions(tmp_path, "beta"), left
+    assert (tmp_path / "logs" / other.path).exists()
+    os.utime(tmp_path / "logs" / other.path, (0, 0))
+    forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+    assert not (tmp_path / "logs" / other.path).exists()
 
 
 @pytest.mark.parametrize("table", ["logs", "grams"])

@@ -221,7 +221,7 @@ def test_vacuum_does_not_move_what_took_the_place_of_a_leftover(
         ingest_file(warehouse, file, mapping)
     for path in (tmp_path / "data").rglob("*.parquet"):
         os.utime(path, (0, 0))
-    listed, _ = find_expired(warehouse, 1)
+    listed = find_expired(warehouse, 1)
     assert ingest_file(warehouse, file, mapping).new
     moved: list[str] = []
     rename = Path.rename

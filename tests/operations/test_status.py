@@ -123,7 +123,7 @@ def test_a_changed_line_of_the_history_is_a_problem_and_all_else_is_told(
 
 
 def test_the_command_tells_a_monitor(run_command: RunCommand, tmp_path: Path) -> None:
-    run_command("run", "--campaign", "smoke", "--days", "1")
+    run_command("run", "--campaign", "smoke", "--days", "1", "--models", "table1")
     fine = run_command("status", "--max-age-hours", "1", "--json")
     assert fine.exit_code == 0
     (champion,) = fine.json["champions"]
