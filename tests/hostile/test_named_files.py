@@ -22,33 +22,19 @@ def read_database(file: Path) -> Any:
     return parse_database(read_can_database(CanBus(database=file.name), file.parent))
 
 
-READERS = {"car.dbc": read_database}
-readers = pytest.mark.parametrize(("name", "read"), READERS.items(), ids=READERS)
-Read = Callable[[Path], Any]
-
-
-@readers
-def test_no_error_quotes_a_file_that_is_not_what_a_config_says(
-    tmp_path: Path, name: str, read: Read
-) -> None:
-    file = tmp_path / name
+def test_no_error_quotes_a_file_that_is_not_what_a_config_says(tmp_path: Path) -> None:
+    file = tmp_path / "car.dbc"
     for content in (LINE, f"{LINE}\n{LINE}\n", f"\n{LINE}", f'"{LINE}', f"\0{LINE}"):
         file.write_text(content)
         with pytest.raises(FleetSlipError) as caught:
-            read(file)
-        assert str(file) in str(caught.value) or name in str(caught.value)
+            read_database(file)
+        assert file.name in str(caught.value)
         assert "s3cret" not in str(caught.value)
 
 
-@readers
-def test_pipes_devices_and_folders_are_refused_at_once(
-    tmp_path: Path, name: str, read: Read
-) -> None:
-    def becomes_pipe(file: Path) -> None:
-        os.mkfifo(file)
-
+def test_pipes_devices_and_folders_are_refused_at_once(tmp_path: Path) -> None:
     makers: tuple[Callable[[Path], object], ...] = (
-        becomes_pipe,
+        os.mkfifo,
         lambda file: file.symlink_to("/dev/zero"),
         lambda file: file.symlink_to("/dev/tty"),
         Path.mkdir,
@@ -56,11 +42,11 @@ def test_pipes_devices_and_folders_are_refused_at_once(
         lambda file: file.symlink_to(file.name),
     )
     for number, make in enumerate(makers):
-        file = tmp_path / str(number) / name
+        file = tmp_path / str(number) / "car.dbc"
         file.parent.mkdir()
         make(file)
-        with within(), pytest.raises(FleetSlipError, match=name):
-            read(file)
+        with within(), pytest.raises(FleetSlipError, match=r"car\.dbc"):
+            read_database(file)
 
 
 def test_a_file_is_read_up_to_a_size(tmp_path: Path) -> None:

@@ -88,54 +88,50 @@ WRITES = [
 ]
 
 
-@pytest.mark.parametrize("attack", WRITES)
-def test_what_writes_is_refused_and_has_not_run(root: Path, attack: str) -> None:
-    before = contents(root)
-    target = root / next(name for name in before if name.endswith(".parquet"))
-    with connect(root) as database, pytest.raises(QuestionError):
-        one_query(database, attack.format(file=target))
-    assert contents(root) == before
+IN_STRINGS = (
+    "FROM json_execute_serialized_sql('{text}')",
+    "SELECT (SELECT 1 FROM json_execute_serialized_sql('{text}'))",
+    "EXPLAIN SELECT * FROM \"json_execute_serialized_sql\"('{text}')",
+)
 
 
-def test_a_statement_in_a_string_is_refused(root: Path) -> None:
+def test_what_writes_is_refused_and_has_not_run(root: Path) -> None:
     before = contents(root)
     target = root / next(name for name in before if name.endswith(".parquet"))
     text = serialised(COPY_IN_CTE.format(file=target))
+    answered = []
     with connect(root) as database:
-        for attack in (
-            f"FROM json_execute_serialized_sql('{text}')",
-            f"SELECT (SELECT 1 FROM json_execute_serialized_sql('{text}'))",
-            f"EXPLAIN SELECT * FROM \"json_execute_serialized_sql\"('{text}')",
-        ):
-            with pytest.raises(QuestionError, match="json_execute_serialized_sql"):
-                one_query(database, attack)
+        for attack in (*WRITES, *IN_STRINGS):
+            with contextlib.suppress(QuestionError):
+                answered.append(one_query(database, attack.format(file=target, text=text)))
+    assert answered == []
     assert contents(root) == before
 
 
-@pytest.mark.parametrize(
-    "query",
-    [
-        "FROM drives",
-        "EXPLAIN SELECT 1",
-        "EXPLAIN (SELECT 1)",
-        "-- é\nEXPLAIN ANALYZE FROM drives",
-        "EXPLAIN (ANALYZE, FORMAT json) SELECT 1",
-        "SUMMARIZE drives",
-        "DESCRIBE log",
-        "SHOW TABLES",
-        "WITH a AS (SELECT 1 AS n) SELECT (SELECT max(n) FROM a) FROM range(3)",
-        "WITH RECURSIVE r AS (SELECT 1 AS n UNION ALL SELECT n + 1 FROM r WHERE n < 5) FROM r",
-        "PIVOT drives ON source IN ('simulated') USING count(*)",
-        "SELECT view, count(*) FROM dictionary GROUP BY ALL UNION ALL SELECT 'all', 1",
-        "SELECT copy, insert FROM (SELECT 1 AS copy, 2 AS insert)",
-        "SELECT 'COPY x TO y; DROP TABLE z'",
-        "FROM duckdb_columns() WHERE NOT internal",
-        "SELECT unnest(sums) FROM grams;",
-    ],
+READS = (
+    "FROM drives",
+    "EXPLAIN SELECT 1",
+    "EXPLAIN (SELECT 1)",
+    "-- é\nEXPLAIN ANALYZE FROM drives",
+    "EXPLAIN (ANALYZE, FORMAT json) SELECT 1",
+    "SUMMARIZE drives",
+    "DESCRIBE log",
+    "SHOW TABLES",
+    "WITH a AS (SELECT 1 AS n) SELECT (SELECT max(n) FROM a) FROM range(3)",
+    "WITH RECURSIVE r AS (SELECT 1 AS n UNION ALL SELECT n + 1 FROM r WHERE n < 5) FROM r",
+    "PIVOT drives ON source IN ('simulated') USING count(*)",
+    "SELECT view, count(*) FROM dictionary GROUP BY ALL UNION ALL SELECT 'all', 1",
+    "SELECT copy, insert FROM (SELECT 1 AS copy, 2 AS insert)",
+    "SELECT 'COPY x TO y; DROP TABLE z'",
+    "FROM duckdb_columns() WHERE NOT internal",
+    "SELECT unnest(sums) FROM grams;",
 )
-def test_what_reads_is_answered(root: Path, query: str) -> None:
+
+
+def test_what_reads_is_answered(root: Path) -> None:
     with connect(root) as database:
-        assert database.sql(one_query(database, query)).fetchall() is not None
+        for query in READS:
+            assert database.sql(one_query(database, query)).fetchall() is not None, query
 
 
 BEFORE = (

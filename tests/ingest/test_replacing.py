@@ -1,5 +1,6 @@
 """A corrected mapping replaces, and a recording that is in is told by its bytes and its counts."""
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.storage.table import Change, Snapshot
 from tests.support.measured import SIGNALS, a_mapping, csv_text
 
-ROWS = 6000
+ROWS = 600
 
 
 def recording(seed: int = 1, rows: int = ROWS) -> dict[str, list[str]]:
@@ -35,14 +36,22 @@ def corrected(**changes: object) -> Mapping:
     return a_mapping(signals={**SIGNALS, "sideslip": turned}, **changes)
 
 
-@pytest.fixture
-def fleet(tmp_path: Path) -> Fleet:
-    """A recording and another one, and Gram rows of them."""
-    fleet = fleet_slip.open(tmp_path / "data")
-    write(tmp_path / "monday.csv", recording())
-    fleet.ingest([tmp_path / "monday.csv", write(tmp_path / "b.csv", recording(2))], a_mapping())
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording and another one, and a root with Gram rows of them."""
+    folder = tmp_path_factory.mktemp("made")
+    fleet = fleet_slip.open(folder / "data")
+    write(folder / "monday.csv", recording())
+    fleet.ingest([folder / "monday.csv", write(folder / "b.csv", recording(2))], a_mapping())
     fleet.gram()
-    return fleet
+    return folder
+
+
+@pytest.fixture
+def fleet(made: Path, tmp_path: Path) -> Fleet:
+    """A copy of that."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    return fleet_slip.open(tmp_path / "data")
 
 
 def drives(fleet: Fleet) -> dict[str, float]:

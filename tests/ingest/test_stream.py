@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from fleet_slip.compute.tasks import AHEAD, read_ahead
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import drives as drive_cutter
 from fleet_slip.ingest import drives as open_drives
 from fleet_slip.ingest import load, stream
 from fleet_slip.ingest.drives import DriveCutter
@@ -249,7 +248,3 @@ def test_items_are_read_ahead_in_order_and_errors_come_in_their_place() -> None:
             seen.append(item)
     assert seen == [0, 1, 2, 3]
     assert not [t for t in threading.enumerate() if t.name.startswith("read-ahead")]
-
-
-def test_the_longest_drive_is_said_in_the_docs() -> None:
-    assert pytest.approx(87 * 60, abs=60) == drive_cutter.LONGEST_DRIVE_S

@@ -82,7 +82,7 @@ moments = st.one_of(times, times, times, st.sampled_from([math.nan, math.inf, 1e
 samples = st.lists(st.tuples(moments, st.one_of(st.none(), st.floats(0, 9))), max_size=25)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(
     st.lists(samples, min_size=2, max_size=4),
     st.lists(st.booleans(), min_size=4, max_size=4),
