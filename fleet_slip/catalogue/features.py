@@ -1,9 +1,9 @@
 """The features in force: `configs/features.toml`, and one's own laid over it."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from decimal import Decimal
 from fractions import Fraction
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from importlib.resources.abc import Traversable
 from itertools import pairwise
 from typing import Any
@@ -25,21 +25,17 @@ from fleet_slip.catalogue.signals import (
 )
 from fleet_slip.catalogue.time_columns import (
     Calibrated,
+    ColumnFamily,
     EstimateColumn,
     Factor,
     Feature,
     GateFamily,
+    KnownColumns,
+    NotYetMadeError,
     ProductColumn,
     SlopeColumn,
     TimeColumn,
     Window,
-    calibrated_column,
-    estimate_column,
-    factor_column,
-    gated_columns,
-    product_column,
-    slope_column,
-    window_column,
 )
 from fleet_slip.config import Config, faults_of, load_config, load_toml
 from fleet_slip.errors import ConfigError, QuestionError
@@ -164,11 +160,8 @@ class FeatureSet(Config):
 # feature over time; a factor is a column times what a car knows of itself; a gate is a column as
 # far as another one opens it.
 
-Columns = Mapping[str, TimeColumn]
-
-Maker = Callable[[Columns], Columns]
-"""Makes columns by name, given those that they are made of."""
-
+_FAMILIES = ("windows", "products", "estimates", "slopes", "factors", "gates", "calibrated")
+"""What makes columns over time, in the order in which they stand."""
 
 _identities: dict[str, tuple["FeatureCatalogue", SignalCatalogue, str]] = {}
 """The identity of a set by its name, and the catalogues of which it was computed last."""
@@ -224,100 +217,19 @@ class FeatureCatalogue(Config):
 
         Raises `ValueError` for one that looks back on nothing known, or twice the same name.
         """
-        found: dict[str, TimeColumn] = {}
-        waiting = list(self._makers())
+        known = KnownColumns(self.features)
+        waiting: list[tuple[str, str, ColumnFamily]] = [
+            (f"{kind}.{name}", name, one)
+            for kind in _FAMILIES
+            for name, one in getattr(self, kind).items()
+        ]
         while waiting:
-            missing = {name for one in waiting for name in one[2]}
-            ready = [one for one in waiting if not one[1] & missing]
-            if not ready:
+            known.missing = frozenset(n for _, name, one in waiting for n in one.names(name))
+            later = [each for each in waiting if not _made(*each, known)]
+            if len(later) == len(waiting):
                 raise ValueError(f"{waiting[0][0]}: it is made of itself")
-            for where, _, names, make in ready:
-                if twice := [name for name in names if name in found]:
-                    raise ValueError(f"{where}: {twice[0]} stands twice")
-                found.update(_named(where, make, found))
-            waiting = [one for one in waiting if one not in ready]
-        return found
-
-    def _makers(self) -> Iterator[tuple[str, set[str], tuple[str, ...], Maker]]:
-        """Yield where columns are defined, what they need and are called, and what makes them."""
-        made = {*self.products, *self.estimates, *self.slopes}
-        for name, window in self.windows.items():
-            needs = {window.of} & made
-            yield f"windows.{name}", needs, self.members(name), partial(self._windows, name, window)
-        for name, product in self.products.items():
-            yield f"products.{name}", {*product.of}, (name,), partial(self._product, name, product)
-        for name, estimate in self.estimates.items():
-            yield f"estimates.{name}", set(), (name,), partial(self._estimate, name, estimate)
-        for name, slope in self.slopes.items():
-            needs = {of for one in slope.equations for of in one.names}
-            yield f"slopes.{name}", needs, (name,), partial(self._slope, name, slope)
-        for name, factor in self.factors.items():
-            yield f"factors.{name}", {factor.of}, (name,), partial(self._factor, name, factor)
-        for name, gate in self.gates.items():
-            yield (
-                f"gates.{name}",
-                {gate.of, *gate.columns},
-                self.members(name),
-                partial(gated_columns, name, gate),
-            )
-        for name, calibrated in self.calibrated.items():
-            needs = {calibrated.of, calibrated.running or ""}
-            make = partial(self._calibrated, name, calibrated)
-            yield f"calibrated.{name}", needs, (name,), make
-
-    def _windows(self, name: str, window: Window, known: Columns) -> Columns:
-        row, scale = self._row(window.of, known)
-        members = window.members(name).items()
-        return {one: window_column(window, ticks, row, scale) for one, ticks in members}
-
-    def _estimate(self, name: str, estimate: EstimateColumn, _: Columns) -> Columns:
-        return {name: estimate_column(name, estimate)}
-
-    def _product(self, name: str, product: ProductColumn, known: Columns) -> Columns:
-        factors = [self._column_or_row(of, known) for of in product.of]
-        return {name: product_column(name, product, factors)}
-
-    def _slope(self, name: str, slope: SlopeColumn, known: Columns) -> Columns:
-        for one in slope.equations:
-            if unknown := [of for of in one.names if of not in known]:
-                raise ValueError(f"{', '.join(unknown)}: no column over time")
-        return {name: slope_column(name, slope, known)}
-
-    def _factor(self, name: str, factor: Factor, known: Columns) -> Columns:
-        return {name: factor_column(factor, *self._column_or_row(factor.of, known))}
-
-    def _calibrated(self, name: str, one: Calibrated, known: Columns) -> Columns:
-        if one.running is not None and one.running not in known:
-            raise ValueError(f"{one.running} is no column over time")
-        of: Feature | Signal | TimeColumn
-        if one.of in known:
-            of, base = known[one.of], known[one.of].definition
-        else:
-            base, _ = self._row(one.of, known)
-            of = self.features[one.of] if one.of in self.features else catalogue()[one.of]
-            if base.sql:  # the count itself, as it stands in the rows
-                base = base.model_copy(update={"bits": base.of_bits})
-        if base.number is not None:
-            raise ValueError(f"{one.of} has a number already")
-        running = known[one.running] if one.running else None
-        return {name: calibrated_column(one, base, of.scale, of.unit, running)}
-
-    def _column_or_row(self, name: str, known: Columns) -> tuple[Definition, Fraction]:
-        """Return a column over time, or a row as one, and its scale."""
-        if name in known:
-            return known[name].definition, known[name].exact_scale
-        return self._row(name, known)
-
-    def _row(self, name: str, known: Columns) -> tuple[Definition, Fraction]:
-        """Return what can be looked back on as the definition of a column, and its scale."""
-        if name in known and name in {*self.products, *self.estimates, *self.slopes}:
-            return known[name].definition, known[name].exact_scale
-        if name in self.features:
-            one = self.features[name]
-            return Definition(of=name, sql=one.sql, of_bits=one.bits), one.exact_scale
-        if name in catalogue().feature_inputs:
-            return Definition(of=name), catalogue()[name].exact_scale
-        raise ValueError(f"{name} is no input signal or feature")
+            waiting = later
+        return known.over_time
 
     def definition(self, name: str) -> Definition | None:
         """Return the definition of an input that is more than a signal or a feature of 16 bits."""
@@ -440,9 +352,8 @@ class FeatureCatalogue(Config):
 
     def members(self, name: str) -> tuple[str, ...]:
         """Return the columns of a family of windows or gates; any other name stays."""
-        if name in self.windows:
-            return tuple(self.windows[name].members(name))
-        return tuple(self.gates[name].members(name)) if name in self.gates else (name,)
+        family = self.windows.get(name) or self.gates.get(name)
+        return family.names(name) if family else (name,)
 
     def families(self, signals: Iterable[str]) -> dict[str, int]:
         """Return the names of signals, whole families of windows and gates by their own.
@@ -535,14 +446,19 @@ class FeatureCatalogue(Config):
         return (*catalogue().feature_inputs, *self.features, *self.time_columns)
 
 
-def _named(where: str, make: Maker, known: Columns) -> Columns:
-    """Make columns. Raises `ValueError` that says where they are defined."""
+def _made(where: str, name: str, family: ColumnFamily, known: KnownColumns) -> bool:
+    """Make the columns of a family, if there is all that they are made of. Raises `ValueError`."""
     try:
-        return make(known)
-    except ValidationError as error:
-        raise ValueError(f"{where}: {faults_of(error)}") from None
+        found = family.make(name, known)
+    except NotYetMadeError:
+        return False
     except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+        told = faults_of(error) if isinstance(error, ValidationError) else error
+        raise ValueError(f"{where}: {told}") from None
+    if twice := [member for member in found if member in known.over_time]:
+        raise ValueError(f"{where}: {twice[0]} stands twice")
+    known.over_time.update(found)
+    return True
 
 
 def load_features_over(shipped: Traversable, own: Traversable) -> FeatureCatalogue:

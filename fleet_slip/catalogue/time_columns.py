@@ -1,13 +1,17 @@
-"""Columns over time of `configs/features.toml`: windows, factors, gates and car numbers."""
+"""Features and columns over time of `configs/features.toml`, as types that make columns.
+
+A family knows what its columns are called, and makes them of those that are known.
+"""
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from decimal import Decimal
 from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -23,6 +27,7 @@ from fleet_slip.catalogue.definitions import (
     Fact,
     FactText,
     Gate,
+    Made,
     Number,
     Over,
     Product,
@@ -30,319 +35,8 @@ from fleet_slip.catalogue.definitions import (
     integer_arithmetic,
 )
 from fleet_slip.catalogue.facts import CAR_NUMBERS, NumberName, Unit
-from fleet_slip.catalogue.signals import Identifier, Scaled, SIUnit, catalogue
+from fleet_slip.catalogue.signals import Identifier, Scaled, Signal, SIUnit, catalogue
 from fleet_slip.config import Config
-
-TICKS = "{ticks}"
-"""In the column of a family of windows: the number of ticks of each."""
-
-
-class Window(Config):
-    """A family of columns that look back on a signal, feature, product or estimate: one of N ticks.
-
-    The column of N ticks is called NAME_N; the mean since the drive began is called NAME.
-    """
-
-    of: Identifier
-    over: Over
-    ticks: tuple[int, ...] = ()
-    scale: Decimal = Field(gt=0)
-    bits: Bits = 20
-    unit: SIUnit
-    column: str = Field(min_length=1, max_length=60)
-    description: str = Field(min_length=1)
-
-    @model_validator(mode="after")
-    def _ticks_fit(self) -> "Window":
-        if (self.over != "running_mean") != bool(self.ticks):
-            raise ValueError("ticks is for mean, sum, lag and change, which must have it")
-        if len(set(self.ticks)) < len(self.ticks):
-            raise ValueError("a number of ticks stands twice")
-        if any(not 1 <= n <= LONGEST_TICKS for n in self.ticks):
-            raise ValueError(f"ticks must lie in 1..{LONGEST_TICKS}")
-        if bool(self.ticks) != (TICKS in self.column):
-            raise ValueError(f"column must have {TICKS} in it if there are ticks, and only then")
-        return self
-
-    def members(self, name: str) -> dict[str, int]:
-        """Return the names of the family's columns, and the ticks of each."""
-        return {f"{name}_{n}": n for n in self.ticks} or {name: 0}
-
-
-class Factor(Config):
-    """A column times what a car knows of itself: a number less `less`, or whether it `equals`."""
-
-    of: Identifier
-    fact: Identifier
-    less: int = 0
-    equals: FactText | None = None
-    scale: Decimal = Field(gt=0)
-    unit: SIUnit
-    column: Identifier
-    description: str = Field(min_length=1)
-
-
-class Calibrated(Config):
-    """A column times a number that the car's own drives tell; `alone`, the number by itself."""
-
-    of: Identifier
-    number: NumberName
-    less: Decimal = Decimal(0)
-    alone: bool = False
-    running: Identifier | None = None
-    column: Identifier
-    description: str = Field(min_length=1)
-
-
-class EstimateColumn(Config):
-    """The estimate of a line that is fitted before, by the `line` of a model list."""
-
-    scale: Decimal = Field(gt=0)
-    column: Identifier
-    description: str = Field(min_length=1)
-
-
-class ProductColumn(Config):
-    """The product of two columns, signals or features; of none, 1."""
-
-    of: tuple[Identifier, ...] = Field(max_length=2)
-    scale: Decimal = Field(gt=0)
-    bits: Bits = 20
-    unit: SIUnit
-    column: Identifier
-    description: str = Field(min_length=1)
-
-
-class EquationColumns(Config):
-    """What tells a slope: `y`, a sum of columns, is the slope times `of`, but for noise.
-
-    Other unknowns times the columns `beside` come to it; a whole number there is a column that is
-    always the same. It counts with a `weight`, at most 1.
-    """
-
-    y: dict[Identifier, Literal[-1, 1]] = Field(min_length=1)
-    of: Identifier
-    beside: tuple[Identifier | int, ...] = ()
-    weight: Decimal = Decimal(1)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The columns in it."""
-        return (*self.y, self.of, *(one for one in self.beside if isinstance(one, str)))
-
-
-class SlopeColumn(Config):
-    """The first unknown of equations, by ridge regression over the drive so far."""
-
-    equations: tuple[EquationColumns, ...] = Field(min_length=1)
-    ridge: tuple[int, ...] = Field(min_length=1)
-    scale: Decimal = Field(gt=0)
-    unit: SIUnit
-    column: Identifier
-    description: str = Field(min_length=1)
-
-
-class TimeColumn(Scaled):
-    """One column over time: how it is defined, and what a count of it is worth."""
-
-    definition: Definition
-    unit: Unit
-    column: Identifier
-    description: str
-
-
-def window_column(window: Window, ticks: int, row: Definition, scale: Fraction) -> TimeColumn:
-    """Return a member of a family, given what it looks back on and that one's scale."""
-    definition = Definition(
-        of=row.of,
-        sql=row.sql,
-        made=row.made,
-        of_bits=row.of_bits,
-        over=window.over,
-        ticks=ticks,
-        ratio=scale / Fraction(window.scale),
-        bits=window.bits,
-    )
-    return TimeColumn(
-        definition=definition,
-        scale=window.scale,
-        unit=window.unit,
-        column=window.column.replace(TICKS, str(ticks)),
-        description=window.description + (f", over {ticks} ticks" if ticks else ""),
-    )
-
-
-def _made_column(
-    name: str,
-    one: EstimateColumn | ProductColumn | SlopeColumn,
-    made: Combination | Product | Slope,
-) -> TimeColumn:
-    """Return what is made of other columns as a column of its own."""
-    bits = one.bits if isinstance(one, ProductColumn) else LARGEST_BITS
-    return TimeColumn(
-        definition=Definition(of=name, made=made, of_bits=bits, bits=bits),
-        scale=one.scale,
-        unit="rad" if isinstance(one, EstimateColumn) else one.unit,
-        column=one.column,
-        description=one.description,
-    )
-
-
-def estimate_column(name: str, one: EstimateColumn) -> TimeColumn:
-    """Return the estimate of a line that has not been fitted."""
-    return _made_column(name, one, Combination(line=""))
-
-
-def product_column(
-    name: str, one: ProductColumn, factors: Sequence[tuple[Definition, Fraction]]
-) -> TimeColumn:
-    """Return a product, given each factor and its scale."""
-    scale = math.prod((scale for _, scale in factors), start=Fraction(1))
-    ratio = scale / Fraction(one.scale)
-    return _made_column(name, one, Product(of=tuple(of for of, _ in factors), ratio=ratio))
-
-
-def slope_column(name: str, one: SlopeColumn, known: Mapping[str, TimeColumn]) -> TimeColumn:
-    """Return a slope. Raises `ValueError` if a scale of its equations does not fit the others."""
-    equations, values = [], set()
-    for number, equation in enumerate(one.equations, 1):
-        of_y = {known[column].exact_scale for column in equation.y}
-        if len(of_y) > 1:
-            raise ValueError(f"{', '.join(equation.y)} differ in scale")
-        terms = tuple((sign, known[column].definition) for column, sign in equation.y.items())
-        y = Definition(
-            of=f"{name}_{number}",
-            made=Combination(terms=terms),
-            of_bits=COUNT_BITS,
-            bits=COUNT_BITS,
-        )
-        x = (equation.of, *equation.beside)
-        columns = tuple(known[of].definition if isinstance(of, str) else of for of in x)
-        equations.append(Equation(y=y, x=columns, weight=Fraction(equation.weight)))
-        values.add(of_y.pop() / known[equation.of].exact_scale)
-    if len(values) > 1:
-        raise ValueError(
-            "the scales of y and `of` have another ratio from one equation to the next"
-        )
-    slope = Slope(
-        equations=tuple(equations), ridge=one.ridge, ratio=values.pop() / Fraction(one.scale)
-    )
-    return _made_column(name, one, slope)
-
-
-def calibrated_column(
-    one: Calibrated, base: Definition, scale: Decimal, unit: str, running: TimeColumn | None
-) -> TimeColumn:
-    """Return a column times a number, given the column without it, its scale and its unit.
-
-    Raises `ValueError` if `running` has another grain than the number, or `less` is between counts.
-    """
-    number = CAR_NUMBERS[one.number]
-    if running is not None and running.scale != number.grain:
-        raise ValueError(
-            f"{one.running} has the scale {running.scale}, {one.number} {number.grain}"
-        )
-    less = Fraction(one.less) / Fraction(number.grain)
-    if less.denominator != 1:
-        raise ValueError(f"less is no multiple of {number.grain}")
-    factor = Number(
-        name=one.number,
-        grain=number.grain,
-        less=int(less),
-        alone=one.alone,
-        running=running.definition if running else None,
-    )
-    own = [] if number.unit == "1" else [number.unit]
-    return TimeColumn(
-        definition=base.model_copy(update={"number": factor}),
-        scale=number.grain if one.alone else number.grain * scale,
-        unit="*".join(own if one.alone else [*own, unit]) or "1",
-        column=one.column,
-        description=one.description,
-    )
-
-
-def factor_column(factor: Factor, base: Definition, scale: Fraction) -> TimeColumn:
-    """Return a column times a fact, given the column without it and that one's scale.
-
-    Raises `ValueError` if the column has a factor already.
-    """
-    if base.fact is not None:
-        raise ValueError(f"{factor.of} has a factor already")
-    fact = Fact(
-        name=factor.fact,
-        less=factor.less,
-        equals=factor.equals,
-        ratio=scale / Fraction(factor.scale),
-    )
-    return TimeColumn(
-        definition=base.model_copy(update={"fact": fact}),
-        scale=factor.scale,
-        unit=factor.unit,
-        column=factor.column,
-        description=factor.description,
-    )
-
-
-class GateFamily(Config):
-    """Several linear models with a blend between them, as columns: one for each knot but the first.
-
-    At a knot one model holds alone; between two knots they are mixed in proportion. Weights add up
-    to one, so that a model has the columns themselves and, for each further knot, what changes
-    there. The column of a knot is called COLUMN_NAME_K, K from 1.
-    """
-
-    of: Identifier
-    """The column over time that opens and closes the gates."""
-    knots: tuple[Decimal, ...] = Field(min_length=2, max_length=20)
-    """Physical values of it, rising; beyond the ends the outermost models hold."""
-    columns: tuple[Identifier, ...] = Field(min_length=1)
-    """Columns over time that are gated."""
-    description: str = Field(min_length=1)
-
-    @model_validator(mode="after")
-    def _knots_rise(self) -> "GateFamily":
-        if any(high <= low for low, high in pairwise(self.knots)):
-            raise ValueError("the knots of a gate must rise")
-        if len(set(self.columns)) < len(self.columns):
-            raise ValueError("a column stands twice")
-        return self
-
-    def members(self, name: str) -> dict[str, tuple[str, int]]:
-        """Return the names of the family's columns, and of each the column and the knot."""
-        return {
-            f"{column}_{name}_{knot}": (column, knot)
-            for knot in range(1, len(self.knots))
-            for column in self.columns
-        }
-
-
-def gated_columns(
-    name: str, family: GateFamily, known: Mapping[str, TimeColumn]
-) -> dict[str, TimeColumn]:
-    """Return the members of a family of gates. Raises `ValueError` for what is no column."""
-    unknown = [one for one in (family.of, *family.columns) if one not in known]
-    if unknown:
-        raise ValueError(f"{', '.join(unknown)}: no column over time")
-    by = known[family.of]
-    counts = [round(Fraction(knot) / by.exact_scale) for knot in family.knots]
-    found = {}
-    for member, (column, knot) in family.members(name).items():
-        base = known[column]
-        gate = Gate(
-            by=by.definition,
-            low=counts[knot - 1],
-            peak=counts[knot],
-            high=counts[knot + 1] if knot + 1 < len(counts) else None,
-        )
-        changed = {
-            "definition": base.definition.model_copy(update={"gate": gate}),
-            "column": f"{base.column}_{name}_{knot}",
-            "description": f"{base.description}, where {family.of} is near {family.knots[knot]:f}",
-        }
-        found[member] = base.model_copy(update=changed)
-    return found
-
 
 # Features of `configs/features.toml` as types: integer functions of the counts of one row.
 
@@ -403,3 +97,336 @@ def _widened(text: str) -> str:
     if not _DECLARED.fullmatch(text):
         raise ValueError(f"{text!r} is not integer arithmetic of + - * ( ) and // NUMBER")
     return _WORD.sub(lambda m: m[0] if m[0] in ("abs", "sign") else f"{m[0]}::BIGINT", text)
+
+
+# Columns over time: windows, products, estimates, slopes, factors, gates and car numbers.
+
+
+class TimeColumn(Scaled):
+    """One column over time: how it is defined, and what a count of it is worth."""
+
+    definition: Definition
+    unit: Unit
+    column: Identifier
+    description: str
+
+
+class NotYetMadeError(Exception):
+    """A column is made of one that is to be made before."""
+
+
+@dataclass
+class KnownColumns:
+    """What columns can be made of: signals, features, and the columns over time that there are.
+
+    `missing` are the names of those that are to be made.
+    """
+
+    features: Mapping[str, Feature]
+    over_time: dict[str, TimeColumn] = field(default_factory=dict)
+    missing: frozenset[str] = frozenset()
+
+    def of(self, name: str) -> Signal | Feature | TimeColumn:
+        """Return an input by name. Raises `ValueError` for what is none, and `NotYetMadeError`."""
+        if name in self.missing:
+            raise NotYetMadeError
+        if found := self.over_time.get(name) or self.features.get(name):
+            return found
+        if name not in catalogue().feature_inputs:
+            raise ValueError(f"{name} is no input signal or feature")
+        return catalogue()[name]
+
+    def definition(self, name: str) -> Definition:
+        """Return a column over time, or a row as one. Raises `ValueError` for no input."""
+        one = self.of(name)
+        if isinstance(one, TimeColumn):
+            return one.definition
+        if isinstance(one, Feature):
+            return Definition(of=name, sql=one.sql, of_bits=one.bits)
+        return Definition(of=name)
+
+    def columns(self, *names: str) -> list[TimeColumn]:
+        """Return columns over time. Raises `ValueError` for what is none, and `NotYetMadeError`."""
+        if not self.missing.isdisjoint(names):
+            raise NotYetMadeError
+        if unknown := [name for name in names if name not in self.over_time]:
+            raise ValueError(f"{', '.join(unknown)}: no column over time")
+        return [self.over_time[name] for name in names]
+
+
+class ColumnFamily(Config):
+    """What makes columns over time."""
+
+    description: str = Field(min_length=1)
+
+    def names(self, name: str) -> tuple[str, ...]:
+        """Return the names of the columns."""
+        return (name,)
+
+    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+        """Return the columns by name. Raises `ValueError`, and `NotYetMadeError`."""
+        raise NotImplementedError
+
+    def _column(self, definition: Definition, **other: Any) -> TimeColumn:
+        """Return a column that is called as the family is, but for what is given."""
+        names = ("scale", "unit", "column", "description")
+        own = {name: getattr(self, name) for name in names if name not in other}
+        return TimeColumn(definition=definition, **own, **other)
+
+
+TICKS = "{ticks}"
+"""In the column of a family of windows: the number of ticks of each."""
+
+
+class Window(ColumnFamily):
+    """A family of columns that look back on a signal, feature, product or estimate: one of N ticks.
+
+    The column of N ticks is called NAME_N; the mean since the drive began is called NAME.
+    """
+
+    of: Identifier
+    over: Over
+    ticks: tuple[int, ...] = ()
+    scale: Decimal = Field(gt=0)
+    bits: Bits = 20
+    unit: SIUnit
+    column: str = Field(min_length=1, max_length=60)
+
+    @model_validator(mode="after")
+    def _ticks_fit(self) -> "Window":
+        if (self.over != "running_mean") != bool(self.ticks):
+            raise ValueError("ticks is for mean, sum, lag and change, which must have it")
+        if len(set(self.ticks)) < len(self.ticks):
+            raise ValueError("a number of ticks stands twice")
+        if any(not 1 <= n <= LONGEST_TICKS for n in self.ticks):
+            raise ValueError(f"ticks must lie in 1..{LONGEST_TICKS}")
+        if bool(self.ticks) != (TICKS in self.column):
+            raise ValueError(f"column must have {TICKS} in it if there are ticks, and only then")
+        return self
+
+    def names(self, name: str) -> tuple[str, ...]:
+        """Return the name of each length, or that of the mean since the drive began."""
+        return tuple(f"{name}_{n}" for n in self.ticks) or (name,)
+
+    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+        """Return a column for each length."""
+        row = known.definition(self.of)
+        if self.of in known.over_time and not (row.made and row.of == self.of):
+            raise ValueError(f"{self.of} is no input signal or feature")
+        ratio, found = known.of(self.of).exact_scale / Fraction(self.scale), {}
+        for member, ticks in zip(self.names(name), self.ticks or (0,), strict=True):
+            definition = Definition(
+                of=row.of,
+                sql=row.sql,
+                made=row.made,
+                of_bits=row.of_bits,
+                over=self.over,
+                ticks=ticks,
+                ratio=ratio,
+                bits=self.bits,
+            )
+            found[member] = self._column(
+                definition,
+                column=self.column.replace(TICKS, str(ticks)),
+                description=self.description + (f", over {ticks} ticks" if ticks else ""),
+            )
+        return found
+
+
+class Factor(ColumnFamily):
+    """A column times what a car knows of itself: a number less `less`, or whether it `equals`."""
+
+    of: Identifier
+    fact: Identifier
+    less: int = 0
+    equals: FactText | None = None
+    scale: Decimal = Field(gt=0)
+    unit: SIUnit
+    column: Identifier
+
+    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+        """Return the product."""
+        base = known.definition(self.of)
+        if base.fact is not None:
+            raise ValueError(f"{self.of} has a factor already")
+        ratio = known.of(self.of).exact_scale / Fraction(self.scale)
+        fact = Fact(name=self.fact, less=self.less, equals=self.equals, ratio=ratio)
+        return {name: self._column(base.model_copy(update={"fact": fact}))}
+
+
+class Calibrated(ColumnFamily):
+    """A column times a number that the car's own drives tell; `alone`, the number by itself."""
+
+    of: Identifier
+    number: NumberName
+    less: Decimal = Decimal(0)
+    alone: bool = False
+    running: Identifier | None = None
+    column: Identifier
+
+    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+        """Return the column times a number.
+
+        Raises `ValueError` if `running` has another grain than the number, or `less` is between
+        counts.
+        """
+        base, of, number = known.definition(self.of), known.of(self.of), CAR_NUMBERS[self.number]
+        if isinstance(of, Feature):  # the count itself, as it stands in the rows
+            base = base.model_copy(update={"bits": base.of_bits})
+        if base.number is not None:
+            raise ValueError(f"{self.of} has a number already")
+        running = known.columns(self.running)[0] if self.running else None
+        if running is not None and running.scale != number.grain:
+            raise ValueError(
+                f"{self.running} has the scale {running.scale}, {self.number} {number.grain}"
+            )
+        less = Fraction(self.less) / Fraction(number.grain)
+        if less.denominator != 1:
+            raise ValueError(f"less is no multiple of {number.grain}")
+        factor = Number(
+            name=self.number,
+            grain=number.grain,
+            less=int(less),
+            alone=self.alone,
+            running=running.definition if running else None,
+        )
+        own = [] if number.unit == "1" else [number.unit]
+        column = self._column(
+            base.model_copy(update={"number": factor}),
+            scale=number.grain if self.alone else number.grain * of.scale,
+            unit="*".join(own if self.alone else [*own, of.unit]) or "1",
+        )
+        return {name: column}
+
+
+class MadeColumn(ColumnFamily):
+    """A column that is made of others."""
+
+    scale: Decimal = Field(gt=0)
+    unit: SIUnit
+    column: Identifier
+
+    def _of(self, name: str, made: Made, bits: int = LARGEST_BITS) -> dict[str, TimeColumn]:
+        return {name: self._column(Definition(of=name, made=made, of_bits=bits, bits=bits))}
+
+
+class EstimateColumn(MadeColumn):
+    """The estimate of a line that is fitted before, by the `line` of a model list."""
+
+    unit: Literal["rad"] = "rad"
+
+    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:  # noqa: ARG002
+        """Return the estimate of a line that has not been fitted."""
+        return self._of(name, Combination(line=""))
+
+
+class ProductColumn(MadeColumn):
+    """The product of two columns, signals or features; of none, 1."""
+
+    of: tuple[Identifier, ...] = Field(max_length=2)
+    bits: Bits = 20
+
+    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+        """Return the product."""
+        factors = tuple(map(known.definition, self.of))
+        scale = math.prod((known.of(one).exact_scale for one in self.of), start=Fraction(1))
+        return self._of(name, Product(of=factors, ratio=scale / Fraction(self.scale)), self.bits)
+
+
+class EquationColumns(Config):
+    """What tells a slope: `y`, a sum of columns, is the slope times `of`, but for noise.
+
+    Other unknowns times the columns `beside` come to it; a whole number there is a column that is
+    always the same. It counts with a `weight`, at most 1.
+    """
+
+    y: dict[Identifier, Literal[-1, 1]] = Field(min_length=1)
+    of: Identifier
+    beside: tuple[Identifier | int, ...] = ()
+    weight: Decimal = Decimal(1)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The columns in it."""
+        return (*self.y, self.of, *(one for one in self.beside if isinstance(one, str)))
+
+
+class SlopeColumn(MadeColumn):
+    """The first unknown of equations, by ridge regression over the drive so far."""
+
+    equations: tuple[EquationColumns, ...] = Field(min_length=1)
+    ridge: tuple[int, ...] = Field(min_length=1)
+
+    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+        """Return a slope. Raises `ValueError` if a scale of its equations does not fit others."""
+        equations, values = [], set()
+        for number, equation in enumerate(self.equations, 1):
+            known.columns(*equation.names)
+            columns = known.over_time
+            of_y = {columns[one].exact_scale for one in equation.y}
+            if len(of_y) > 1:
+                raise ValueError(f"{', '.join(equation.y)} differ in scale")
+            terms = tuple((sign, columns[one].definition) for one, sign in equation.y.items())
+            y = Definition(
+                of=f"{name}_{number}",
+                made=Combination(terms=terms),
+                of_bits=COUNT_BITS,
+                bits=COUNT_BITS,
+            )
+            x = (equation.of, *equation.beside)
+            factors = tuple(columns[of].definition if isinstance(of, str) else of for of in x)
+            equations.append(Equation(y=y, x=factors, weight=Fraction(equation.weight)))
+            values.add(of_y.pop() / columns[equation.of].exact_scale)
+        if len(values) > 1:
+            raise ValueError(
+                "the scales of y and `of` have another ratio from one equation to the next"
+            )
+        ratio = values.pop() / Fraction(self.scale)
+        return self._of(name, Slope(equations=tuple(equations), ridge=self.ridge, ratio=ratio))
+
+
+class GateFamily(ColumnFamily):
+    """Several linear models with a blend between them, as columns: one for each knot but the first.
+
+    At a knot one model holds alone; between two knots they are mixed in proportion. Weights add up
+    to one, so that a model has the columns themselves and, for each further knot, what changes
+    there. The column of a knot is called COLUMN_NAME_K, K from 1.
+    """
+
+    of: Identifier
+    """The column over time that opens and closes the gates."""
+    knots: tuple[Decimal, ...] = Field(min_length=2, max_length=20)
+    """Physical values of it, rising; beyond the ends the outermost models hold."""
+    columns: tuple[Identifier, ...] = Field(min_length=1)
+    """Columns over time that are gated."""
+
+    @model_validator(mode="after")
+    def _knots_rise(self) -> "GateFamily":
+        if any(high <= low for low, high in pairwise(self.knots)):
+            raise ValueError("the knots of a gate must rise")
+        if len(set(self.columns)) < len(self.columns):
+            raise ValueError("a column stands twice")
+        return self
+
+    def names(self, name: str) -> tuple[str, ...]:
+        """Return the names of the columns of each knot."""
+        knots = range(1, len(self.knots))
+        return tuple(f"{column}_{name}_{knot}" for knot in knots for column in self.columns)
+
+    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+        """Return the columns of each knot."""
+        by, *bases = known.columns(self.of, *self.columns)
+        counts = [round(Fraction(knot) / by.exact_scale) for knot in self.knots]
+        found = []
+        for knot, peak in enumerate(counts[1:], 1):
+            high = counts[knot + 1] if knot + 1 < len(counts) else None
+            gate = Gate(by=by.definition, low=counts[knot - 1], peak=peak, high=high)
+            near = f", where {self.of} is near {self.knots[knot]:f}"
+            for base in bases:
+                changed = {
+                    "definition": base.definition.model_copy(update={"gate": gate}),
+                    "column": f"{base.column}_{name}_{knot}",
+                    "description": base.description + near,
+                }
+                found.append(base.model_copy(update=changed))
+        return dict(zip(self.names(name), found, strict=True))

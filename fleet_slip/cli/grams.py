@@ -138,7 +138,7 @@ def features(
 def _families(known: FeatureCatalogue) -> TextTable:
     """Return columns over time by family: one by one they are hundreds."""
     families = [
-        [name, " ".join(map(str, one.members(name).values())), one.description]
+        [name, " ".join(map(str, one.ticks or (0,))), one.description]
         for name, one in known.windows.items()
     ]
     made = {**known.products, **known.estimates, **known.slopes}
