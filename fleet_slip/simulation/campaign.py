@@ -23,28 +23,24 @@ from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import find_config
-from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative, Positive
+from fleet_slip.simulation.imperfections import NONE, NotNegative, Positive
 from fleet_slip.simulation.plan import (
+    CarOnRoad,
     DriveDraw,
     FleetPlan,
     GridPlan,
-    Traffic,
     TrafficPlan,
     TrialPlan,
 )
 from fleet_slip.simulation.receivers import Receiver, Receivers
 from fleet_slip.simulation.roads import (
-    Manoeuvre,
-    SpeedLimits,
     SpeedProfile,
-    Track,
     random_generator,
     speed_profile,
     surface,
 )
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Distortion, Sensors
 from fleet_slip.vehicle.batch import Surface
-from fleet_slip.vehicle.parameters import VehicleParameters
 
 if TYPE_CHECKING:
     from fleet_slip.simulation.traffic import TrafficDrive
@@ -60,35 +56,22 @@ class PacePoint(Config):
     factor: Positive
 
 
-@dataclass(frozen=True)
-class DriveSpec:
+@dataclass(frozen=True, kw_only=True)
+class DriveSpec(CarOnRoad):
     """Everything that determines one drive's bytes."""
 
     drive_id: str
     vehicle_id: str
     campaign: str
     day: date
-    vehicle: VehicleParameters
-    sensors: Sensors
-    track: Track
-    adhesion: float
-    limits: SpeedLimits
-    speed_factor: float
     laps: float
     seed: int
     source: str = "simulated"
-    script: Annotated[tuple[Manoeuvre, ...], Field(exclude_if=lambda script: not script)] = ()
-    """Manoeuvres; a drive without any has the digest that it had before there were some."""
-    flaws: Annotated[Imperfections, Field(exclude_if=lambda flaws: flaws == NONE)] = NONE
-    """Not part of the digest where there are none: it is what it was before there were any."""
     receiver: Annotated[Receiver | None, Field(exclude_if=lambda one: one is None)] = None
     drawn_as: Annotated[str, Field(exclude_if=lambda name: not name)] = ""
     """The campaign whose car, road and noise this drive has, if it is not its own."""
     pace: Annotated[tuple[PacePoint, ...], Field(exclude=True)] = ()
     """Of a scenario: how its speed varies beside what the track asks for."""
-
-    traffic: Annotated[Traffic | None, Field(exclude_if=lambda one: one is None)] = None
-    """Where highway-env drives; None: the track is known."""
 
     @cached_property
     def in_traffic(self) -> "TrafficDrive | None":

@@ -214,42 +214,32 @@ def _repeated(values: pa.Array, times: Sequence[int]) -> pa.ChunkedArray:
     return pa.chunked_array(chunks, type=encoded.type)
 
 
-def has_landed(snapshot: Snapshot, batch: Batch) -> bool:
-    """Whether a batch is in the logs. Raises `RefusedError` if another batch has its place."""
-    landed = snapshot.landed(unit_name(batch.campaign, batch.day, batch.index))
-    if landed is not None and landed != unit_of(batch).version:
-        raise changed_campaign(batch.campaign, batch.day)
-    return landed is not None
-
-
-def changed_campaign(campaign: str, day: date) -> RefusedError:
-    """Return the error that a day's batches, or the day, landed as something else."""
-    return RefusedError(
-        f"{day}: the campaign {campaign!r} was changed since this day was simulated, and logs are "
-        "never replaced. Give the changed campaign another name, or use another data root."
-    )
-
-
 def unit_of(batch: Batch) -> Unit:
     """Return the unit of work that lands a batch; its version is from the batch's content."""
-    name = unit_name(batch.campaign, batch.day, batch.index)
+    name = f"{day_name(batch.campaign, batch.day)}/{batch.index}"
     return Unit(name, int(batch.digest[:15], base=16))
 
 
-def unit_name(campaign: str, day: date, index: int) -> str:
-    """Return the name of the unit of work that lands a day's batch of an index."""
-    return f"simulate/{campaign}/{day}/{index}"
+def unit_of_day(campaign: Campaign, day: date) -> Unit:
+    """Return the unit of work that records that a day is complete."""
+    return Unit(day_name(campaign.name, day), int(campaign.digest[:15], base=16))
 
 
-def file_name(batch: Batch) -> str:
-    """Return the name of a batch's file, before the checksum of its bytes."""
-    return f"{batch.campaign}-{batch.index:04d}-{batch.digest[:12]}"
+def day_name(campaign: str, day: date) -> str:
+    """Return what the units of work of a day are called, and its batches' before their number."""
+    return f"simulate/{campaign}/{day}"
 
 
-def day_units(campaign: Campaign, days: Iterable[date]) -> Iterator[tuple[Unit, date]]:
-    """Yield the unit of work that records that a day is complete, for each of some days."""
-    version = int(campaign.digest[:15], base=16)
-    return ((Unit(f"simulate/{campaign.name}/{day}", version), day) for day in days)
+def has_landed(snapshot: Snapshot, unit: Unit) -> bool:
+    """Whether a unit is in the logs. Raises `RefusedError` if another version of it is."""
+    landed = snapshot.landed(unit.name)
+    if landed not in (None, unit.version):
+        _, campaign, day, *_ = unit.name.split("/")
+        raise RefusedError(
+            f"{day}: the campaign {campaign!r} was changed since this day was simulated, and logs "
+            "are never replaced. Give the changed campaign another name, or use another data root."
+        )
+    return landed is not None
 
 
 @dataclass
@@ -319,10 +309,10 @@ def simulate_campaign(
     snapshot = warehouse.logs.snapshot()
     every = tuple(days)
     open_days = _open_days(snapshot, campaign, every)
-    begun = [d for d in open_days if snapshot.landed(unit_name(campaign.name, d, 0)) is not None]
-    for day in begun:  # before anything is written, so that a changed campaign is refused
-        for batch in campaign.batches(day):
-            has_landed(snapshot, batch)
+    for day in open_days:  # before anything is written, so that a changed campaign is refused
+        if snapshot.landed(f"{day_name(campaign.name, day)}/0") is not None:
+            for batch in campaign.batches(day):
+                has_landed(snapshot, unit_of(batch))
     plan = (campaign.batches(day) for day in open_days)
     report = _simulate(warehouse, plan, len(open_days), executor, progress)
     report.campaign, report.days_present = campaign.name, len(every) - len(open_days)
@@ -331,22 +321,15 @@ def simulate_campaign(
     return report
 
 
-def _open_days(snapshot: Snapshot, campaign: Campaign, days: Iterable[date]) -> tuple[date, ...]:
+def _open_days(snapshot: Snapshot, campaign: Campaign, days: Iterable[date]) -> list[date]:
     """Return the days not recorded as complete. Raises `RefusedError` for a changed campaign."""
-    found = []
-    for unit, day in day_units(campaign, days):
-        landed = snapshot.landed(unit.name)
-        if landed is None:
-            found.append(day)
-        elif landed != unit.version:
-            raise changed_campaign(campaign.name, day)
-    return tuple(found)
+    return [day for day in days if not has_landed(snapshot, unit_of_day(campaign, day))]
 
 
 @retrying
 def _complete(warehouse: Warehouse, campaign: Campaign, days: Iterable[date]) -> None:
     snapshot = warehouse.logs.snapshot()
-    units = [unit for unit, _ in day_units(campaign, _open_days(snapshot, campaign, days))]
+    units = [unit_of_day(campaign, day) for day in _open_days(snapshot, campaign, days)]
     if units:
         snapshot.commit(Change(units=units, note={"job": "simulate", "campaign": campaign.name}))
 
@@ -365,7 +348,7 @@ def simulate_batches(
     """
     snapshot = warehouse.logs.snapshot()
     for batch in batches:
-        has_landed(snapshot, batch)
+        has_landed(snapshot, unit_of(batch))
     return _simulate(warehouse, [batches], 1, executor, progress)
 
 
@@ -377,9 +360,20 @@ def _simulate(
     progress: Progress,
 ) -> SimulationReport:
     start = time.perf_counter()
-    backlog = _Backlog(warehouse.logs.snapshot(), plan, days)
-    report = SimulationReport()
-    for _, result in run_tasks(executor, partial(_write, warehouse), backlog, _name):
+    snapshot, report = warehouse.logs.snapshot(), SimulationReport()
+    days_planned = rows = 0
+
+    def backlog() -> Iterator[Batch]:
+        """Yield batches that have not landed, planned day by day as they are asked for."""
+        nonlocal days_planned, rows
+        for batches in plan:
+            missing = [batch for batch in batches if not has_landed(snapshot, unit_of(batch))]
+            report.batches_present += len(batches) - len(missing)
+            days_planned += 1
+            rows += sum(drive.expected_rows for batch in missing for drive in batch.drives)
+            yield from missing
+
+    for _, result in run_tasks(executor, partial(_write, warehouse), backlog(), _name):
         if landed := _land(warehouse, result):
             report.batches_written += 1
             report.drives += len(landed.drives)
@@ -387,36 +381,11 @@ def _simulate(
             report.drives_forgotten += len(landed.batch.drives) - len(landed.drives)
             report.rows += landed.rows
             report.size_bytes += landed.action.size if landed.action else 0
-        progress(result.rows, backlog.expected_rows)
-    report.batches_present = backlog.present
+        # The rows of days that are not planned yet are taken to be like the others'.
+        progress(result.rows, rows * days // days_planned)
     report.logs_version = warehouse.logs.snapshot().version
     report.seconds = time.perf_counter() - start
     return report
-
-
-class _Backlog:
-    """Batches that have not landed, planned day by day as they are asked for."""
-
-    def __init__(self, snapshot: Snapshot, plan: Iterable[Sequence[Batch]], days: int) -> None:
-        self._snapshot = snapshot
-        self._plan = plan
-        self._days = days
-        self._days_planned = 0
-        self._rows = 0
-        self.present = 0
-
-    @property
-    def expected_rows(self) -> int:
-        """Rows to simulate; those of days not planned yet are taken to be like the others'."""
-        return self._rows * self._days // max(self._days_planned, 1)
-
-    def __iter__(self) -> Iterator[Batch]:
-        for batches in self._plan:
-            missing = [batch for batch in batches if not has_landed(self._snapshot, batch)]
-            self.present += len(batches) - len(missing)
-            self._days_planned += 1
-            self._rows += sum(drive.expected_rows for batch in missing for drive in batch.drives)
-            yield from missing
 
 
 def _name(batch: Batch) -> str:
@@ -429,7 +398,8 @@ def _write(warehouse: Warehouse, batch: Batch) -> _Written:
         return _Written(batch, (), None, 0)
     check_against_highway_env(drives)
     rows = simulate_batch(replace(batch, drives=drives))
-    action = warehouse.logs.put(file_name(batch), warehouse.logs.encode(rows), batch.day)
+    name = f"{batch.campaign}-{batch.index:04d}-{batch.digest[:12]}"  # before its checksum
+    action = warehouse.logs.put(name, warehouse.logs.encode(rows), batch.day)
     return _Written(batch, drives, action, rows.num_rows)
 
 
@@ -450,7 +420,7 @@ def _land(warehouse: Warehouse, written: _Written) -> _Written | None:
     def attempt() -> _Written | None:
         nonlocal written
         snapshot = warehouse.logs.snapshot()
-        landed = has_landed(snapshot, written.batch)
+        landed = has_landed(snapshot, unit_of(written.batch))
         # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
         while landed or written.drives != _not_forgotten(warehouse, written.drives):
             warehouse.logs.discard(_files(written))

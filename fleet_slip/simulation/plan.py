@@ -105,9 +105,12 @@ class CarOnRoad:
     adhesion: float
     limits: SpeedLimits
     speed_factor: float
-    script: tuple[Manoeuvre, ...] = ()
-    flaws: Imperfections = NONE
-    traffic: Traffic | None = None
+    script: Annotated[tuple[Manoeuvre, ...], Field(exclude_if=lambda script: not script)] = ()
+    """Manoeuvres; a drive without any has the digest that it had before there were some."""
+    flaws: Annotated[Imperfections, Field(exclude_if=lambda flaws: flaws == NONE)] = NONE
+    """Not part of the digest where there are none: it is what it was before there were any."""
+    traffic: Annotated[Traffic | None, Field(exclude_if=lambda one: one is None)] = None
+    """Where highway-env drives; None: the track is known."""
 
 
 @dataclass(frozen=True)

@@ -77,11 +77,6 @@ def target_acceleration(road: Road) -> FloatArray:
     return np.gradient(energy, road.spacing_m)
 
 
-def road_table(road: Road) -> FloatArray:
-    """Return what the kernel looks up of a road: curvature, target speed and acceleration."""
-    return _continued(road, road.curvature_1pm, road.speed_mps, target_acceleration(road))
-
-
 def surface_table(road: Road) -> FloatArray:
     """Return what the kernel looks up of a road's surface."""
     zero, one = np.zeros(len(road.curvature_1pm)), np.ones(len(road.curvature_1pm))
@@ -225,7 +220,10 @@ def _car(drive: LaneDrive) -> FloatArray:
 def _routes(drives: Sequence[LaneDrive]) -> tuple[NDArray[np.void], FloatArray, FloatArray]:
     """Return the way of each drive, and the tables of all roads and surfaces that it points to."""
     roads = {id(drive.road): drive.road for drive in drives}
-    tables = [road_table(road) for road in roads.values()]
+    tables = [
+        _continued(road, road.curvature_1pm, road.speed_mps, target_acceleration(road))
+        for road in roads.values()
+    ]
     ends = np.cumsum([len(table) for table in tables])
     spans = dict(zip(roads, zip([0, *ends[:-1]], ends - 1, strict=True), strict=True))
     routes = np.array([_route(drive, *spans[id(drive.road)]) for drive in drives], dtype=ROUTE)
