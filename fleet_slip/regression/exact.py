@@ -79,13 +79,10 @@ def eliminate(matrix: Sequence[Sequence[int]]) -> Elimination:
 
 
 def inverse_matrix(matrix: Sequence[Sequence[int]]) -> list[list[Fraction]]:
-    """Return the inverse of a regular symmetric integer matrix, exactly."""
-    entries, determinant = adjugate(matrix)
-    return [[Fraction(entry, determinant) for entry in row] for row in entries]
+    """Return the inverse of a regular symmetric integer matrix, exactly.
 
-
-def adjugate(matrix: Sequence[Sequence[int]]) -> tuple[list[list[int]], int]:
-    """Return adjugate and determinant, whose ratio is the inverse (fraction-free Gauss-Jordan)."""
+    By fraction-free Gauss-Jordan: it ends with the adjugate, and the determinant.
+    """
     size = len(matrix)
     work = [[*row, *(int(i == j) for j in range(size))] for i, row in enumerate(matrix)]
     previous = 1
@@ -100,7 +97,7 @@ def adjugate(matrix: Sequence[Sequence[int]]) -> tuple[list[list[int]], int]:
                     for x, y in zip(work[a], pivot_row, strict=True)
                 ]
         previous = pivot
-    return [row[size:] for row in work], previous
+    return [[Fraction(entry, previous) for entry in row[size:]] for row in work]
 
 
 MAX_SWEEPS = 60

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.exact import adjugate, eliminate
+from fleet_slip.regression.exact import eliminate, inverse_matrix
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import dependence, moments
 
@@ -29,30 +29,26 @@ def declared(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]: 
 def correlation(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
     """Order by the absolute correlation with the label, largest first."""
     matrix = _moments(gram, inputs, label)
-    scores = [_gain(matrix[i], i) for i in range(len(inputs))]
+    scores = [Fraction(matrix[i][-1] ** 2, matrix[i][i]) for i in range(len(inputs))]
     return _descending(inputs, scores)
 
 
 def t_value(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
     """Order by |t| in the full model, largest first: b_i^2 / (S^-1)_ii."""
-    matrix, _ = _full_model(_moments(gram, inputs, label))
-    return _descending(inputs, [_gain(matrix[i], i) for i in range(len(inputs))])
+    matrix = _moments(gram, inputs, label)
+    inverse = inverse_matrix([row[:-1] for row in matrix[:-1]])
+    slopes = [sum(a * b for a, b in zip(row, matrix[-1], strict=False)) for row in inverse]
+    return _descending(inputs, [b**2 / inverse[i][i] for i, b in enumerate(slopes)])
 
 
 def forward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
     """Add, at each step, the signal that reduces the residual sum of squares most."""
-    order = _pivot(_moments(gram, inputs, label), largest=True)
-    return tuple(inputs[i] for i in order)
+    return _stepwise(gram, inputs, label, "forward")
 
 
 def backward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
     """Remove the signal whose loss costs least, of equals the later: Wang's and WEKA's order."""
-    k = len(inputs)
-    matrix = _moments(gram, inputs, label)
-    later_first = [*reversed(range(k)), k]
-    rows, determinant = _full_model([[matrix[i][j] for j in later_first] for i in later_first])
-    removed = _pivot(rows, largest=False, divisor=determinant)
-    return tuple(inputs[k - 1 - i] for i in reversed(removed))
+    return _stepwise(gram, inputs, label, "backward")
 
 
 RANKINGS: dict[str, Ranking] = {
@@ -78,36 +74,12 @@ def _moments(gram: Gram, inputs: Sequence[str], label: str) -> Matrix:
     return matrix
 
 
-def _full_model(matrix: Matrix) -> tuple[Matrix, int]:
-    """Return the rows (adj N, d b) of the full model and its determinant d (Jacobi's identity)."""
-    inverse, determinant = adjugate([row[:-1] for row in matrix[:-1]])
-    numerators = [
-        sum(a * row[-1] for a, row in zip(line, matrix, strict=False)) for line in inverse
-    ]
-    return [[*line, b] for line, b in zip(inverse, numerators, strict=True)], determinant
-
-
-def _gain(row: list[int], i: int) -> Fraction:
-    return Fraction(row[-1] ** 2, row[i])
-
-
-def _pivot(matrix: Matrix, *, largest: bool, divisor: int = 1) -> list[int]:
-    """Eliminate inputs by the best gain, fraction-free: entries share one positive factor."""
-    sign = -1 if largest else 1
-    inputs = len(matrix[0]) - 1
-    work = {i: matrix[i] for i in range(inputs)}
-    order = []
-    while work:
-        scores = {i: sign * _gain(row, i) for i, row in work.items()}
-        pivot = min(work, key=lambda i: (scores[i], i))
-        pivot_row = work.pop(pivot)
-        d = pivot_row[pivot]
-        for i, row in work.items():
-            f = row[pivot]
-            work[i] = [(x * d - f * y) // divisor for x, y in zip(row, pivot_row, strict=True)]
-        divisor = d
-        order.append(pivot)
-    return order
+def _stepwise(gram: Gram, inputs: Sequence[str], label: str, method: str) -> tuple[str, ...]:
+    """Return the order of a search, behind it what is as good as dependent, as declared."""
+    _moments(gram, inputs, label)
+    found = stepwise_order(gram, inputs, label, method, len(inputs))
+    order = found[-1] if found else ()
+    return (*order, *(name for name in inputs if name not in order))
 
 
 def _descending(inputs: Sequence[str], scores: Sequence[Fraction]) -> tuple[str, ...]:
