@@ -98,12 +98,14 @@ def test_only_what_the_history_may_keep_is_kept(fleet: Fleet, tmp_path: Path) ->
 def test_running_twice_does_nothing_twice(tmp_path: Path) -> None:
     fleet = fleet_slip.open(tmp_path / "data")
     steps: list[str] = []
-    first = fleet.run("smoke", days=1, progress=lambda step, *_: steps.append(step))
+    first = fleet.run(
+        "smoke", days=1, models="table1", progress=lambda step, *_: steps.append(step)
+    )
     assert first.changed
     assert first.publication
     assert first.publication.new
     assert {*steps} >= {"simulate smoke", "gram signals"}
-    second = fleet.run("smoke", days=1)
+    second = fleet.run("smoke", days=1, models="table1")
     assert not second.changed
     assert second.publication
     assert second.publication.version == first.publication.version

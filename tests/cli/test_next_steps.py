@@ -40,7 +40,9 @@ def test_another_root_stands_in_them(
     run_command: RunCommand, smoke_root: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(smoke_root, tmp_path / "my data", ignore=shutil.ignore_patterns("models"))
-    done = run_command("run", "--campaign", "smoke", root=tmp_path / "my data")
+    done = run_command(
+        "run", "--campaign", "smoke", "--models", "table1", root=tmp_path / "my data"
+    )
     assert f"--root '{tmp_path / 'my data'}' sql" in done.stderr
 
 

@@ -73,7 +73,7 @@ def test_querying_and_selecting_need_the_core_alone(root: Path) -> None:
     asked = [
         [*at, "sql", "SELECT count(*) FROM log"],
         [*at, "gram"],
-        [*at, "select"],
+        [*at, "select", "--models", "table1"],
         [*at, "select", "--all-subsets", "--nested", "ay,yaw_rate,ax"],
         [*at, "publish", "core", "--nested", "ay,yaw_rate,ax,steer_fl"],
         [*at, "show", "core"],
