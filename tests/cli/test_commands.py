@@ -144,31 +144,31 @@ def test_publish_show_score_promote_and_roll_back(
     run_command: RunCommand, tmp_path: Path, smoke_root: Path
 ) -> None:
     shutil.copytree(smoke_root, tmp_path / "data")
-    same = ("--models", "estimator", "--cohort", "campaign = 'smoke'")
-    again = run_command("publish", "smoke", *same, "--json").json
-    assert (again["version"], again["new"]) == (1, False)
-    alone = ("--features", "windows", "--nested", "ax")
-    worse = run_command("publish", "smoke", *alone)
+    same = ("publish", "slip", "--models", "table1", "--cohort", "campaign = 'smoke'", "--json")
+    made = [run_command(*same).json for _ in range(2)]
+    assert [(one["version"], one["new"]) for one in made] == [(1, True), (1, False)]
+    alone = ("--nested", "ax")
+    worse = run_command("publish", "slip", *alone)
     assert worse.exit_code == 7
     assert "worse than the champion" in worse.stderr
-    other = run_command("publish", "smoke", "--nested", "ax")
+    other = run_command("publish", "smoke", "--nested", "ax")  # its columns are windows
     assert other.exit_code == 7
     assert "cannot be compared" in other.stderr
-    forced = run_command("publish", "smoke", *alone, "--force", "--json").json
+    forced = run_command("publish", "slip", *alone, "--force", "--json").json
     assert (forced["version"], forced["new"]) == (2, True)
-    assert run_command("show", "smoke", "--json").json["version"] == 2
-    assert run_command("promote", "smoke", "--previous").exit_code == 0
-    shown = run_command("show", "smoke@champion", "--json").json
+    assert run_command("show", "slip", "--json").json["version"] == 2
+    assert run_command("promote", "slip", "--previous").exit_code == 0
+    shown = run_command("show", "slip@champion", "--json").json
     assert shown["version"] == 1
-    score = run_command("score", "smoke", "--json").json
+    score = run_command("score", "slip", "--json").json
     assert score["rows"] == shown["trained_on"]["rows"]
     assert 0 < score["error_median_deg"] < score["error_p95_deg"] < score["error_max_deg"]
     assert abs(score["error_mean_deg"]) < 1e-9  # an OLS fit has no mean error on its own rows
-    assert run_command("promote", "smoke@2", "--alias", "shadow").exit_code == 0
-    listed = run_command("models", "--json").json
+    assert run_command("promote", "slip@2", "--alias", "shadow").exit_code == 0
+    listed = run_command("models", "slip", "--json").json
     assert [(m["version"], m["aliases"]) for m in listed] == [(1, "champion"), (2, "shadow")]
-    assert "rollback" in run_command("models", "smoke").stdout
-    assert "ax_mps2" in run_command("show", "smoke@2").stdout
+    assert "rollback" in run_command("models", "slip").stdout
+    assert "ax_mps2" in run_command("show", "slip@2").stdout
 
 
 @pytest.mark.long

@@ -97,7 +97,7 @@ def test_all_subsets_report_the_best_of_every_size(
 def test_a_model_names_the_rows_that_it_was_made_of(
     run_command: RunCommand, every_set: Path
 ) -> None:
-    report = run_command("select", "--json", root=every_set).json
+    report = run_command("select", "--models", "table1", "--json", root=every_set).json
     model = report["models"][1]
     assert model["drives"] == report["drives"] == 8
     with fleet_slip.connect(every_set) as database:
