@@ -31,7 +31,6 @@ COMMANDS = (
     "simulator",
     "simulator_profile",
     "pipeline",
-    "gram_variants",
     "cluster",
     "crash --kills 30",
 )

@@ -1,9 +1,9 @@
-"""The paper's other systems on the test drives: networks, trees, neuro-fuzzy rules, observers.
+"""The paper's other systems on the test drives: networks, trees, neuro-fuzzy rules, filters.
 
-    python -m benchmarks.rivals ROOT MODEL [--rivals mlp_8,luenberger] [--rows 60000]
+    python -m benchmarks.rivals ROOT MODEL [--rivals mlp_8,ekf_tree] [--rows 60000]
         [--drives nominal,car_suv]
 
-Learners are fitted to rows of the drives that the published model learned from, observers are tuned
+Learners are fitted to rows of the drives that the published model learned from, filters are tuned
 on 24 of them. They see 2 signals, 8, or `windows`: the 8 and all columns of the model. The table
 has the bytes that a car carries, the seconds of training, the microseconds of each of many
 estimates, and root mean square errors in degrees: cross-validated, and on each test drive.
@@ -28,20 +28,11 @@ from benchmarks.rivals.learners import (
     fit_trees,
     one_thread,
 )
-from benchmarks.rivals.observers import (
-    GAINS_TUNABLE,
-    POLES_TUNABLE,
-    ObserverPoles,
-    SlidingGains,
-    luenberger,
-    sliding_mode,
-)
 from benchmarks.rivals.tree_filter import fit_tree_filter
 from fleet_slip.evaluation.drives import simulate_drives
 from fleet_slip.evaluation.filters import (
     FILTERS,
     TABLE_ONE,
-    Filter,
     FilterEstimate,
     PublishedEstimate,
     TuningDrives,
@@ -67,10 +58,7 @@ LEARNERS: dict[str, Fit] = {
     "anfis": fit_anfis,
     "grnn": fit_general_regression,
 }
-OBSERVERS = (
-    Filter("luenberger", "luenberger", luenberger, ObserverPoles(), POLES_TUNABLE),
-    Filter("sliding_mode", "sliding_mode", sliding_mode, SlidingGains(), GAINS_TUNABLE),
-)
+FILTER = next(one for one in FILTERS if one.name == "ekf_class")
 TREE = "ekf_tree"
 T = TypeVar("T")
 
@@ -120,19 +108,17 @@ def train(
         for name, fit in LEARNERS.items():
             if wanted(f"{name}_{suffix}"):
                 yield f"{name}_{suffix}", learn(fit, sample, inputs)
+    if not (wanted(FILTER.name) or wanted(TREE)):
+        return
     car = load_scenario("nominal").car
     drives = TuningDrives.of(fleet.warehouse, cohort, weighed=False)
-    base = next(one for one in FILTERS if one.name == "ekf_class")
     with ThreadPoolExecutor(1) as executor:
-        for one in (*OBSERVERS, base):
-            if not wanted(one.name) and not (one is base and wanted(TREE)):
-                continue
-            best, took_s = timed(partial(one.tune, drives.read(), car, executor))
-            estimate = FilterEstimate(one, best.parameters, car)
-            yield one.name, Rival(estimate, training_s=took_s)
-            if one is base and wanted(TREE):
-                tree, took_s = timed(partial(fit_tree_filter, estimate, drives.read(), executor))
-                yield TREE, Rival(tree, tree.size_bytes, took_s)
+        best, took_s = timed(partial(FILTER.tune, drives.read(), car, executor))
+        estimate = FilterEstimate(FILTER, best.parameters, car)
+        yield FILTER.name, Rival(estimate, training_s=took_s)
+        if wanted(TREE):
+            tree, took_s = timed(partial(fit_tree_filter, estimate, drives.read(), executor))
+            yield TREE, Rival(tree, tree.size_bytes, took_s)
 
 
 def main() -> None:

@@ -123,15 +123,10 @@ def without_fixes(drive: DriveSignals, lost: BoolArray) -> DriveSignals:
     )
 
 
-def axle_stiffness_n(car: VehicleParameters) -> tuple[float, float]:
-    """Return the cornering stiffness of both axles at rest, per unit of slip."""
-    front, rear, *_ = loaded_axles(car, np.zeros(1), np.zeros(1), adhesion=1.0)[:, 0]
-    return float(front), float(rear)
-
-
 def steady_sideslip_rad(car: VehicleParameters, vx_mps: float, yaw_rate_rad_s: float) -> float:
     """Return β of steady cornering, arctan(b r / vx − a m vx r / (Cr L))."""
-    body, rear_n = car.body, axle_stiffness_n(car)[1]
+    body, still = car.body, np.zeros(1)
+    rear_n = loaded_axles(car, still, still, adhesion=1.0)[1, 0]
     slip = body.front_axle_m * body.mass_kg * vx_mps / (rear_n * body.wheelbase_m)
     return float(np.arctan(yaw_rate_rad_s * (body.rear_axle_m / vx_mps - slip)))
 

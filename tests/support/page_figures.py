@@ -1,6 +1,6 @@
 """Figures in pages that `make bench` measures again, each before a mark that readers do not see.
 
-    | the query in use | 0.26 <!-- bench gram_variants: number 2 after "query in use" --> |
+    | the query in use | 0.26 <!-- bench pipeline: number 2 after "query in use" --> |
 
 The mark says where the benchmark prints the figure: which number behind a label. Ratios are
 compared as they are. The mark of a processor time ends with `, yardstick 1.9 s`, what the yardstick

@@ -103,7 +103,7 @@ def test_a_tree_without_factors_is_the_filter_and_never_worse_with_them() -> Non
 
 @pytest.mark.long
 def test_the_table_has_a_line_for_each_rival(smoke_root: Path) -> None:
-    rivals = "regression_8,trees_windows,luenberger"
+    rivals = "regression_8,trees_windows"
     command = f"-m benchmarks.rivals {smoke_root} smoke --rows 2000 --drives nominal"
     done = subprocess.run(
         [sys.executable, *command.split(), "--rivals", rivals],

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.rivals.observers import ObserverPoles, SlidingGains, luenberger, sliding_mode
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, kalman
@@ -21,11 +20,8 @@ CAR = load_vehicle("d_class_sedan")
 ESTIMATORS: dict[str, tuple[Callable[..., FloatArray], Any]] = {
     "kalman": (kalman.estimate, kalman.FilterNoise()),
     "ekf": (ekf.estimate, ekf.EkfNoise()),
-    "luenberger": (luenberger, ObserverPoles()),
-    "sliding_mode": (sliding_mode, SlidingGains()),
 }
 ALL = pytest.mark.parametrize("name", ESTIMATORS)
-OBSERVERS = pytest.mark.parametrize("name", ["ekf", "luenberger", "sliding_mode"])
 
 simulated = cache(simulated_drive)
 
@@ -80,37 +76,23 @@ def test_a_gap_of_the_sensors_is_bridged(name: str) -> None:
     np.testing.assert_array_equal(found[:900], expected[:900])
 
 
-@OBSERVERS
 @pytest.mark.parametrize(
     ("field", "message"),
     [("ay_mps2", "no ay"), ("wheel_rl_rad_s", "wheel speeds"), ("steer.*_rad", "steer_fl")],
 )
-def test_an_absent_sensor_is_named(name: str, field: str, message: str) -> None:
-    estimate, parameters = ESTIMATORS[name]
+def test_an_absent_sensor_is_named(field: str, message: str) -> None:
     drive = slalom(CAR, 50)[0]
     absent = {one: np.full(50, np.nan) for one in vars(drive) if re.fullmatch(field, one)}
     with pytest.raises(DataError, match=message):
-        estimate(replace(drive, **absent), CAR, parameters)
+        ekf.estimate(replace(drive, **absent), CAR, ekf.EkfNoise())
 
 
-@OBSERVERS
-def test_a_car_that_logs_one_front_wheels_angle_steers_by_it(name: str) -> None:
-    estimate, parameters = ESTIMATORS[name]
+@pytest.mark.parametrize("fields", ["steer_fl_rad", "steer_fr_rad", "gps_vx_mps gps_vy_mps"])
+def test_one_front_wheels_angle_is_enough_and_gps_not_looked_at(fields: str) -> None:
     drive = slalom(CAR, 500)[0]
-    for field in ("steer_fl_rad", "steer_fr_rad"):
-        one = replace(drive, **{field: np.full(500, np.nan)})
-        np.testing.assert_array_equal(
-            estimate(one, CAR, parameters), estimate(drive, CAR, parameters)
-        )
-
-
-@OBSERVERS
-def test_observers_do_not_look_at_gps(name: str) -> None:
-    estimate, parameters = ESTIMATORS[name]
-    drive = noisy(slalom(CAR, 500)[0], seed=4)
-    without = replace(drive, gps_vx_mps=np.full(500, np.nan), gps_vy_mps=np.full(500, np.nan))
-    expected = estimate(drive, CAR, parameters)
-    np.testing.assert_array_equal(estimate(without, CAR, parameters), expected)
+    one = replace(drive, **dict.fromkeys(fields.split(), np.full(500, np.nan)))
+    found, expected = (ekf.estimate(each, CAR, ekf.EkfNoise()) for each in (one, drive))
+    np.testing.assert_array_equal(found, expected)
 
 
 @ALL
