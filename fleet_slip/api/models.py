@@ -138,7 +138,7 @@ class PublishedModels(Rooted):
 
         require_model_name(name)
         selection = self._chosen(name, choice)
-        manifest = with_straight_intercept(self.warehouse, manifest_of(selection, name), selection)
+        manifest = with_straight_intercept(self.warehouse, manifest_of(selection, name))
         manifest = with_assumptions(self.warehouse, manifest, selection)
         if manifest.learned_from and not force:
             delays_s = require_in_time(self.warehouse, manifest)

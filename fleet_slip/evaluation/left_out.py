@@ -28,7 +28,7 @@ from fleet_slip.grams.folding import FOLD_KEYS, Folding
 from fleet_slip.grams.gram_files import hash_numbers
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import manifest_of, with_straight_intercept
-from fleet_slip.models.request import BOTH, SelectionRequest
+from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import Selection, SelectionPlan
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
@@ -148,18 +148,14 @@ class Learner:
         warehouse: Warehouse,
         request: SelectionRequest,
         condition: str,
-        trained_on: str,
         drives: Sequence[HeldOutDrive],
     ) -> "Learner":
         """Return a model by its recipe, to be learned from drives of a cohort.
 
-        Of cars without the label it learns beside those that it was `trained_on`. Raises as
-        `load_cohort`.
+        Raises as `load_cohort`.
         """
         asked = SelectionPlan.of(request)
-        mixed = asked.request.label == BOTH
-        cohort = asked.load(warehouse, trained_on if mixed else condition)
-        return cls(asked, cohort, drives, warehouse)
+        return cls(asked, asked.load(warehouse, condition), drives, warehouse)
 
     @cached_property
     def divided(self) -> Cohort:
@@ -196,7 +192,7 @@ class Learner:
         values = cohort.drives[FOLD_KEYS[asked.folds.by]].unique()
         if len(values) < 2:
             asked = replace(asked, folds=Folding(by="drive", count=asked.folds.count))
-        return asked.choose(replace(cohort, beside=prior) if prior else cohort)
+        return asked.choose(replace(cohort, prior=prior) if prior else cohort)
 
     def estimate(
         self, left_out: LeftOut, cars: CarCounts, prior: Cohort | None = None
@@ -204,7 +200,7 @@ class Learner:
         """Return the columns that are chosen without some parts, and an estimate of all drives."""
         selection = self.choose(left_out, prior)
         manifest = manifest_of(selection, "left_out")
-        model = Predictor.of(with_straight_intercept(self.warehouse, manifest, selection))
+        model = Predictor.of(with_straight_intercept(self.warehouse, manifest))
         apart = {i for i, _ in left_out}
         return [*selection.winner.model.signals], [
             predict_drive(model, one, cars) if i in apart else np.full(len(one.rows), np.nan)

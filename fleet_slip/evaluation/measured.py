@@ -183,21 +183,21 @@ class Competition:
         """Return who competes: Table I, versions, and filters in a car if there is one."""
         registry = Registry.of(warehouse)
         recipes = {
-            f"table1/{one.name}": (SelectionRequest(model=",".join(one.signals)), condition)
+            f"table1/{one.name}": SelectionRequest(model=",".join(one.signals))
             for one in load_model_list(TABLE_ONE).model
         }
         told = dict.fromkeys(recipes, FITTED)
         published: dict[str, Predictor] = {}
         for version in versions:
             manifest, name = version.manifest, version.reference
-            of_course = manifest.learned_from is not None and manifest.learned_from.weight is None
+            of_course = manifest.learned_from is not None
             if of_course or find_seen(warehouse, registry, manifest, condition).trained == 0:
                 published[name], told[name] = Predictor.of(manifest), "as published"
             else:
-                recipes[name], told[name] = recipe_of(version), CHOSEN
+                recipes[name], told[name] = recipe_of(version)[0], CHOSEN
         learners = {
-            name: Learner.of(warehouse, request, condition, own, drives)
-            for name, (request, own) in recipes.items()
+            name: Learner.of(warehouse, request, condition, drives)
+            for name, request in recipes.items()
         }
         numbered = any(one.plan.numbers for one in published.values()) or any(
             features().feature_set(one.asked.feature_set).calibrated for one in learners.values()

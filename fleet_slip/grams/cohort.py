@@ -21,7 +21,7 @@ from fleet_slip.catalogue.facts import RECEIVED, SCENARIO, TRAINING_DRIVES
 from fleet_slip.catalogue.features import PLAIN, features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, NotComputedError, QuestionError, RefusedError
-from fleet_slip.grams.expansion import about_mean, expansion_of
+from fleet_slip.grams.expansion import expansion_of
 from fleet_slip.grams.folding import (
     EACH,
     FOLD_KEYS,
@@ -80,8 +80,8 @@ class Cohort:
         tables: the Gram rows in the order of `drives`, by signals; none if only sums were kept.
         sums, folding: the Gram of each fold, if only these were kept, and what the folds are of.
         source: where the Gram rows were read, and can be read again.
-        beside, weight: Gram rows that are in no fold and always trained on, with this weight, where
-            the others have 1: changes of the course of drives without the label, or a prior.
+        prior, weight: Gram rows of simulated drives, which are in no fold and always trained on,
+            with this weight, where the others have 1.
     """
 
     condition: Condition
@@ -94,22 +94,12 @@ class Cohort:
     sums: CohortFolds | None = None
     folding: Folding | None = None
     source: Warehouse | GramReader | None = None
-    beside: "Cohort | None" = None
+    prior: "Cohort | None" = None
     weight: Fraction = Fraction(1)
 
     @property
-    def unlabelled(self) -> "Cohort | None":
-        """What is beside, if it is of drives without the label."""
-        return self.beside if features().feature_set(self.feature_set).change_ticks else None
-
-    @property
-    def prior(self) -> "Cohort | None":
-        """What is beside, if it is of simulated drives."""
-        return None if self.unlabelled else self.beside
-
-    @property
     def rows(self) -> int:
-        """Number of rows of the logs behind the cohort; those without the label do not count."""
+        """Number of rows of the logs behind the cohort."""
         return int(pc.sum(self.drives["n"]).as_py())
 
     @cached_property
@@ -120,18 +110,18 @@ class Cohort:
 
     @property
     def drive_count(self) -> int:
-        """Number of drives; those without the label do not count."""
+        """Number of drives."""
         return int(pc.count_distinct(self.drives["drive_hash"]).as_py())
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """What a search may choose of the columns that any drive has, in the set's order.
 
-        Of what is beside those that it has as well.
+        With a prior those that it has as well.
         """
         known = {name for kind in _kinds(self.drives) for name in kind.split(",")}
-        if self.beside is not None:
-            known &= set(self.beside.inputs)
+        if self.prior is not None:
+            known &= set(self.prior.inputs)
         return tuple(n for n in features().searched(self.feature_set) if n in known)
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
@@ -146,30 +136,18 @@ class Cohort:
 
     def hash_drives_with(self, signals: Collection[str]) -> Hashes:
         """Return the hashes of the drives trained on with all of some signals, once, sorted."""
-        hashes: Hashes = np.unique(self._with(signals)["drive_hash"].to_numpy())
+        hashes: Hashes = np.unique(_lines_with(self.drives, signals)["drive_hash"].to_numpy())
         return hashes
 
     def count_vehicles_with(self, signals: Collection[str]) -> int:
         """Return the number of cars trained on that have all of some signals."""
-        return int(pc.count_distinct(self._with(signals)["vehicle_hash"]).as_py())
+        return int(pc.count_distinct(_lines_with(self.drives, signals)["vehicle_hash"]).as_py())
 
     def count_received_with(self, signals: Collection[str] = ()) -> int:
         """Return the number of drives trained on without a log that have all of some signals."""
-        rows = self._with(signals)
+        rows = _lines_with(self.drives, signals)
         received = rows.filter(pc.equal(rows["source"].cast(pa.string()), RECEIVED))
         return int(pc.count_distinct(received["drive_hash"]).as_py())
-
-    def count_unlabelled_with(self, signals: Collection[str]) -> tuple[int, int]:
-        """Return how many drives without the label have some signals, and of how many changes."""
-        if self.unlabelled is None:
-            return 0, 0
-        rows = _lines_with(self.unlabelled.drives, signals)
-        return pc.count_distinct(rows["drive_hash"]).as_py(), pc.sum(rows["n"]).as_py() or 0
-
-    def _with(self, signals: Collection[str]) -> pa.Table:
-        every = [self, *([self.unlabelled] if self.unlabelled else [])]
-        names = ["drive_hash", "vehicle_hash", "source"]
-        return pa.concat_tables(_lines_with(one.drives, signals).select(names) for one in every)
 
     def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
         """Divide the cohort into folds, of whole drives unless by `part`.
@@ -179,9 +157,9 @@ class Cohort:
         `QuestionError` if it has none. Where only sums were kept the Gram rows are read again.
         """
         folds = self._own_folds(by, count)
-        if self.beside is None:
+        if self.prior is None:
             return folds
-        beside = tuple(table.total() for table in self.beside.tables)
+        beside = tuple(table.total() for table in self.prior.tables)
         return replace(folds, beside=beside, weight=self.weight)
 
     def _own_folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
@@ -193,8 +171,6 @@ class Cohort:
             return again._own_folds(by, count)
         require_divided(self.feature_set, by)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
-        if self.unlabelled and by == "vehicle" and len(set(values)) == 1:
-            by, values = "drive", self.drives[FOLD_KEYS["drive"]].to_pylist()
         return CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
 
     def serving(self, inputs: Sequence[str]) -> Served:
@@ -224,11 +200,11 @@ class Cohort:
         """
         kept, left = self.part(parts > 0), parts[parts > 0]
         each = np.split(left, np.cumsum([len(one) for one in kept.tables])[:-1])
-        beside = self.beside
-        if beside is not None:
-            beside = beside.weighed(np.full(len(beside.drives), FULL))
+        prior = self.prior
+        if prior is not None:
+            prior = prior.weighed(np.full(len(prior.drives), FULL))
         tables = tuple(weighted(one, some) for one, some in zip(kept.tables, each, strict=True))
-        return replace(kept, tables=tables, beside=beside)
+        return replace(kept, tables=tables, prior=prior)
 
 
 def _kinds(drives: pa.Table) -> list[str]:
@@ -341,55 +317,6 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
         f"no drive matches the cohort condition {condition.text!r}. The warehouse has sources "
         f'{sources} and campaigns {campaigns}. See the columns with: fleet-slip sql "DESCRIBE '
         'drives"'
-    )
-
-
-# Labels of few cars and the course of all others as one cohort.
-#
-# Rows with the label count about their drive's mean, since changes have no constant either: it
-# follows from cars that go straight on (`fleet_slip.models.straight_on`). Only these drives are
-# tested on; the course of others is always trained on, with a weight.
-
-
-def load_mixed_labels(
-    warehouse: Warehouse, condition: str | Condition, feature_set: str, by: FoldKey
-) -> Cohort:
-    """Read the drives with the label, and beside them the changes of the course of all others.
-
-    What folds are made of is trained on by its label alone if it has one. Raises `DataError` if no
-    drive has one, or all have, and as `load_cohort`.
-    """
-    base = features().feature_set(feature_set).of
-    if base is None:
-        raise DataError(
-            f"the feature set {feature_set} is not of another, whose Gram rows have the label. Use "
-            "one that has of in configs/features.toml, such as course."
-        )
-    every = load_cohort(warehouse, condition, base)
-    changes = load_cohort(warehouse, condition, feature_set)
-    label = catalogue().label
-    labelled = every.part(
-        np.repeat([label in one.signals for one in every.tables], [len(t) for t in every.tables])
-    )
-    if not labelled.tables:
-        raise DataError(
-            f"no drive of the cohort {every.condition.text!r} has the label. Learn from the course "
-            "alone: fleet-slip select --label course"
-        )
-    cars = labelled.drives["vehicle_id"].unique()
-    key = FOLD_KEYS["vehicle" if by == "vehicle" and len(cars) > 1 else "drive"]
-    known = set(labelled.drives[key].to_pylist())
-    alone = np.array([one not in known for one in changes.drives[key].to_pylist()])
-    if not alone.any():
-        raise DataError(
-            f"all drives of the cohort {every.condition.text!r} have the label. Learn from it "
-            "alone: fleet-slip select"
-        )
-    return replace(
-        labelled,
-        feature_set=changes.feature_set,
-        tables=tuple(about_mean(table) for table in labelled.tables),
-        beside=changes.part(alone),
     )
 
 

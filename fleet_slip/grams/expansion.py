@@ -31,15 +31,6 @@ from fleet_slip.warehouse.condition import parse_condition
 # then zero, and products add up over drives.
 
 
-def about_mean(table: GramTable) -> GramTable:
-    """Return the table of what the columns differ by from their mean in each row."""
-    left, right = np.tril_indices(len(table.signals))
-    sums = table.sums.astype(np.float64)
-    taken = sums[:, left] * sums[:, right] / table.n[:, None]
-    products = table.products - np.rint(taken).astype(np.int64)
-    return GramTable(table.signals, table.n, np.zeros_like(table.sums), products)
-
-
 def swept(table: GramTable) -> GramTable:
     """Return the table without `BESIDE`, the turned `TURNED`, and what is constant in a drive."""
     signals = tuple(name for name in table.signals if name not in BESIDE)

@@ -226,7 +226,7 @@ def compare_unseen(
     `StorageError` if which drives made an incumbent cannot be read.
     """
     made = [registry.trained_drives(one.manifest) for one in incumbents]
-    if None in made or selection.cohort.unlabelled:
+    if None in made:
         return None
     cohort, asked = _some_drives(selection), contest(selection, incumbents)
     drives = hash_numbers(cohort.drives["drive_id"])
@@ -435,11 +435,11 @@ _HEX = 4
 def odd_gain(registry: Registry, selection: Selection, champion: ModelVersion) -> str | None:
     """Return why a person must look first: it is better on odd new drives alone; else None.
 
-    Nothing is said where changes of the course taught, or all drives are as known as the others.
+    Nothing is said where all drives are as known as the others.
     Raises `StorageError` if which drives made the champion cannot be read.
     """
     made = registry.trained_drives(champion.manifest)
-    if made is None or selection.cohort.unlabelled:
+    if made is None:
         return None
     try:
         cohort = _some_drives(selection)

@@ -217,11 +217,10 @@ class LearnedFrom(Config):
     """What stood for a label: changes of the course over `change_s`.
 
     The intercept is that of `cars` going straight, with its uncertainty, None if untold, and the
-    spread between them. A change has a `weight` beside rows with the label, which have 1.
+    spread between them.
     """
 
-    label: Literal["course", "course+sideslip"]
-    weight: Annotated[ExactFraction | None, Field(exclude_if=lambda one: one is None)] = None
+    label: Literal["course"]
     change_s: Seconds | Annotated[tuple[Seconds, ...], Field(min_length=2)]
     cars: Count
     intercept_uncertainty_deg: FiniteFloat | None

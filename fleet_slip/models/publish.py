@@ -164,7 +164,6 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
     wanted = (*winner.signals, signals.label)
     drives = drives_of(selection, name)
     definitions = features().definitions(selection.cohort.feature_set)
-    unlabelled, changes = selection.cohort.count_unlabelled_with(wanted)
     return Manifest(
         name=name,
         label=ModelLabel(
@@ -181,10 +180,10 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
         trained_on=TrainedOn(
             cohort=selection.cohort.condition.text,
             feature_set=features().identity(selection.cohort.feature_set),
-            drives=winner.drives + unlabelled,
+            drives=winner.drives,
             vehicles=selection.cohort.count_vehicles_with(wanted),
             drives_without_log=selection.cohort.count_received_with(wanted) or None,
-            rows=selection.trained_rows + changes,
+            rows=selection.trained_rows,
             logs_version=selection.cohort.logs_version,
             grams_version=selection.cohort.grams_version,
             drives_sha256=checksum_of_drives(drives),
@@ -218,9 +217,7 @@ def _prior_of(selection: Selection) -> Prior | None:
     )
 
 
-def with_straight_intercept(
-    warehouse: Warehouse, manifest: Manifest, selection: Selection
-) -> Manifest:
+def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifest:
     """Return a manifest with the intercept that changes do not tell, if changes taught its model.
 
     One through the origin keeps 0, of no cars. Raises `DataError` if no drive tells the intercept.
@@ -232,10 +229,8 @@ def with_straight_intercept(
     found = StraightOn(Fraction(0), {}, None, 0.0, 0)
     if not manifest.through_origin:
         found = straight_on(warehouse, parse_cohort(manifest.trained_on.cohort), manifest)
-    weight = selection.cohort.weight if selection.cohort.unlabelled else None
     learned = LearnedFrom(
-        label="course" if weight is None else "course+sideslip",
-        weight=weight,
+        label="course",
         change_s=float(change_s[0]) if len(change_s) == 1 else tuple(map(float, change_s)),
         cars=found.cars,
         intercept_uncertainty_deg=(

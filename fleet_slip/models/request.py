@@ -30,13 +30,11 @@ DEFAULT_MODELS = "estimator"
 LOGGED_MODELS = "table1"
 """That of logged signals, for other feature sets or where the usual columns are not computed."""
 
-Label = Literal["course", "course+sideslip"]
-"""What may stand for the label of a reference sensor, or beside it where few cars have one."""
+Label = Literal["course"]
+"""What may stand for the label of a reference sensor."""
 
 COURSE = "course"
 """Also the name of the feature set, and of the model list, that are taken for it."""
-BOTH: Label = "course+sideslip"
-"""The course of most cars, and the label of those that have it."""
 
 DEFAULT_MOST = 24
 
@@ -93,9 +91,8 @@ class SelectionRequest:
     label: Annotated[
         Label | None,
         Doc(
-            "course: learn without a reference sensor, from changes of the course over ground; "
-            "course+sideslip: from these, and the label of the cars that have it. Feature set and "
-            "model list are then those called course, unless others are named."
+            "course: learn without a reference sensor, from changes of the course over ground. "
+            "Feature set and model list are then those called course, unless others are named."
         ),
     ] = None
     by: Annotated[
@@ -196,21 +193,14 @@ class SelectionRequest:
                 "cluster says what is independent evidence for nested, rank, criterion and "
                 "all_subsets: leave it out."
             )
-        if self.label == BOTH and (self.ordered or self.nested or self.robust):
-            raise UsageError(
-                "course+sideslip compares a list of models, one model or a search: leave out "
-                "nested, rank, criterion, all_subsets and robust."
-            )
         ranked = self.ordered or (self.nested and not self.search)
         if self.prior and (self.label or ranked):
             raise UsageError(
                 "a prior joins models of a list, one model or a search: leave out label, rank, "
                 "criterion, all_subsets, and nested without search."
             )
-        if self.half_life is not None and (self.half_life < 1 or self.label == BOTH):
-            raise UsageError(
-                "half_life: a whole number of days from 1 on, and not with course+sideslip."
-            )
+        if self.half_life is not None and self.half_life < 1:
+            raise UsageError("half_life: a whole number of days from 1 on.")
         if self.search and self.ordered:
             raise UsageError(
                 "a search is made again in every fold, and looks at folds alone: leave out rank, "

@@ -20,14 +20,12 @@ from fleet_slip.grams.cohort import (
     Cohort,
     Served,
     load_cohort,
-    load_mixed_labels,
 )
 from fleet_slip.grams.folding import PARTS, Folding, make_folding
 from fleet_slip.grams.gram_files import by_signals, gram_table
 from fleet_slip.grams.reader import open_grams
 from fleet_slip.grams.weights import FULL, Weighed, age_weights, robust_weights
 from fleet_slip.models.request import (
-    BOTH,
     COURSE,
     DEFAULT_MODELS,
     LOGGED_MODELS,
@@ -57,11 +55,10 @@ from fleet_slip.models.search import (
 )
 from fleet_slip.models.summary import summarize
 from fleet_slip.pages.notebook import notebook_table
-from fleet_slip.regression.choice import NestedDistances, Rule, Winner, Worth, fall_short
+from fleet_slip.regression.choice import NestedDistances, Rule, Winner, Worth
 from fleet_slip.regression.drives import (
     DriveMoments,
 )
-from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.folds import (
     CohortFolds,
     CrossValidation,
@@ -433,8 +430,6 @@ def answer_request(
     usual = not (named or request.label)
     find = _answer_usual if usual else _answer
     answer = replace(find(warehouse, request, condition), request=request, asked=condition)
-    if answer.cohort.unlabelled:  # its figures are of the angle
-        return answer
     told = without_label(warehouse, answer.cohort, answer.winner.model.pooled.rmse_deg)
     noise_deg = None if told else label_noise_deg(warehouse, answer.cohort)
     return replace(answer, without_label=told, label_noise_deg=noise_deg)
@@ -482,14 +477,10 @@ class SelectionPlan:
             request = replace(request, label=model_list.label)
             request.check()
         folds = _folding(request, model_list)
-        if request.label == BOTH and not request.by:
-            folds = folds.model_copy(update={"by": "vehicle"})
         return cls(request, model_list, folds, _feature_set(request, model_list))
 
     def load(self, warehouse: Warehouse, condition: str) -> Cohort:
         """Return the Gram rows that it is made on. Raises as `load_cohort`."""
-        if self.request.label == BOTH:
-            return load_mixed_labels(warehouse, condition, self.feature_set, self.folds.by)
         return load_cohort(warehouse, condition, self.feature_set)
 
     def choose(self, cohort: Cohort) -> Selection:
@@ -504,8 +495,6 @@ class SelectionPlan:
             full *= FULL if weighed else 1
         if prior := cohort.prior:
             found = weigh_prior(cohort, prior, self)
-        elif cohort.unlabelled:
-            found = weigh(cohort, self.request, self.model_list, self.folds)
         elif self.request.ordered:
             found = _search(cohort, self.request, self.folds)
         else:
@@ -516,8 +505,6 @@ class SelectionPlan:
 def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> Selection:
     asked = SelectionPlan.of(request)
     request, folds = asked.request, asked.folds
-    if request.label == BOTH:
-        return asked.choose(asked.load(warehouse, condition))
     distances = bool(
         request.nested and not request.ordered and not _searches_of(request, asked.model_list)
     )
@@ -529,7 +516,7 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
     if request.prior:
         from fleet_slip.models.prior import simulate_prior  # noqa: PLC0415 - only here simulated
 
-        cohort = replace(cohort, beside=simulate_prior(request.prior, asked.feature_set))
+        cohort = replace(cohort, prior=simulate_prior(request.prior, asked.feature_set))
     answer = asked.choose(cohort)
     if distances:
         inputs = inputs_of(answer.cohort, request.nested or WHOLE_SET)
@@ -537,9 +524,6 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
         answer = replace(answer, distances=told)
     return answer
 
-
-WEIGHTS = tuple(Fraction(4) ** power for power in range(4, -5, -1))
-"""Weights of a change of the course that are tried, where a row with the label has 1."""
 
 PRIOR_SHARES = (Fraction(0), *(Fraction(4) ** power for power in range(-5, 2)))
 """Weights of all rows of a prior that are tried, where the rows of the cohort have 1 together."""
@@ -552,7 +536,7 @@ def weigh_prior(cohort: Cohort, prior: Cohort, asked: "SelectionPlan") -> Select
     agree on the wrong ones. A search is made again in every fold.
     """
     by, count = asked.folds.by, asked.folds.count
-    alone = replace(cohort, beside=None)
+    alone = replace(cohort, prior=None)
     first = _compare_listed(alone, asked.request, asked.model_list, asked.folds)
     winner, found = first.winner.model, first.searched_winner
     label, intercept = catalogue().label, asked.request.intercept
@@ -590,32 +574,6 @@ def weigh_prior(cohort: Cohort, prior: Cohort, asked: "SelectionPlan") -> Select
         models=(*first.models, best),
         winner=replace(first.winner, model=best, reason=f"{first.winner.reason} {told}"),
     )
-
-
-def weigh(
-    cohort: Cohort,
-    request: SelectionRequest,
-    model_list: ModelList | None,
-    folds: Folding,
-) -> Selection:
-    """Select with the weight of the course that serves held-out drives with the label best.
-
-    Of those not worse for sure, by Student's t over the folds, the largest: few cars have a label.
-    """
-    found = [
-        _compare_listed(replace(cohort, weight=weight), request, model_list, folds)
-        for weight in WEIGHTS
-    ]
-    best = min((one.winner.model for one in found), key=lambda model: model.pooled.rmse)
-    return next(one for one in found if _may_be_as_good(one.winner.model, best))
-
-
-def _may_be_as_good(model: CrossValidation, best: CrossValidation) -> bool:
-    """Whether a model's error is not larger than that of the best, with 95 %."""
-    short = fall_short(model, best, Worth(0.0))
-    if not short.rmse > 0 or not short.standard_error:
-        return not short.rmse > 0
-    return student_t_two_sided(short.rmse / short.standard_error, len(best.folds) - 1) > 0.05
 
 
 def _weigh_drives(cohort: Cohort, asked: SelectionPlan) -> tuple[Cohort, dict[str, Weighed]]:

@@ -60,11 +60,6 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
         yield from _distances(selection.distances)
     yield _models(selection, everything)
     yield from _left_out(selection)
-    if selection.cohort.unlabelled:
-        yield Remark(
-            f"a course change weighs {selection.cohort.weight} times as much as a labelled row; "
-            "the figures are of the angle about its mean in each drive with the label."
-        )
     if selection.folds.by in (PARTS, BANDS):
         model = winner.model
         yield TextTable(
@@ -165,8 +160,7 @@ def _without_label(told: "WithoutLabel") -> Iterator[Remark]:
 
 def _left_out(selection: "Selection") -> Iterator[Remark]:
     """Yield which drives of the cohort the models were not made of, and what the label is worth."""
-    if not selection.cohort.unlabelled:
-        yield from remark_without_information(selection.rows_without, selection.cohort.rows)
+    yield from remark_without_information(selection.rows_without, selection.cohort.rows)
     if without_log := selection.cohort.count_received_with():
         without = number_of(without_log, "drive")
         yield Remark(f"{without} of these have no log: their cars sent Gram rows.")
@@ -176,7 +170,7 @@ def _left_out(selection: "Selection") -> Iterator[Remark]:
         yield Remark(selection.remark)
     if selection.without_label is not None:
         yield from _without_label(selection.without_label)
-    elif not selection.cohort.unlabelled:
+    else:
         yield _label_noise(selection)
 
 

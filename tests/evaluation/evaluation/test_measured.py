@@ -157,7 +157,7 @@ def test_gram_rows_of_quarters_add_up_to_those_of_drives(own: Path) -> None:
     cohort = load_cohort(fleet.warehouse, "true")
     drives = read_measured_drives(fleet.warehouse, cohort)
     request = SelectionRequest(model="ax,ay,yaw_rate")
-    learner = Learner.of(fleet.warehouse, request, "true", "true", drives)
+    learner = Learner.of(fleet.warehouse, request, "true", drives)
     (whole,), (quarters,) = cohort.tables, learner.divided.tables
     assert len(quarters) == 4 * len(whole)
     assert quarters.total() == whole.total()
