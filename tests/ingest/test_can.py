@@ -20,11 +20,11 @@ from fleet_slip.ingest.formats.can import (
     CanBus,
     CanFrames,
     FrameBlock,
+    open_can_trace,
     physical,
     raw_numbers,
     read_can_database,
 )
-from fleet_slip.ingest.formats.can_files import open_can_trace
 from fleet_slip.ingest.formats.source import Budget, Spool
 from fleet_slip.ingest.mapping import load_mapping
 from tests.support.logs import without_names

@@ -54,7 +54,7 @@ FORMATS = {
     "tdms": Format((b"TDSm",), "tdms", ("nptdms",)),
     "mat": Format((b"MATLAB 5.0 MAT-file",), "matlab", ("scipy.io",)),
     "mat73": Format((b"\x89HDF\r\n\x1a\n",), "matlab", ("h5py",)),
-    "can_trace": Format((b"LOGG",), "can_files", ("can", "cantools")),
+    "can_trace": Format((b"LOGG",), "can", ("can", "cantools")),
 }
 """Each has `open_FORMAT` in its module."""
 SIZES = struct.Struct("<QQ")

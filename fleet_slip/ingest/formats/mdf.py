@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import shown
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.can import Bytes, CanBus, FrameBlock
-from fleet_slip.ingest.formats.can_files import CanSource
+from fleet_slip.ingest.formats.can import Bytes, CanBus, CanSource, FrameBlock
 from fleet_slip.ingest.formats.source import (
     EARLIEST_S,
     OWN_TIME,
