@@ -366,8 +366,6 @@ def to_ticks(
             continue
         if method == "snap" and source.interpolate and not source.delay_s:
             values = [chunk.to_numpy() for chunk in rows.column(signal).get_chunks()]
-        elif len(intervals_s) == 1:
-            values = [_resample(rows.column(signal).to_numpy(), resampler, signal, mapping)]
         else:
             samples = rows.samples(signal)
             own = _on_own_times(rows, signal, samples, resampler, intervals_s)
@@ -404,20 +402,17 @@ def _fixes(
     counts: dict[str, pa.Array],
 ) -> dict[str, pa.Array]:
     """Return the counts of course and speed over ground, null between fixes."""
-    if len(intervals_s) == 1:
-        samples = pl.DataFrame([rows.column(name).alias(name) for name in (COURSE, SPEED)])
-    else:
-        samples = rows.samples(COURSE).join(rows.samples(SPEED), on="time", how="inner")
-        resampler = _on_own_times(rows, COURSE, samples, resampler, intervals_s)
+    both = rows.samples(COURSE), rows.samples(SPEED)
+    samples = both[0].join(both[1], on="time", how="inner", maintain_order="left")
     fixes = fixes_on_ticks(
         mapping.signals[COURSE],
         (samples[COURSE].to_numpy(), samples[SPEED].to_numpy()),
-        resampler,
+        _on_own_times(rows, COURSE, samples, resampler, intervals_s),
         physical(counts, "yaw_rate"),
         physical(counts, "ay") if "ay" in counts else None,
     )
-    both = zip((COURSE, SPEED), fixes, strict=True)
-    return {name: round_chunks([values], catalogue()[name]) for name, values in both}
+    of = zip((COURSE, SPEED), fixes, strict=True)
+    return {name: round_chunks([values], catalogue()[name]) for name, values in of}
 
 
 def _resample(
