@@ -11,7 +11,7 @@ from deltalake.exceptions import DeltaError
 from fleet_slip.errors import StorageError
 
 _CREDENTIALS = (
-    "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY or AWS_PROFILE, "
+    "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, "
     "GOOGLE_APPLICATION_CREDENTIALS, or AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY"
 )
 
@@ -19,7 +19,8 @@ _MEANINGS: tuple[tuple[str, str], ...] = (
     (
         r"169\.254\.169\.254|computeMetadata|metadata\.google|Account must be specified|"
         r"CredentialsNotLoaded|no providers in chain|no credentials found in chain",
-        f"there are no credentials. Set {_CREDENTIALS}.",
+        f"there are no credentials. Set {_CREDENTIALS}. "
+        'eval "$(aws configure export-credentials --format env)" sets those of a profile.',
     ),
     (
         r"NoSuchBucket|ContainerNotFound|[Tt]he specified bucket does not exist",

@@ -22,7 +22,7 @@ from typing import Any
 from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
 from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
 
-from fleet_slip.storage.objects import aws_profile, client
+from fleet_slip.storage.objects import client
 from tests.support.commands import COMMAND, PATIENCE_S, Finished, run, run_on, start
 
 ACCESS_KEY = "AKIDFORTESTS"
@@ -201,8 +201,7 @@ def command_on(root: object, *arguments: str, apart: bool = False) -> Finished:
 
 
 def forget_clients() -> None:
-    """Let this process look anew for credentials, as a new one would."""
-    aws_profile.cache_clear()
+    """Let this process make its clients anew, as a new one would."""
     client.cache_clear()
 
 
