@@ -1,6 +1,7 @@
 """Drift of a published model, on a control chart from Gram rows."""
 
 import math
+import shutil
 from datetime import date, timedelta
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
 from fleet_slip.operations.monitor import Chart, Limits, monitor
 from fleet_slip.regression.figures import student_t_quantile
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import counts, drive
@@ -42,13 +44,21 @@ def add_days(warehouse: Warehouse, first: int, number: int, bias_rad: float = 0)
     update_grams(warehouse)
 
 
-@pytest.fixture
-def trained(warehouse: Warehouse) -> tuple[Warehouse, ModelVersion]:
+@pytest.fixture(scope="module")
+def of_training_days(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data root with a model of six days."""
+    root = tmp_path_factory.mktemp("trained") / "data"
+    warehouse = Warehouse(LocalFolder(root))
     add_days(warehouse, 0, TRAINING_DAYS)
-    planned = answer_request(warehouse, SelectionRequest())
-    manifest = manifest_of(planned, "m")
-    registry = Registry(warehouse.root / "models")
-    return warehouse, publish(registry, manifest, planned).version
+    planned = answer_request(warehouse, SelectionRequest(models="table1"))
+    publish(Registry(warehouse.root / "models"), manifest_of(planned, "m"), planned)
+    return root
+
+
+@pytest.fixture
+def trained(of_training_days: Path, warehouse: Warehouse) -> tuple[Warehouse, ModelVersion]:
+    shutil.copytree(of_training_days, str(warehouse.root))
+    return warehouse, Registry(warehouse.root / "models").resolve("m")
 
 
 def new_days(chart: Chart) -> list[tuple[date, tuple[str, ...]]]:

@@ -1,8 +1,12 @@
 """Labels that are wrong alike on one day: the other drives tell, whatever the day's own say."""
 
 import math
+import shutil
 from collections.abc import Callable
 from datetime import date, timedelta
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -10,8 +14,9 @@ import pytest
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.quality import examine_drives, find_wrong_labels
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.cars import Signals, counts, drive
+from tests.support.cars import Signals, broken, counts, drive
 from tests.support.logs import DAY, land, log_rows
 
 CARS, DAYS = 12, 3
@@ -20,20 +25,34 @@ NIGHT = DAY + timedelta(days=DAYS - 1)
 
 def land_days(warehouse: Warehouse, change: Callable[[Signals], None], every: int = 1) -> None:
     """Land three days of drives of as many cars; on the last, labels of every n-th are wrong."""
+    folder, last = two_days()
+    shutil.copytree(folder.name, str(warehouse.root))
+    changed = [s if car % every else broken(s, change) for car, s in enumerate(last)]
+    land_day(warehouse, NIGHT, changed)
+
+
+@cache
+def two_days() -> tuple[TemporaryDirectory[str], list[Signals]]:
+    """A data root with the first days, and the drives of the last."""
     rng = np.random.default_rng(1)
     factors = 1 + 0.1 * rng.standard_normal(CARS)
+    folder = TemporaryDirectory()
+    warehouse = Warehouse(LocalFolder(Path(folder.name)))
     for number in range(DAYS):
-        day, drives = DAY + timedelta(days=number), []
-        for car, factor in enumerate(factors):
-            signals = drive(rng, gentleness=2)
-            signals["sideslip"] = factor * signals["sideslip"]
-            if day == NIGHT and car % every == 0:
-                change(signals)
-            name, vehicle = f"{day}-{car:02d}", f"car-{car}"
-            drives.append(
-                log_rows(name, counts(signals), day, vehicle_id=vehicle, source="measured")
-            )
-        land(warehouse, str(day), *drives, day=day)
+        drives = [drive(rng, gentleness=2) for _ in factors]
+        for signals, factor in zip(drives, factors, strict=True):
+            signals["sideslip"] *= factor
+        if number < DAYS - 1:
+            land_day(warehouse, DAY + timedelta(days=number), drives)
+    return folder, drives
+
+
+def land_day(warehouse: Warehouse, day: date, drives: list[Signals]) -> None:
+    rows = [
+        log_rows(f"{day}-{car:02d}", counts(one), day, vehicle_id=f"car-{car}", source="measured")
+        for car, one in enumerate(drives)
+    ]
+    land(warehouse, str(day), *rows, day=day)
     update_grams(warehouse)
 
 

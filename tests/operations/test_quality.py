@@ -1,7 +1,11 @@
 """Faulty sensors found from Gram rows: what was broken is what is named."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -14,6 +18,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.operations import quality
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.operations.quality import QualityReport, examine, examine_drives, find_wrong_labels
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import TICKS, Signals, broken, counts, drive
 from tests.support.commands import RunCommand
@@ -25,15 +30,22 @@ DRIVES = 30
 
 def fleet(warehouse: Warehouse, change: Callable[[Signals], None], saturated: int = 0) -> None:
     """Land drives of which the last has a fault."""
-    rng = np.random.default_rng(5)
-    signals = [drive(rng) for _ in range(DRIVES)]
-    signals[-1] = broken(signals[-1], change)
-    rows = [
-        log_rows(f"d{i:02d}", counts(one), saturated=saturated if i == DRIVES - 1 else 0)
-        for i, one in enumerate(signals)
-    ]
-    land(warehouse, "all", *rows)
+    folder, last = sound()
+    shutil.copytree(folder.name, str(warehouse.root))
+    land(warehouse, "last", log_rows("d29", counts(broken(last, change)), saturated=saturated))
     update_grams(warehouse)
+
+
+@cache
+def sound() -> tuple[TemporaryDirectory[str], Signals]:
+    """A data root with all drives but the last, and what that would be."""
+    rng = np.random.default_rng(5)
+    *signals, last = [drive(rng) for _ in range(DRIVES)]
+    folder = TemporaryDirectory()
+    warehouse = Warehouse(LocalFolder(Path(folder.name)))
+    land(warehouse, "all", *(log_rows(f"d{i:02d}", counts(one)) for i, one in enumerate(signals)))
+    update_grams(warehouse)
+    return folder, last
 
 
 def only_finding(report: QualityReport) -> Fault:

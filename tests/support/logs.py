@@ -43,7 +43,6 @@ def schema_without(optional: Collection[str]) -> pa.Schema:
 
 def log_rows(drive_id: str, counts: dict[str, Any], day: date = DAY, **metadata: Any) -> pa.Table:
     """Rows of the logs for one drive; a signal that is not given is absent."""
-    signals = catalogue()
     rows = len(next(iter(counts.values())))
     known: dict[str, Any] = {
         "drive_id": drive_id,
@@ -58,13 +57,18 @@ def log_rows(drive_id: str, counts: dict[str, Any], day: date = DAY, **metadata:
         "duration_s": (rows - 1) / 100,
         "rows": rows,
         "saturated": 0,
+        "day": day,
         **metadata,
     }
-    columns: dict[str, Any] = {"day": [day] * rows}
-    columns |= {name: [known.get(name)] * rows for name in signals.drive}
-    columns["tick"] = np.arange(rows, dtype=np.int32)
-    columns |= {name: counts.get(name, [None] * rows) for name in signals.signals}
-    return pa.table(columns, schema=signals.log_schema)
+    columns = {"tick": np.arange(rows, dtype=np.int32), **counts}
+    schema = catalogue().log_schema
+    every = [
+        pa.array(columns[field.name], field.type)
+        if field.name in columns
+        else pa.repeat(pa.scalar(known.get(field.name), field.type), rows)
+        for field in schema
+    ]
+    return pa.table(every, schema=schema)
 
 
 def land(warehouse: Warehouse, name: str, *drives: pa.Table, day: date = DAY) -> None:
