@@ -12,7 +12,7 @@ out, the median group of them must not be worse off either, each group having on
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import zip_longest
@@ -627,7 +627,27 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
     feature_set = features().name_of(manifest.trained_on.feature_set)
     with open_grams(warehouse, feature_set, condition) as opened:
         cars = dict(opened.course_delays(condition))
-    problems = [*_unsure(delays, cars), *_not_corrected(delays, cars)]
+    left = {
+        car: max((delays[car].value - GRAIN_S * parts for parts in corrected), key=abs)
+        for car, corrected in cars.items()
+        if car in delays
+    }
+    unsure = [car for car in left if (delays[car].uncertainty or math.inf) > SURE_S]
+    late = [car for car, delay_s in left.items() if abs(delay_s) > MOST_S]
+    problems = []
+    if unsure:
+        problems.append(
+            f"delays are not estimated to {1000 * SURE_S:g} ms ({_named(delays, unsure)})"
+        )
+    if unknown := len(cars) - len(left):
+        cars_text = number_of(unknown, "car")
+        problems.append(f"that of {cars_text} cannot be estimated from their drives")
+    if late:
+        problems.append(
+            "the Gram rows of some cars are corrected by another delay than they have "
+            f"({_named(delays, late)}): run fleet-slip gram --features course, and send the new "
+            "delay to cars that count on board"
+        )
     if problems:
         raise RefusedError(
             f"{manifest.name} was not published: a late course looks like side-slip, and "
@@ -636,41 +656,12 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
             f"To publish it anyway: fleet-slip publish {manifest.name} --label "
             "course --force"
         )
-    return {car: max(_left(delays[car], corrected), key=abs) for car, corrected in cars.items()}
+    return left
 
 
-def _unsure(delays: Mapping[str, ReceiverDelay], cars: Iterable[str]) -> Iterator[str]:
-    known = {car: delays[car] for car in cars if car in delays}
-    unsure = {c: d for c, d in known.items() if d.uncertainty is None or d.uncertainty > SURE_S}
-    if unsure:
-        yield f"delays are not estimated to {1000 * SURE_S:g} ms ({_named(unsure)})"
-    if untold := sum(car not in delays for car in cars):
-        yield f"that of {number_of(untold, 'car')} cannot be estimated from their drives"
-
-
-def _not_corrected(
-    delays: Mapping[str, ReceiverDelay], cars: Mapping[str, tuple[int, int]]
-) -> Iterator[str]:
-    late = {
-        car: delays[car]
-        for car, corrected in cars.items()
-        if car in delays and max(map(abs, _left(delays[car], corrected))) > MOST_S
-    }
-    if late:
-        yield (
-            "the Gram rows of some cars are corrected by another delay than they have "
-            f"({_named(late)}): run fleet-slip gram --features course, and send the new delay to "
-            "cars that count on board"
-        )
-
-
-def _left(one: ReceiverDelay, corrected: tuple[int, int]) -> list[float]:
-    return [one.value - GRAIN_S * parts for parts in corrected]
-
-
-def _named(delays: Mapping[str, ReceiverDelay]) -> str:
-    shown = ", ".join(f"{car}: {_said(one)}" for car, one in list(delays.items())[:NAMED])
-    return f"{shown}, and {len(delays) - NAMED} more" if len(delays) > NAMED else shown
+def _named(delays: Mapping[str, ReceiverDelay], cars: Sequence[str]) -> str:
+    shown = ", ".join(f"{car}: {_said(delays[car])}" for car in cars[:NAMED])
+    return f"{shown}, and {len(cars) - NAMED} more" if len(cars) > NAMED else shown
 
 
 def _said(one: ReceiverDelay) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.errors import DataError
-from fleet_slip.regression.gram import GramTable, packed_position, packed_size
+from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.least_squares import LinearModel
 
 ClusterUnit = Literal["drive", "vehicle"]
@@ -54,7 +54,7 @@ class DriveMoments:
     Attributes:
         centre: mean count of each signal over all drives, rounded to an integer.
         spread: standard deviation of each signal's counts; 1 for a constant.
-        packed: lower triangle of the (k+1) x (k+1) moments of u, shape (drives, (k+1)(k+2)/2).
+        each: moments of u, shape (drives, k+1, k+1).
         cluster: number of each drive's piece of evidence, shape (drives,); None: its own.
         unit: what a piece of evidence is: drives of a car share its biases and tyres.
     """
@@ -62,7 +62,7 @@ class DriveMoments:
     signals: tuple[str, ...]
     centre: tuple[int, ...]
     spread: FloatArray
-    packed: FloatArray
+    each: FloatArray
     cluster: IntArray | None = None
     unit: ClusterUnit = "drive"
 
@@ -74,58 +74,33 @@ class DriveMoments:
         total = table.total()
         if total.n == 0:
             raise DataError(f"no rows have all of {', '.join(table.signals)}.")
-        k = len(table.signals)
         centre = tuple(round(s / total.n) for s in total.sums)
-        squares = np.array([total.centred()[i][i] for i in range(k)], dtype=np.float64)
+        squares = np.array([row[i] for i, row in enumerate(total.centred())], dtype=np.float64)
         spread = np.where(squares > 0, np.sqrt(squares) / total.n, 1.0)
-        about = table.about(centre)
-        row, column = np.tril_indices(k)
-        packed = np.empty((len(table), packed_size(k + 1)))
-        packed[:, 0] = about.n
-        for i in range(k):
-            start = packed_position(i + 1, 0)
-            packed[:, start] = about.sums[:, i] / spread[i]
-        inner = [
-            packed_position(i, j)
-            for i, j in zip((row + 1).tolist(), (column + 1).tolist(), strict=True)
-        ]
-        packed[:, inner] = about.products / (spread[row] * spread[column])
-        return cls(table.signals, centre, spread, packed, cluster, unit)
+        unit_of_u = np.array([1.0, *spread])
+        each = table.about(centre).moments() / np.outer(unit_of_u, unit_of_u)
+        return cls(table.signals, centre, spread, each, cluster, unit)
 
     def __len__(self) -> int:
-        return len(self.packed)
-
-    @property
-    def size(self) -> int:
-        """Length of u: the constant, the inputs and the label."""
-        return len(self.signals) + 1
+        return len(self.each)
 
     def take(self, rows: NDArray[Any]) -> "DriveMoments":
         """Return the drives at an index array or a mask, with the same centre and spread."""
         cluster = None if self.cluster is None else self.cluster[rows]
-        return replace(self, packed=self.packed[rows], cluster=cluster)
+        return replace(self, each=self.each[rows], cluster=cluster)
 
     @property
-    def clusters(self) -> "DriveMoments":
-        """The moments of each independent piece of evidence, in the order of their numbers."""
-        if self.cluster is None:
-            return self
-        numbers = np.unique(self.cluster)
-        return replace(self, packed=self.sum_clusters(self.packed), cluster=numbers)
+    def clusters(self) -> int:
+        """How many pieces of evidence there are."""
+        return len(self) if self.cluster is None else len(np.unique(self.cluster))
 
-    def sum_clusters(self, values: FloatArray) -> FloatArray:
-        """Add up what is given for each drive, shape (drives, columns), over each cluster."""
+    def by_cluster(self, values: FloatArray) -> FloatArray:
+        """Add up what is given for each drive, drives first, over each piece of evidence."""
         if self.cluster is None:
             return values
         order = np.argsort(self.cluster, kind="stable")
         _, first = np.unique(self.cluster[order], return_index=True)
         return np.add.reduceat(values[order], first, axis=0)
-
-    def matrix(self, packed: FloatArray) -> FloatArray:
-        """Unpack moments, shape (..., p), to symmetric matrices, shape (..., k+1, k+1)."""
-        k = range(self.size)
-        at = np.array([[packed_position(i, j) for j in k] for i in k])
-        return packed[..., at]
 
     def direction(self, model: LinearModel) -> FloatArray:
         """Return w with w'u = prediction minus label, in spreads of the label; model in counts."""
@@ -141,12 +116,3 @@ class DriveMoments:
             for s, spread in zip(inputs, self.spread, strict=False)
         ]
         return np.array([float(level) / unit, *slopes, -1.0])
-
-    def products_with(self, w: FloatArray) -> FloatArray:
-        """Return sum over a drive's rows of u times w'u, shape (drives, k+1)."""
-        k = self.size
-        expand = np.zeros((self.packed.shape[1], k))
-        for i in range(k):
-            for j in range(k):
-                expand[packed_position(i, j), i] += w[j]
-        return self.packed @ expand

@@ -47,7 +47,7 @@ def clustered_variances(fitted: Fit, drives: DriveMoments) -> tuple[FloatArray, 
     """
     at, first = _columns(fitted, drives), int(not fitted.has_intercept)
     chosen = at[first:]
-    each = drives.matrix(drives.clusters.packed)[:, chosen][:, :, chosen]
+    each = drives.by_cluster(drives.each)[:, chosen][:, :, chosen]
     back = np.linalg.inv(np.linalg.cholesky(each.sum(axis=0)))
     leverage = back @ each @ back.T
     values, vectors = np.linalg.eigh(np.eye(len(back)) - leverage)
@@ -137,7 +137,7 @@ def infer_by_clusters(fitted: Fit, drives: DriveMoments, scales: Scales) -> Infe
     CR2 with Satterthwaite's degrees of freedom: the intervals of few clusters, or of such that
     differ in size, hold. Raises `DataError` for one cluster, or too few rows.
     """
-    clusters = _require_clusters(len(drives.clusters), drives.unit)
+    clusters = _require_clusters(drives.clusters, drives.unit)
     variances, degrees = clustered_variances(fitted, drives)
     units = [float(unit) for unit in _units(fitted, scales)]
     errors = [math.sqrt(v) * u for v, u in zip(variances, units, strict=True)]
@@ -155,9 +155,8 @@ def _to_counts(drives: DriveMoments, at: Sequence[int]) -> FloatArray:
 
 def cluster_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
     """Return each cluster's sum of (1, inputs) times residual, standardised, (clusters, k+1)."""
-    w = drives.direction(fitted.model)
-    scores = -drives.products_with(w)[:, _columns(fitted, drives)]
-    return drives.sum_clusters(scores)
+    scores = -(drives.each @ drives.direction(fitted.model))[:, _columns(fitted, drives)]
+    return drives.by_cluster(scores)
 
 
 def _require_clusters(clusters: int, unit: str) -> int:
@@ -255,7 +254,7 @@ class Evidence:
         """
         full, variance = fits[-1], _variance(fits[-1])
         at = _columns(full, drives)
-        total = drives.matrix(drives.packed.sum(axis=0))[np.ix_(at, at)]
+        total = drives.each.sum(axis=0)[np.ix_(at, at)]
         scores = cluster_scores(full, drives)
         rotated = np.linalg.solve(np.linalg.cholesky(total), scores.T)[1:]
         unit = float(drives.spread[-1]) ** 2

@@ -24,7 +24,7 @@ def drives_of(seed: int, lost: dict[int, float], drives: int = 40, rows: int = 1
 def fitted(table: GramTable, found: DriveWeights) -> np.ndarray:
     """Slopes of the exactly weighted sum."""
     m = DriveMoments.of(weighted(table, found.parts))
-    matrix = m.matrix(m.packed.sum(axis=0))
+    matrix = m.each.sum(axis=0)
     slopes = np.linalg.solve(matrix[:-1, :-1], matrix[:-1, -1])[1:]
     return np.asarray(slopes * m.spread[-1] / m.spread[:-1])
 

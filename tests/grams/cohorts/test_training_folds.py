@@ -27,7 +27,7 @@ def test_a_fold_holds_out_whole_drives_cars_or_days(by: FoldKey, column: str) ->
         assert gram == Gram.from_counts((*INPUTS, LABEL), rows_of(mine))
     assert training.folds.total.n == 20 * 80
     table = cohort.serving(INPUTS).table
-    assert np.array_equal(training.drives.packed, DriveMoments.of(table).packed)
+    assert np.array_equal(training.drives.each, DriveMoments.of(table).each)
 
 
 def test_drives_without_a_signal_are_left_out_and_without_any_that_is_told() -> None:
