@@ -1,27 +1,12 @@
 """The streaming object has the bits of `predict` and `score`, sample by sample."""
 
 from fractions import Fraction
-from pathlib import Path
 
 import pytest
 
-import fleet_slip
 from fleet_slip.errors import InputError
 from fleet_slip.export.stepping import Estimator
 from tests.export.models import model_of
-
-
-def test_a_whole_drive_has_the_bits_of_predict(smoke_root: Path) -> None:
-    fleet = fleet_slip.open(smoke_root)
-    estimator = fleet.estimator("smoke")
-    drive = fleet.sql(
-        "SELECT * FROM log WHERE drive_id = 'smoke-2024-05-01-0003' ORDER BY tick"
-    ).pl()
-    predicted = fleet.model("smoke").predict(drive).to_list()
-    rows = drive.to_dicts()
-    assert [estimator.step(row) for row in rows] == predicted
-    estimator.restart()
-    assert [estimator.step(row) for row in rows[:50]] == predicted[:50]
 
 
 @pytest.mark.parametrize("ticks", [1, 3, 4, 5, 10**12])

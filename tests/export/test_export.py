@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import fleet_slip
@@ -23,25 +22,6 @@ def document(smoke_root: Path) -> Any:
     ((name, text),) = export_texts(fleet.model("smoke"), fleet.warehouse, "json").items()
     assert name == "smoke-1.json"
     return json.loads(text)
-
-
-def test_the_document_alone_gives_the_angles_of_a_whole_drive(
-    smoke_root: Path, document: Any
-) -> None:
-    fleet = fleet_slip.open(smoke_root)
-    names = [one["name"] for one in document["program"]["signals"]]
-    log = fleet.sql(
-        f"SELECT {', '.join(names)} FROM log_counts WHERE drive_id = 'smoke-2024-05-01-0003' "
-        "ORDER BY tick"
-    ).fetchall()
-    frame = fleet.sql(
-        "SELECT * FROM log WHERE drive_id = 'smoke-2024-05-01-0003' ORDER BY tick"
-    ).pl()
-    predicted = fleet.model("smoke").predict(frame).to_numpy()
-    scale = float(document["program"]["angle"]["scale"])
-    found = plain.angles(document["program"], [], [], log)
-    assert len(found) > 5000
-    assert found == [None if np.isnan(b) else int(np.floor(b / scale + 0.5)) for b in predicted]
 
 
 def test_the_checks_hold_and_are_of_no_drive_of_the_logs(document: Any) -> None:

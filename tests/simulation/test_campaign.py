@@ -22,10 +22,6 @@ def load_text(folder: Path, text: str) -> Campaign:
     return load_campaign(str(file))
 
 
-def total_rows(campaign: Campaign) -> int:
-    return sum(d.expected_rows for day in campaign.days() for d in campaign.drives(day))
-
-
 @pytest.mark.parametrize("name", ["smoke", "fleet"])
 def test_batches_hold_each_drive_once_in_order_and_about_as_many_rows(name: str) -> None:
     campaign = load_campaign(name)
@@ -91,12 +87,6 @@ def test_cars_of_a_fleet_differ_and_keep_their_properties() -> None:
     assert len({d.adhesion for d in drives}) == len(drives)
     for drive in drives:
         assert drive.limits.lateral_mps2 <= 0.61 * drive.adhesion * 9.81
-
-
-def test_shipped_campaigns_are_as_large_as_they_say() -> None:
-    assert 20_000 < total_rows(load_campaign("smoke")) < 80_000
-    assert total_rows(load_campaign("waterford")) >= 2_000_000
-    assert 10_000_000 < total_rows(load_campaign("fleet")) < 30_000_000
 
 
 def test_random_generators_differ_by_seed_and_by_every_part_of_their_name() -> None:

@@ -19,11 +19,11 @@ from fleet_slip.vehicle.highway import FourWheelVehicle
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 
-DAYS = 12
+DAYS = 5
 
 
 def campaign(**changes: object) -> Campaign:
-    """Return a dozen days of one drive of a few seconds."""
+    """Return days of one drive of a few seconds."""
     plan = {"number_of_days": DAYS, "drives_per_day": 1, "laps": 0.03, **changes}
     return load_campaign("smoke").model_copy(update=plan)
 
@@ -61,7 +61,7 @@ def test_days_are_planned_while_others_are_simulated(
 
 
 def test_a_changed_campaign_is_refused_before_anything_is_written(tmp_path: Path) -> None:
-    late = campaign().days()[8:9]
+    late = campaign().days()[3:4]
     with ThreadPoolExecutor(2) as executor:
         simulate_campaign(Warehouse(LocalFolder(tmp_path)), campaign(), late, executor)
     before = Warehouse(LocalFolder(tmp_path)).logs.snapshot()

@@ -39,7 +39,7 @@ print(digests_of(sys.argv[1:]))
 """
 
 
-def drives(roads: list[str], duration_s: float = 6.0) -> tuple[DriveSpec, ...]:
+def drives(roads: list[str], duration_s: float = 3.0) -> tuple[DriveSpec, ...]:
     """Return a drive on each road, whose names and seeds do not depend on their order."""
     campaign = load_campaign("traffic")
     length = Uniform(min=duration_s, max=duration_s)
@@ -73,12 +73,12 @@ def test_a_drive_has_the_same_bytes_in_every_process_and_order() -> None:
     there = run(words, env={**os.environ, "PYTHONHASHSEED": "2024"})
     here = digests_of(roads)
     assert there.stdout.splitlines() == [str(here)], there.stderr
-    assert [rows // 100 for _, rows, _ in here] == [6] * len(roads)
+    assert [rows for _, rows, _ in here] == pytest.approx([300] * len(roads), rel=0.1)
 
 
 @pytest.fixture(scope="module", params=sorted(SITES))
 def spec(request: pytest.FixtureRequest) -> DriveSpec:
-    (one,) = drives([request.param], 40.0)
+    (one,) = drives([request.param], 30.0)
     return one
 
 
@@ -96,7 +96,7 @@ def test_the_plan_keeps_the_driver_s_limits_and_lasts_as_long_as_asked(spec: Dri
     assert lateral.max() <= 1.1 * limits.lateral_mps2
     assert along.max() <= 1.1 * limits.acceleration_mps2
     assert along.min() >= -1.1 * limits.braking_mps2
-    assert profile.time_s(1) / spec.speed_factor == pytest.approx(40.0, abs=0.5)
+    assert profile.time_s(1) / spec.speed_factor == pytest.approx(30.0, abs=0.5)
 
 
 def test_the_car_follows_it_on_four_tyres(spec: DriveSpec) -> None:

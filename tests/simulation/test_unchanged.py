@@ -8,6 +8,7 @@ changed campaign, so that they must not change either.
 
 from hashlib import sha256
 
+import polars as pl
 import pyarrow as pa
 import pytest
 
@@ -68,7 +69,7 @@ def checksum(rows: pa.Table) -> str:
     """Return a checksum of the values of a table, whatever its chunks, but for what came later."""
     digest = sha256()
     for name in rows.drop_columns(["rows", "duration_s"]).column_names:
-        digest.update(f"{name}{rows[name].to_pylist()}".encode())
+        digest.update(f"{name}{pl.Series(rows[name]).to_list()}".encode())  # faster than Arrow's
     return digest.hexdigest()
 
 
