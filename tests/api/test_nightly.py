@@ -65,7 +65,7 @@ def champions_by(folder: Path, old: str, new: str) -> Iterator[None]:
 
 @pytest.fixture(scope="module", autouse=True)
 def forgiving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Rules that let small differences pass, which are large of few drives; one file is verified."""
+    """Rules that let small differences pass: of few drives they are large. One file is verified."""
     own = tmp_path_factory.mktemp("forgiving") / "configs"
     with (
         champions_by(own, "worth_deg = 0.025", "worth_deg = 1.0  "),
