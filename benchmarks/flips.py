@@ -10,7 +10,6 @@ early (Ctrl-C, SIGTERM) it shows what it has counted.
 import argparse
 import collections
 import contextlib
-import os
 import random
 import signal
 import sys
@@ -176,7 +175,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kind", choices=list(KINDS), action="append")
     options = parser.parse_args()
-    os.environ["FLEET_SLIP_LOG"] = "text"
     started = time.monotonic()
     with quick_folder() as folder:
         root = folder / "data"

@@ -91,7 +91,7 @@ class Inputs:
     def environment(self, *names: str) -> Environment:
         """Return the environment of commands; migrating needs another catalogue."""
         chosen = "new_signals" if "migrate" in names else "signals"
-        return {CATALOGUE_VARIABLE: str(self.folder / f"{chosen}.toml"), "FLEET_SLIP_LOG": "text"}
+        return {CATALOGUE_VARIABLE: str(self.folder / f"{chosen}.toml")}
 
 
 def write_inputs(where: Path) -> Inputs:

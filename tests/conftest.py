@@ -18,8 +18,6 @@ from tests.support.budget import Budget
 from tests.support.commands import Finished, RunCommand, done_on, run_on
 from tests.support.once import compile_once, made_once, require_unchanged
 
-os.environ["FLEET_SLIP_LOG"] = "text"  # a test reads what a person would
-
 # A test that has a cache of its own does not compile anew, which takes half a minute.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder("compiled")))
 

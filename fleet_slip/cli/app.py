@@ -19,9 +19,9 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 import fleet_slip
-from fleet_slip.cli.early_exit import LOG_VARIABLE, leave
+from fleet_slip.cli.early_exit import leave
 from fleet_slip.cli.output import say
-from fleet_slip.cli.streams import LogFormat, Streams, configure_logs
+from fleet_slip.cli.streams import Streams, configure_remarks
 from fleet_slip.errors import (
     INTERRUPTED,
     FleetSlipError,
@@ -218,14 +218,6 @@ def options(
             show_default=False,
         ),
     ] = None,
-    log: Annotated[
-        LogFormat,
-        typer.Option(
-            envvar=LOG_VARIABLE,
-            help="Remarks on stderr: text, json (one object a line), or auto: json in a systemd "
-            "journal and, unless on a terminal, with --json; else text.",
-        ),
-    ] = LogFormat.AUTO,
     config: Annotated[
         str | None,
         typer.Option(
@@ -247,7 +239,7 @@ def options(
 
     With logs of your own: **fleet-slip mapping suggest LOG**, then **fleet-slip learn**
     """
-    configure_logs(log)
+    configure_remarks()
     if config is not None:
         os.environ[CONFIG_VARIABLE] = str(Path(config).absolute())
     own_configs()
@@ -257,7 +249,7 @@ def options(
 def run_app() -> int:
     """Run the command line; an expected error becomes one line on stderr and the exit code."""
     streams = Streams()
-    configure_logs(LogFormat.AUTO)
+    configure_remarks()
     _choose_font_folder()
     exit_code = _exit_code_of_app()
     if reason := streams.unprinted():

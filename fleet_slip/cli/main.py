@@ -16,12 +16,12 @@ def main() -> None:
         require_limits()
         from fleet_slip.cli.app import run_app  # noqa: PLC0415 - see above
     except FleetSlipError as error:
-        tell(f"error: {error}", "error")
+        tell(f"error: {error}")
         sys.exit(error.exit_code)
     except (ImportError, OSError, MemoryError) as error:
         if not is_lack_of_memory(error):
             raise
         allowed = f"this process may have {memory_bytes() // 2**20:,} MiB for data"
-        tell(f"error: out of memory before anything was done: {allowed}. Give it more.", "error")
+        tell(f"error: out of memory before anything was done: {allowed}. Give it more.")
         sys.exit(StorageError.exit_code)
     sys.exit(run_app())

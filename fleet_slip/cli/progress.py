@@ -2,7 +2,6 @@
 
 import logging
 import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -20,11 +19,7 @@ from rich.progress import (
 from rich.text import Text
 
 from fleet_slip.cli.output import say
-from fleet_slip.cli.streams import drawing_on, for_people, stderr
-from fleet_slip.storage.runs import log_event
-
-TOLD_EVERY_S = 30.0
-"""How often the log tells the progress of a job."""
+from fleet_slip.cli.streams import drawing_on, stderr
 
 
 class _Rate(ProgressColumn):
@@ -56,8 +51,8 @@ def progress_of_steps(
 ) -> Iterator[Callable[[str, int, int], None]]:
     """Show bars with rate and time left on stderr while steps are done, if a person watches.
 
-    Machines are told by an event now and then. Yields the callback: what is being done, how much is
-    done, and how much there is. At Ctrl-C a line says how much of each step was done.
+    Yields the callback: what is being done, how much is done, and how much there is. At Ctrl-C a
+    line says how much of each step was done.
     """
     console = stderr()
     bar = Progress(
@@ -69,32 +64,24 @@ def progress_of_steps(
         TimeRemainingColumn(),
         console=console,
         transient=True,
-        disable=not (console.is_terminal and for_people()) or bool(os.environ.get("CI")),
+        disable=not console.is_terminal or bool(os.environ.get("CI")),
     )
-    begun: dict[str, tuple[TaskID, float]] = {}
+    begun: dict[str, TaskID] = {}
     reached: dict[str, tuple[int, int]] = {}
-    told = time.monotonic()
 
-    def begin(doing: str) -> tuple[TaskID, float]:
-        task = bar.add_task(doing, total=None, unit=unit)
-        return task, time.monotonic()
+    def begin(doing: str) -> None:
+        begun[doing] = bar.add_task(doing, total=None, unit=unit)
 
     def show(doing: str, done: int, total: int) -> None:
-        nonlocal told
         if doing not in begun:
-            begun[doing] = begin(doing)
-        task, since = begun[doing]
+            begin(doing)
         reached[doing] = done, total
-        bar.update(task, completed=done, total=total)
-        if (now := time.monotonic()) - told > TOLD_EVERY_S:
-            told = now
-            rate = {f"{unit}_per_s": round(done / (now - since))}
-            log_event("progress", doing=doing, done=done, total=total, **rate)
+        bar.update(begun[doing], completed=done, total=total)
 
     try:
         with drawing_on(console), bar:
             if first is not None:
-                begun[first] = begin(first)
+                begin(first)
             yield show
     except KeyboardInterrupt:
         for doing, (done, total) in reached.items():

@@ -4,20 +4,16 @@ None of these stops a job: the work is done, what cannot be written is not, and 
 """
 
 import io
-import json
 import logging
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime
-from enum import StrEnum
 from typing import TYPE_CHECKING, Any, TextIO
 
-from fleet_slip.cli.early_exit import for_machines
 from fleet_slip.errors import hide_passwords, printable
 from fleet_slip.rendering import wrap_lines
-from fleet_slip.storage.runs import LOGGER, current_run_id
+from fleet_slip.storage.runs import LOGGER
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -81,15 +77,7 @@ def _as_text(raw: io.FileIO, like: TextIO | None, errors: str = "surrogateescape
     )
 
 
-# Remarks and events on stderr: text for people, or one JSON object a line for machines.
-
-
-class LogFormat(StrEnum):
-    """How remarks are written: `auto` is text, but JSON with `--json` and in journals."""
-
-    AUTO = "auto"
-    TEXT = "text"
-    JSON = "json"
+# Remarks on stderr.
 
 
 _drawn_on: "list[Console]" = []
@@ -114,49 +102,22 @@ def drawing_on(console: "Console") -> Iterator[None]:
         _drawn_on.remove(console)
 
 
-class PeopleHandler(logging.Handler):
-    """Prints remarks, on a terminal in lines that it can show.
-
-    Events, which have figures and no sentence, are left out.
-    """
+class _RemarkHandler(logging.Handler):
+    """Prints remarks, on a terminal in lines that it can show."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a remark."""
-        if not hasattr(record, "event"):
-            text = printable(hide_passwords(record.getMessage()))
-            if not (_drawn_on or sys.stderr.isatty()):
-                print(text, file=sys.stderr, flush=True)  # noqa: T201 - a remark
-                return
-            console = stderr()
-            shown = wrap_lines(text, console.width) if console.is_terminal else text
-            console.print(shown, markup=False)
+        text = printable(hide_passwords(record.getMessage()))
+        if not (_drawn_on or sys.stderr.isatty()):
+            print(text, file=sys.stderr, flush=True)  # noqa: T201 - a remark
+            return
+        console = stderr()
+        shown = wrap_lines(text, console.width) if console.is_terminal else text
+        console.print(shown, markup=False)
 
 
-class JsonFormatter(logging.Formatter):
-    """Makes a record a line of JSON: time, level, run_id, event, and what is particular to it."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the line."""
-        known = {"event": getattr(record, "event", "message"), **getattr(record, "fields", {})}
-        if known["event"] == "message":
-            known["message"] = hide_passwords(record.getMessage())
-        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-        level = record.levelname.lower()
-        head = {"time": time, "level": level, "run_id": current_run_id()}
-        return json.dumps(head | known, default=str)
-
-
-def configure_logs(chosen: LogFormat) -> None:
-    """Send the program's log to stderr in a format."""
-    handler: logging.Handler = PeopleHandler()
-    if for_machines(chosen):
-        handler = logging.StreamHandler()
-        handler.setFormatter(JsonFormatter())
-    LOGGER.handlers[:] = [handler]
+def configure_remarks() -> None:
+    """Send the program's remarks to stderr."""
+    LOGGER.handlers[:] = [_RemarkHandler()]
     LOGGER.setLevel(logging.INFO)
     LOGGER.propagate = False
-
-
-def for_people() -> bool:
-    """Whether a person reads stderr: then progress may be drawn there."""
-    return any(isinstance(handler, PeopleHandler) for handler in LOGGER.handlers)

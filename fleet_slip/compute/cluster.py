@@ -38,7 +38,6 @@ from fleet_slip.compute.tasks import LostTaskError
 from fleet_slip.errors import ClusterError, FleetSlipError, RefusedError, StorageError
 from fleet_slip.resources import folder, own_configs
 from fleet_slip.storage.folder import Folder
-from fleet_slip.storage.runs import log_event
 
 PACKAGES = (
     "fleet-slip",
@@ -80,7 +79,7 @@ def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
     Workers must see `root` too. Raises `ClusterError` without a scheduler in 10 s (or Dask's own
     limit).
     """
-    _route_logs()
+    _hush_logs()
     try:
         resolve_address(address)
         client = _connect(address)
@@ -210,7 +209,6 @@ class ClusterExecutor(Executor):
         self._futures.discard(future)
         error = theirs.exception()
         if isinstance(error, KilledWorker):
-            log_event("task lost", logging.WARNING, reason=str(error))
             error = LostTaskError(str(error))
         with contextlib.suppress(InvalidStateError):  # it was given up
             if error is not None:
@@ -236,8 +234,6 @@ class ClusterExecutor(Executor):
             threads = self._client.nthreads()
         except (OSError, TimeoutError):
             return  # the client connects again, or closes
-        if (len(threads), sum(threads.values())) != (self.workers, self._threads):
-            log_event("workers", workers=len(threads), threads=sum(threads.values()))
         self.workers, self._threads = len(threads), sum(threads.values())
         if threads:
             self._last_seen_s = time.monotonic()
@@ -323,21 +319,11 @@ def _shipped(entry: Traversable) -> Iterator[Traversable]:
         yield entry
 
 
-class _Forwarder(logging.Handler):
-    """Hands what Dask logs to our log, where machines read it and people are not disturbed."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Hand on what is no mere remark."""
-        if record.levelno >= logging.WARNING:
-            message = " ".join(record.getMessage().split())
-            log_event("dask", record.levelno, logger=record.name, message=message)
-
-
-def _route_logs() -> None:
+def _hush_logs() -> None:
     """Undo what Dask does to the logging of the process when it is imported."""
     for name in ("distributed", "tornado", "asyncio"):
         logger = logging.getLogger(name)
-        logger.handlers[:] = [_Forwarder()]
+        logger.handlers[:] = [logging.NullHandler()]
         logger.propagate = False
     for name in list(logging.root.manager.loggerDict):
         if name.startswith(("distributed.", "tornado.")):

@@ -22,7 +22,6 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.models.summary import remark_without_information
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
-from fleet_slip.storage.runs import log_event
 from fleet_slip.warehouse.condition import (
     Condition,
     asking,
@@ -170,9 +169,7 @@ def _estimate_rows(
 
 def calibrated_cars(warehouse: Warehouse) -> CarCounts:
     """Return the counts of every car's numbers, by its drives so far. Raises `DataError`."""
-    found = calibrate(warehouse)
-    log_event("calibration", cars=len(found.cars), grams_version=found.grams_version)
-    return found.counts()
+    return calibrate(warehouse).counts()
 
 
 def _figures(estimate_rad: FloatArray, truth_rad: FloatArray, rows: int) -> Score:

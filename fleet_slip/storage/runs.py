@@ -210,7 +210,6 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
     begun = time.monotonic()
     token = _current.set(run)
     recorded = _exists(root) and _append(root, file, run.beginning())
-    log_event("run started", command=command, arguments=run.shown_arguments)
     error: BaseException | None = None
     try:
         yield run
@@ -219,15 +218,14 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
         raise
     finally:
         end = run.end(error, time.monotonic() - begun)
-        log_event("run ended", **{key: end[key] for key in ("outcome", "exit_code", "seconds")})
-        if _exists(root):
-            _append(root, file, *([] if recorded else [run.beginning()]), end)
+        if _exists(root) and not _append(root, file, *([] if recorded else [run.beginning()]), end):
+            LOGGER.warning("%s: the history of runs cannot be written, and lacks this one.", root)
         _current.reset(token)
 
 
 @contextlib.contextmanager
 def step(name: str) -> Iterator[MeasuredStep]:
-    """Time a step of the run under way, and log it. Without a run it is logged only."""
+    """Time a step of the run under way, if there is one."""
     run = _current.get()
     one = MeasuredStep(name)
     begun = time.monotonic()
@@ -237,8 +235,6 @@ def step(name: str) -> Iterator[MeasuredStep]:
         one.seconds = round(time.monotonic() - begun, 6)
         if run:
             run.steps.append(one)
-        figures = asdict(one)
-        log_event("step ended", step=figures.pop("name"), **figures)
 
 
 def publishable(arguments: Sequence[str]) -> list[str]:
@@ -286,17 +282,10 @@ def _exists(root: Folder) -> bool:
 
 def _append(root: Folder, file: str, *records: Mapping[str, Any]) -> bool:
     text = b"".join(b"\n" + write_line(record) + b"\n" for record in records)
-    try:
+    with contextlib.suppress(StorageError):
         root.append(file, text)
-    except StorageError as error:
-        log_event("run not recorded", logging.WARNING, file=f"{root}/{file}", reason=str(error))
-        return False
-    return True
-
-
-def log_event(event: str, level: int = logging.INFO, **fields: Any) -> None:
-    """Log what happened, with figures: a line for machines, nothing for people."""
-    LOGGER.log(level, event, extra={"event": event, "fields": fields})
+        return True
+    return False
 
 
 def _exit_code(error: BaseException | None) -> int:

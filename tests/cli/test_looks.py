@@ -72,7 +72,7 @@ def shown(
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_word_is_whole(smoke_root: Path, shown: Shown, command: str) -> None:
     def give() -> None:
-        words = ["--root", str(smoke_root), "--log", "text", *command.split()]
+        words = ["--root", str(smoke_root), *command.split()]
         with contextlib.suppress(AlarmError):
             app(words, standalone_mode=False)
 

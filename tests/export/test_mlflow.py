@@ -158,7 +158,7 @@ def run(
         text=True,
         check=False,
         timeout=300,
-        env={**os.environ, "FLEET_SLIP_LOG": "text", **(more or {})},
+        env={**os.environ, **(more or {})},
     )
     assert done.returncode == code, done.stderr[-3000:]
     return done
