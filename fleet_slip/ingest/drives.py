@@ -1,7 +1,7 @@
 """Checks the order of time and cuts rows, block by block, into drives: uninterrupted stretches."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property, partial
@@ -207,8 +207,10 @@ def _latest(
     return latest, np.where(heads, before, shifted)
 
 
-MOST_OPEN_ROWS = 2**20
+MOST_OPEN_ROWS = 2**19
 """Rows of drives that have not ended, in memory; all others wait in a temporary file."""
+MOST_PARTS = 64
+"""Parts whose rows are taken out of a block at once: thousands of small frames take much memory."""
 
 
 @dataclass(frozen=True)
@@ -260,6 +262,8 @@ class OpenDrives:
     def __init__(self) -> None:
         """Begin without rows."""
         self._rows: dict[int, list[pl.DataFrame]] = {}
+        self._mixed: list[pl.DataFrame] = []
+        """Later blocks, of many parts."""
         self._in_memory = 0
         self._spool = Spool()
 
@@ -269,12 +273,26 @@ class OpenDrives:
             return
         self._in_memory += rows.height
         one = rows["part"][0] == rows["part"][-1]
-        for run in [rows] if one else rows.partition_by("part", maintain_order=True):
+        if self._mixed or (not one and rows["part"].n_unique() > MOST_PARTS):
+            self._mixed.append(rows)
+        else:
+            self._keep([rows] if one else rows.partition_by("part", maintain_order=True))
+
+    def _keep(self, runs: Iterable[pl.DataFrame]) -> None:
+        for run in runs:
             pieces = _by_base(run) if "base" in run.columns else [run]
             self._rows.setdefault(int(run["part"][0]), []).extend(pieces)
 
-    def take(self, parts: Iterable[int]) -> Iterator[DriveRows]:
+    def take(self, parts: Sequence[int]) -> Iterator[DriveRows]:
         """Yield the rows of parts that have any, and let go of them."""
+        if self._mixed and len(parts) > MOST_PARTS:
+            self._put_aside()
+        elif self._mixed and parts:
+            mine = pl.col("part").is_in(parts)
+            runs = pl.concat([rows.filter(mine) for rows in self._mixed])
+            self._keep(runs.partition_by("part", maintain_order=True))
+            rest = (rows.filter(~mine) for rows in self._mixed)
+            self._mixed = [rows for rows in rest if rows.height]
         for part in parts:
             in_memory = self._rows.pop(part, [])
             self._in_memory -= sum(piece.height for piece in in_memory)
@@ -290,8 +308,13 @@ class OpenDrives:
 
     def spill(self) -> None:
         """Put the rows aside if they are many. Raises `InputError` if the disk is full."""
-        if self._in_memory <= MOST_OPEN_ROWS:
-            return
+        if self._in_memory > MOST_OPEN_ROWS:
+            self._put_aside()
+
+    def _put_aside(self) -> None:
+        if self._mixed:
+            mixed, self._mixed = pl.concat(self._mixed), []
+            self._keep(mixed.partition_by("part", maintain_order=True))
         for part, pieces in self._rows.items():
             alike = "base" not in pieces[0].columns
             for piece in [pl.concat(pieces)] if alike else pieces:

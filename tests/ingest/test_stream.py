@@ -177,21 +177,24 @@ def test_nothing_is_left_of_a_file_that_fails_at_its_end(
     assert not list((tmp_path / "data").rglob("*.parquet"))
 
 
+@pytest.mark.parametrize(("rows", "parts"), [(4, 64), (4, 1), (9, 2), (2**20, 1), (2**20, 2)])
 def test_open_drives_that_wait_in_a_file_are_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int, parts: int
 ) -> None:
-    """Drives that alternate row by row, and one that stands together."""
+    """Drives that alternate row by row, of which one ends early, and one that stands together."""
     columns: dict[str, list[Any]] = {**good_columns(60)}
     columns["run"] = [i % 3 if i < 45 else 9 for i in range(60)]
+    columns["t"] = [f"{i / 100 + 5 * (i % 3 == 1 and i > 20):.2f}" for i in range(60)]
     columns["ax"][7] = "x"
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 200)
     mapping = a_mapping(drive={"column": "run"}, time={"longest_gap_s": 0.1})
     whole = read_columns(tmp_path, columns, mapping)
-    monkeypatch.setattr(open_drives, "MOST_OPEN_ROWS", 4)
+    monkeypatch.setattr(open_drives, "MOST_OPEN_ROWS", rows)
+    monkeypatch.setattr(open_drives, "MOST_PARTS", parts)
     spilled = read_columns(tmp_path, columns, mapping)
     assert spilled.drives.equals(whole.drives)
     assert spilled.counts == whole.counts
-    assert whole.counts.drives == 4
+    assert whole.counts.drives == 5
 
 
 numbers = st.one_of(

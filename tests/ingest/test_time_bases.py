@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import stream, time_bases
+from fleet_slip.ingest import drives, stream, time_bases
 from fleet_slip.ingest.formats.source import BASE, OWN_TIME, Channel, Source
 from fleet_slip.ingest.time_bases import DISORDER, HELD, ROW, merge_bases
 from tests.support.measured import MeasuredLog, a_mapping, read_measured
@@ -141,6 +141,8 @@ def read_in(
         patched.enter_context(mock.patch.object(time_bases, "open_source", opened))
         patched.enter_context(mock.patch.object(time_bases, "BATCH_ROWS", max(batch // 2, 1)))
         patched.enter_context(mock.patch.object(time_bases, "WINDOW_ROWS", window))
+        patched.enter_context(mock.patch.object(drives, "MOST_PARTS", batch % 3))
+        patched.enter_context(mock.patch.object(drives, "MOST_OPEN_ROWS", 5 * window))
         patched.enter_context(mock.patch.object(stream, "RATE_ROWS", 60))
         patched.enter_context(mock.patch.object(stream, "FEWEST_STEPS", 20))
         patched.enter_context(mock.patch.object(stream, "LONGEST_DRIVE_S", 0.8))
