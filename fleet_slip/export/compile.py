@@ -12,7 +12,6 @@ import pyarrow as pa
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import COUNT_MAX
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
-from fleet_slip.columns.operations import CarFact
 from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program, write_program
 from fleet_slip.grams.compute import counts_of
 from fleet_slip.models.manifest import Manifest
@@ -48,12 +47,14 @@ class Check:
 
     Attributes:
         name: what it is.
+        known: facts of the car as logs have them.
         facts, numbers: what the car knows, in the order of the program; None where unknown.
         samples: of each tick.
         angles: counts of the program's angle.
     """
 
     name: str
+    known: Mapping[str, object]
     facts: tuple[int | None, ...]
     numbers: tuple[int | None, ...]
     samples: tuple[Sample, ...]
@@ -123,7 +124,8 @@ def _check(
 ) -> Check:
     ticks = tuple(samples)
     angles = tuple(angles_by_kernel(manifest, program, car, ticks))
-    return Check(name, car.fact_counts(program), car.number_counts(program), ticks, angles)
+    counts = car.fact_counts(program), car.number_counts(program)
+    return Check(name, car.facts, *counts, ticks, angles)
 
 
 def _smooth(program: Program) -> Iterable[Sample]:
@@ -142,16 +144,12 @@ def _swing(signal: Input, tick: int, period: int) -> int:
 
 def _hostile_car(program: Program) -> Car:
     """Return a car whose facts and numbers are far from usual."""
-    facts: Mapping[str, object] = {one.name: _hostile_fact(one) for one in program.facts}
+    facts = {one.name: 2**16 if one.equals is None else one.equals for one in program.facts}
     numbers = {
         one.name: COUNT_MAX if place % 2 else -COUNT_MAX
         for place, one in enumerate(program.numbers)
     }
     return Car(facts, numbers)
-
-
-def _hostile_fact(fact: CarFact) -> object:
-    return 2**16 if fact.equals is None else fact.equals
 
 
 def _extremes(program: Program, random: np.random.Generator) -> Iterable[Sample]:
@@ -207,7 +205,7 @@ def checks_csv(program: Program, checks: Sequence[Check]) -> str:
     numbers = [one.name for one in program.numbers]
     writer.writerow(["drive_id", "tick", *columns, *facts, *numbers, "expected_angle"])
     for check in checks:
-        known = [_fact(program, check, name) for name in facts]
+        known = [check.known.get(name) for name in facts]
         known += [
             _physical(count, one.grain)
             for count, one in zip(check.numbers, program.numbers, strict=True)
@@ -223,16 +221,3 @@ def checks_csv(program: Program, checks: Sequence[Check]) -> str:
 
 def _physical(count: int | None, scale: Decimal) -> str | None:
     return None if count is None else f"{count * scale:f}"
-
-
-def _fact(program: Program, check: Check, name: str) -> object:
-    """Return a fact as the logs have it; `another` is a text that no fact of the program is."""
-    found: object = None
-    for one, count in zip(program.facts, check.facts, strict=True):
-        if one.name == name and count is not None:
-            if one.equals is None:
-                return count
-            found = one.equals if count else found or "another"
-            if count:
-                return found
-    return found

@@ -3,8 +3,8 @@
 import base64
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, get_args
 
 from fleet_slip.base import canonical_json, sha256_of
@@ -33,13 +33,28 @@ SCHEMA = 2
 """Number of the schema: it changes if an implementation of before would compute something else."""
 
 
-def document_of(
-    version: ModelVersion, program: Program, checks: Sequence[Check], drives: bytes | None
-) -> dict[str, Any]:
-    """Return the document of a published version; `sha256` is of everything else in it.
+@dataclass(frozen=True)
+class Subject:
+    """A version that is exported, its program, and checks of it.
 
-    `drives` is the content of the file about the drives that trained it.
+    `drives` is the content of the file about the drives that trained it; None if it is not known.
     """
+
+    version: ModelVersion
+    program: Program
+    checks: tuple[Check, ...]
+    drives: bytes | None
+    with_gram: bool = False
+
+    @property
+    def table(self) -> str:
+        """The checks as CSV."""
+        return checks_csv(self.program, self.checks)
+
+
+def document_of(subject: Subject) -> dict[str, Any]:
+    """Return the document of a published version; `sha256` is of everything else in it."""
+    version, drives = subject.version, subject.drives
     drives_sha256 = version.manifest.trained_on.drives_sha256
     if drives is not None:
         drives_sha256 = checksum_of_drives(drives)
@@ -53,9 +68,12 @@ def document_of(
             "drives": None if drives is None else base64.b64encode(drives).decode("ascii"),
             "manifest": version.manifest.model_dump(mode="json"),
         },
-        "program": program_content(program),
-        "costs": count_costs(program).as_dict(),
-        "checks": [asdict(one) for one in checks],
+        "program": program_content(subject.program),
+        "costs": count_costs(subject.program).as_dict(),
+        "checks": [
+            {name: value for name, value in vars(one).items() if name != "known"}
+            for one in subject.checks
+        ],
     }
     return {**content, "sha256": sha256_of(canonical_json(content))}
 
@@ -132,22 +150,6 @@ def manifest_of(
     }
 
 
-@dataclass(frozen=True)
-class Subject:
-    """A version that is exported, its program, checks of it, and the hashes of its drives."""
-
-    version: ModelVersion
-    program: Program
-    checks: tuple[Check, ...]
-    drives: bytes | None
-    with_gram: bool = False
-
-    @property
-    def stem(self) -> str:
-        """What the names of its files begin with."""
-        return f"{self.version.manifest.name}-{self.version.version}"
-
-
 def export_files(
     version: ModelVersion, warehouse: Warehouse | None, to: str, *, with_gram: bool = False
 ) -> dict[str, bytes]:
@@ -199,15 +201,13 @@ def log_version(version: ModelVersion, warehouse: Warehouse, uri: str) -> str:
     """
     from fleet_slip.export.mlflow import log_to_mlflow  # noqa: PLC0415 - it renders documents
 
-    subject = _subject(version, warehouse)
-    content = document_of(version, subject.program, subject.checks, subject.drives)
     aliases = Registry(warehouse.root / "models").history(version.manifest.name).aliases()
-    return log_to_mlflow(uri, version, subject.program, subject.checks, content, aliases)
+    return log_to_mlflow(uri, _subject(version, warehouse), aliases)
 
 
 def _json(subject: Subject) -> dict[str, str]:
-    content = document_of(subject.version, subject.program, subject.checks, subject.drives)
-    return {f"{subject.stem}.json": render(content)}
+    version = subject.version
+    return {f"{version.manifest.name}-{version.version}.json": render(document_of(subject))}
 
 
 def _c(subject: Subject) -> dict[str, str]:
@@ -241,7 +241,7 @@ def _sql(subject: Subject) -> dict[str, str]:
     return {
         f"{prefix}.sql": sql_statement(version, program),
         f"{prefix}_macro.sql": sql_macro(version, program),
-        f"{prefix}_checks.csv": checks_csv(program, subject.checks),
+        f"{prefix}_checks.csv": subject.table,
     }
 
 
@@ -270,7 +270,7 @@ def _dbc(subject: Subject) -> dict[str, str]:
     }
     return {
         f"{prefix}.dbc": fill_in_version("templates/estimator.dbc", version, program, **words),
-        f"{prefix}_checks.csv": checks_csv(program, subject.checks),
+        f"{prefix}_checks.csv": subject.table,
     }
 
 
@@ -286,16 +286,15 @@ def _onnx(subject: Subject) -> dict[str, str | bytes]:
     return {
         f"{prefix}_float32.onnx": onnx_model(version, program, "float32"),
         f"{prefix}_float64.onnx": onnx_model(version, program, "float64"),
-        f"{prefix}_checks.csv": checks_csv(program, subject.checks),
+        f"{prefix}_checks.csv": subject.table,
     }
 
 
 def _fmu(subject: Subject) -> dict[str, bytes]:
     version, program = subject.version, subject.program
-    prefix, checks = file_prefix(version), checks_csv(program, subject.checks)
     return {
-        f"{prefix}_fmi2.fmu": fmu(version, program, checks, 2),
-        f"{prefix}_fmi3.fmu": fmu(version, program, checks, 3),
+        f"{file_prefix(version)}_fmi{fmi}.fmu": fmu(version, program, subject.table, fmi)
+        for fmi in (2, 3)
     }
 
 

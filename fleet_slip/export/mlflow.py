@@ -3,7 +3,7 @@
 MLflow and pandas are the extra `fleet-slip[mlflow]`; they are imported when they are used.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from http.client import HTTPException
 from importlib.metadata import version as package_version
@@ -19,7 +19,7 @@ from urllib.request import urlopen
 from fleet_slip.base import number_of
 from fleet_slip.errors import ConfigError, StorageError, UsageError
 from fleet_slip.export.compile import Check
-from fleet_slip.export.files import render
+from fleet_slip.export.files import Subject, document_of, render
 from fleet_slip.export.program import Program
 from fleet_slip.models.registry import ModelVersion
 
@@ -35,14 +35,7 @@ SHA256_TAG = "fleet_slip.sha256"
 _TEXTS = ("vehicle_id", "vehicle_model", "campaign", "track", "source")
 
 
-def log_to_mlflow(
-    uri: str,
-    version: ModelVersion,
-    program: Program,
-    checks: Sequence[Check],
-    document: dict[str, Any],
-    aliases: Mapping[str, int],
-) -> str:
+def log_to_mlflow(uri: str, subject: Subject, aliases: Mapping[str, int]) -> str:
     """Register a version under its model's name; return the number that MLflow gave it.
 
     One that is registered already, by its checksum, is not registered again; `aliases` that point
@@ -54,13 +47,11 @@ def log_to_mlflow(
             "the URI of MLflow has a name or password in it, which logs would keep. Set "
             "MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD instead."
         )
-    mlflow = _library()
+    mlflow, version = _library(), subject.version
     require_answer(uri, version.reference)
     try:
         with _tracking(mlflow, uri), TemporaryDirectory() as folder:
-            number = _registered(mlflow, version) or _log(
-                mlflow, version, program, checks, document, Path(folder)
-            )
+            number = _registered(mlflow, version) or _log(mlflow, subject, Path(folder))
             describe(mlflow.MlflowClient(), version, number, aliases)
             return number
     except mlflow.exceptions.MlflowException as error:
@@ -132,16 +123,10 @@ def _registered(mlflow: Any, version: ModelVersion) -> str | None:
     return None
 
 
-def _log(
-    mlflow: Any,
-    version: ModelVersion,
-    program: Program,
-    checks: Sequence[Check],
-    document: dict[str, Any],
-    folder: Path,
-) -> str:
+def _log(mlflow: Any, subject: Subject, folder: Path) -> str:
+    version, program = subject.version, subject.program
     manifest = version.manifest
-    (folder / DOCUMENT).write_text(render(document), "utf-8")
+    (folder / DOCUMENT).write_text(render(document_of(subject)), "utf-8")
     tags = _tags(version)
     with mlflow.start_run(run_name=version.reference, tags=tags):
         mlflow.log_params(parameters(version))
@@ -151,7 +136,7 @@ def _log(
             loader_module=LOADER,
             data_path=str(folder / DOCUMENT),
             signature=_signature(mlflow, program),
-            input_example=_example(program, checks[0]),
+            input_example=_example(program, subject.checks[0]),
             registered_model_name=manifest.name,
             pip_requirements=[f"fleet-slip=={package_version('fleet-slip')}"],
             metadata=tags,

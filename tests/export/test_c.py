@@ -35,7 +35,7 @@ def test_hostile_drives_give_the_angles_of_the_kernel(name: str, tmp_path: Path)
     manifest = model_of(MODELS[name], Fraction(-1, 700), name)
     program = compile_program(manifest)
     version = ModelVersion(1, manifest, "0" * 64)
-    options = SANITIZED if can_sanitize(tmp_path) else ("-O2",)
+    options = SANITIZED if can_sanitize() else ("-O2",)
     driver = build_driver(tmp_path, version, program, *options)
     angles: set[int | None] = set()
     for seed, car in enumerate(CARS):
@@ -91,7 +91,7 @@ int main(void)
 
 def test_no_bytes_make_the_fuzz_target_overflow(tmp_path: Path) -> None:
     """With bytes from numpy; with clang, libFuzzer calls the same target."""
-    if not can_sanitize(tmp_path):
+    if not can_sanitize():
         pytest.skip("the compiler's sanitizers are not here")
     manifest = model_of(MODELS["every_kind"], Fraction(5), "any")
     files = export_texts(ModelVersion(1, manifest, "0" * 64), None, "c")

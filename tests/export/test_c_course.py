@@ -83,9 +83,7 @@ def received_rows(root: Path, content: bytes) -> list[dict[str, Any]]:
     return found
 
 
-@pytest.mark.parametrize(
-    ("late", "every"), [(0, 10), (-40, 10), (-11, 5), (-2, 10), (1, 1), (34, 10), (200, 20)]
-)
+@pytest.mark.parametrize(("late", "every"), [(0, 10), (-40, 10), (-11, 5), (1, 1), (200, 20)])
 def test_received_rows_are_those_of_the_log(
     tmp_path: Path, counter: Counter, late: int, every: int
 ) -> None:
@@ -132,7 +130,7 @@ def test_several_times_are_parts_of_the_drive(tmp_path: Path, three: str) -> Non
 
 def test_nothing_overflows(tmp_path: Path, counter: Counter) -> None:
     """Not with counts beyond all ranges, and delays that no receiver has."""
-    if not can_sanitize(tmp_path):
+    if not can_sanitize():
         pytest.skip("the compiler's sanitizers are not here")
     sanitized = build(tmp_path, counter.sets, *SANITIZED)
     rows, width = 3000, 1 + len(counter.signals)

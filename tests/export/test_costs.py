@@ -4,17 +4,10 @@ import json
 from fractions import Fraction
 from pathlib import Path
 
-import pytest
-
 import fleet_slip
-from fleet_slip.export.c import c_header
-from fleet_slip.export.compile import compile_program
-from fleet_slip.export.costs import cost_on_board, costs_content, count_costs, describe_costs
+from fleet_slip.export.costs import cost_on_board, costs_content, describe_costs
 from fleet_slip.export.files import export_files
-from fleet_slip.export.templating import c_prefix
-from fleet_slip.models.registry import ModelVersion
-from tests.export.compiled import compile_c, needs_cc
-from tests.export.models import DEFINITIONS, MODELS, model_of
+from tests.export.models import DEFINITIONS, model_of
 
 ONE = Fraction(1, 1000)
 
@@ -49,21 +42,6 @@ def test_a_feature_is_computed_once() -> None:
     assert both.multiplications == alone.multiplications + heavy.multiplications + gated
     assert both.divisions == alone.divisions + heavy.divisions + gate[1] + rounded[1]
     assert (alone.divisions_64, both.divisions_64) == (1, 2)
-
-
-@needs_cc
-@pytest.mark.parametrize("name", MODELS)
-def test_the_memory_is_what_a_compiler_says(tmp_path: Path, name: str) -> None:
-    version = ModelVersion(1, model_of(MODELS[name], name=name), "0" * 64)
-    program, prefix = compile_program(version.manifest), c_prefix(version)
-    (tmp_path / f"{prefix}.h").write_text(c_header(version, program))
-    size = count_costs(program).memory_bytes
-    (tmp_path / "size.c").write_text(
-        f'#include "{prefix}.h"\n'
-        f"extern char as_counted[(sizeof({prefix}_state) == {size}U) ? 1 : -1];\n"
-        "int main(void) { return 0; }\n"
-    )
-    compile_c(tmp_path, ["size.c"])
 
 
 def test_the_manifest_of_an_export_and_show_say_the_same(smoke_root: Path) -> None:

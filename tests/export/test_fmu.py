@@ -28,12 +28,12 @@ from tests.export.models import CARS, MODELS, hostile_drive, model_of
 pytestmark = needs_cc
 
 TICK_S = 0.01
+MANIFEST = model_of(MODELS["every_kind"], Fraction(-1, 700), "any")
 
 
 @pytest.fixture(scope="module")
 def archives() -> dict[str, bytes]:
-    manifest = model_of(MODELS["every_kind"], Fraction(-1, 700), "any")
-    return export_files(ModelVersion(1, manifest, "0123" * 16), None, "fmu")
+    return export_files(ModelVersion(1, MANIFEST, "0123" * 16), None, "fmu")
 
 
 def unpack(content: bytes, folder: Path) -> tuple[Any, ElementTree.Element]:
@@ -123,13 +123,11 @@ def test_hostile_drives_give_the_angles_of_the_kernel(
     archives: dict[str, bytes], fmi: int, tmp_path: Path
 ) -> None:
     one = Fmu(*unpack(archives[f"sideslip_any_fmi{fmi}.fmu"], tmp_path))
-    manifest = model_of(MODELS["every_kind"], Fraction(-1, 700), "any")
-    program = compile_program(manifest)
+    program = compile_program(MANIFEST)
     for seed, car in enumerate(CARS):
         samples = hostile_drive(program, 200, seed)
-        assert drive(one, program, car, samples) == angles_by_kernel(
-            manifest, program, car, samples
-        )
+        expected = angles_by_kernel(MANIFEST, program, car, samples)
+        assert drive(one, program, car, samples) == expected
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
@@ -143,7 +141,7 @@ def test_a_step_is_of_whole_ticks_and_a_state_comes_back(
     assert not one.instantiate(b"{another}")
     state = c_void_p()
     name = "FMUstate" if fmi == 2 else "FMUState"
-    program = compile_program(model_of(MODELS["every_kind"], Fraction(-1, 700), "any"))
+    program = compile_program(MANIFEST)
     samples = hostile_drive(program, 60, 1)
     before = drive(one, program, CARS[1], samples)
     assert one.call(f"Get{name}", byref(state)) == 0
@@ -161,8 +159,11 @@ def test_a_step_is_of_whole_ticks_and_a_state_comes_back(
 
 
 def test_it_says_what_it_is_of_and_is_the_same_again(archives: dict[str, bytes]) -> None:
-    manifest = model_of(MODELS["every_kind"], Fraction(-1, 700), "any")
-    assert export_files(ModelVersion(1, manifest, "0123" * 16), None, "fmu") == archives
+    version = ModelVersion(1, MANIFEST, "0123" * 16)
+    again = archives["sideslip_any_fmi2.fmu"]
+    with zipfile.ZipFile(BytesIO(again)) as archive:
+        table = archive.read("resources/checks.csv").decode()
+    assert fmu.fmu(version, compile_program(MANIFEST), table, 2) == again
     with zipfile.ZipFile(BytesIO(archives["sideslip_any_fmi2.fmu"])) as archive:
         text = archive.read("modelDescription.xml").decode()
         assert "any@1, SHA-256 01230123" in text
