@@ -2,6 +2,7 @@
 
 import duckdb
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -21,6 +22,8 @@ from fleet_slip.warehouse.database import open_database
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, random_counts
 from tests.support.manifests import manifest
+
+DATABASE = duckdb.connect()
 
 LASTING = [
     "true",
@@ -126,11 +129,15 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Warehouse:
     return warehouse
 
 
+@pytest.fixture(scope="module")
+def drives(fleet: Warehouse) -> pa.Table:
+    return load_cohort(fleet, "true").drives
+
+
 @pytest.mark.parametrize("text", LASTING)
-def test_what_stands_in_statements_means_what_was_written(fleet: Warehouse, text: str) -> None:
+def test_what_stands_in_statements_means_what_was_written(drives: pa.Table, text: str) -> None:
     condition = parse_condition(text)
-    drives = load_cohort(fleet, "true").drives
-    with duckdb.connect() as database:
+    with DATABASE.cursor() as database:
         database.register("drives", drives)
         written, meant = (
             database.execute(f"SELECT drive_id FROM drives WHERE ({where}\n)").fetchall()
@@ -177,8 +184,7 @@ def test_a_score_may_ask_about_rows() -> None:
 
 def test_conditions_are_joined_as_they_are_meant() -> None:
     both = parse_condition("adhesion < 1 OR true") & parse_condition("false")
-    with duckdb.connect() as database:
-        answer = database.execute(f"SELECT {both.sql} FROM (SELECT 2 AS adhesion)").fetchall()
+    answer = DATABASE.execute(f"SELECT {both.sql} FROM (SELECT 2 AS adhesion)").fetchall()
     assert answer == [(False,)]
     assert parse_condition(both.text)
 
@@ -205,18 +211,17 @@ def test_whatever_passes_cannot_leave_its_parentheses(text: str) -> None:
     except QuestionError:
         return
     names = {**catalogue().drive_schema.empty_table().to_pydict(), "day": []}
-    with duckdb.connect() as database:
-        columns = ", ".join(
-            f"{'0' if catalogue().drive[n].type != 'string' else repr('x')} AS {n}"
-            if n in catalogue().drive
-            else f"DATE '2024-05-01' AS {n}"
-            for n in names
-        )
-        statement = f"SELECT count(*) FROM (SELECT {columns}) WHERE false AND {condition.sql}"
-        try:
-            assert database.execute(statement).fetchall() == [(0,)]
-        except duckdb.Error as error:
-            assert "syntax" not in str(error).lower()
+    columns = ", ".join(
+        f"{'0' if catalogue().drive[n].type != 'string' else repr('x')} AS {n}"
+        if n in catalogue().drive
+        else f"DATE '2024-05-01' AS {n}"
+        for n in names
+    )
+    statement = f"SELECT count(*) FROM (SELECT {columns}) WHERE false AND {condition.sql}"
+    try:
+        assert DATABASE.execute(statement).fetchall() == [(0,)]
+    except duckdb.Error as error:
+        assert "syntax" not in str(error).lower()
 
 
 def test_asking_ends_when_the_time_is_over() -> None:
@@ -233,14 +238,10 @@ def test_asking_ends_when_the_time_is_over() -> None:
 @pytest.mark.parametrize(
     "condition", ["regexp_matches(drive_id, '(')", "drive_id SIMILAR TO '['", "drive_id ~ '*'"]
 )
-def test_a_wrong_regular_expression_is_a_wrong_question(
-    warehouse: Warehouse, condition: str
-) -> None:
-    land(warehouse, "one", log_rows("d1", random_counts(np.random.default_rng(0), 50)))
-    update_grams(warehouse)
-    for ask in (load_cohort, lambda w, c: load_cohort(w, c, folding=Folding())):
+def test_a_wrong_regular_expression_is_a_wrong_question(fleet: Warehouse, condition: str) -> None:
+    for folding in (None, Folding()):
         with pytest.raises(QuestionError, match="cannot be asked"):
-            ask(warehouse, condition)
+            load_cohort(fleet, condition, folding=folding)
 
 
 def test_what_fails_in_the_middle_of_an_answer_is_a_wrong_question() -> None:
