@@ -1,7 +1,6 @@
 """Simulated drives as a whole, which only tests and benchmarks ask for."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,33 +9,14 @@ from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive, simulate_block
 from fleet_slip.vehicle.batch_kernel import CHANNELS
 
 
-@dataclass(frozen=True)
 class Truth:
-    """What happened in one drive, at 100 Hz: float64 arrays of one length, signs after ISO 8855."""
+    """What happened in one drive, at 100 Hz: float64 arrays of one length by `CHANNELS`."""
 
-    ax_mps2: FloatArray
-    """Longitudinal specific force at the centre of gravity."""
-    ay_mps2: FloatArray
-    """Lateral specific force at the centre of gravity."""
-    yaw_rate_rad_s: FloatArray
-    steering_wheel_rad: FloatArray
-    wheel_fl_rad_s: FloatArray
-    wheel_fr_rad_s: FloatArray
-    wheel_rl_rad_s: FloatArray
-    wheel_rr_rad_s: FloatArray
-    steer_fl_rad: FloatArray
-    steer_fr_rad: FloatArray
-    sideslip_rad: FloatArray
-    vx_mps: FloatArray
-    vy_mps: FloatArray
-    station_m: FloatArray
-    """Distance along the road within the lap."""
-    lateral_offset_m: FloatArray
-    yaw_acceleration_rad_s2: FloatArray
-    leaning_ax_mps2: FloatArray
-    leaning_ay_mps2: FloatArray
-    lost_control_tick: int | None
-    """First tick at which the driver had lost the car; None where he never did."""
+    def __init__(self, channels: dict[str, FloatArray], lost_control_tick: int | None) -> None:
+        self.channels, self.lost_control_tick = channels, lost_control_tick
+
+    def __getattr__(self, name: str) -> FloatArray:
+        return self.channels[name]
 
 
 def simulate_drives(
@@ -50,8 +30,7 @@ def simulate_drives(
         lost[block.drive] = block.lost_control_tick
     return [
         Truth(
-            **{name: np.concatenate([part[name] for part in some]) for name in CHANNELS},
-            lost_control_tick=lost[drive],
+            {name: np.concatenate([part[name] for part in some]) for name in CHANNELS}, lost[drive]
         )
         for drive, some in enumerate(parts)
     ]

@@ -97,7 +97,10 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_drives_without_a_vehicle_are_judged_by_models_alone(own: Path) -> None:
     four = "vehicle_id <> 'car-0' AND vehicle_id <> 'car-5'"
-    found = done_on(own, "evaluate", "own", "--cohort", four, "--json").json
+    told = fleet_slip.open(own).evaluate_measured("own", four)
+    assert "No filter was evaluated" in str(told)
+    assert f"kept as evaluations/measured/{told.number}.json" in str(told)
+    found = told.content
     assert found["vehicle"] is None
     assert found["estimators"]["own@1"]["told"] == "chosen and fitted without what is judged"
     assert found["estimators"]["own@1"]["rmse_deg"] < 0.05
@@ -105,9 +108,6 @@ def test_drives_without_a_vehicle_are_judged_by_models_alone(own: Path) -> None:
     assert (len(found["drives"]), found["parts"], found["parts_of"]) == (4, 4, "drives")
     assert 0 < found["estimators"]["own@1"]["rmse_standard_error_deg"] < 0.01
     assert found["estimators"]["own@1"]["worst_drive"] in [one["name"] for one in found["drives"]]
-    told = done_on(own, "evaluate", "own", "--cohort", four)
-    assert "No filter was evaluated" in told.stdout
-    assert f"kept as evaluations/measured/{found['number']}.json" in told.stderr, "kept once"
 
 
 def test_a_model_that_saw_none_of_the_drives_is_judged_as_it_is(own: Path) -> None:

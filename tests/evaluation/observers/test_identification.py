@@ -100,6 +100,7 @@ def test_one_speed_in_the_place_of_all_wheels_tells_of_no_turn(drive: LabelledDr
 
 
 def test_what_was_left_out_is_measured_without_it(drive: LabelledDrive, executor: Executor) -> None:
+    drive = drive.beginning(2000)
     wrong = replace(drive, drive_id="wrong", sideslip_rad=drive.sideslip_rad + np.radians(1))
     found = identify_held_out(MEASURED, [drive, wrong], executor)
     assert found.held_out_rad is not None
