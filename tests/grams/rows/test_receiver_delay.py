@@ -172,7 +172,7 @@ def test_a_late_course_teaches_what_one_in_time_does(late_fleet: LateFleet, tmp_
 def test_gram_rows_follow_the_delay_that_more_drives_tell(
     late_fleet: LateFleet, tmp_path: Path
 ) -> None:
-    fleet = late_fleet(tmp_path, 0.187, grams=())
+    fleet = late_fleet(tmp_path, 0.087, grams=())
     ((first,), *_) = fleet.sql("SELECT min(day) FROM drives").fetchall()
     fleet.gram("course", cohort=f"day = '{first}'")
     early = corrected_rows(fleet)
@@ -187,7 +187,7 @@ def test_gram_rows_follow_the_delay_that_more_drives_tell(
 def test_what_a_forgotten_drive_told_of_the_delay_is_gone(
     late_fleet: LateFleet, tmp_path: Path
 ) -> None:
-    fleet = late_fleet(tmp_path, 0.187, grams=("course",))
+    fleet = late_fleet(tmp_path, 0.087, grams=("course",))
     ((drive,), *_) = fleet.sql("SELECT min(drive_id) FROM drives").fetchall()
     fleet.forget(drive=drive)
     kept = corrected_rows(fleet)
@@ -202,7 +202,7 @@ def test_what_a_forgotten_drive_told_of_the_delay_is_gone(
 def test_what_a_course_of_unknown_delay_taught_is_not_published(
     late_fleet: LateFleet, tmp_path: Path
 ) -> None:
-    fleet = late_fleet(tmp_path, 0.06, grams=("calibration",))
+    fleet = late_fleet(tmp_path, 0.087, grams=("calibration",))
     drives = [drive for (drive,) in fleet.sql("SELECT drive_id FROM drives").fetchall()]
     few = f"drive_id <= '{sorted(drives)[1]}'"
     for name in ("course", "windows"):
