@@ -116,7 +116,7 @@ def test_cars_without_a_log_or_a_label_teach_the_very_same_model(
 ) -> None:
     """What they count on board, and nothing else; a drive is told in some kilobytes."""
     taught = without_label(fleet)
-    counter = build(tmp_path, sets_on_board(taught), "-O2")
+    counter = build(tmp_path, sets_on_board(taught), "-O0")
     logged = fleet.sql(
         "SELECT drive_id, any_value(course_late) FROM grams "
         "WHERE course_late IS NOT NULL GROUP BY drive_id ORDER BY drive_id"

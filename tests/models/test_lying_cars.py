@@ -1,5 +1,6 @@
 """Cars that send rows with a wrong label: none of them, nor a few, decide what is true."""
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,14 +28,20 @@ def grams() -> list[Gram]:
     return [gram_of(counts(one)) for one in drives]
 
 
-@pytest.fixture
-def fleet(tmp_path: Path, grams: Sequence[Gram]) -> fleet_slip.Fleet:
-    """A fleet whose champion was made of the honest drives of a day."""
-    fleet = fleet_slip.open(tmp_path / "data")
-    receive(fleet, tmp_path / "honest", honest(grams, START_S))
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory, grams: Sequence[Gram]) -> Path:
+    """A fleet whose champion was made of the honest drives of a day. Copy it."""
+    folder = tmp_path_factory.mktemp("honest")
+    fleet = fleet_slip.open(folder / "data")
+    receive(fleet, folder / "honest", honest(grams, START_S))
     fleet.publish("beta", select(fleet))
-    receive(fleet, tmp_path / "next", honest(grams, START_S + DAY_S))
-    return fleet
+    receive(fleet, folder / "next", honest(grams, START_S + DAY_S))
+    return folder / "data"
+
+
+@pytest.fixture
+def fleet(tmp_path: Path, root: Path) -> fleet_slip.Fleet:
+    return fleet_slip.open(shutil.copytree(root, tmp_path / "data"))
 
 
 def honest(grams: Sequence[Gram], start_s: int) -> Rows:

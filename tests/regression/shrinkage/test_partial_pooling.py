@@ -74,7 +74,7 @@ def test_errors_hold_as_often_as_stated_and_are_smaller(spread: float, members: 
     random = np.random.default_rng([7, members])
     variances = np.resize([1.0, 1 / 3, 0.1], members)
     within, gain = [], []
-    for _ in range(2400 // members):
+    for _ in range(1200 // members):
         true = 3 + spread * random.standard_normal(members)
         values = true + np.sqrt(variances) * random.standard_normal(members)
         found = pool(values, variances)

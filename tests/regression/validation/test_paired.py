@@ -43,9 +43,9 @@ def draw(rng: np.random.Generator, groups: int) -> list[np.ndarray]:
 
 def test_the_error_is_the_spread_of_many_repetitions() -> None:
     rng = np.random.default_rng(1)
-    made = [compare(draw(rng, 12)) for _ in range(300)]
+    made = [compare(draw(rng, 12)) for _ in range(120)]
     spread = np.std([one.rmse for one in made])
-    assert np.mean([one.standard_error for one in made]) == pytest.approx(spread, rel=0.15)
+    assert np.mean([one.standard_error for one in made]) == pytest.approx(spread, rel=0.2)
 
 
 def test_rows_of_a_group_are_not_taken_for_independent() -> None:
