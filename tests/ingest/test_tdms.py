@@ -127,43 +127,27 @@ def test_values_do_not_depend_on_segments_or_blocks(
     np.testing.assert_allclose(found[OWN_TIME] - START.timestamp(), step, atol=1e-6)
 
 
-def text(value: str, order: str) -> bytes:
-    return struct.pack(f"{order}I", len(value.encode())) + value.encode()
+def text(value: str) -> bytes:
+    return struct.pack("<I", len(value.encode())) + value.encode()
 
 
-def a_segment(order: str, rows: np.ndarray[Any, Any], *, interleaved: bool) -> bytes:
+def a_segment(rows: np.ndarray[Any, Any]) -> bytes:
     """A segment by the description of National Instruments: 16-bit channels x and y."""
-    objects = struct.pack(f"{order}I", rows.shape[1])
+    objects = struct.pack("<I", rows.shape[1])
     for name in "xy"[: rows.shape[1]]:
-        objects += text(f"/'g'/'{name}'", order) + struct.pack(f"{order}I", 20)
-        objects += struct.pack(f"{order}IIQ", 2, 1, len(rows)) + struct.pack(f"{order}I", 1)
-        objects += text("wf_increment", order) + struct.pack(f"{order}Id", 10, 0.01)
-    data = (rows if interleaved else rows.T).astype(f"{order}i2").tobytes()
-    flags = 2 | 4 | 8 | (1 << 5) * interleaved | (1 << 6) * (order == ">")
-    lead = b"TDSm" + struct.pack("<I", flags)
-    sizes = struct.pack(f"{order}IQQ", 4713, len(objects) + len(data), len(objects))
-    return lead + sizes + objects + data
-
-
-@pytest.mark.parametrize("order", "<>")
-@pytest.mark.parametrize("interleaved", [False, True])
-def test_bytes_by_the_description_of_the_format(
-    tmp_path: Path, order: str, interleaved: bool
-) -> None:
-    rows = np.arange(40).reshape(20, 2) * [1, -1]
-    file = tmp_path / "log.tdms"
-    segment = a_segment(order, rows, interleaved=interleaved)
-    file.write_bytes(segment + a_segment(order, rows + 7, interleaved=interleaved))
-    found = read(file, "y", "x")
-    assert found["x"].to_list() == [*rows[:, 0], *(rows[:, 0] + 7)]
-    assert found["y"].to_list() == [*rows[:, 1], *(rows[:, 1] + 7)]
+        objects += text(f"/'g'/'{name}'") + struct.pack("<I", 20)
+        objects += struct.pack("<IIQ", 2, 1, len(rows)) + struct.pack("<I", 1)
+        objects += text("wf_increment") + struct.pack("<Id", 10, 0.01)
+    data = rows.T.astype("<i2").tobytes()
+    sizes = struct.pack("<IQQ", 4713, len(objects) + len(data), len(objects))
+    return b"TDSm" + struct.pack("<I", 2 | 4 | 8) + sizes + objects + data
 
 
 def test_a_file_that_ends_too_early_is_refused_wherever_it_was_cut(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = tmp_path / "log.tdms"
-    whole = a_segment("<", np.ones((30, 2)), interleaved=False)
+    whole = a_segment(np.ones((30, 2)))
     for cut in [5, 27, 40, len(whole) - 1, len(whole) + 5, len(whole) + 60, 2 * len(whole) - 1]:
         file.write_bytes((whole + whole)[:cut])
         assert "ends too early" in failure(file, own_clock()), cut
@@ -178,7 +162,7 @@ def test_an_index_beside_a_file_is_not_believed(tmp_path: Path) -> None:
 
 
 def test_counts_of_a_converter_are_refused(tmp_path: Path) -> None:
-    objects = struct.pack("<I", 1) + text("/'g'/'x'", "<") + struct.pack("<I", 0x1269)
+    objects = struct.pack("<I", 1) + text("/'g'/'x'") + struct.pack("<I", 0x1269)
     objects += struct.pack("<IIQ", 0xFFFFFFFF, 1, 4)  # raw data of DAQmx
     objects += struct.pack("<IIIIII", 1, 3, 0, 0, 0, 0) + struct.pack("<II", 1, 2)
     objects += struct.pack("<I", 0)
