@@ -134,12 +134,6 @@ class SignalColumn(Config):
     antenna_y_m: OffsetM | None = added(None)
     """How far it is to the left of the centre of gravity."""
 
-    @property
-    def is_of_satellites(self) -> bool:
-        """Whether it has keys that are for the course."""
-        given = (self.clockwise_from_north, self.antenna_x_m, self.antenna_y_m, self.component)
-        return any(one is not None for one in given)
-
     @model_validator(mode="after")
     def _gain_is_something(self) -> "SignalColumn":
         if self.gain == 0:
@@ -190,8 +184,9 @@ def split_components(signals: Any) -> Any:
 
 def require_satellites(signals: Named[str, SignalColumn]) -> None:
     """Raise `ValueError` unless the course, if there is one, comes with all that it needs."""
-    for name, column in signals.items():
-        if column.is_of_satellites and name not in {COURSE, SPEED}:
+    for name, one in signals.items():
+        keys = (one.clockwise_from_north, one.antenna_x_m, one.antenna_y_m, one.component)
+        if name not in {COURSE, SPEED} and any(key is not None for key in keys):
             raise ValueError(f"signals.{name}: antenna and direction are keys of the course")
     course = signals.get(COURSE)
     if course is None:

@@ -8,7 +8,6 @@ shows.
 import json
 import re
 import shlex
-import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,9 +122,6 @@ def signal_keys(guess: Guess) -> dict[str, Any]:
 
 # Writes a draft of a mapping as TOML, each guess with its reasons as a comment.
 
-WIDTH = 100
-"""Of a comment."""
-_COPIED = re.compile(r"# ([a-z_0-9]+ = |fleet-slip )")
 _HEAD = """\
 # A draft for {file}. Every line is a guess: check it, with
 # fleet-slip ingest {file} --mapping THIS_FILE --dry-run
@@ -159,16 +155,7 @@ def write_draft(draft: Draft, name: str, place: Path | str | None = None) -> str
     parts.append(_signals(draft))
     if draft.open_questions:
         parts.append("".join(f"# To check: {text}\n" for text in draft.open_questions))
-    return "\n".join(_wrapped(line) for line in "\n".join(parts).split("\n"))
-
-
-def _wrapped(line: str) -> str:
-    """Return a line; a long comment as several lines, unless it has a key or a command."""
-    if len(line) <= WIDTH or not line.startswith("# ") or _COPIED.match(line):
-        return line
-    return textwrap.fill(
-        line, WIDTH, subsequent_indent="#   ", break_long_words=False, break_on_hyphens=False
-    )
+    return "\n".join(parts)
 
 
 def _drive(draft: Draft) -> str:

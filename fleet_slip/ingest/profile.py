@@ -160,17 +160,15 @@ def find_absent(profiles: Sequence["Profile"]) -> tuple[tuple[str, ...], tuple[f
         is_known = np.isin(present, known["numbers"])
         others = present[~is_known]
         for number in map(float, np.unique(present[is_known])):
-            is_none = others.size >= _FEWEST and _is_far(number, others)
+            is_none = others.size >= _FEWEST
+            if is_none:
+                low, high = float(others.min()), float(others.max())
+                margin = _FAR * max(high - low, 1e-6)
+                is_none = number > high + margin or number < low - margin
             means_none[number] = is_none and means_none.get(number, True)
     numbers = tuple(number for number, is_none in means_none.items() if is_none)
     written = [f"{number:.0f}" for number in numbers]
     return tuple(dict.fromkeys([*written, *texts])), numbers
-
-
-def _is_far(number: float, others: FloatArray) -> bool:
-    low, high = float(others.min()), float(others.max())
-    margin = _FAR * max(high - low, 1e-6)
-    return number > high + margin or number < low - margin
 
 
 MOST_ROWS = 200_000

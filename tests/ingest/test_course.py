@@ -175,17 +175,12 @@ def suggested(tmp_path: Path, columns: Columns) -> str:
     return written.read_text()
 
 
-def unwrapped(text: str) -> list[str]:
-    """Return the lines of a draft, long comments as one."""
-    return text.replace("\n#   ", " ").splitlines()
-
-
 @pytest.mark.parametrize("name", ["Heading", "True Heading", "Track", "gps_hdg", "Bearing"])
 def test_a_heading_is_a_question_and_no_line(tmp_path: Path, name: str) -> None:
     columns = on_time()
     text = suggested(tmp_path, {name: columns["cog"], "GPS_Speed": columns["sog"]})
     assert "course" not in tomllib.loads(text)["signals"]
-    (asked,) = (line for line in unwrapped(text) if line.startswith("# To check"))
+    (asked,) = (line for line in text.splitlines() if line.startswith("# To check"))
     assert f"column = {json.dumps(name)}" in asked and "antenna_x_m" in asked
 
 

@@ -1,6 +1,5 @@
 """Drafts of mappings, of cars whose signals are known: how many guesses are right."""
 
-import re
 import shlex
 import tomllib
 from pathlib import Path
@@ -112,18 +111,6 @@ def test_a_draft_loads_whatever_the_file_is_called(tmp_path: Path, stem: str) ->
     suggest(tmp_path, tmp_path / f"{stem}.parquet")
     text = (tmp_path / "draft.toml").read_text()
     assert f"# fleet-slip ingest {shlex.quote(f'{tmp_path}/{stem}.parquet')} --mapping" in text
-
-
-def test_a_long_comment_is_wrapped_and_a_key_in_a_comment_is_not(tmp_path: Path) -> None:
-    names = {name: f"{name} of the second measuring box in the boot of the car" for name in a_car()}
-    as_logged(a_car(), names, {}).with_columns(t=pl.Series(np.arange(6000) / 100)).write_parquet(
-        tmp_path / "log.parquet"
-    )
-    suggest(tmp_path, tmp_path / "log.parquet")
-    lines = (tmp_path / "draft.toml").read_text().splitlines()
-    comments = [line for line in lines if re.match("#(?! fleet-slip )", line) and " = " not in line]
-    assert max(map(len, comments)) <= 100
-    assert any(line.startswith("#   ") for line in comments)
 
 
 def test_what_cannot_be_drafted_says_so(tmp_path: Path) -> None:

@@ -65,11 +65,6 @@ class CsvFormat(Config):
             raise ValueError("data_line must come after header_line")
         return self
 
-    @property
-    def lines_between(self) -> int:
-        """Lines between the header and the data."""
-        return (self.data_line or self.header_line + 1) - self.header_line - 1
-
 
 def decompressed(stream: BinaryIO) -> BinaryIO:
     """Return the text of a stream, whatever it is compressed with."""
@@ -220,7 +215,7 @@ def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str
         names = next(csv.reader([text], delimiter=csv_format.separator, strict=True))
     except csv.Error as error:
         raise InputError(f"{shown(file)}: its header is not CSV: {error}.") from None
-    for _ in range(csv_format.lines_between):
+    for _ in range(csv_format.header_line + 1, csv_format.data_line or 0):
         stream.readline(MAX_LINE_BYTES)
     return [name.strip() for name in names]
 
