@@ -167,8 +167,8 @@ def forget(
 
 
 def _require_delta_logs(warehouse: Warehouse) -> None:
-    """Raise `StorageError` if a Delta log was lost: a fence would begin one without the files."""
-    for table in warehouse.tables:
+    """Raise `StorageError` if the Delta log of logs or Gram rows was lost: a fence begins a new one."""
+    for table in (warehouse.logs, warehouse.grams):
         files = find_unreferenced(table)
         old = any(file.age_hours >= BEING_WRITTEN_HOURS for file in files)
         if old and table.snapshot().version is None:
