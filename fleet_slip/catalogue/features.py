@@ -12,10 +12,9 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalogue.course import BESIDE, LONGEST_TICKS, YAW_RATE, course_units
-from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, plain_column
+from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, parity, plain_column
 from fleet_slip.catalogue.facts import CALIBRATION, DELAY, RECEIVED
 from fleet_slip.catalogue.lines import FittedLine, Fitting, known_line
-from fleet_slip.catalogue.mirror import parity
 from fleet_slip.catalogue.signals import (
     SAMPLE_TIME_S,
     Identifier,

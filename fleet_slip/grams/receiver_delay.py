@@ -5,7 +5,7 @@ longitudinal acceleration; changes of both over 0.4 s more are free of its offse
 integral with the smallest sum of squares, by a parabola, is the delay. The integral k ticks late is
 that of 40 + k ticks less that of k, which Gram rows have. Its uncertainty is a jackknife over
 drives, and what all have in common. Cars with one type of receiver are drawn towards its delay, the
-more so the fewer drives they have (`regression/shrinkage/partial_pooling.py`).
+more so the fewer drives they have (`regression/inference.py`).
 """
 
 import math
@@ -25,7 +25,7 @@ from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.grams.gram_files import by_signals, gram_table, is_received, rows_of_set
 from fleet_slip.regression.gram import GramTable
-from fleet_slip.regression.shrinkage import Pooled, pool
+from fleet_slip.regression.inference import Pooled, pool
 from fleet_slip.storage.table import Snapshot
 
 RECEIVER_DELAY = "receiver_delay"

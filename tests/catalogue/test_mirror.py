@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from fleet_slip.catalogue.definitions import EXCHANGED, OPPOSITE, parity
 from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.mirror import EXCHANGED, OPPOSITE, parity
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan

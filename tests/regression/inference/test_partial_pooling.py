@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.regression.shrinkage import pool
+from fleet_slip.regression.inference import pool
 
 BASEBALL = np.array([18, 17, 16, 15, 14, 14, 13, 12, 11, 11, 10, 10, 10, 10, 10, 9, 8, 7]) / 45
 """Hits of 18 players in 45 at bats, after Efron and Morris (1975)."""
