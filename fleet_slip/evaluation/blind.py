@@ -122,12 +122,9 @@ def judge_blindly(sha256: str, estimators: Mapping[str, Estimate]) -> list[dict[
 
 def _group(name: str, runs: Sequence[EvaluatedScenario]) -> dict[str, Any]:
     truth = np.concatenate([run.truth_rad[run.evaluated] for run in runs])
-    speed = np.concatenate([run.drive.speed_mps for run in runs])
     return {
         "name": name,
         "drives": len(runs),
-        "speed_min_mps": float(speed.min()),
-        "speed_max_mps": float(speed.max()),
         "sideslip_std_deg": float(np.degrees(truth.std())),
         "results": {name: asdict(found) for name, found in judge(runs).items()},
     }

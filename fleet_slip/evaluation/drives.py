@@ -246,11 +246,3 @@ def _runs(mask: BoolArray) -> Iterator[tuple[int, int]]:
     """Yield begin and end (exclusive) of each run of true entries."""
     edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
     yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
-
-
-def rear_compliance(drive: EvaluatedDrive) -> float:
-    """Return the rear slip angle per lateral acceleration, rad s²/m, fitted through the origin."""
-    rear = -slip_angles(drive)[1]
-    ay = drive.signals["ay_mps2"] - drive.scenario.sensors.ay_bias_mps2
-    there = drive.evaluated & np.isfinite(rear) & np.isfinite(ay)
-    return float(rear[there] @ ay[there] / (ay[there] @ ay[there]))

@@ -16,7 +16,6 @@ from fleet_slip.evaluation.blind import judge_blindly
 from fleet_slip.evaluation.drives import (
     EvaluatedDrive,
     find_stretches,
-    rear_compliance,
     simulate_drives,
 )
 from fleet_slip.evaluation.filters import (
@@ -160,7 +159,6 @@ def _truth(drive: EvaluatedDrive) -> dict[str, Any]:
         "speed_max_mps": float(drive.speed_mps.max()),
         "lateral_offset_max_m": float(np.abs(drive.lateral_offset_m).max()),
         "lateral_acceleration_p99_mps2": float(np.nanquantile(np.abs(ay), 0.99)),
-        "rear_slip_per_lateral_acceleration_deg_s2pm": float(np.degrees(rear_compliance(drive))),
     }
 
 

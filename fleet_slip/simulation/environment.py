@@ -15,24 +15,12 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
-from fleet_slip.compiling import equation, kernel
+from fleet_slip.compiling import kernel
 from fleet_slip.errors import UsageError
 from fleet_slip.simulation.scenario import load_scenario
-from fleet_slip.vehicle.dynamics import (
-    Derivative,
-    Loads,
-    braked_spins,
-    driven_body,
-    driver_brakes,
-    ideal_forces,
-    rates_of,
-    transferred_loads,
-)
+from fleet_slip.vehicle.dynamics import Brakes, derivative
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
 from fleet_slip.vehicle.parameters import Constants, Controls, State, constants, load_vehicle
-
-Brakes = Loads
-"""Brake force at the rim of each wheel in N, beside the driver's, before anti-lock control."""
 
 
 class Moved(NamedTuple):
@@ -42,17 +30,6 @@ class Moved(NamedTuple):
     slopes: Slopes
     ax: float
     ay: float
-
-
-@equation
-def braked_derivative(x: State, u: Controls, brakes: Brakes, c: Constants) -> Derivative:
-    """Return the rates of a car with a brake at each wheel."""
-    load = transferred_loads(x, c)
-    force = ideal_forces(x, load, c)
-    motion = driven_body(x, force, c)
-    front, rear = driver_brakes(x, c)
-    each = (front + brakes.fl, front + brakes.fr, rear + brakes.rl, rear + brakes.rr)
-    return rates_of(x, u, motion, braked_spins(x, force, load, each, c), c)
 
 
 @kernel
@@ -69,7 +46,7 @@ def move(
     """Return the car after so many steps; `order` is that of the first."""
     ax = ay = 0.0
     for k in range(count):
-        d = braked_derivative(x, u, brakes, c)
+        d = derivative(x, u, brakes, c)
         if k == 0:
             ax, ay = d.ax, d.ay
         x, slopes = advance(x, d, slopes, c, step_s, order)

@@ -23,6 +23,7 @@ from fleet_slip.vehicle.driver import (
     decide,
 )
 from fleet_slip.vehicle.dynamics import (
+    NO_BRAKES,
     Around,
     Give,
     GiveRates,
@@ -339,7 +340,7 @@ def integrate(memory: Any, step_s: float, first_step: bool) -> None:
         around = read(memory, AROUND, lane, Around)
         give = read(memory, GIVE, lane, Give)
         order = memory[ORDER * LANES + lane]
-        d, rates = imperfect_derivative(x, u, give, around, c, t)
+        d, rates = imperfect_derivative(x, u, give, around, NO_BRAKES, c, t)
         after, slopes = advance(x, d, read(memory, SLOPES, lane, Slopes), c, step_s, order)
         before = read(memory, GIVE_SLOPES, lane, GiveRates)
         given = advance_give(give, rates, before, after.steering_wheel, t, step_s, order)

@@ -100,6 +100,12 @@ class Loads(NamedTuple):
     rr: float
 
 
+Brakes = Loads
+"""Brake force at the rim of each wheel in N, beside the driver's, before anti-lock control."""
+
+NO_BRAKES = Brakes(0.0, 0.0, 0.0, 0.0)
+
+
 class WheelForce(NamedTuple):
     """Force of one wheel on the car in the car's frame, in N, and what turns the wheel."""
 
@@ -269,17 +275,6 @@ def wheel_forces(
 
 
 @equation
-def ideal_forces(x: State, load: Loads, c: Constants) -> WheelForces:
-    """Return the forces of the wheels of the textbook's car on a flat, even and calm road."""
-    rigid = Give(x.steering_wheel, 0.0, 0.0, 0.0, 0.0, 0.0)
-    calm = Around(0.0, 0.0, 1.0, 1.0, 0.0, 1.0)
-    r = c.radius
-    ideal = Traits(0.0, 0.0, 0.0, 0.0, 0.0, r, r, r, r, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    forces, _ = wheel_forces(x, rigid, calm, load, c, ideal)
-    return forces
-
-
-@equation
 def spin_rate(
     force: WheelForce, spin: float, load: float, drive: float, brake: float, c: Constants
 ) -> WheelRate:
@@ -299,33 +294,21 @@ def spin_rate(
 
 
 @equation
-def driver_brakes(x: State, c: Constants) -> tuple[float, float]:
-    """Return the brake force that the driver asks of a front and of a rear wheel, in N."""
-    brake = c.mass * max(-x.traction, 0.0)
-    return c.brake_front * brake, c.brake_rear * brake
-
-
-@equation
-def braked_spins(
-    x: State, force: WheelForces, load: Loads, brakes: tuple[float, ...], c: Constants
+def spin_rates(
+    x: State, force: WheelForces, load: Loads, brakes: Brakes, c: Constants
 ) -> WheelRates:
-    """Return the rates of the wheels under the drivetrain's torque and a brake force of each."""
+    """Return the rates of the wheels under the drivetrain's torque and all brakes."""
     strongest = c.power_per_mass / max(abs(x.vx), SLOWEST_DRIVE_MPS)
     drive = c.mass * min(max(x.traction, 0.0), strongest)
     drive_f, drive_r = c.drive_front * drive, c.drive_rear * drive
+    brake = c.mass * max(-x.traction, 0.0)
+    brake_f, brake_r = c.brake_front * brake, c.brake_rear * brake
     return WheelRates(
-        spin_rate(force.fl, x.wheel_fl, load.fl, drive_f, brakes[0], c),
-        spin_rate(force.fr, x.wheel_fr, load.fr, drive_f, brakes[1], c),
-        spin_rate(force.rl, x.wheel_rl, load.rl, drive_r, brakes[2], c),
-        spin_rate(force.rr, x.wheel_rr, load.rr, drive_r, brakes[3], c),
+        spin_rate(force.fl, x.wheel_fl, load.fl, drive_f, brake_f + brakes.fl, c),
+        spin_rate(force.fr, x.wheel_fr, load.fr, drive_f, brake_f + brakes.fr, c),
+        spin_rate(force.rl, x.wheel_rl, load.rl, drive_r, brake_r + brakes.rl, c),
+        spin_rate(force.rr, x.wheel_rr, load.rr, drive_r, brake_r + brakes.rr, c),
     )
-
-
-@equation
-def driven_spins(x: State, force: WheelForces, load: Loads, c: Constants) -> WheelRates:
-    """Return the rates of the wheels under the torques of drivetrain and driver."""
-    front, rear = driver_brakes(x, c)
-    return braked_spins(x, force, load, (front, front, rear, rear), c)
 
 
 class Derivative(NamedTuple):
@@ -390,19 +373,16 @@ def rates_of(
 
 
 @equation
-def derivative(x: State, u: Controls, c: Constants) -> Derivative:
-    """Return the equations of motion of the textbook's car, a pure function of its arguments."""
-    load = transferred_loads(x, c)
-    force = ideal_forces(x, load, c)
-    motion = driven_body(x, force, c)
-    return rates_of(x, u, motion, driven_spins(x, force, load, c), c)
-
-
-@equation
 def imperfect_derivative(
-    x: State, u: Controls, give: Give, around: Around, c: Constants, t: Traits
+    x: State,
+    u: Controls,
+    give: Give,
+    around: Around,
+    brakes: Brakes,
+    c: Constants,
+    t: Traits,
 ) -> tuple[Derivative, GiveRates]:
-    """Return the rates of a car with imperfections; accelerometers feel wind, not weight."""
+    """Return the equations of motion, a pure function; accelerometers feel wind, not weight."""
     load = transferred_loads(x, c)
     force, give_rates = wheel_forces(x, give, around, load, c, t)
     still = driven_body(x, force, c)
@@ -414,4 +394,14 @@ def imperfect_derivative(
         still.vy + t.wind_force * push + around.gravity_y,
         still.yaw_rate + t.wind_moment * push,
     )
-    return rates_of(x, u, motion, driven_spins(x, force, load, c), c), give_rates
+    return rates_of(x, u, motion, spin_rates(x, force, load, brakes, c), c), give_rates
+
+
+@equation
+def derivative(x: State, u: Controls, brakes: Brakes, c: Constants) -> Derivative:
+    """Return the same of the textbook's car on a flat, even and calm road."""
+    rigid, r = Give(x.steering_wheel, 0.0, 0.0, 0.0, 0.0, 0.0), c.radius
+    ideal = Traits(0.0, 0.0, 0.0, 0.0, 0.0, r, r, r, r, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    calm = Around(0.0, 0.0, 1.0, 1.0, 0.0, 1.0)
+    rates, _ = imperfect_derivative(x, u, rigid, calm, brakes, c, ideal)
+    return rates

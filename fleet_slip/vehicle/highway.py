@@ -18,6 +18,7 @@ from fleet_slip.errors import RefusedError
 from fleet_slip.vehicle.batch import LaneDrive, simulate_samples
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.dynamics import (
+    NO_BRAKES,
     Acceleration,
     Derivative,
     WheelForce,
@@ -73,7 +74,7 @@ class Motion(NamedTuple):
 
 @kernel
 def _rates(x: State, u: Controls, c: Constants) -> Derivative:
-    return derivative(x, u, c)
+    return derivative(x, u, NO_BRAKES, c)
 
 
 @kernel
@@ -105,7 +106,7 @@ def _steps(
             place.heading + step * extrapolate(drift.heading, before.heading, order),
         )
         before = drift
-        x, slopes = advance(x, derivative(x, u, c), slopes, c, step, order)
+        x, slopes = advance(x, derivative(x, u, NO_BRAKES, c), slopes, c, step, order)
         order = SECOND_ORDER
     return Motion(x, place, slopes, before)
 

@@ -7,7 +7,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.vehicle.driver import SAMPLE_S, SPEED_GAIN_1PS
-from fleet_slip.vehicle.dynamics import Around, Give, GiveRates, imperfect_derivative
+from fleet_slip.vehicle.dynamics import NO_BRAKES, Around, Give, GiveRates, imperfect_derivative
 from fleet_slip.vehicle.imperfections import CarImperfections, traits
 from fleet_slip.vehicle.integration import (
     FIRST_ORDER,
@@ -59,7 +59,7 @@ def _run(
         u = Controls(demand[i], resistance - x.vy * x.yaw_rate + SPEED_GAIN_1PS * (speed - x.vx))
         out[0, i], out[1, i], out[3, i] = x.yaw_rate, x.vy, x.vx
         for step in range(STEPS):
-            d, new = imperfect_derivative(x, u, give, around, c, t)
+            d, new = imperfect_derivative(x, u, give, around, NO_BRAKES, c, t)
             if step == 0:
                 out[2, i] = d.ay
             x, slopes = advance(x, d, slopes, c, STEP_S, order)

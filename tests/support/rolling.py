@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.compiling import kernel
-from fleet_slip.vehicle.dynamics import Derivative, derivative
+from fleet_slip.vehicle.dynamics import NO_BRAKES, Derivative, derivative
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
 from fleet_slip.vehicle.parameters import (
     GRAVITY_MPS2,
@@ -24,7 +24,7 @@ NO_SLOPES = Slopes(*(0.0 for _ in Slopes._fields))
 
 @kernel
 def rates(x: State, u: Controls, c: Constants) -> Derivative:
-    return derivative(x, u, c)
+    return derivative(x, u, NO_BRAKES, c)
 
 
 @kernel
@@ -35,7 +35,7 @@ def _run(x: State, u: Controls, c: Constants, slopes: Slopes, step: float, count
     for i in range(count):
         for k, value in enumerate(x):
             states[i, k] = value
-        d = derivative(x, u, c)
+        d = derivative(x, u, NO_BRAKES, c)
         forces[i, 0], forces[i, 1] = d.ax, d.ay
         x, slopes = advance(x, d, slopes, c, step, order)
         order = SECOND_ORDER
