@@ -8,9 +8,9 @@ The way of a row, in the order of its stations:
    values in SI units, or the reason why it is refused.
 4. `drives` checks the order of time, cuts rows into drives, and brings each to ticks by
    `resampling`, and to counts.
-5. `stream` goes through 2 to 4 for one log: it yields ended drives, keeps refused rows, and
-   refuses a log of which nothing is usable. `log_faults` says what looks wrong in a log as a whole,
-   `suspicion` in a drive.
+5. `stream` goes through 2 to 4 for one log: it yields ended drives, keeps refused rows, refuses a
+   log of which nothing is usable, and says what looks wrong in it as a whole, `suspicion` in a
+   drive.
 6. `load` goes through batches of logs: it leaves out what was forgotten or is in the logs already,
    as `recordings` says, writes data files, and commits them.
 

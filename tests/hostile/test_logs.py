@@ -290,6 +290,9 @@ def test_a_container_that_was_cut_is_no_shorter_trace(tmp_path: Path) -> None:
     file.write_bytes(blf(content))
     assert read_measured(file, FORMATS["blf"].mapping).counts.rows_kept
     assert "ends too early" in trace(tmp_path, "log.blf", blf(content, packed[: len(packed) // 2]))
+    head = int.from_bytes(sound[4:8], "little") + 16
+    unknown = blf(content)[:head] + b"\7" + blf(content)[head + 1 :]
+    assert "Unknown compression method (7)" in trace(tmp_path, "log.blf", unknown)
 
 
 def test_what_a_trace_unfolds_to_is_bounded(

@@ -13,7 +13,7 @@ import fleet_slip
 from fleet_slip.arrays import FloatArray
 from fleet_slip.cli.app import app
 from fleet_slip.errors import AlarmError
-from fleet_slip.ingest.log_faults import find_refusals
+from fleet_slip.ingest.stream import find_refusals
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_suspicions
 from tests.ingest.test_folders import MAPPING as PLAIN
 from tests.support.measured import csv_text, good_columns
