@@ -288,7 +288,8 @@ def find_lacks(manifest: Manifest) -> list[str]:
         return []
     found, least = [], floor()
     columns, trained = len(manifest.terms), manifest.trained_on
-    if columns > least.max_columns_per_drive * trained.drives:
+    own_rows_only = manifest.prior is None or not manifest.prior.weight
+    if own_rows_only and columns > least.max_columns_per_drive * trained.drives:
         drives = number_of(trained.drives, "drive")
         most = f"{least.max_columns_per_drive:g}"
         found.append(f"it has {columns} columns on {drives}, more than {most} a drive")

@@ -176,9 +176,12 @@ def search_models(
     *,
     intercept: bool = True,
 ) -> SearchedModels:
-    """Search among the inputs on the drives that have them all. Raises `DataError`."""
+    """Search among the inputs on the drives that have them all. Raises `DataError`.
+
+    Folds without such a row are left out: a car that stands or creeps has no curvature.
+    """
     label = catalogue().label
-    folds = cohort.folds(folding.by, folding.count).serving(inputs, label)
+    folds = cohort.folds(folding.by, folding.count).serving(inputs, label, sparse=True)
 
     def fits(gram: Gram) -> list[Fit]:
         return _fits(gram if intercept else gram.about_origin(), inputs, label, search)

@@ -49,7 +49,6 @@ from fleet_slip.models.search import (
     choose_by,
     require_criterion,
     search_models,
-    searching,
     select_inputs,
     try_distances,
 )
@@ -62,13 +61,11 @@ from fleet_slip.regression.drives import (
 from fleet_slip.regression.folds import (
     CohortFolds,
     CrossValidation,
-    assemble,
+    cross_validate,
     cross_validate_inputs,
-    held_out_errors,
     least_squares,
 )
 from fleet_slip.regression.gram import GramTable, packed_position
-from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import METHODS
 from fleet_slip.rendering import Answer, Part
 from fleet_slip.resources import find_config
@@ -525,55 +522,41 @@ def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> 
     return answer
 
 
-PRIOR_SHARES = (Fraction(0), *(Fraction(4) ** power for power in range(-5, 2)))
-"""Weights of all rows of a prior that are tried, where the rows of the cohort have 1 together."""
+PRIOR_SHARE = Fraction(1, 8)
+"""Weight of all rows of a prior together, where those of the cohort have 1 (docs/measured.md)."""
 
 
 def weigh_prior(cohort: Cohort, prior: Cohort, asked: "SelectionPlan") -> Selection:
-    """Choose the columns on the cohort alone, then the weight of its prior by held-out drives.
+    """Fit the columns of a list's first search to the cohort and its prior, or choose without it.
 
-    A prior does not choose columns: in a car that few drives identified badly its drives would
-    agree on the wrong ones. A search is made again in every fold.
+    With a prior nothing is searched for: simulated drives tell what real ones leave open, so all
+    columns can stay. Held-out drives are driven as the others are, and flatter what is chosen on
+    few of them: of n drives the choice without the prior must be better by more than 1/n.
     """
-    by, count = asked.folds.by, asked.folds.count
     alone = replace(cohort, prior=None)
     first = _compare_listed(alone, asked.request, asked.model_list, asked.folds)
-    winner, found = first.winner.model, first.searched_winner
-    label, intercept = catalogue().label, asked.request.intercept
-    choose = least_squares(winner.signals, label, intercept=intercept)
-    if found:
-        choose = searching(found, len(winner.signals), intercept=intercept)
-    inputs = found.inputs if found else winner.signals
-    folds = alone.folds(by, count).serving(inputs, label)
-    chosen = [choose(training).signals for training, _ in folds.splits()]
-    both = cohort.folds(by, count).serving(inputs, label)
-    one = Fraction(2) ** round(math.log2(cohort.rows / prior.rows))
-
-    def validate_at(weight: Fraction) -> CrossValidation:
-        weighed = replace(both, weight=weight)
-        tests = [
-            held_out_errors(
-                fit(training, signals, label, intercept=intercept).model, training, fold
-            )
-            for signals, (training, fold) in zip(chosen, weighed.splits(), strict=True)
-        ]
-        counts = fit(weighed.total, winner.signals, label, intercept=intercept).model
-        return assemble("prior", weighed, tests, counts, input_scales())
-
-    tried = {one * share: validate_at(one * share) for share in PRIOR_SHARES}
-    weight, best = min(tried.items(), key=lambda each: each[1].pooled.rmse)
-    told = "The prior has no weight: held-out drives are estimated worse with it."
-    if weight:
-        told = (
-            f"With the prior, {weight} of the weight for each row, its RMSE is "
-            f"{best.pooled.rmse_deg:.4f} deg, without it {winner.pooled.rmse_deg:.4f} deg."
-        )
-    return replace(
-        first,
-        cohort=replace(cohort, weight=weight),
-        models=(*first.models, best),
-        winner=replace(first.winner, model=best, reason=f"{first.winner.reason} {told}"),
+    winner, label = first.winner.model, catalogue().label
+    searches = _searches_of(asked.request, asked.model_list)
+    named = next((one.inputs for one in searches if one.inputs), ())
+    signals = tuple(name for name in named if name in cohort.inputs) or winner.signals
+    share = PRIOR_SHARE * Fraction(cohort.rows, prior.rows)
+    weighed = replace(cohort, weight=Fraction(2) ** round(math.log2(share)))
+    folds = weighed.folds(asked.folds.by, asked.folds.count).serving(signals, label, sparse=True)
+    choose = least_squares(signals, label, intercept=asked.request.intercept)
+    joined = cross_validate("prior", folds, choose, input_scales())
+    told = (
+        f"RMSE on held-out drives: {joined.pooled.rmse_deg:.4f} deg with the prior, each row with "
+        f"the weight {weighed.weight}, {winner.pooled.rmse_deg:.4f} deg without."
     )
+    models = (*first.models, joined)
+    if joined.pooled.rmse > winner.pooled.rmse * (1 + 1 / cohort.drive_count):
+        reason = f"{first.winner.reason} The prior is not used. {told}"
+        chosen = replace(first.winner, reason=reason)
+        unused = replace(cohort, weight=Fraction(0))
+        return replace(first, cohort=unused, models=models, winner=chosen)
+    reason = f"The prior stays. {told}"
+    chosen = replace(first.winner, model=joined, reason=reason)
+    return replace(first, cohort=weighed, models=models, winner=chosen)
 
 
 def _weigh_drives(cohort: Cohort, asked: SelectionPlan) -> tuple[Cohort, dict[str, Weighed]]:

@@ -77,7 +77,10 @@ def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
 
 @dataclass(frozen=True)
 class Folds:
-    """One Gram a fold, their names and numbers of drives; rows `beside` are always trained on."""
+    """One Gram a fold, their names and numbers of drives; rows `beside` are always trained on.
+
+    These have an intercept of their own: what they tell is how columns and label change together.
+    """
 
     grams: tuple[Gram, ...]
     names: tuple[str, ...]
@@ -88,13 +91,25 @@ class Folds:
     @cached_property
     def total(self) -> Gram:
         """The Gram of all that a model is trained on, in whole parts of a row's weight."""
-        own = sum(self.grams[1:], self.grams[0]).times(self.weight.denominator)
-        return own if self.beside is None else own + self.beside.times(self.weight.numerator)
+        own = sum(self.grams[1:], self.grams[0]).times(self._times)
+        if self.beside is None or not self.weight:
+            return own
+        about_mean = self.beside.about_mean()
+        return own + about_mean.times(self.weight.numerator * self._times // self._divisor)
+
+    @property
+    def _divisor(self) -> int:
+        return self.weight.denominator * (self.beside.n if self.beside else 1)
+
+    @cached_property
+    def _times(self) -> int:
+        """How often each row counts, so that all weights are whole."""
+        return self._divisor // math.gcd(self.weight.numerator, self._divisor)
 
     def splits(self) -> Iterator[tuple[Gram, Gram]]:
         """Yield for each fold the Gram of all others, to train on, and its own, to test on."""
         for fold in self.grams:
-            yield self.total - fold.times(self.weight.denominator), fold
+            yield self.total - fold.times(self._times), fold
 
     def without(self, number: int, drives: int) -> "Folds":
         """Return the other folds, which hold so many drives."""

@@ -118,6 +118,15 @@ class Gram:
         """Return the Gram with all sums zero, of the rows and their mirror: no intercept."""
         return Gram(self.signals, self.n, (0,) * len(self.sums), self.products)
 
+    def about_mean(self) -> "Gram":
+        """Return n times the Gram of the rows less their mean, as of no rows: no part of a mean."""
+        return Gram(
+            self.signals,
+            0,
+            (0,) * len(self.sums),
+            tuple(product for i, row in enumerate(self.centred()) for product in row[: i + 1]),
+        )
+
     def combine(self, combinations: Mapping[str, Mapping[str, int]]) -> "Gram":
         """Return the Gram of integer combinations, such as {"difference": {"a": 1, "b": -1}}.
 

@@ -55,25 +55,31 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "data"
 
 
-def times(gram: Gram, weight: int) -> Gram:
-    return sum((gram for _ in range(weight - 1)), gram)
+def with_mark(gram: Gram, mark: int) -> Gram:
+    """Return the Gram with one more column, which is `mark` in every row."""
+    sums, products = (*gram.sums, mark * gram.n), tuple(mark * one for one in gram.sums)
+    return Gram((*gram.signals, "mark"), gram.n, sums, (*gram.products, *products, mark * gram.n))
 
 
-def test_a_prior_is_weighed_exactly(own: Path, few: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fleet_slip.models.select.PRIOR_SHARES", (Fraction(1, 16),))
+def test_a_prior_is_weighed_exactly_and_has_an_intercept_of_its_own(
+    own: Path, few: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fleet_slip.models.select.PRIOR_SHARE", Fraction(1, 2**20))
     fleet = fleet_slip.open(own)
     found = fleet.cohort().select(model=INPUTS, prior=few)
     prior = simulate_prior(few, "signals")
     weight = found.cohort.weight
     signals = (*INPUTS.split(","), catalogue().label)
     (simulated,) = prior.tables
-    real = load_cohort(fleet.warehouse).serving(INPUTS.split(",")).table.total()
-    both = times(real.restrict(signals), weight.denominator)
-    both += times(simulated.total().restrict(signals), weight.numerator)
+    real = load_cohort(fleet.warehouse).serving(INPUTS.split(",")).table.total().restrict(signals)
+    both = with_mark(real, 1).times(weight.denominator)
+    both += with_mark(simulated.total().restrict(signals), 0).times(weight.numerator)
     assert 0 < weight < 1
     assert found.as_dict()["prior"] == {"campaign": few, "weight": str(weight)}
-    by_hand = fit(both, INPUTS.split(","), catalogue().label).model
-    assert by_hand == found.winner.model.counts
+    by_hand = fit(both, [*INPUTS.split(","), "mark"], catalogue().label).model
+    counts = found.winner.model.counts
+    assert [*counts.weights.values()] == [by_hand.weights[name] for name in counts.weights]
+    assert counts.offset == pytest.approx(by_hand.offset + by_hand.weights["mark"], rel=1e-12)
     assert prior.rows > 1000 and found.cohort.drive_count == 6
 
 
@@ -86,7 +92,7 @@ def test_a_version_names_its_prior_and_is_trained_so_again(own: Path, few: str) 
     assert manifest.prior.campaign_sha256 == load_campaign(few).digest
     assert manifest.trained_on.drives == 6, "those of the cohort"
     assert "few: 2 simulated drives" in done_on(own, "show", "with").stdout
-    assert "The prior has no weight" in made.stdout, "these drives have a label without noise"
+    assert "The prior stays" in made.stdout
     again = answer(own, "publish", "with")
     assert not again["new"], "it is trained as it was, to the same bits"
     half = ("--half-life", "30", "--force")
@@ -114,9 +120,7 @@ def test_what_a_prior_does_not_join_is_refused(own: Path, few: str, words: tuple
     assert "nowhere" in unknown.stderr
 
 
-def test_a_wrong_prior_gets_next_to_no_weight(
-    own: Path, few: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_prior_is_not_used(own: Path, few: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its label is reversed: whatever is taken of it makes held-out drives worse."""
     prior = simulate_prior(few, "signals")
     (table,) = prior.tables
@@ -129,7 +133,11 @@ def test_a_wrong_prior_gets_next_to_no_weight(
     reversed_prior = prior.__class__(**{**vars(prior), "tables": (wrong,)})
     monkeypatch.setattr("fleet_slip.models.prior.simulate_prior", lambda *_: reversed_prior)
     found = fleet_slip.open(own).cohort().select(model=INPUTS, prior=few)
-    assert found.cohort.weight * prior.rows / found.cohort.rows < 1 / 500
+    assert found.cohort.weight == 0 and "The prior is not used" in found.winner.reason
+    assert (
+        found.winner.model.counts
+        == fleet_slip.open(own).cohort().select(model=INPUTS).winner.model.counts
+    )
 
 
 def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
