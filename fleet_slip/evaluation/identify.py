@@ -29,6 +29,7 @@ from fleet_slip.evaluation.single_track import (
     DriveSignals,
     LabelledDrive,
     measured_speed_mps,
+    without_rest,
 )
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters
@@ -559,6 +560,7 @@ def identify(measured: Measured, drives: Sequence[LabelledDrive], executor: Exec
     what is known of cars before any drive is a further residual of each parameter: what the drives
     do not tell stays there.
     """
+    drives = [without_rest(one, measured.car(Fitted())) for one in drives]
     finite(np.concatenate([one.sideslip_rad for one in drives]))
     told = [np.isfinite(one.sideslip_rad[::EVERY]) for one in drives]
     wheels = any(one.signals.has_road_wheels for one in drives)
@@ -609,6 +611,7 @@ def identify_held_out(
     measured: Measured, drives: Sequence[LabelledDrive], executor: Executor
 ) -> Identified:
     """Identify a car from all drives, and measure it on drives that it was not identified from."""
+    drives = [without_rest(one, measured.car(Fitted())) for one in drives]
     found = identify(measured, drives, executor)
     if len(drives) < 2:
         return found

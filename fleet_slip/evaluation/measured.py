@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import features
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.belief import YawRateNoise
 from fleet_slip.evaluation.belief import estimate as estimate_yaw_rate
-from fleet_slip.evaluation.drives import SLOWEST_MPS
 from fleet_slip.evaluation.filters import (
     FILTERS,
     TABLE_ONE,
@@ -48,6 +47,7 @@ from fleet_slip.evaluation.single_track import (
     LabelledDrive,
     follow,
     measured_speed_mps,
+    without_rest,
 )
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.expansion import CarCounts
@@ -206,7 +206,10 @@ class Competition:
         measured = Measured.of(car) if isinstance(car, VehicleParameters) else car
         cars = calibrated_cars(warehouse) if numbered else {}
         if measured is not None:
-            drives = [replace(one, drive=accelerated(one.drive, measured)) for one in drives]
+            drives = [
+                replace(one, drive=_judged(accelerated(one.drive, measured), measured))
+                for one in drives
+            ]
         return cls(drives, published, learners, vehicle, measured, cars, executor, told)
 
     def judge_without(self, parts: Sequence[LeftOut]) -> list[JudgedDrive]:
@@ -225,7 +228,7 @@ class Competition:
             JudgedDrive(
                 one.drive.drive_id,
                 one.drive.sideslip_rad,
-                _judged(one.drive, self.measured),
+                np.isfinite(one.drive.sideslip_rad),
                 {name: estimates[number] for name, estimates in found.items()},
             )
             for number, one in enumerate(self.drives)
@@ -349,17 +352,6 @@ def identified_prior(campaign: Campaign | None) -> VehicleParameters | None:
     return cars[0] if len(cars) == 1 and cars[0].description == IDENTIFIED else None
 
 
-def _judged(drive: LabelledDrive, car: Measured | None) -> BoolArray:
-    """Return the rows with a label where the car moves, by its wheel speeds."""
-    labelled: BoolArray = np.isfinite(drive.sideslip_rad)
-    if car is None:
-        return labelled
-    try:
-        return labelled & (measured_speed_mps(drive.signals, car.car(Fitted())) > SLOWEST_MPS)
-    except DataError:
-        return labelled
-
-
 def _estimate(
     one: Filter, car: VehicleParameters, parameters: Config, signals: DriveSignals
 ) -> FloatArray:
@@ -381,6 +373,13 @@ def accelerated(drive: LabelledDrive, car: Measured) -> LabelledDrive:
         return drive
     ax_mps2 = follow(np.diff(speed, prepend=speed[:1]) / STEP_S, WHEELS_LAG)
     return replace(drive, signals=replace(signals, ax_mps2=ax_mps2))
+
+
+def _judged(drive: LabelledDrive, car: Measured) -> LabelledDrive:
+    """Return the drive with the labels that are judged: where its wheels tell that it moves."""
+    with suppress(DataError):
+        return without_rest(drive, car.car(Fitted()))
+    return drive
 
 
 def _rolling(vehicle: VehicleParameters, signals: DriveSignals) -> FloatArray:

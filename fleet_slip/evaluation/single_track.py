@@ -171,6 +171,19 @@ def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> FloatArra
     return hold_last(undriven_axle(drive, car).vx_mps, "wheel speeds")
 
 
+WALKING_MPS = 2.0
+"""Slower than this an angle of travel is noise: a reference sensor at rest says anything."""
+
+
+def without_rest(drive: LabelledDrive, car: VehicleParameters) -> LabelledDrive:
+    """Return the drive without the labels of rows in which the car rests or creeps.
+
+    Raises `DataError` without wheel speeds.
+    """
+    moves = measured_speed_mps(drive.signals, car) > WALKING_MPS
+    return replace(drive, sideslip_rad=np.where(moves, drive.sideslip_rad, np.nan))
+
+
 def measured_steer_rad(drive: DriveSignals) -> FloatArray:
     """Return the mean angle of the front wheels, or that of the one that a car logs.
 
