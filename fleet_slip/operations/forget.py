@@ -167,7 +167,7 @@ def forget(
 
 
 def _require_delta_logs(warehouse: Warehouse) -> None:
-    """Raise `StorageError` if the Delta log of logs or Gram rows was lost: a fence begins a new one."""
+    """Raise `StorageError` if a Delta log was lost: a fence begins a new one."""
     for table in (warehouse.logs, warehouse.grams):
         files = find_unreferenced(table)
         old = any(file.age_hours >= BEING_WRITTEN_HOURS for file in files)
