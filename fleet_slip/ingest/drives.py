@@ -296,7 +296,7 @@ class OpenDrives:
         for part in parts:
             in_memory = self._rows.pop(part, [])
             self._in_memory -= sum(piece.height for piece in in_memory)
-            pieces = [*map(pl.read_ipc_stream, self._spool.take(part)), *in_memory]
+            pieces = [*map(pl.read_ipc_stream, self._spool.read(part)), *in_memory]
             if pieces and "base" not in pieces[0].columns:
                 yield DriveRows({0: pl.concat(pieces)})
             elif pieces:

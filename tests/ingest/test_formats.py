@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import duckdb
 import h5py
 import numpy as np
 import pyarrow as pa
@@ -302,12 +301,6 @@ def test_the_folders_of_a_hive_partitioned_dataset_are_columns(tmp_path: Path) -
     other.mkdir(parents=True)
     pq.write_table(a_table(), other / "part-0.parquet")
     assert read_measured(other / "part-0.parquet", mapping).digest != log.digest
-
-
-def test_a_duckdb_file_is_to_be_written_as_parquet(tmp_path: Path) -> None:
-    with duckdb.connect(str(tmp_path / "log.duckdb")) as database:
-        database.sql("CREATE TABLE log AS SELECT 1 AS t")
-    assert "COPY my_table TO 'log.parquet'" in failure(tmp_path / "log.duckdb", a_mapping())
 
 
 @pytest.mark.parametrize("magic", [b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07"])

@@ -43,7 +43,6 @@ from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, open_parquet
 
 [_HDF5], _HDF5_AT = FORMATS["mat73"].begins, 512
 """A MATLAB file of version 7.3 becomes HDF5 there: MATLAB's own header is before it."""
-_DUCKDB, _DUCKDB_AT = b"DUCK", 8
 _ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
 _BINARY = {
     (".parquet", ".pq"): "a Parquet file",
@@ -111,11 +110,6 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
         name = name or "can_trace"
     if start.startswith(PARQUET_MAGIC):
         return open_parquet(budget)
-    if start[_DUCKDB_AT:].startswith(_DUCKDB):
-        raise InputError(
-            f"{shown(file)}: it is a DuckDB file, which is not read. Write the table with DuckDB: "
-            "COPY my_table TO 'log.parquet', and give that."
-        )
     if name == "can_trace" and formats.can is None:
         raise InputError(
             f'{shown(file)}: this format needs [can] with database = "….dbc" in the mapping '

@@ -319,11 +319,6 @@ class Spool:
             self._file.seek(start)
             yield self._file.read(size)
 
-    def take(self, key: Hashable) -> Iterator[bytes]:
-        """Yield the pieces of a key, and forget them; their room is not used again."""
-        yield from self.read(key)
-        self._pieces.pop(key, None)
-
     def clear(self) -> None:
         """Forget all pieces."""
         self._pieces.clear()
