@@ -1,6 +1,6 @@
 """Data and plain float64 formulas that the tests compare with."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.regression.least_squares import fit
 
 Matrix = NDArray[Any]
 
@@ -74,3 +75,20 @@ def dense_fit(counts: Matrix) -> tuple[Matrix, float]:
 def unit_scales(inputs: int) -> dict[str, Fraction]:
     """Return the scale 1 for x1, x2, ..., y."""
     return dict.fromkeys(names(inputs), Fraction(1))
+
+
+def greedy_order(gram: Gram, method: str) -> tuple[str, ...]:
+    """Return the order of a Gram's inputs, label last, by exact sums of squares at each step."""
+    *inputs, label = gram.signals
+
+    def rss(chosen: Iterable[str]) -> Fraction:
+        return fit(gram, [*chosen], label).rss
+
+    order: list[str] = []
+    while left := [name for name in inputs if name not in order]:
+        if method == "forward":
+            order.append(min(left, key=lambda name: rss([*order, name])))
+        else:  # of equals the later
+            without = {name: rss(n for n in left if n != name) for name in reversed(left)}
+            order.append(min(without, key=lambda name: without[name]))
+    return tuple(order if method == "forward" else reversed(order))

@@ -19,9 +19,10 @@ from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.predict import predict
 from fleet_slip.models.score import score
-from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support import cars
+from tests.support.counts import table_of
 from tests.support.logs import land, log_rows
 
 DAY = date(2024, 5, 1)
@@ -35,15 +36,6 @@ WANTED: tuple[str, ...] = (
     "wheelbase_alone",
     "yaw_rate_offset_slowness",
 )
-
-
-def table_of(grams: list[Gram]) -> GramTable:
-    return GramTable(
-        grams[0].signals,
-        np.array([gram.n for gram in grams]),
-        np.array([gram.sums for gram in grams]),
-        np.array([gram.products for gram in grams]),
-    )
 
 
 @pytest.mark.parametrize("factor", [7, 2**15 - 1])

@@ -18,7 +18,7 @@ from fleet_slip.regression.inference import Evidence
 from fleet_slip.regression.least_squares import correlation_matrix, fit
 from fleet_slip.regression.orders import RANKINGS, rank, stepwise_order
 from fleet_slip.regression.subsets import all_rss, best_subsets, signals_of
-from tests.support.counts import dense_fit, gram_of, names, random_drives, table_of
+from tests.support.counts import dense_fit, gram_of, greedy_order, names, random_drives, table_of
 from tests.support.evidence import evidence
 
 ORDERS = {
@@ -89,23 +89,8 @@ def test_all_subsets_equal_brute_force(seed: int, k: int) -> None:
 @given(st.integers(0, 10**6))
 def test_greedy_orders_equal_their_definition(seed: int) -> None:
     gram = gram_of(np.concatenate(random_drives(seed, drives=2, inputs=5)))
-    inputs = names(5)[:-1]
-
-    def rss(chosen: tuple[str, ...]) -> Any:
-        return fit(gram, chosen, "y").rss
-
-    added: tuple[str, ...] = ()
-    while len(added) < 5:
-        left = [name for name in inputs if name not in added]
-        added = (*added, min(left, key=lambda name: rss((*added, name))))
-    assert rank("forward", gram, inputs, "y") == added
-    kept = inputs
-    removed: tuple[str, ...] = ()
-    while kept:
-        worst = min(kept, key=lambda name: rss(tuple(n for n in kept if n != name)))
-        removed = (worst, *removed)
-        kept = tuple(name for name in kept if name != worst)
-    assert rank("backward", gram, inputs, "y") == removed
+    for method in ("forward", "backward"):
+        assert rank(method, gram, names(5)[:-1], "y") == greedy_order(gram, method)
 
 
 def test_exchange_gives_up_what_was_best_alone() -> None:
