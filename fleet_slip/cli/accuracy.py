@@ -162,9 +162,7 @@ def watch(file: Path) -> None:
 
     Example: **fleet-slip watch adhesion_0_4 --output slippery.html**
     """
-    from fleet_slip.pages.page import size  # noqa: PLC0415 - of the extra, which is there now
-
-    say(f"{file}: {size(file.stat().st_size)}")
+    say(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
 
 
 @command(without=["json"])

@@ -46,16 +46,6 @@ def scientific(value: float, digits: int = 2) -> str:
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def size(value: int) -> str:
-    """Return a number of bytes in its largest unit."""
-    amount = float(value)
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if amount < 1000 or unit == "TB":
-            break
-        amount /= 1000
-    return f"{amount:.0f} {unit}" if unit == "B" else f"{amount:.1f} {unit}"
-
-
 def listed(words: list[str]) -> str:
     """Return words as a list in a sentence: a, b and c."""
     if len(words) < 2:

@@ -1,6 +1,8 @@
 """What the filters are tuned to, sought once: that takes more than all else in an evaluation."""
 
 import shutil
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -18,3 +20,10 @@ def evaluated(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
         call(root, "evaluate", "smoke", *SCENARIOS)
 
     return made_once(tmp_path_factory, "evaluated", make)
+
+
+@pytest.fixture(scope="session")
+def executor() -> Iterator[Executor]:
+    """Threads on which parameters are sought."""
+    with ThreadPoolExecutor(2) as threads:
+        yield threads

@@ -1,15 +1,19 @@
-"""Trials on a proving ground: what is drawn, and what manoeuvres make of a road and a drive."""
+"""Trials on a proving ground and on roads: what is drawn, what manoeuvres make of a drive."""
 
 import numpy as np
 import pytest
 
+from fleet_slip.errors import ConfigError
+from fleet_slip.evaluation.blind import blind_scenarios
 from fleet_slip.simulation.campaign import DriveSpec, load_campaign
 from fleet_slip.simulation.plan import TrialPlan
-from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, road_with
+from fleet_slip.simulation.roads import CLASSES, SLOWEST_MPS, Manoeuvre, load_track, road_with
 from fleet_slip.simulation.scenario import shipped_scenarios
 from fleet_slip.vehicle.batch import LaneDrive, Road
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.whole_drives import simulate_drives
+
+SEDAN = load_vehicle("d_class_sedan")
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +78,46 @@ def test_a_manoeuvre_goes_on_over_the_start_of_a_closed_road_and_not_of_an_open_
 
 
 def test_a_car_drives_the_lateral_acceleration_of_a_slalom() -> None:
-    car = load_vehicle("d_class_sedan")
     road = road_with(straight(), [Manoeuvre("slalom", 200.0, 8.0, 2.0, 4.0)])
-    (plain, swung) = simulate_drives([LaneDrive(car, r, 1.0, 1.0) for r in (straight(), road)])
+    (plain, swung) = simulate_drives([LaneDrive(SEDAN, r, 1.0, 1.0) for r in (straight(), road)])
     assert np.abs(plain.ay_mps2).max() < 0.01
     assert 1.6 < np.abs(swung.ay_mps2).max() < 2.8
     assert swung.lost_control_tick is None
+
+
+@pytest.fixture(scope="module")
+def on_roads() -> tuple[DriveSpec, ...]:
+    campaign = load_campaign("proving_roads")
+    return campaign.drives(campaign.first_day)
+
+
+def test_every_class_of_road_is_driven_at_its_speeds(on_roads: tuple[DriveSpec, ...]) -> None:
+    by_class = {
+        name: [d for d in on_roads if d.track.name.startswith(f"{name}_")] for name in CLASSES
+    }
+    for name, some in by_class.items():
+        top_mps = CLASSES[name].top_speed_mps
+        assert 0.6 * top_mps < max(d.limits.top_speed_mps for d in some) <= top_mps
+        lines = {d.track.segments for d in some if d.track.name == some[0].track.name}
+        assert len(lines) > 1, "each driver takes a line of his own"
+    assert max(d.limits.top_speed_mps for d in by_class["motorway"]) > 42
+    assert min(d.adhesion for d in on_roads) < 0.2
+    assert all(d.flaws.road.superelevation_percent > 0 for d in on_roads)
+
+
+def test_load_and_wear_are_of_the_drive_and_all_else_of_the_car(
+    on_roads: tuple[DriveSpec, ...],
+) -> None:
+    tested = [d for d in on_roads if d.vehicle_id == "proving_roads-0000"]
+    rear_m = [d.vehicle.body.rear_axle_m for d in tested]
+    assert min(rear_m) < SEDAN.body.rear_axle_m - 0.2
+    assert len({d.vehicle.tyre.rolling_radius_m for d in tested}) > len(tested) / 2
+    assert {d.flaws.car for d in tested} == {tested[0].flaws.car}
+
+
+def test_no_road_of_the_plan_is_a_blind_one() -> None:
+    """Names reach to nine digits; a version's seeds are below that once in 10⁹ versions."""
+    with pytest.raises(ConfigError):
+        load_track("country_1000000000")
+    assert min(one.seed for one in blind_scenarios("ab" * 32)) > 1e9
+    assert load_campaign("proving_roads").seed != load_campaign("proving_ground").seed
