@@ -138,7 +138,7 @@ class LogsAndGrams(Rooted):
 
     @record_call
     def ingest_counted(self, file: Path | str) -> "CountedReport":
-        """Bring in Gram rows that cars counted: a Parquet or Arrow table (`docs/export.md`).
+        """Bring in Gram rows that cars counted: a Parquet table (`docs/export.md`).
 
         It lands whole and once. Raises `InputError` for a row that no drive can have or of what was
         forgotten, `RepeatedError` for a drive that is there, `StorageError` and `ConflictError`.

@@ -1,4 +1,4 @@
-"""Loads Gram rows that cars counted on board: a Parquet or Arrow table, beside rows of logs.
+"""Loads Gram rows that cars counted on board: a Parquet table, beside rows of logs.
 
 The table has the columns of `COLUMNS`. It is loaded whole, once, in one commit, or not at all: an
 error names the first row that cannot be, and why. The drive of a row has the source `received`, and
@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.arrays import BoolArray
 from fleet_slip.base import canonical_json, number_of, sha256_of, shown
 from fleet_slip.catalogue.course import (
     BESIDE,
@@ -182,8 +182,8 @@ PRODUCTS = "has products outside the ranges of its signals"
 INDEFINITE = "has a matrix that is not positive semidefinite"
 
 
-def find_impossible(table: GramTable, ranges: Sequence[tuple[int, int]]) -> dict[str, IntArray]:
-    """Return impossible Gram rows by reason, given the range of each of their signals."""
+def find_impossible(table: GramTable, ranges: Sequence[tuple[int, int]]) -> dict[int, str]:
+    """Return why Gram rows are impossible, by place, given the range of each of their signals."""
     sums, products = table.sums, table.products
     least, most = np.array(ranges, dtype=np.int64).reshape(-1, 2).T
     row, column = np.tril_indices(len(least))
@@ -191,19 +191,14 @@ def find_impossible(table: GramTable, ranges: Sequence[tuple[int, int]]) -> dict
     possible = (table.n >= 1) & (table.n <= most_rows(ranges))
     n = np.where(possible, table.n, 1)[:, None]
     bound = n * (size[row] * size[column])
-    judged = (
-        (NO_ROWS, ~possible),
-        (SUMS, ((sums < n * least) | (sums > n * most)).any(axis=1)),
-        (PRODUCTS, ((products > bound) | (products < -bound)).any(axis=1)),
-        (INDEFINITE, _indefinite(replace(table, n=n[:, 0]))),
-    )
-    found: dict[str, IntArray] = {}
-    left = np.ones(len(table), dtype=np.bool_)
-    for reason, bad in judged:
-        if (bad & left).any():
-            found[reason] = np.flatnonzero(bad & left)
-            left &= ~bad
-    return found
+    judged = {
+        NO_ROWS: ~possible,
+        SUMS: ((sums < n * least) | (sums > n * most)).any(axis=1),
+        PRODUCTS: ((products > bound) | (products < -bound)).any(axis=1),
+        INDEFINITE: _indefinite(replace(table, n=n[:, 0])),
+    }
+    reasons = np.select([*judged.values()], [*judged], "").tolist()
+    return {place: reason for place, reason in enumerate(reasons) if reason}
 
 
 def impossible_rows(
@@ -221,14 +216,14 @@ def impossible_rows(
         for batch in mine.to_batches(BATCH_ROWS):
             for signals, alike, _ in by_signals(batch):
                 names = signals.split(",") if signals else []
-                found: dict[str, IntArray] = {}
+                found: dict[int, str] = {}
                 if not set(names) <= ranges.keys():
-                    found = {"has signals that there are not": np.arange(len(alike))}
+                    found = dict.fromkeys(range(len(alike)), "has signals that there are not")
                 elif names:
                     known = [ranges[name] for name in names]
                     found = find_impossible(gram_table(signals, alike), known)
-                for reason, at in found.items():
-                    yield from ((alike.slice(i, 1).to_pylist()[0], reason) for i in at.tolist())
+                for place, reason in found.items():
+                    yield alike.slice(place, 1).to_pylist()[0], reason
 
 
 def most_rows(ranges: Sequence[tuple[int, int]]) -> int:
@@ -284,13 +279,11 @@ class CountedReport(Answer):
 
     def parts(self) -> Iterator[Part]:
         """Return what was loaded, as a remark."""
-        if self.new:
-            drives, rows = number_of(self.drives, "drive"), number_of(self.rows, "row")
-            yield Remark(
-                f"{self.file}: {number_of(self.gram_rows, 'Gram row')} of {drives}, {rows}"
-            )
-        else:
-            yield Remark(f"{self.file}: nothing to do, it was ingested before")
+        grams, drives = number_of(self.gram_rows, "Gram row"), number_of(self.drives, "drive")
+        said = f"{grams} of {drives}, {number_of(self.rows, 'row')}"
+        yield Remark(
+            f"{self.file}: {said if self.new else 'nothing to do, it was ingested before'}"
+        )
 
 
 def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:
@@ -328,15 +321,16 @@ def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:
 def _read(file: Path, content: bytes) -> pa.Table:
     """Return the rows of a file in the order of `COLUMNS`. Raises `InputError`."""
     try:
-        if content[:4] == b"PAR1":
-            parquet = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
-            metadata = parquet.metadata
-            _require_size(file, metadata.num_rows, _require_checksums(file, content, metadata))
-            table = parquet.read()
-        else:
-            table = pa.ipc.open_file(pa.BufferReader(content)).read_all()
-            table.validate(full=True)
-            _require_size(file, len(table), table.nbytes)
+        parquet = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
+        rows = parquet.metadata.num_rows
+        unpacked_bytes = _require_checksums(file, content, parquet.metadata)
+        if not rows:
+            raise InputError(f"{file}: has no Gram rows.")
+        if rows > MOST_ROWS or unpacked_bytes > MOST_UNPACKED_BYTES:
+            raise InputError(
+                f"{file}: more than {MOST_ROWS:,} Gram rows or 1 GiB of them. Divide it."
+            )
+        table = parquet.read()
         absent = [name for name in COLUMNS.names if name not in {*table.column_names, *OPTIONAL}]
         if absent:
             raise InputError(f"{file}: no table of Gram rows: no column {absent[0]}. {_SEE}")
@@ -349,13 +343,6 @@ def _read(file: Path, content: bytes) -> pa.Table:
 
 _NOTE = {"job": "receive"}
 _SEE = "docs/export.md has its columns."
-
-
-def _require_size(file: Path, rows: int, unpacked_bytes: int) -> None:
-    if not rows:
-        raise InputError(f"{file}: has no Gram rows.")
-    if rows > MOST_ROWS or unpacked_bytes > MOST_UNPACKED_BYTES:
-        raise InputError(f"{file}: more than {MOST_ROWS:,} Gram rows or 1 GiB of them. Divide it.")
 
 
 def _require_checksums(file: Path, content: bytes, metadata: pq.FileMetaData) -> int:

@@ -166,13 +166,9 @@ def test_pages_need_checksums_and_a_flipped_bit_is_found(
     assert gram_rows(fleet) == []
 
 
-def test_an_arrow_file_is_taken_and_what_is_no_table_is_not(
-    fleet: fleet_slip.Fleet, tmp_path: Path
-) -> None:
+def test_what_is_no_table_is_not_taken(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
     table = rows_of_fleet(3, START_S, seed=1).drop_columns(["part", "course_late"])
-    with pa.ipc.new_file(str(tmp_path / "rows.arrow"), table.schema) as writer:
-        writer.write_table(table)
-    assert fleet.ingest_counted(tmp_path / "rows.arrow").gram_rows == 3
+    assert fleet.ingest_counted(write_counted(tmp_path / "rows", table)).gram_rows == 3
     (tmp_path / "text").write_text("FSGR")
     with pytest.raises(InputError, match="table of Gram rows"):
         fleet.ingest_counted(tmp_path / "text")

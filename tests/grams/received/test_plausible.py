@@ -55,12 +55,10 @@ DRIVE = Gram.from_counts("abc", np.array([[3, 5, -7], [4, 5, 900], [-2, 8, 11], 
 def test_what_no_counts_have_is_told(field: str, place: int, change: int, reason: str) -> None:
     table = table_of([DRIVE])
     getattr(table, field).reshape(-1)[place] += np.int64(change)
-    found = find_impossible(table, RANGES)
-    assert {why: at.tolist() for why, at in found.items()} == {reason: [0]}
+    assert find_impossible(table, RANGES) == {0: reason}
 
 
 def test_each_row_is_judged_by_itself() -> None:
     table = table_of([DRIVE, DRIVE, DRIVE])
     table.products[1, 4] += 50_000
-    found = find_impossible(table, RANGES)
-    assert {why: at.tolist() for why, at in found.items()} == {INDEFINITE: [1]}
+    assert find_impossible(table, RANGES) == {1: INDEFINITE}
