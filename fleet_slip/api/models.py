@@ -11,6 +11,7 @@ from fleet_slip.api.calls import (
     ALIAS,
     MODEL,
     UNEXAMINED,
+    VERSION,
     CarMeasures,
     Rooted,
     ShowProgress,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from fleet_slip.evaluation.evaluate import Evaluation
     from fleet_slip.evaluation.report import Written
     from fleet_slip.export.stepping import Estimator
+    from fleet_slip.models.diff import Difference
     from fleet_slip.models.manifest import Manifest
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.score import Score
@@ -202,6 +204,16 @@ class PublishedModels(Rooted):
         """Keep an alias where it is until `promote` or `off`; return its version, as `model`."""
         registry = self.registry()
         return registry.load(name, registry.hold(name, alias, "unpin" if off else "pin"))
+
+    def diff(
+        self,
+        one: Annotated[str | ModelVersion, VERSION],
+        other: Annotated[str | ModelVersion, VERSION],
+    ) -> "Difference":
+        """Tell two versions apart, by their manifests and their drives. Raises as `model`."""
+        from fleet_slip.models.diff import compare_versions
+
+        return compare_versions(self.registry(), self.model(one), self.model(other))
 
     def estimator(
         self, model: str | ModelVersion, car: Mapping[str, Any] | None = None

@@ -66,6 +66,7 @@ GROUPS = {
         "models": "models",
         "promote": "models",
         "pin": "models",
+        "diff": "models",
     },
     "Accuracy": {
         "score": "accuracy",

@@ -1,4 +1,4 @@
-"""Commands that serve models: models, show, promote, pin, export."""
+"""Commands that serve models: models, show, promote, pin, diff, export."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -192,6 +192,14 @@ def pin(version: ModelVersion, name: str, alias: str, off: bool) -> None:
     """
     done = "is pinned to version {}" if not off else "is version {}; publications may move it"
     say(f"{name}@{alias} {done.format(version.version)}")
+
+
+@command(Fleet.diff, arguments=["one", "other"])
+def diff() -> None:
+    """Tell two versions of a model apart: data, prior, signals, coefficients, figures.
+
+    Example: **fleet-slip diff waterford@1 waterford@2**
+    """
 
 
 @command(Fleet.export, arguments=["model"])

@@ -43,6 +43,8 @@ READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "mapping": (str, lambda mapping: mapping),
     "model": (str | None, lambda model: model),
     "night": (str | None, lambda night: date_of(night, "--night")),
+    "one": (str, str),
+    "other": (str, str),
     "others": (list[str] | None, lambda names: names or ()),
     "over": (str | None, lambda over: [one.strip() for one in over.split(",")] if over else ()),
     "scenarios": (list[str] | None, lambda names: names or ()),

@@ -17,6 +17,10 @@ def test_candidates_wait_are_compared_and_promoted(
     assert (waiting["version"], waiting["candidate"]) == (2, True)
     assert "worse than the champion" in waiting["reason"]
     assert run_command("show", "smoke", "--json").json["version"] == 1
+    compared = run_command("diff", "smoke@champion", "smoke@candidate")
+    assert "selected_by.asked.features" in compared.stdout and "sha256" not in compared.stdout
+    assert "8 made both, 0 only smoke@1, 0 only smoke@2" in compared.stderr
+    assert "are the same estimator" in run_command("diff", "smoke@1", "smoke@1").stderr
     names = ("smoke@champion", "smoke@candidate")
     better, worse = (run_command("score", name, "--json").json for name in names)
     assert (better["model"], worse["model"]) == ("smoke@1", "smoke@2")

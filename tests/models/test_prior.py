@@ -97,8 +97,9 @@ def test_a_version_names_its_prior_and_is_trained_so_again(own: Path, few: str) 
     assert not again["new"], "it is trained as it was, to the same bits"
     half = ("--half-life", "30", "--force")
     done_on(own, "publish", "with", "--model", "ay,yaw_rate", *half)
-    after = fleet.model("with").manifest
-    assert (after.prior, (after.selected_by.asked or {})["half_life"]) == (None, 30)
+    facts = answer(own, "diff", "with@1", "with@2")["facts"]
+    assert facts["prior.campaign"] == {"one": "few", "other": None}
+    assert facts["selected_by.asked.half_life"]["other"] == 30
     drives = answer(own, "sql", "SELECT DISTINCT source FROM drives")
     assert "simulated" not in str(drives), "it is not in the warehouse"
 
