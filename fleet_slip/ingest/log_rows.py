@@ -77,6 +77,13 @@ def find_problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
     )
 
 
+def _number_problems(name: str, present: pl.Expr, more: tuple[pl.Expr, str]) -> pl.Expr:
+    """Return what can be wrong with a number of a field; `present` says where there is a text."""
+    value = pl.col(name)
+    unread, infinite = value.is_null() & present, ~value.is_finite()
+    return find_problems((unread, "not_a_number"), (infinite, "not_finite"), more)
+
+
 def as_text(column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
     """Return a column as text, whole numbers without a point, null for missing."""
     raw = pl.col(RAW + column)
@@ -148,12 +155,7 @@ def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
     if unit is None:
         return _timestamp(column, schema, mapping)
     number, present = as_number(column, schema, mapping)
-    value = pl.col("time")
-    problem = find_problems(
-        (value.is_null() & present, "not_a_number"),
-        (value.is_null(), "missing"),
-        (~value.is_finite(), "not_finite"),
-    )
+    problem = _number_problems("time", present, (pl.col("time").is_null(), "missing"))
     time_s = number * conversion_factor(unit, "s")
     return Field("time", "time", pl.col(RAW + column), time_s, problem)
 
@@ -261,11 +263,7 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
     (signal, least, most), value = count_range(name, source), pl.col(name)
     count = value / float(signal.scale)
     outside = (count <= least - 0.5) | (count >= most + 0.5)
-    problem = find_problems(
-        (value.is_null() & present, "not_a_number"),
-        (~value.is_finite(), "not_finite"),
-        (outside, "out_of_range"),
-    )
+    problem = _number_problems(name, present, (outside, "out_of_range"))
     return Field(name, "signal", raw, _si_value(name, source, number), problem)
 
 
@@ -290,12 +288,7 @@ def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
 
 def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
     number, present = as_number(column, schema, mapping)
-    value = pl.col(name)
-    problem = find_problems(
-        (value.is_null() & present, "not_a_number"),
-        (~value.is_finite(), "not_finite"),
-        (value <= 0, "out_of_range"),
-    )
+    problem = _number_problems(name, present, (pl.col(name) <= 0, "out_of_range"))
     return Field(name, "key", pl.col(RAW + column), number, problem)
 
 
