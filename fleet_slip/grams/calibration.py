@@ -430,11 +430,7 @@ class Calibration(Answer):
 
     def _remarks_on_roads(self) -> Iterator[Remark]:
         if self.evidence.roads.hide_offsets:
-            yield Remark(
-                "bends look banked, and roads may always lean to one side, which cannot be "
-                f"separated from a sensor offset with fewer than {FEWEST_CARS} cars: no car has "
-                "ay_offset"
-            )
+            yield Remark(f"no car has ay_offset: {LEANS}")
         elif not self.evidence.roads.banked:
             yield Remark(
                 "bends are seen not to be banked: a road that always leans to one side counts as "

@@ -351,11 +351,17 @@ def publish(
         found = _decide(registry, manifest, selection, force=force, candidate=candidate)
         if found.stays:
             return Publication(found.stays, False, found.reason)
-        if found.waits:
-            return _wait(registry, added(), newest_move, found)
         version = added()
-        published = registry.make_champion(version, after=newest_move, best=found.best)
-        return Publication(version, True, found.reason) if published else None
+        if not found.waits:
+            moved = registry.make_champion(version, after=newest_move, best=found.best)
+            return Publication(version, True, found.reason) if moved else None
+        number = version.version
+        there = history.pointed_at(CANDIDATE) == number
+        if not there and not history.move(CANDIDATE, number, "publish", after=newest_move):
+            return None
+        until = f"until: fleet-slip promote {version.reference}"
+        reason = f"{found.reason} {_why(manifest.name, found.held)}, {until}"
+        return Publication(version, not there, reason, candidate=True)
 
     return history.decide(publication)
 
@@ -456,20 +462,6 @@ def _decide(
         return _Decision(reason, champion)
     best = None if judgement.problems else judgement.best
     return _Decision(judgement.reason, None, candidate or held is not None, held, best)
-
-
-def _wait(
-    registry: Registry, version: ModelVersion, newest: int, found: _Decision
-) -> Publication | None:
-    """Make a version the candidate; return None if an alias moved after the move given."""
-    name = version.manifest.name
-    history = registry.history(name)
-    there = history.pointed_at(CANDIDATE) == version.version
-    if not there and not history.move(CANDIDATE, version.version, "publish", after=newest):
-        return None
-    until = f"until: fleet-slip promote {version.reference}"
-    reason = f"{found.reason} {_why(name, found.held)}, {until}"
-    return Publication(version, not there, reason, candidate=True)
 
 
 def _why(name: str, held: AliasMove | None) -> str:
