@@ -206,10 +206,7 @@ def _places(
         # The log has stations in steps of 0.25 m, which the car would jump.
         smooth_m, offset = _smooth(np.unwrap(station, period=track.length_m)), _smooth(offset)
         at_m = smooth_m % track.length_m if track.closed else smooth_m
-        x, y, along = (
-            np.interp(at_m, line.station_m, values)
-            for values in (line.x_m, line.y_m, line.heading_rad)
-        )
+        x, y, along = line.at(at_m)
         x, y = x - offset * np.sin(along), y + offset * np.cos(along)
         course = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
         return x, y, course - np.arctan2(vy, np.maximum(vx, 0.5)), (line.x_m, line.y_m)
@@ -237,11 +234,8 @@ def _others(
     if traffic is None or not np.isfinite(station_m).all():
         return places
     line = traffic.profile.track.centre_line(SPACING_M)
-    for frame, station in enumerate(_smooth(station_m)[seen].tolist()):
-        x, y, along = (
-            float(np.interp(station, line.station_m, values))
-            for values in (line.x_m, line.y_m, line.heading_rad)
-        )
+    stations = _smooth(station_m)[seen]
+    for frame, (station, x, y, along) in enumerate(zip(stations, *line.at(stations), strict=True)):
         ahead, left, turned = traffic.others_at(station).T
         cosine, sine = np.cos(along), np.sin(along)
         places[frame] = np.stack(

@@ -1,11 +1,11 @@
 """What cars, sensors and roads have beyond the textbook's. Sources: `docs/simulator.md`."""
 
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from fleet_slip.config import Config, added
+from fleet_slip.config import Config, ConfigT, added
 from fleet_slip.vehicle.imperfections import CarImperfections
 from fleet_slip.vehicle.parameters import VehicleParameters
 
@@ -14,8 +14,6 @@ NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 Latency = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Bandwidth = Annotated[FiniteFloat, Field(ge=0, le=30)]
 Turned = Annotated[FiniteFloat, Field(ge=-5, le=5)]
-
-ConfigT = TypeVar("ConfigT", bound=Config)
 
 
 class SensorImperfections(Config):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, model_validator
+from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
 from fleet_slip.config import Config, added
 from fleet_slip.errors import ConfigError
@@ -62,13 +62,10 @@ NotEmpty = Field(min_length=1)
 def _known_to_highway_env(name: str) -> str:
     from fleet_slip.simulation.traffic import require_road  # noqa: PLC0415 - takes a second
 
-    try:
-        return require_road(name)
-    except ConfigError as error:
-        raise ValueError(str(error)) from None
+    return require_road(name)
 
 
-RoadWithTraffic = Annotated[str, AfterValidator(_known_to_highway_env)]
+RoadWithTraffic = Annotated[str, load_by_name(_known_to_highway_env)]
 
 
 class Traffic(Config):

@@ -68,6 +68,12 @@ class CentreLine:
     y_m: FloatArray
     heading_rad: FloatArray
 
+    def at(self, station_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return x and y in m and the heading in rad at stations in m."""
+        along = (self.x_m, self.y_m, self.heading_rad)
+        x, y, heading = (np.interp(station_m, self.station_m, values) for values in along)
+        return x, y, heading
+
 
 class Track(Config):
     """A centre line given by its curvature, positive when bending left."""
