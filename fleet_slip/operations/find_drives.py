@@ -181,13 +181,15 @@ def remove_uncommitted(warehouse: Warehouse, subject: Forgettable, drives: Colle
     found: list[StoredFile] = []
     for table in (warehouse.logs, warehouse.grams, warehouse.quarantine):
         removed = table.snapshot().removed()
-        for file in find_unreferenced(table) if subject.kind != "before" else ():
+        files = [file for file in find_unreferenced(table) if file.path not in removed]
+        for file in files if subject.kind != "before" else ():
             with suppress(StorageError):  # half a file, or just deleted
                 rows = table.read(file.path, ["drive_id", "vehicle_id"])
                 refused = table is warehouse.quarantine
                 mine = quarantined_of(rows, subject, drives) if refused else rows_of(rows, subject)
-                if file.path not in removed and pc.any(mine).as_py():
-                    drives = {*drives, *rows.filter(mine)["drive_id"].to_pylist()}
+                if pc.any(mine).as_py():
+                    names = rows["drive_id"].filter(mine).drop_null()
+                    drives = {*drives, *names.to_pylist()}
                     found.append(file)
     for file in reversed(found):
         file.folder.remove(file)

@@ -127,13 +127,11 @@ def test_what_a_killed_job_left_goes_at_once_and_what_of_others_stays_for_an_hou
     tmp_path: Path,
 ) -> None:
     warehouse = fill(tmp_path, "alfa", "beta")
-    refused = pa.Table.from_pylist(
-        [{"drive_id": "beta-7"}], schema=warehouse.quarantine.schema
-    )  # that it is of the car, the log alone tells
-    left = [
-        warehouse.logs.write_file("left", drive("beta", 7), date(2024, 5, 1)),
-        warehouse.quarantine.write_file("left", refused),
-    ]
+    refused = [{"drive_id": "beta-7"}, {"vehicle_id": "beta"}]  # of the first, the log alone tells
+    left = [warehouse.logs.write_file("left", drive("beta", 7), date(2024, 5, 1))]
+    for number, row in enumerate(reversed(refused)):
+        table = pa.Table.from_pylist([row], schema=warehouse.quarantine.schema)
+        left.append(warehouse.quarantine.write_file(f"left{number}", table))
     warehouse.quarantine.fence()
     other = warehouse.logs.write_file("other", drive("alfa", 7), date(2024, 5, 1))
     assert not forget(warehouse, Forgettable("vehicle", "beta"), now=True).pending
