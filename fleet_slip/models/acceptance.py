@@ -51,7 +51,6 @@ from fleet_slip.regression.folds import (
     Folds,
     Procedure,
     assemble,
-    cross_validate,
     held_out_errors,
     least_squares,
 )
@@ -164,16 +163,48 @@ class Contest:
     """How a selection's winner is made again without what is held out, and whom it meets.
 
     Attributes:
+        name: the winner's.
         signals: all that any of them needs.
         by: what is held out, vehicle or drive.
         procedure: makes the challenger, its columns searched for anew if a search found them.
-        models: those that it meets, as they are, in counts.
+        incumbents: those that it meets, by reference, as they are, in counts.
     """
 
+    name: str
     signals: tuple[str, ...]
     by: FoldKey
     procedure: Procedure
-    models: tuple[LinearModel, ...]
+    incumbents: dict[str, LinearModel]
+
+    def serving(self, folds: CohortFolds) -> Folds:
+        """Return the folds of drives with all signals. Raises `DataError` without."""
+        return folds.serving(self.signals, catalogue().label, sparse=True)
+
+    def part(self, cohort: Cohort, wanted: BoolArray) -> Folds:
+        """Return some drives in the groups that the whole cohort has. Raises `DataError`."""
+        values = cohort.drives[FOLD_KEYS[self.by]].to_pylist()
+        whole = assign_folds(values, self.by, GROUPS)
+        used, fold = np.unique(whole.fold[wanted], return_inverse=True)
+        names = tuple(whole.names[number] for number in used.tolist())
+        part = cohort.part(wanted)
+        assignment = FoldAssignment(fold, names)
+        return self.serving(CohortFolds.of(part.tables, assignment, part.drive_numbers))
+
+    def on(self, groups: Folds, tested: Folds) -> Comparison:
+        """Compare, the challenger made without each of `groups`, on what `tested` has of it."""
+        tests = dict(zip(tested.names, tested.grams, strict=True))
+        sums = [
+            held_out_errors(self.procedure(training), training, tests[name])
+            for name, (training, _) in zip(groups.names, groups.splits(), strict=True)
+            if name in tests
+        ]
+        whole = self.procedure(groups.total)
+        challenger = assemble(self.name, tested, sums, whole, input_scales())
+        others = tuple(as_it_is(*one, tested) for one in self.incumbents.items())
+        shortfalls = tuple(compare_paired(challenger, one, worth()) for one in others)
+        typical = tuple(compare_typical(challenger, one, worth()) for one in others)
+        by_car = self.by == "vehicle"
+        return Comparison(self.by, challenger, others, shortfalls, typical if by_car else ())
 
 
 def worth() -> Worth:
@@ -191,8 +222,8 @@ def contest(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest
         _require_same_features(version, feature_set)
     label, winner, found = catalogue().label, selection.winner.model, selection.searched_winner
     inputs = found.inputs if found is not None else winner.signals
-    models = tuple(version.manifest.counts_model(feature_set) for version in incumbents)
-    every = (name for model in models for name in model.signals)
+    models = {one.reference: one.manifest.counts_model(feature_set) for one in incumbents}
+    every = (name for model in models.values() for name in model.signals)
     signals = tuple(dict.fromkeys((*inputs, *every)))
     cars = selection.cohort.count_vehicles_with((*signals, label))
     by: FoldKey = "vehicle" if cars >= LEAST_VEHICLES else "drive"
@@ -201,7 +232,7 @@ def contest(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest
         procedure = searching(found, len(winner.signals), intercept=intercept)
     else:
         procedure = least_squares(inputs, label, intercept=intercept)
-    return Contest(signals, by, procedure, models)
+    return Contest(winner.name, signals, by, procedure, models)
 
 
 def compare(selection: Selection, incumbents: Sequence[ModelVersion]) -> Comparison:
@@ -210,11 +241,8 @@ def compare(selection: Selection, incumbents: Sequence[ModelVersion]) -> Compari
     Raises `DataError` or `QuestionError` if no drive has the signals of all, and as `contest`.
     """
     asked = contest(selection, incumbents)
-    folds = selection.cohort.folds(asked.by, GROUPS)
-    groups = folds.serving(asked.signals, catalogue().label, sparse=True)
-    name = selection.winner.model.name
-    challenger = cross_validate(name, groups, asked.procedure, input_scales())
-    return _beside(challenger, asked, groups, incumbents)
+    groups = asked.serving(selection.cohort.folds(asked.by, GROUPS))
+    return asked.on(groups, groups)
 
 
 def compare_unseen(
@@ -225,35 +253,43 @@ def compare_unseen(
     None if these are none, all, or of fewer groups than `LEAST_VEHICLES`. Raises as `compare`, and
     `StorageError` if which drives made an incumbent cannot be read.
     """
-    made = [registry.trained_drives(one.manifest) for one in incumbents]
-    if None in made:
+    if (divided := _divide(registry, selection, incumbents)) is None:
         return None
-    cohort, asked = _some_drives(selection), contest(selection, incumbents)
-    drives = hash_numbers(cohort.drives["drive_id"])
-    known = np.any([one.among(drives) for one in made if one], axis=0)
-    if known.all() or not known.any():
-        return None
-    groups, new = (_folds(cohort, asked, mask) for mask in (np.ones_like(known), ~known))
+    cohort, known = divided
+    asked = contest(selection, incumbents)
+    groups, new = (asked.part(cohort, mask) for mask in (np.ones_like(known), ~known))
     if len(new.names) < LEAST_VEHICLES:
         return None
-    challenger = _held_out(selection.winner.model.name, asked, groups, new)
-    return replace(_beside(challenger, asked, new, incumbents), unseen=True)
+    return replace(asked.on(groups, new), unseen=True)
 
 
-def _beside(
-    challenger: CrossValidation,
-    asked: Contest,
-    groups: Folds,
-    incumbents: Sequence[ModelVersion],
-) -> Comparison:
-    others = tuple(
-        as_it_is(version.reference, model, groups)
-        for version, model in zip(incumbents, asked.models, strict=True)
-    )
-    shortfalls = tuple(compare_paired(challenger, other, worth()) for other in others)
-    typical = tuple(compare_typical(challenger, other, worth()) for other in others)
-    by_car = asked.by == "vehicle"
-    return Comparison(asked.by, challenger, others, shortfalls, typical if by_car else ())
+MOST_DRIVES = 20_000
+"""Of a larger cohort so many drives, chosen by their hash, are judged."""
+
+_HEX = 4
+
+
+def _divide(
+    registry: Registry, selection: Selection, versions: Sequence[ModelVersion]
+) -> tuple[Cohort, BoolArray] | None:
+    """Return a selection's cohort, and which of its drives made any of some versions.
+
+    None if all or none did, or a version does not tell. Raises `StorageError` if it cannot be read.
+    """
+    made = [registry.trained_drives(one.manifest) for one in versions]
+    if None in made:
+        return None
+    cohort = selection.cohort
+    if cohort.source is not None and cohort.sums is not None:
+        condition, drives = cohort.condition, cohort.drive_count
+        if drives > MOST_DRIVES:
+            below = 16**_HEX * MOST_DRIVES // drives
+            chosen = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
+            condition &= parse_condition(chosen)
+        cohort = load_cohort(cohort.source, condition, cohort.feature_set)
+    numbers = hash_numbers(cohort.drives["drive_id"])
+    known = np.any([one.among(numbers) for one in made if one], axis=0)
+    return (cohort, known) if known.any() and not known.all() else None
 
 
 def as_it_is(name: str, model: LinearModel, folds: Folds) -> CrossValidation:
@@ -427,86 +463,32 @@ def _signals(columns: Mapping[str, Any]) -> Signals:
 ODD = 2.0
 """Drives on which the champion's error is so many times that on the others are odd."""
 
-MOST_DRIVES = 20_000
-"""Of a larger cohort so many drives, chosen by their hash, are judged."""
-
-_HEX = 4
-
 
 def odd_gain(registry: Registry, selection: Selection, champion: ModelVersion) -> str | None:
     """Return why a person must look first: it is better on odd new drives alone; else None.
 
-    Nothing is said where all drives are as known as the others.
-    Raises `StorageError` if which drives made the champion cannot be read.
+    Nothing is said where all drives are as known as the others. Raises `DataError` if there are too
+    few of either, and `StorageError` if which drives made the champion cannot be read.
     """
-    made = registry.trained_drives(champion.manifest)
-    if made is None:
+    if (divided := _divide(registry, selection, [champion])) is None:
         return None
-    try:
-        cohort = _some_drives(selection)
-        known = made.among(hash_numbers(cohort.drives["drive_id"]))
-        if known.any() and not known.all():
-            return _compare(selection, champion, cohort, known)
-    except DataError as error:
-        LOGGER.warning(
-            "not checked whether the improvement comes only from unusual drives: %s", error
-        )
-    return None
-
-
-def _some_drives(selection: Selection) -> Cohort:
-    cohort = selection.cohort
-    if cohort.source is None or cohort.sums is None:
-        return cohort
-    condition, drives = cohort.condition, cohort.drive_count
-    if drives > MOST_DRIVES:
-        below = 16**_HEX * MOST_DRIVES // drives
-        chosen = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
-        condition &= parse_condition(chosen)
-    return load_cohort(cohort.source, condition, cohort.feature_set)
-
-
-def _compare(
-    selection: Selection, champion: ModelVersion, cohort: Cohort, known: BoolArray
-) -> str | None:
+    cohort, known = divided
     asked = contest(selection, [champion])
-    every = np.ones(len(known), dtype=np.bool_)
-    groups, old, new = (_folds(cohort, asked, mask) for mask in (every, known, ~known))
-    incumbent = as_it_is(champion.reference, asked.models[0], old)
-    on_new = as_it_is(champion.reference, asked.models[0], new).pooled.rmse_deg
-    if on_new <= ODD * incumbent.pooled.rmse_deg:
+    groups, old, new = (asked.part(cohort, mask) for mask in (np.ones_like(known), known, ~known))
+    (model,) = asked.incumbents.items()
+    on_old, on_new = (as_it_is(*model, folds).pooled for folds in (old, new))
+    if on_new.rmse_deg <= ODD * on_old.rmse_deg:
         return None
-    challenger = _held_out(selection.winner.model.name, asked, groups, old)
-    shortfall = compare_paired(challenger, incumbent, worth())
+    found = asked.on(groups, old)
+    (shortfall,) = found.shortfalls
     if shortfall.negligible:
         return None
     return (
         "the improvement comes only from unusual new drives: on the training set of "
-        f"{champion.reference} it has {challenger.pooled.rmse_deg:.4f} deg and the champion "
-        f"{incumbent.pooled.rmse_deg:.4f} deg, difference {shortfall}; on the new drives the "
-        f"champion has {on_new:.4f} deg. Check these before training"
+        f"{champion.reference} it has {found.challenger.pooled.rmse_deg:.4f} deg and the champion "
+        f"{on_old.rmse_deg:.4f} deg, difference {shortfall}; on the new drives the champion has "
+        f"{on_new.rmse_deg:.4f} deg. Check these before training"
     )
-
-
-def _held_out(name: str, asked: Contest, groups: Folds, old: Folds) -> CrossValidation:
-    """Cross-validate over all groups, tested on some drives of each."""
-    training = dict(zip(groups.names, (train for train, _ in groups.splits()), strict=True))
-    tests = [
-        held_out_errors(asked.procedure(training[fold]), training[fold], test)
-        for fold, test in zip(old.names, old.grams, strict=True)
-    ]
-    return assemble(name, old, tests, asked.procedure(groups.total), input_scales())
-
-
-def _folds(cohort: Cohort, asked: Contest, wanted: BoolArray) -> Folds:
-    """Return some drives in the groups that the whole cohort has. Raises `DataError`."""
-    values = cohort.drives[FOLD_KEYS[asked.by]].to_pylist()
-    whole = assign_folds(values, asked.by, GROUPS)
-    used, fold = np.unique(whole.fold[wanted], return_inverse=True)
-    names = tuple(whole.names[number] for number in used.tolist())
-    part = cohort.part(wanted)
-    folds = CohortFolds.of(part.tables, FoldAssignment(fold, names), part.drive_numbers)
-    return folds.serving(asked.signals, catalogue().label, sparse=True)
 
 
 @dataclass(frozen=True)
@@ -597,6 +579,10 @@ def judge(
             problems.append(odd)
     except StorageError as error:
         problems.append(f"no comparison on the champion's training set: {error}")
+    except DataError as error:
+        LOGGER.warning(
+            "not checked whether the improvement comes only from unusual drives: %s", error
+        )
     best = next((one.version for one in incumbents if one.reference == comparison.best), None)
     return Judgement(tuple(problems), str(comparison), best, comparison.drifts)
 
