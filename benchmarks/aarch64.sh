@@ -30,7 +30,7 @@ fi
 "$python" -m pip install --quiet --target "$packages" --upgrade --no-deps .
 
 run() {
-    "$@" -c 'from fleet_slip.cli.main import main; main()' --log text --root "$root" run --campaign "$campaign"
+    "$@" -c 'from fleet_slip.cli.main import main; main()' --root "$root" run --campaign "$campaign"
 }
 
 digests() {
