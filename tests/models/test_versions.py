@@ -89,7 +89,12 @@ def test_aliases_move_and_go_back(tmp_path: Path) -> None:
         publish(registry, manifest(Fraction(number)))
     registry.promote("sideslip", 1, CHAMPION)
     registry.promote("sideslip", 2, "shadow")
-    assert registry.history("sideslip").aliases() == {CHAMPION: 1, "shadow": 2}
+    history = registry.history("sideslip")
+    assert history.aliases() == {CHAMPION: 1, "shadow": 2}
+    assert [history.pointed_at(one) for one in (CHAMPION, "shadow", "unknown")] == [1, 2, None]
+    rows = registry.as_table().to_pylist()
+    assert [row["aliases"] for row in rows] == ["champion", "shadow", ""]
+    assert [row["published_at"] for row in rows] == sorted(row["published_at"] for row in rows)
     assert [registry.rollback("sideslip", CHAMPION) for _ in range(3)] == [3, 2, 1]
     with pytest.raises(RefusedError, match="never pointed at another version"):
         registry.rollback("sideslip", CHAMPION)
@@ -202,17 +207,3 @@ def test_a_version_and_the_champion_are_found_without_reading_the_others(
     read.clear()
     assert registry.as_table().num_rows == 20
     assert len(read) <= 3 * 20
-
-
-def test_an_alias_points_where_its_last_move_left_it(tmp_path: Path) -> None:
-    registry = Registry(LocalFolder(tmp_path))
-    for number in (1, 2, 3):
-        publish(registry, manifest(Fraction(number)))
-    registry.promote("sideslip", 1, "tested")
-    registry.rollback("sideslip", CHAMPION)
-    history = registry.history("sideslip")
-    for alias in (CHAMPION, "tested", "unknown"):
-        assert history.pointed_at(alias) == history.aliases().get(alias)
-    rows = registry.as_table().to_pylist()
-    assert [row["aliases"] for row in rows] == ["tested", "champion", ""]
-    assert [row["published_at"] for row in rows] == sorted(row["published_at"] for row in rows)
