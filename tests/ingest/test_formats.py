@@ -71,14 +71,6 @@ def beta(**changes: Any) -> Signal:
     return Signal(**{"samples": BETA_DEG, "timestamps": TIME_S, "name": "beta", **changes})
 
 
-@pytest.mark.parametrize(
-    ("version", "compression"), [("3.30", 0), ("4.10", 0), ("4.10", 1), ("4.20", 2)]
-)
-def test_mdf(tmp_path: Path, version: str, compression: int) -> None:
-    file = write_mdf(tmp_path, [a_x(), beta()], version=version, compression=compression)
-    require_the_drive(read_measured(file, mdf_mapping()))
-
-
 def test_groups_of_an_mdf_file_keep_their_own_times(tmp_path: Path) -> None:
     slow = beta(samples=BETA_DEG[::5], timestamps=TIME_S[::5])
     fast_s = np.arange(-3, 10 * 100) / 1000
@@ -182,17 +174,6 @@ def test_a_channel_of_two_groups_must_be_told_apart(tmp_path: Path) -> None:
     require_the_drive(read_measured(file, mdf_mapping(signals=signals("a_x", "beta@0"))))
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5, 0.8, 0.999])
-def test_a_truncated_mdf_file_is_refused(
-    tmp_path: Path, share: float, capfd: pytest.CaptureFixture[str]
-) -> None:
-    file = write_mdf(tmp_path, [a_x(), beta()])
-    data = file.read_bytes()
-    file.write_bytes(data[: int(share * len(data))])
-    assert "Is it complete? Copy it again" in failure(file, mdf_mapping())
-    assert capfd.readouterr().err == ""
-
-
 @pytest.mark.parametrize(
     ("block", "offset", "value", "message"),
     [
@@ -280,9 +261,6 @@ def test_matlab(tmp_path: Path, write: Callable[[Path, dict[str, Any]], None]) -
     assert log.drives["sideslip"].drop_null().to_pylist() == BETA_COUNTS[::2]
     absent = mat_mapping(signals=signals("Data.Vehicle.ay", "gps.beta"))
     assert "Did the mapping mean 'Data.Vehicle.ax'" in failure(file, absent)
-    content = file.read_bytes()
-    file.write_bytes(content[: len(content) // 2])
-    assert "Is it complete?" in failure(file, mat_mapping())
 
 
 def a_table() -> pa.Table:
