@@ -352,13 +352,14 @@ def publish(
         if found.stays:
             return Publication(found.stays, False, found.reason)
         version = added()
-        if not found.waits:
-            moved = registry.make_champion(version, after=newest_move, best=found.best)
-            return Publication(version, True, found.reason) if moved else None
+        alias, best = (CANDIDATE, None) if found.waits else (CHAMPION, found.best)
         number = version.version
-        there = history.pointed_at(CANDIDATE) == number
-        if not there and not history.move(CANDIDATE, number, "publish", after=newest_move):
+        there = history.pointed_at(alias) == number
+        moved = there or history.move(alias, number, "publish", after=newest_move, best=best)
+        if not moved:
             return None
+        if not found.waits:
+            return Publication(version, True, found.reason)
         until = f"until: fleet-slip promote {version.reference}"
         reason = f"{found.reason} {_why(manifest.name, found.held)}, {until}"
         return Publication(version, not there, reason, candidate=True)
@@ -431,7 +432,7 @@ class _Decision:
         stays: the champion, if nothing is published.
         waits: whether it becomes the candidate.
         held: the move that holds the champion.
-        best: the number of the best champion so far, as `Registry.make_champion` takes it.
+        best: the number of the best champion so far, as `AliasHistory.move` takes it.
     """
 
     reason: str

@@ -378,12 +378,6 @@ class Registry:
         version = versions.after_newest(next_version)
         return self.load(name, version)
 
-    def make_champion(self, version: ModelVersion, *, after: int, best: int | None = None) -> bool:
-        """Point the champion at a version, and at the `best`; False if an alias moved since."""
-        history = self.history(version.manifest.name)
-        there = history.pointed_at(CHAMPION) == version.version
-        return there or history.move(CHAMPION, version.version, "publish", after=after, best=best)
-
     def promote(self, name: str, version: int, alias: str) -> None:
         """Point an alias at a version. Raises `QuestionError` for an unknown version.
 

@@ -158,7 +158,8 @@ def test_what_was_decided_on_another_champion_is_decided_again(tmp_path: Path) -
         seen.append(history.pointed_at(CHAMPION))
         if len(seen) == 1:
             publish(registry, manifest(Fraction(1)))  # another process, in between
-        return registry.make_champion(challenger, after=newest_move) or None
+        number = challenger.version
+        return history.move(CHAMPION, number, "publish", after=newest_move) or None
 
     history.decide(decision)
     assert seen == [None, 2]

@@ -11,7 +11,7 @@ from fleet_slip.models.manifest import (
     SelectedBy,
     TrainedOn,
 )
-from fleet_slip.models.registry import ModelVersion, Registry
+from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 
 
 def manifest(coefficient: Fraction = Fraction(1, 3), name: str = "sideslip") -> Manifest:
@@ -46,5 +46,11 @@ def publish(registry: Registry, manifest: Manifest) -> ModelVersion:
     """Make a manifest the next version of its model, and its champion."""
     version = registry.add(manifest)
     history = registry.history(manifest.name)
-    history.decide(lambda newest: registry.make_champion(version, after=newest) or None)
+    number = version.version
+
+    def move(newest: int) -> bool | None:
+        there = history.pointed_at(CHAMPION) == number
+        return there or history.move(CHAMPION, number, "publish", after=newest) or None
+
+    history.decide(move)
     return version
