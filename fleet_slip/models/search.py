@@ -16,6 +16,7 @@ from fleet_slip.regression.choice import (
     CROSS_VALIDATION,
     DEFAULT_WORTH,
     FEWEST_FOLDS,
+    NestedChoice,
     NestedDistances,
     Rule,
     Winner,
@@ -27,9 +28,8 @@ from fleet_slip.regression.choice import (
     nested_fits,
     select_nested,
 )
-from fleet_slip.regression.choice import NestedChoice as NestedSelection
 from fleet_slip.regression.figures import ErrorSums
-from fleet_slip.regression.folds import CrossValidation, Folds, Procedure, assemble, held_out_errors
+from fleet_slip.regression.folds import CrossValidation, Procedure, assemble, held_out_errors
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Evidence
 from fleet_slip.regression.least_squares import Fit, LinearModel, fit
@@ -59,7 +59,7 @@ class SearchChoice(Record):
 
     rule: Rule
     evidence: Evidence
-    nested: NestedSelection | None = None
+    nested: NestedChoice | None = None
     subsets: tuple[SizeResult, ...] | None = None
     picks: dict[str, int] | None = None
     honest: CrossValidation | None = None
@@ -119,10 +119,8 @@ def select_inputs(
             )
         choice = SearchChoice(rule, chosen.evidence, nested=chosen, honest=honest)
         size = chosen.size
-    if rule.criterion == CROSS_VALIDATION:
-        winner = choose(models, rule.worth)
-    else:
-        winner = _winner(models, size, rule, choice.evidence)
+    by_folds = rule.criterion == CROSS_VALIDATION
+    winner = choose(models, rule.worth) if by_folds else _winner(models, size, choice)
     return SearchResult(tuple(models), winner, choice)
 
 
@@ -138,7 +136,8 @@ def try_distances(
         return str(error)
 
 
-def _winner(models: Sequence[CrossValidation], size: int, rule: Rule, evidence: Evidence) -> Winner:
+def _winner(models: Sequence[CrossValidation], size: int, choice: SearchChoice) -> Winner:
+    rule = choice.rule
     if size == 0:
         raise DataError(
             f"the criterion {rule.criterion} keeps no signal: none says more than chance. Choose "
@@ -148,7 +147,7 @@ def _winner(models: Sequence[CrossValidation], size: int, rule: Rule, evidence: 
     among = "the best subsets" if rule.ranking == ALL_SUBSETS else f"the order by {rule.ranking}"
     reason = (
         f"{rule.criterion} keeps {size} of {len(models)} signals of {among}, taking "
-        f"{evidence.kind} for independent."
+        f"{choice.evidence.kind} for independent."
     )
     return Winner(models[size - 1], best, reason)
 
@@ -184,15 +183,21 @@ def search_models(
     folds = cohort.folds(folding.by, folding.count).serving(inputs, label, sparse=True)
 
     def fits(gram: Gram) -> list[Fit]:
-        return _fits(gram if intercept else gram.about_origin(), inputs, label, search)
+        seen = gram if intercept else gram.about_origin()
+        sets = stepwise_order(seen, inputs, label, search.method, search.most)
+        nested = all(sets[size][:-1] == sets[size - 1] for size in range(1, len(sets)))
+        if sets and nested:
+            return nested_fits(seen, sets[-1], label)[1:]
+        return [fit(seen, chosen, label) for chosen in sets]
 
     chosen = fits(folds.total)
     tests: list[list[ErrorSums]] = [[] for _ in chosen]
     for training, fold in folds.splits():
         for sums, fitted in zip(tests, fits(training), strict=False):
             sums.append(held_out_errors(fitted.model, training, fold))
+    name = search.name or search.method
     models = tuple(
-        _model(folds, sums, fitted, search)
+        assemble(f"{name} {fitted.size}", folds, sums, fitted.model, input_scales())
         for sums, fitted in zip(tests, chosen, strict=True)
         if len(sums) == len(folds.grams)
     )
@@ -210,19 +215,6 @@ def searching(found: SearchedModels, size: int, *, intercept: bool) -> Procedure
         return fit(seen, sets[-1] if sets else (), label).model
 
     return procedure
-
-
-def _model(folds: Folds, sums: Sequence[ErrorSums], fitted: Fit, search: Search) -> CrossValidation:
-    name = f"{search.name or search.method} {fitted.size}"
-    return assemble(name, folds, sums, fitted.model, input_scales())
-
-
-def _fits(gram: Gram, inputs: Sequence[str], label: str, search: Search) -> list[Fit]:
-    sets = stepwise_order(gram, inputs, label, search.method, search.most)
-    nested = all(sets[size][:-1] == sets[size - 1] for size in range(1, len(sets)))
-    if sets and nested:
-        return nested_fits(gram, sets[-1], label)[1:]
-    return [fit(gram, chosen, label) for chosen in sets]
 
 
 def choose_by(
