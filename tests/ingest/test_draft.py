@@ -12,10 +12,10 @@ import pytest
 from fleet_slip.errors import ConfigError, InputError, UsageError
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
+from tests.support import suggested
 from tests.support.measured import read_measured
 from tests.support.reported import call
-from tests.support.suggested import DEGREES, ENGLISH, KMH, LOGS, with_first_units, wrong_guesses
-from tests.support.suggested import suggest as suggest_of
+from tests.support.suggested import DEGREES, ENGLISH, KMH, LOGS, filled_in, with_first_units
 from tests.support.textbook_car import Car, a_car
 
 
@@ -23,10 +23,7 @@ def suggest(folder: Path, file: Path, *options: str) -> dict[str, Any]:
     """Return the draft as it stands in its file, which is filled in and loads."""
     written = folder / "draft.toml"
     call(folder / "root", "mapping", "suggest", str(file), "--output", str(written), *options)
-    text = written.read_text()
-    for line in ("day = 2024-05-31  #", 'vehicle_id = ""', 'vehicle_model = ""'):
-        text = text.replace(f"# {line}", line.replace('""', '"A7"'))
-    text = with_first_units(text)
+    text = with_first_units(filled_in(written.read_text()))
     written.write_text(text)
     log = read_measured(file, load_mapping(str(written)))
     assert log.counts.quarantined == {}
@@ -39,7 +36,7 @@ def as_logged(car: Car, names: dict[str, str], factors: dict[str, float]) -> pl.
 
 @pytest.mark.parametrize("name", LOGS)
 def test_files_of_every_format_are_guessed_right(tmp_path: Path, name: str) -> None:
-    assert wrong_guesses(LOGS[name], suggest_of(LOGS[name], tmp_path)) == []
+    assert suggested.wrong_guesses(LOGS[name], suggested.suggest(LOGS[name], tmp_path)) == []
 
 
 def test_a_draft_does_not_load_until_its_units_are_chosen(tmp_path: Path) -> None:
@@ -58,10 +55,7 @@ def test_a_draft_does_not_load_until_its_units_are_chosen(tmp_path: Path) -> Non
     (tmp_path / "draft.toml").unlink()
     text = call(tmp_path, "mapping", "suggest", str(tmp_path / "log.csv"))
     assert '# Choose the unit: "m/s" or "km/h" or "mph".\nvehicle_speed = {' in text
-    draft = text[text.index("name = ") :]
-    for line in ("day = 2024-05-31  #", 'vehicle_id = ""', 'vehicle_model = ""'):
-        draft = draft.replace(f"# {line}", line.replace('""', '"A7"'))
-    (tmp_path / "draft.toml").write_text(draft)
+    (tmp_path / "draft.toml").write_text(filled_in(text[text.index("name = ") :]))
     with pytest.raises(ConfigError, match="no unit in the file: write the right one"):
         load_mapping(str(tmp_path / "draft.toml"))
 

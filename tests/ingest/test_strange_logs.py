@@ -15,7 +15,7 @@ from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_one_sided, find_suspicions
 from tests.support.reported import call
-from tests.support.suggested import with_first_units
+from tests.support.suggested import filled_in, with_first_units
 from tests.support.textbook_car import Car, a_car
 
 TO_DEG = 180 / np.pi
@@ -103,14 +103,7 @@ def test_a_strangers_log_becomes_the_drives_that_it_has(tmp_path: Path, name: st
     write(tmp_path / name)
     text = call(tmp_path, "mapping", "suggest", str(tmp_path / name)).partition("\n# A draft")[2]
     mapping = tmp_path / "draft.toml"
-    filled = {
-        "# day = 2024-05-31  #": "day = 2024-05-31 #",
-        '# vehicle_id = ""': 'vehicle_id = "A"',
-    }
-    filled['# vehicle_model = ""'] = 'vehicle_model = "m"'
-    for absent, present in filled.items():
-        text = text.replace(absent, present)
-    mapping.write_text(f"# {with_first_units(text)}", encoding="utf-8")
+    mapping.write_text(f"# {with_first_units(filled_in(text))}", encoding="utf-8")
     found, counts = read(tmp_path / name, load_mapping(str(mapping)))
     assert counts.quarantined == {}
     assert len(found) == drives
@@ -198,9 +191,7 @@ def test_date_and_time_stand_in_columns_of_their_own(tmp_path: Path, column: str
     draft = call(tmp_path, "mapping", "suggest", str(tmp_path / "log.csv"))
     text = draft.partition("\n# A draft")[2]
     assert "# day = " not in text
-    for fact in ("vehicle_id", "vehicle_model"):
-        text = text.replace(f'# {fact} = ""', f'{fact} = "A"')
-    (tmp_path / "m.toml").write_text(f"# {text}", encoding="utf-8")
+    (tmp_path / "m.toml").write_text(f"# {filled_in(text)}", encoding="utf-8")
     mapping = load_mapping(str(tmp_path / "m.toml"))
     (drive,), counts = read(tmp_path / "log.csv", mapping)
     assert drive.metadata["started_at"] == start

@@ -31,11 +31,6 @@ ENGLISH = {
     "wheel_fl": "VelFL", "wheel_fr": "VelFR", "wheel_rl": "VelRL", "wheel_rr": "VelRR",
     "sideslip": "Correvit_slip_angle",
 }  # fmt: skip
-GERMAN = {
-    "ax": "Laengsbeschl_a_x", "ay": "Querbeschl_a_y", "yaw_rate": "Gierrate",
-    "steering_wheel": "Lenkradwinkel", "wheel_fl": "Raddrehzahl_VL", "wheel_fr": "Raddrehzahl_VR",
-    "wheel_rl": "Raddrehzahl_HL", "wheel_rr": "Raddrehzahl_HR", "sideslip": "Schwimmwinkel",
-}  # fmt: skip
 ROS = {
     "ax": "/imu/data.linear_acceleration.x", "ay": "/imu/data.linear_acceleration.y",
     "yaw_rate": "/imu/data.angular_velocity.z", "steering_wheel": "/car.steering_wheel_angle",
@@ -75,15 +70,6 @@ def _columns(car: Car, names: Mapping[str, str], factors: Mapping[str, float]) -
 
 def _csv(names: Mapping[str, str], factors: Mapping[str, float]) -> Callable[[Path, Car], None]:
     return lambda file, car: _columns(car, names, factors).write_csv(file)
-
-
-def _german_csv(file: Path, car: Car) -> None:
-    text = _columns(car, GERMAN, {**DEGREES, **KMH}).write_csv(separator=";")
-    file.write_text(text.replace(".", ","), encoding="utf-8")
-
-
-def _parquet(file: Path, car: Car) -> None:
-    _columns(car, ENGLISH, {}).write_parquet(file)
 
 
 def _mdf(file: Path, car: Car) -> None:
@@ -128,11 +114,6 @@ def _blf(file: Path, car: Car) -> None:
         _frames(trace, {name: values[:1200] for name, values in car.items()})
 
 
-def _mf4_bus(file: Path, car: Car) -> None:
-    with can.MF4Writer(file) as trace:
-        _frames(trace, {name: values[:1200] for name, values in car.items()})
-
-
 def _mcap(file: Path, car: Car) -> None:
     fields = [ROS[n].partition(".")[2] for n in ROS if ROS[n].startswith("/car.")]
     vector = f"{'=' * 80}\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
@@ -159,8 +140,7 @@ class Suggested:
 
     Attributes:
         names: column of each signal.
-        factors: value in the file of one SI unit;.
-        least_mps: the car's least speed.
+        factors: value in the file of one SI unit.
         bus: the database of a CAN trace.
     """
 
@@ -168,7 +148,6 @@ class Suggested:
     write: Callable[[Path, Car], None]
     names: Mapping[str, str]
     factors: Mapping[str, float]
-    least_mps: float = 8.0
     bus: CanBus | None = None
 
 
@@ -176,8 +155,6 @@ LOGS: dict[str, Suggested] = {
     "CSV, names of a race team, km/h and degrees": Suggested(
         ".csv", _csv(ENGLISH, {**DEGREES, **KMH}), ENGLISH, {**DEGREES, **KMH}
     ),
-    "CSV, German names, decimal commas": Suggested(".csv", _german_csv, GERMAN, {**DEGREES, **KMH}),
-    "Parquet, SI": Suggested(".parquet", _parquet, ENGLISH, {}, 2.5),
     "MDF 4, g and degrees, a label of 10 Hz": Suggested(
         ".mf4", _mdf, ENGLISH, {"ax": 1 / G_MPS2, "ay": 1 / G_MPS2, **DEGREES}
     ),
@@ -185,7 +162,6 @@ LOGS: dict[str, Suggested] = {
         ".mat", _matlab, {name: f"Data.{name}" for name in ENGLISH}, DEGREES
     ),
     "CAN trace (BLF) with a DBC": Suggested(".blf", _blf, ON_BUS, _BUS_FACTORS, bus=BUS),
-    "MDF 4 with bus logging and a DBC": Suggested(".mf4", _mf4_bus, ON_BUS, _BUS_FACTORS, bus=BUS),
     "MCAP, sensor_msgs/Imu and a message of the car": Suggested(".mcap", _mcap, ROS, {}),
 }
 
@@ -193,8 +169,15 @@ LOGS: dict[str, Suggested] = {
 def suggest(one: Suggested, folder: Path) -> Draft:
     """Write a log, and return the draft of its mapping."""
     file = folder / f"log{one.suffix}"
-    one.write(file, a_car(one.least_mps))
+    one.write(file, a_car())
     return draft_mapping(file, profile_file(file, one.bus))
+
+
+def filled_in(draft: str) -> str:
+    """Return a draft with a day and a car, where it asks for them."""
+    for line in ("day = 2024-05-31  #", 'vehicle_id = ""', 'vehicle_model = ""'):
+        draft = draft.replace(f"# {line}", line.replace('""', '"A7"'))
+    return draft
 
 
 def with_first_units(draft: str) -> str:
