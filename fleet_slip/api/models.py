@@ -147,12 +147,10 @@ class PublishedModels(Rooted):
             require_sound_course(self.warehouse, manifest, delays_s)
         if not (force or candidate):
             registry = self.registry()
-            champion, made = registry.champion(name), None
-            if champion:
-                made = registry.trained_drives(champion.manifest)
-            if champion is None or made is not None:
-                settled = len(champion.manifest.terms) if champion else 0
-                require_sound_drives(self.warehouse, manifest, made, settled)
+            champion = registry.champion(name)
+            made = registry.trained_drives(champion.manifest) if champion else None
+            settled = len(champion.manifest.terms) if champion else 0
+            require_sound_drives(self.warehouse, manifest, made, settled)
         return manifest, selection
 
     def _chosen(self, name: str, choice: "Selection | FleetCohort | None") -> "Selection":
@@ -312,7 +310,7 @@ class JudgedModels(PublishedModels):
         with examined.explaining():
             seen = find_seen(self.warehouse, self.registry(), version.manifest, rows)
             found = score(self.warehouse, version.manifest, rows if cohort else seen.others)
-        without = 0 if cohort or seen.trained == seen.drives else seen.trained or 0
+        without = 0 if cohort or seen.trained == seen.drives else seen.trained
         return replace(
             found,
             drives=seen.drives,

@@ -130,8 +130,8 @@ def _facts(version: ModelVersion) -> dict[str, str]:
         manifest.trained_on,
         manifest.selected_by,
     )
-    cars = "" if trained.vehicles is None else f" of {number_of(trained.vehicles, 'car')}"
-    drives = f"{number_of(trained.drives, 'drive')}{cars}, {number_of(trained.rows, 'row')}"
+    drives = f"{number_of(trained.drives, 'drive')} of {number_of(trained.vehicles, 'car')}, "
+    drives += number_of(trained.rows, "row")
     facts = {
         "correlation": f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})",
         "RMSE": f"{figures.rmse_deg:.4f} deg",

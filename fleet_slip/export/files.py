@@ -20,7 +20,6 @@ from fleet_slip.export.fmu import fmu
 from fleet_slip.export.program import Angle, Input, Program, Target
 from fleet_slip.export.sql import sql_macro, sql_statement
 from fleet_slip.export.templating import c_prefix, different, file_prefix, fill_in_version
-from fleet_slip.models.manifest import checksum_of_drives
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -55,16 +54,13 @@ class Subject:
 def document_of(subject: Subject) -> dict[str, Any]:
     """Return the document of a published version; `sha256` is of everything else in it."""
     version, drives = subject.version, subject.drives
-    drives_sha256 = version.manifest.trained_on.drives_sha256
-    if drives is not None:
-        drives_sha256 = checksum_of_drives(drives)
     content: dict[str, Any] = {
         "format": FORMAT,
         "schema": SCHEMA,
         "model": {
             "reference": version.reference,
             "sha256": version.sha256,
-            "drives_sha256": drives_sha256,
+            "drives_sha256": version.manifest.trained_on.drives_sha256,
             "drives": None if drives is None else base64.b64encode(drives).decode("ascii"),
             "manifest": version.manifest.model_dump(mode="json"),
         },
@@ -188,8 +184,7 @@ def _subject(
     checks = make_checks(version.manifest, program)
     drives = None
     if warehouse is not None:
-        made = Registry.of(warehouse).trained_drives(version.manifest)
-        drives = made.content if made else None
+        drives = Registry.of(warehouse).trained_drives(version.manifest).content
     return Subject(version, program, checks, drives, with_gram)
 
 

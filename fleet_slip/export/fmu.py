@@ -39,7 +39,7 @@ def fmu(version: ModelVersion, program: Program, checks: str, fmi: FmiVersion) -
     words = {
         "token": _token(version),
         "about": f"{version.reference}, SHA-256 {version.sha256}, trained on drives with SHA-256 "
-        f"{version.manifest.trained_on.drives_sha256 or 'unknown'}",
+        f"{version.manifest.trained_on.drives_sha256}",
         "told": _told(program),
         "units": _units(program),
         "valid": "whether there is an angle; where there is none, the angle is 0",

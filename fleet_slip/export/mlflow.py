@@ -181,7 +181,7 @@ def _tags(version: ModelVersion) -> dict[str, str]:
     return {
         "fleet_slip.reference": version.reference,
         SHA256_TAG: version.sha256,
-        "fleet_slip.drives_sha256": trained.drives_sha256 or "",
+        "fleet_slip.drives_sha256": trained.drives_sha256,
         "fleet_slip.drives": str(trained.drives),
         "fleet_slip.feature_set": trained.feature_set,
         "fleet_slip.model": version.manifest.selected_by.model,

@@ -147,7 +147,7 @@ def _properties(version: ModelVersion, program: Program, kind: FloatName) -> dic
     return {
         "model": version.reference,
         "sha256": version.sha256,
-        "drives_sha256": version.manifest.trained_on.drives_sha256 or "",
+        "drives_sha256": version.manifest.trained_on.drives_sha256,
         "signals": ",".join(one.column for one in program.signals),
         "facts": ",".join(one.field for one in program.facts),
         "numbers": ",".join(f"{one.name} in counts of {one.grain:f}" for one in program.numbers),

@@ -274,11 +274,9 @@ def _divide(
 ) -> tuple[Cohort, BoolArray] | None:
     """Return a selection's cohort, and which of its drives made any of some versions.
 
-    None if all or none did, or a version does not tell. Raises `StorageError` if it cannot be read.
+    None if all or none did. Raises `StorageError` if which these are cannot be read.
     """
     made = [registry.trained_drives(one.manifest) for one in versions]
-    if None in made:
-        return None
     cohort = selection.cohort
     if cohort.source is not None and cohort.sums is not None:
         condition, drives = cohort.condition, cohort.drive_count
@@ -288,7 +286,7 @@ def _divide(
             condition &= parse_condition(chosen)
         cohort = load_cohort(cohort.source, condition, cohort.feature_set)
     numbers = hash_numbers(cohort.drives["drive_id"])
-    known = np.any([one.among(numbers) for one in made if one], axis=0)
+    known = np.any([one.among(numbers) for one in made], axis=0)
     return (cohort, known) if known.any() and not known.all() else None
 
 
@@ -310,7 +308,7 @@ def find_faults(manifest: Manifest, champion: Manifest | None) -> list[str]:
         found.append(
             f"it was trained on {number_of(trained.drives, 'drive')}, fewer than {least.min_drives}"
         )
-    if trained.vehicles is not None and trained.vehicles < least.min_vehicles:
+    if trained.vehicles < least.min_vehicles:
         cars = number_of(trained.vehicles, "car")
         found.append(f"it was trained on {cars}, fewer than {least.min_vehicles}")
     if champion is not None:
@@ -345,7 +343,7 @@ def _shrunk(manifest: Manifest, champion: Manifest, part: float) -> list[str]:
     return [
         f"it was trained on {own:,} {what}, less than {part:.0%} of the champion's {other:,}"
         for what, own, other in pairs
-        if own is not None and other is not None and own < part * other
+        if own < part * other
     ]
 
 

@@ -19,7 +19,7 @@ class Difference(Answer):
 
     Attributes:
         facts: values of both by the path of their entry; None where one has no such entry.
-        drives: that made only the one, only the other, and both; None where these are not kept.
+        drives: that made only the one, only the other, and both; None of two models.
     """
 
     one: ModelVersion
@@ -89,9 +89,6 @@ def _drives(
 ) -> tuple[int, int, int] | None:
     if one.manifest.name != other.manifest.name:  # their hashes are salted differently
         return None
-    made = [registry.trained_drives(version.manifest) for version in (one, other)]
-    a, b = (drives.salted if drives else None for drives in made)
-    if a is None or b is None:
-        return None
+    a, b = (registry.trained_drives(version.manifest).salted for version in (one, other))
     both = len(np.intersect1d(a, b, assume_unique=True))
     return len(a) - both, len(b) - both, both

@@ -187,25 +187,21 @@ class CrossValidated(Config):
 
 
 class TrainedOn(Config):
-    """The data that made a model.
-
-    `vehicles` and `drives_sha256` (`TrainedDrives`) are None in older versions;
-    `drives_without_log` sent Gram rows.
-    """
+    """The data that made a model; `drives_without_log` sent Gram rows (`TrainedDrives`)."""
 
     cohort: str
     feature_set: str = "signals"
     drives: Count
-    vehicles: Count | None = None
+    vehicles: Count
     drives_without_log: Annotated[Count | None, _LEFT_OUT] = None
     rows: Count
     logs_version: Count
     grams_version: Count
-    drives_sha256: Sha256 | None = None
+    drives_sha256: Sha256
 
     @model_validator(mode="after")
     def _can_be(self) -> Self:
-        if not max(self.vehicles or 0, self.drives_without_log or 0) <= self.drives <= self.rows:
+        if not max(self.vehicles, self.drives_without_log or 0) <= self.drives <= self.rows:
             raise ValueError("says that there are more cars than drives, or more drives than rows")
         return self
 

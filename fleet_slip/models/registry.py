@@ -345,11 +345,9 @@ class Registry:
         """Return the moves of a model's aliases."""
         return AliasHistory(DocumentFolder(self.folder / name / "history"))
 
-    def trained_drives(self, manifest: Manifest) -> TrainedDrives | None:
-        """Return what drives made a version; None if it does not tell. Raises `StorageError`."""
+    def trained_drives(self, manifest: Manifest) -> TrainedDrives:
+        """Return what drives made a version. Raises `StorageError`."""
         expected = manifest.trained_on.drives_sha256
-        if expected is None:
-            return None
         folder, file = self.folder_of(manifest.name), _drives_file(expected)
         content = folder.read(file)
         if checksum_of_drives(content) != expected:
@@ -359,15 +357,14 @@ class Registry:
             )
         return TrainedDrives.unpacked(manifest.name, content)
 
-    def add(self, manifest: Manifest, drives: bytes | None = None) -> ModelVersion:
+    def add(self, manifest: Manifest, drives: bytes) -> ModelVersion:
         """Make a manifest the next version of its model, after what tells its `drives`.
 
         If the latest is the same estimator from the same rows, it is used: another process added
         it.
         """
         name, versions = manifest.name, self._versions(manifest.name)
-        if drives is not None:
-            self.folder_of(name).create(_drives_file(checksum_of_drives(drives)), drives)
+        self.folder_of(name).create(_drives_file(checksum_of_drives(drives)), drives)
 
         def next_version(latest: int) -> int | None:
             if latest and self.load(name, latest).manifest.same_estimator(manifest):

@@ -51,9 +51,9 @@ class Score(Answer):
     error_p95_deg: float
     error_p99_deg: float
     error_max_deg: float
-    drives: int | None = None
+    drives: int = 0
     """Of the cohort, where they were counted; `drives_trained` of them made the model."""
-    drives_trained: int | None = None
+    drives_trained: int = 0
     drives_left_out: int = 0
     """How many of these are not scored, since no cohort was asked for."""
     rows_without: int = 0
@@ -81,17 +81,13 @@ class Score(Answer):
 
     def _trained(self) -> Iterator[Remark]:
         """Yield which drives made the model: on these its error is that of a fit."""
-        if self.drives_trained is None:
-            yield Remark(
-                f"{self.model} does not record its training set: these drives may be in it."
-            )
-        elif self.drives_left_out:
+        if self.drives_left_out:
             left = number_of(self.drives_left_out, "drive")
             yield Remark(f"left out: {left} of {self.drives:,} that {self.model} was trained on.")
         elif self.drives_trained:
             yield Remark(
                 f"{self.model} was trained on {self.drives_trained:,} of these "
-                f"{number_of(self.drives or 0, 'drive')}: there the error is that of the fit. For "
+                f"{number_of(self.drives, 'drive')}: there the error is that of the fit. For "
                 f"new drives: fleet-slip evaluate {self.model}"
             )
 
@@ -198,10 +194,10 @@ def _figures(estimate_rad: FloatArray, truth_rad: FloatArray, rows: int) -> Scor
 
 @dataclass(frozen=True)
 class SeenDrives:
-    """A cohort's drives, those that made a version (None: not kept), the condition of others."""
+    """A cohort's drives, those that made a version, the condition of others."""
 
     drives: int
-    trained: int | None
+    trained: int
     others: Condition
 
 
@@ -215,10 +211,7 @@ def find_seen(
     query = f"SELECT DISTINCT drive_id FROM {view} WHERE {logged} ORDER BY 1"
     with connect_tables(warehouse, query) as database, asking(database, cohort):
         names = database.sql(query).to_arrow_table()["drive_id"]
-    made = registry.trained_drives(manifest)
-    if made is None:
-        return SeenDrives(len(names), None, cohort)
-    seen = made.among(hash_numbers(names))
+    seen = registry.trained_drives(manifest).among(hash_numbers(names))
     if not seen.any() or seen.all():
         return SeenDrives(len(names), int(seen.sum()), cohort)
     kept = [name for name, old in zip(names.to_pylist(), seen, strict=True) if not old]

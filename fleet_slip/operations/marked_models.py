@@ -70,7 +70,7 @@ def _may_have_seen(
         if here and manifest.trained_on.grams_version >= without:
             return False
         made = registry.trained_drives(manifest)
-        return made is None or not bool(np.isin(made.salted, present(name)).all())
+        return not bool(np.isin(made.salted, present(name)).all())
     except FleetSlipError:
         return True
 
@@ -84,7 +84,7 @@ def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str
         for number in registry.versions(name):
             try:
                 made = registry.trained_drives(registry.load(name, number).manifest)
-                trained = made is None or made.among(hashes).any()
+                trained = bool(made.among(hashes).any())
             except FleetSlipError:
                 trained = True
             if trained:

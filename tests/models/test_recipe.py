@@ -65,7 +65,7 @@ def test_a_version_from_before_that_no_list_chose_needs_to_be_told(tmp_path: Pat
     chosen = SelectedBy(
         model_list="nested:catalogue backward cv", model="5", reason="best", config_sha256="0"
     )
-    registry.add(manifest(name="old").model_copy(update={"selected_by": chosen}))
+    registry.add(manifest(name="old").model_copy(update={"selected_by": chosen}), b"")
     with pytest.raises(QuestionError, match="old@1 was chosen from 'nested"):
         recipe_for(registry, "old", SelectionRequest())
 

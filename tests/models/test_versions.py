@@ -151,7 +151,7 @@ def test_writers_at_once_publish_the_same_estimator_once(tmp_path: Path) -> None
 def test_what_was_decided_on_another_champion_is_decided_again(tmp_path: Path) -> None:
     registry = Registry(LocalFolder(tmp_path))
     history = registry.history("sideslip")
-    challenger = registry.add(manifest(Fraction(2)))
+    challenger = registry.add(manifest(Fraction(2)), b"")
     seen: list[int | None] = []
 
     def decision(newest_move: int) -> bool | None:

@@ -10,6 +10,7 @@ from fleet_slip.models.manifest import (
     ModelTerm,
     SelectedBy,
     TrainedOn,
+    checksum_of_drives,
 )
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 
@@ -36,7 +37,10 @@ def manifest(coefficient: Fraction = Fraction(1, 3), name: str = "sideslip") -> 
             folds_by="drive", folds=5, correlation=0.99, correlation_standard_error=0.001,
             rmse_deg=0.1, error_mean_deg=0.0, error_std_deg=0.1, condition_number=1.0,
         ),
-        trained_on=TrainedOn(cohort="true", drives=3, rows=300, logs_version=1, grams_version=1),
+        trained_on=TrainedOn(
+            cohort="true", drives=3, vehicles=1, rows=300, logs_version=1, grams_version=1,
+            drives_sha256=checksum_of_drives(b""),
+        ),
         selected_by=SelectedBy(model_list="table1", model="1", reason="best", config_sha256="0"),
         package_version="0",
     )  # fmt: skip
@@ -44,7 +48,7 @@ def manifest(coefficient: Fraction = Fraction(1, 3), name: str = "sideslip") -> 
 
 def publish(registry: Registry, manifest: Manifest) -> ModelVersion:
     """Make a manifest the next version of its model, and its champion."""
-    version = registry.add(manifest)
+    version = registry.add(manifest, b"")
     history = registry.history(manifest.name)
     number = version.version
 
