@@ -96,7 +96,7 @@ def condition(belief: Belief, h: Row, innovation: float, variance: float) -> flo
 # ("Integrating INS sensors with GPS measurements for continuous estimation of vehicle sideslip,
 # roll, and tire cornering stiffness", IEEE Transactions on Intelligent Transportation Systems 7,
 # 2006) estimate a gyroscope's bias against an absolute reference. The reference here is not the
-# GPS heading, which a log has not, but the difference of wheel speeds (`wheel_speeds`), which no
+# GPS heading, which a log has not, but the difference of wheel speeds (`AxleSpeeds`), which no
 # tunnel takes away:
 #
 #     r(k) = r(k−1) + Δt w_r        gyroscope   z_g = r + b + w_g

@@ -2,7 +2,7 @@
 
 After Best, Gordon and Dixon, "An extended adaptive Kalman filter for real-time state estimation of
 vehicle handling dynamics", Vehicle System Dynamics 34 (2000); instead of adapting the tyres it
-follows the wheels' loads (`axle_forces`). The state is x = [vx, vy, r, b], with b the bias of the
+follows the wheels' loads (`loaded_axles`). The state is x = [vx, vy, r, b], with b the bias of the
 lateral accelerometer; ax and the steering angle δ drive it, and wheel speed, yaw rate and ay
 correct it. With the lateral forces F of the axles:
 
@@ -11,7 +11,7 @@ correct it. With the lateral forces F of the axles:
     ṙ  = (a Ff cos δ − b Fr)/I             z3 = (Ff cos δ + Fr)/m + b
     ḃ  = 0
 
-The gyroscope's bias is a state of the yaw rate filter (`yaw_rate`) before it. A drive may begin in
+The gyroscope's bias is a state of the yaw rate filter (`belief`) before it. A drive may begin in
 a bend: at first the rear wheels are taken to roll without slip, vy = b r. From vy = 0 the rear
 tyres would slide there, where their force has no slope that leads back.
 """
@@ -101,7 +101,7 @@ TUNABLE = (
     "stiffness_rear_factor",
     *belief.TUNABLE,
 )
-"""The parameters that `tuning.tune` should search."""
+"""The parameters that `identify.tune` should search."""
 
 
 class Variances(NamedTuple):

@@ -43,7 +43,7 @@ TUNABLE = (
     "bias_std_mps2",
     *belief.TUNABLE,
 )
-"""The parameters of Q, R and the first P that `tuning.tune` should search."""
+"""The parameters of Q, R and the first P that `identify.tune` should search."""
 
 
 class Covariances(NamedTuple):
