@@ -20,6 +20,9 @@ from tests.support.measured import csv_text, good_columns
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
 
+Change = Callable[[Car], Car]
+SIGNED = ("ax", "ay", "yaw_rate", "steering_wheel", "sideslip")
+
 
 def kinds(car: Car) -> set[tuple[str, tuple[str, ...]]]:
     return {(one.kind, one.signals) for one in find_suspicions(car)}
@@ -35,10 +38,40 @@ def test_a_car_by_the_textbook_is_above_suspicion(least_mps: float) -> None:
     )
 
 
-@pytest.mark.parametrize("name", ["ax", "ay", "yaw_rate", "steering_wheel", "sideslip"])
-def test_a_sign(name: str) -> None:
-    car = a_car()
-    assert kinds({**car, name: -car[name]}) == {("reversed", (name,))}
+def times(name: str, factor: float) -> Change:
+    return lambda car: {name: factor * car[name]}
+
+
+def swapped(*pairs: tuple[str, str]) -> Change:
+    return lambda car: {a: car[b] for pair in pairs for a, b in (pair, pair[::-1])}
+
+
+FRONT, REAR = (WHEELS[0], WHEELS[1]), (WHEELS[2], WHEELS[3])
+WRONG: list[tuple[Change, str, tuple[str, ...]]] = [
+    *((times(name, -1), "reversed", (name,)) for name in SIGNED),
+    *((times("sideslip", by), "scaled", ("sideslip",)) for by in (20, 2, 1 / 57.3)),
+    (lambda car: {"sideslip": car["sideslip"] + np.radians(1)}, "biased", ("sideslip",)),
+    (lambda car: {"ay": np.full(6000, 0.3)}, "stuck", ("ay",)),
+    (lambda car: {"ax": np.full(6000, np.nan)}, "absent", ("ax",)),
+    (swapped(("ax", "ay")), "swapped", ("ax", "ay")),
+    (lambda car: {"ax": -car["ay"], "ay": car["ax"]}, "swapped", ("ax", "ay")),
+    (swapped(FRONT), "swapped", FRONT),
+    (swapped(REAR), "swapped", REAR),
+    (swapped((FRONT[0], REAR[0]), (FRONT[1], REAR[1])), "swapped", WHEELS),
+]
+
+
+@pytest.mark.parametrize(("change", "kind", "signals"), WRONG)
+def test_what_is_wrong_is_named_and_nothing_else(
+    change: Change, kind: str, signals: tuple[str, ...]
+) -> None:
+    car = a_car(least_mps=2.5)
+    assert kinds({**car, **change(car)}) == {(kind, signals)}
+
+
+def test_a_label_in_degrees_at_speed() -> None:
+    car = a_car(20.0)
+    assert ("scaled", ("sideslip",)) in kinds({**car, "sideslip": 57.3 * (car["sideslip"] + 0.02)})
 
 
 def test_tyres_at_their_limit_tell_nothing_of_the_labels_sign() -> None:
@@ -61,26 +94,6 @@ def test_of_wheels_and_axes_that_contradict_the_fewest_are_at_fault() -> None:
     assert kinds(few) >= {("reversed", ("ay",)), ("reversed", ("yaw_rate",))}
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-def test_the_axes_of_acceleration_swapped(sign: int) -> None:
-    car = a_car()
-    assert ("swapped", ("ax", "ay")) in kinds({**car, "ax": sign * car["ay"], "ay": car["ax"]})
-
-
-@pytest.mark.parametrize("axle", ["f", "r"])
-def test_left_and_right_wheels_swapped(axle: str) -> None:
-    car, left, right = a_car(), f"wheel_{axle}l", f"wheel_{axle}r"
-    found = kinds({**car, left: car[right], right: car[left]})
-    assert ("swapped", (left, right)) in found
-    assert all(kind == "swapped" for kind, _ in found)
-
-
-def test_front_and_rear_wheels_swapped() -> None:
-    car = a_car(least_mps=2.5)
-    swapped = dict(zip(WHEELS, (car[n] for n in (*WHEELS[2:], *WHEELS[:2])), strict=True))
-    assert kinds({**car, **swapped}) == {("swapped", WHEELS)}
-
-
 @pytest.mark.parametrize(
     ("name", "factor", "hint"),
     [
@@ -94,24 +107,6 @@ def test_a_unit_that_lies(name: str, factor: float, hint: str) -> None:
     car = a_car()
     found = [s for s in find_suspicions({**car, name: factor * car[name]}) if s.kind == "scaled"]
     assert any(name in one.signals and hint in one.figure for one in found)
-
-
-def test_a_label_in_degrees() -> None:
-    car = a_car(20.0)
-    assert ("scaled", ("sideslip",)) in kinds({**car, "sideslip": 57.3 * (car["sideslip"] + 0.02)})
-    slow = a_car()
-    assert kinds({**slow, "sideslip": 20 * slow["sideslip"]}) == {("scaled", ("sideslip",))}
-
-
-@pytest.mark.parametrize(
-    ("factor", "offset_deg", "kind"), [(2, 0, "scaled"), (1 / 57.3, 0, "scaled"), (1, 1, "biased")]
-)
-def test_a_label_that_no_car_has_needs_no_peers(
-    factor: float, offset_deg: float, kind: str
-) -> None:
-    car = a_car()
-    wrong = factor * car["sideslip"] + np.radians(offset_deg)
-    assert kinds({**car, "sideslip": wrong}) == {(kind, ("sideslip",))}
 
 
 STEPS = {"ax": 0.08, "ay": 0.08, "yaw_rate": 0.005, "steering_wheel": 0.026, "sideslip": 0.002}
@@ -130,13 +125,6 @@ def test_signals_as_buses_send_them_are_above_suspicion(held: int, least_mps: fl
         step = STEPS.get(name, 0.1)
         sent[name] = np.round(values[last] / step) * step
     assert kinds(sent) == set()
-
-
-def test_a_signal_that_stands_still_or_is_absent() -> None:
-    car = a_car()
-    car["ay"] = np.full(6000, 0.3)
-    car["ax"] = np.full(6000, np.nan)
-    assert kinds(car) == {("stuck", ("ay",)), ("absent", ("ax",))}
 
 
 @pytest.mark.parametrize("change", [lambda v: v[:50], lambda v: 0 * v, lambda v: np.nan * v])
@@ -232,6 +220,10 @@ def test_few_refused_rows_are_no_suspicion() -> None:
     (together,) = find_refusals(few, 1000, {"out_of_range": 120})
     assert together.figure == "120 of 1,000 rows were refused, 120 of them: out_of_range"
     assert not list(find_refusals({("ax", "out_of_range"): 10}, 12, {"out_of_range": 10}))
+    (untimed,) = find_refusals({}, 1000, {"time_duplicate": 60, "time_backwards": 50})
+    assert (untimed.kind, untimed.signals) == ("values", ("time",))
+    assert "110 of 1,000 rows were refused, 60 of them: time_duplicate" in str(untimed)
+    assert not list(find_refusals({}, 1000, {"no_value": 90}))
 
 
 def test_files_that_land_together_say_it_once(tmp_path: Path) -> None:
@@ -263,10 +255,3 @@ def test_rows_that_are_refused_for_their_time_call_for_attention(tmp_path: Path)
         call(tmp_path / "root", *words)
     fleet = fleet_slip.open(tmp_path / "root")
     assert fleet.sql("SELECT count(*) FROM log").fetchall() == [(100,)]
-
-
-def test_reasons_together_are_told() -> None:
-    found = list(find_refusals({}, 1000, {"time_duplicate": 60, "time_backwards": 50}))
-    assert [(one.kind, one.signals) for one in found] == [("values", ("time",))]
-    assert "110 of 1,000 rows were refused, 60 of them: time_duplicate" in str(found[0])
-    assert not list(find_refusals({}, 1000, {"no_value": 90}))
