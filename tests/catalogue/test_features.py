@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from fractions import Fraction
-from math import ceil, floor
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.resources import folder
 from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.counts import nearest
 from tests.support.logs import land, log_rows, random_counts
 
 RADIUS_M = Fraction(31, 100)
@@ -126,11 +126,6 @@ PHYSICS: dict[str, Callable[[Row], Fraction | None]] = {
         (row["wheel_rl"] + row["wheel_rr"] - row["wheel_fl"] - row["wheel_fr"]) / 2
     ),
 }
-
-
-def nearest(value: Fraction) -> int:
-    """Round to the nearest integer, halves away from zero."""
-    return floor(value + Fraction(1, 2)) if value >= 0 else ceil(value - Fraction(1, 2))
 
 
 def counts(rows: int, seed: int) -> dict[str, Any]:

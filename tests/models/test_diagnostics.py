@@ -39,19 +39,6 @@ def test_figures_are_those_of_the_rows() -> None:
     assert document["design_effect"] == found.evidence.design_effect
 
 
-def test_an_offset_of_each_drive_makes_the_naive_errors_too_small() -> None:
-    """The rows of a drive repeat one draw of its offset."""
-    drives = driven(2, COEFFICIENTS, drives=20, rows=200, noise=10)
-    rng = np.random.default_rng(3)
-    for one in drives:
-        one.counts[:, -1] += int(rng.normal(0, 200))
-    found = diagnose(cohort_of(drives), INPUTS, cluster="drive")
-    naive, robust = found.naive.estimates[0], found.robust.estimates[0]
-    assert robust.standard_error > 3 * naive.standard_error
-    assert found.evidence.kind == "drives"
-    assert found.evidence.rows < 20 * 200
-
-
 def test_drives_of_a_car_are_one_piece_of_evidence_unless_told_otherwise() -> None:
     """Against matrices of all rows, with the cars or the drives as clusters."""
     drives = driven(9, COEFFICIENTS, drives=22, rows=30)
@@ -77,16 +64,3 @@ def test_drives_of_a_car_are_one_piece_of_evidence_unless_told_otherwise() -> No
     at = cohort.drives.schema.get_field_index("vehicle_id")
     one_car = cohort.drives.set_column(at, "vehicle_id", pa.array(["a"] * len(drives)))
     assert diagnose(replace(cohort, drives=one_car), INPUTS).cluster == "drive"
-
-
-def test_offsets_of_cars_are_seen_by_cars_alone() -> None:
-    """What all drives of a car share makes the errors by drives too small, and rows worth more."""
-    drives = driven(10, COEFFICIENTS, drives=160, rows=40, noise=10)
-    cars = np.random.default_rng(11).normal(0, 300, 4)
-    for number, one in enumerate(drives):
-        one.counts[:, -1] += int(cars[number % 4])
-    by_car, by_drive = (
-        diagnose(cohort_of(drives), INPUTS, cluster=cluster) for cluster in (None, "drive")
-    )
-    errors = [one.robust.estimates[0].standard_error for one in (by_car, by_drive)]
-    assert errors[0] > 3 * errors[1]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
+from math import ceil, floor
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,11 @@ from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.least_squares import fit
 
 Matrix = NDArray[Any]
+
+
+def nearest(value: Fraction) -> int:
+    """Round to the nearest integer, halves away from zero."""
+    return floor(value + Fraction(1, 2)) if value >= 0 else ceil(value - Fraction(1, 2))
 
 
 def columns_to_counts(rows: list[list[str]]) -> tuple[Matrix, list[Fraction]]:

@@ -1,6 +1,5 @@
 """Pieces of one drive share a fold, however its log was cut."""
 
-from collections.abc import Mapping as Told
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import EACH
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.resources import read_sql
-from tests.support.measured import csv_text
+from tests.support.measured import SIGNALS, a_mapping, csv_text
 
 BEGAN = datetime(2024, 5, 31, 8, tzinfo=UTC)
 
@@ -94,17 +93,8 @@ def test_a_pause_of_ten_minutes_does_not_part_a_trip_and_a_longer_one_does() -> 
 
 
 def mapping(day: str | None = None, **time: Any) -> Mapping:
-    known: Told[str, Any] = {
-        "name": "test",
-        "time": {"column": "t", **time},
-        "drive": {"vehicle_id": "car", "vehicle_model": "sedan", "day": day},
-        "signals": {
-            "ax": {"column": "ax", "unit": "m/s^2"},
-            "ay": {"column": "ay", "unit": "m/s^2"},
-            "sideslip": {"column": "beta", "unit": "deg"},
-        },
-    }
-    return Mapping.model_validate(known)
+    signals = {**SIGNALS, "ay": {"column": "ay", "unit": "m/s^2"}}
+    return a_mapping(time={"unit": None, **time}, drive={"day": day}, signals=signals)
 
 
 def log_of(rng: np.random.Generator, start: datetime, rows: int = 400) -> dict[str, list[str]]:

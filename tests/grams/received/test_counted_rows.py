@@ -135,14 +135,20 @@ def test_a_drive_that_is_there_is_refused_under_any_name(
     assert len(gram_rows(fleet)) == 1
 
 
-def test_a_drive_with_a_log_is_refused(smoke_root: Path, tmp_path: Path) -> None:
-    fleet = fleet_slip.open(shutil.copytree(smoke_root, tmp_path / "data"))
+def renamed(fleet: fleet_slip.Fleet, name: str) -> tuple[dict[str, Any], str]:
+    """Return the row of a logged drive as if a car had counted it, and the drive's own name."""
     row = fleet.sql("FROM grams WHERE feature_set = 'signals' ORDER BY drive_id LIMIT 1")
     (stored,) = row.to_arrow_table().to_pylist()
     signals = tuple(stored["signals"].split(","))
     gram = Gram(signals, stored["n"], tuple(stored["sums"]), tuple(stored["products"]))
     same = {"vehicle_id": stored["vehicle_id"], "day": stored["day"]}
-    path = write_counted(tmp_path / "rows", [row_of(gram, drive_id="other", **same)])
+    return row_of(gram, drive_id=name, **same), stored["drive_id"]
+
+
+def test_a_drive_with_a_log_is_refused(smoke_root: Path, tmp_path: Path) -> None:
+    fleet = fleet_slip.open(shutil.copytree(smoke_root, tmp_path / "data"))
+    same, _ = renamed(fleet, "other")
+    path = write_counted(tmp_path / "rows", [same])
     with pytest.raises(RepeatedError, match="is there already"):
         fleet.ingest_counted(path)
 
@@ -190,18 +196,10 @@ def test_the_command_says_what_landed(run_command: RunCommand, tmp_path: Path) -
 
 
 def test_rows_of_a_drive_go_when_its_log_comes(smoke_root: Path, tmp_path: Path) -> None:
-    whole = fleet_slip.open(smoke_root)
-    (stored,) = (
-        whole.sql("FROM grams WHERE feature_set = 'signals' ORDER BY drive_id LIMIT 1")
-        .to_arrow_table()
-        .to_pylist()
-    )
-    signals = tuple(stored["signals"].split(","))
-    gram = Gram(signals, stored["n"], tuple(stored["sums"]), tuple(stored["products"]))
-    same = {"vehicle_id": stored["vehicle_id"], "day": stored["day"]}
+    same, drive = renamed(fleet_slip.open(smoke_root), "renamed")
     fleet = fleet_slip.open(tmp_path / "data")
-    other = row_of(gram_of(1), drive_id=stored["drive_id"])  # the same name, and other counts
-    rows = [row_of(gram, drive_id="renamed", **same), other, row_of(gram_of(2), "VIN2")]
+    other = row_of(gram_of(1), drive_id=drive)  # the same name, and other counts
+    rows = [same, other, row_of(gram_of(2), "VIN2")]
     fleet.ingest_counted(write_counted(tmp_path / "rows", rows))
     shutil.copytree(smoke_root / "logs", tmp_path / "data" / "logs")
     report = fleet.gram()

@@ -20,6 +20,7 @@ from fleet_slip.grams.changes import Fixes
 from fleet_slip.grams.compute import aggregate, counts_of, wide_grams
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.counts import nearest
 from tests.support.logs import land, log_rows, random_counts
 
 APART = 400
@@ -43,10 +44,6 @@ def hostile_drive(name: str, rows: int, seed: int, *, every: int = 10) -> pa.Tab
     ticks = np.arange(rows) + np.where(np.arange(rows) > rows * 2 // 3, 300, 0)
     at = table.schema.get_field_index("tick")
     return table.set_column(at, "tick", pa.array(ticks.astype(np.int32)))
-
-
-def nearest(value: Fraction) -> int:
-    return int(math.copysign(math.floor(abs(value) + Fraction(1, 2)), value))
 
 
 def plain_changes(table: pa.Table, late: int = 0, apart: int = APART) -> dict[int, tuple[int, ...]]:

@@ -1,7 +1,7 @@
 """Columns over time by the kernel, by SQL and by plain integers: the same, on hostile drives."""
 
 from fractions import Fraction
-from math import ceil, floor
+from math import floor
 from typing import Any
 
 import duckdb
@@ -24,6 +24,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.export.models import DEFINITIONS as OF_MODELS
 from tests.export.models import SPEED
+from tests.support.counts import nearest
 from tests.support.logs import land, log_rows, random_counts
 
 OPEN_ABOVE = Gate(by=SPEED, low=500, peak=1501)
@@ -50,11 +51,6 @@ def drives(draw: st.DrawFn) -> pa.Table:
     table = log_rows("d", counts, mass_kg=mass, vehicle_model=draw(st.sampled_from(["suv", "van"])))
     ticks = pa.array(np.cumsum([0, *steps[1:]]).astype(np.int32))
     return table.set_column(table.schema.get_field_index("tick"), "tick", ticks)
-
-
-def nearest(value: Fraction) -> int:
-    """Round to the nearest integer, halves away from zero."""
-    return floor(value + Fraction(1, 2)) if value >= 0 else ceil(value - Fraction(1, 2))
 
 
 def clip(value: int, bits: int) -> int:

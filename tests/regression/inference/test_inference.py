@@ -29,22 +29,15 @@ def moments_of(drives: list[np.ndarray]) -> DriveMoments:
 @given(st.integers(0, 10**6), st.integers(1, 5))
 def test_cluster_errors_are_those_of_the_rows(seed: int, inputs: int) -> None:
     drives = random_drives(seed, drives=9, inputs=inputs)
-    fitted = fit(gram_of(np.concatenate(drives)), names(inputs)[:-1], "y")
+    order = [*range(inputs)][::-1][:3]
+    fitted = fit(gram_of(np.concatenate(drives)), [f"x{i + 1}" for i in order], "y")
     result = infer_by_clusters(fitted, moments_of(drives), unit_scales(inputs))
-    errors, degrees = by_rows(drives)
+    errors, degrees = by_rows([drive[:, [*order, -1]] for drive in drives])
     np.testing.assert_allclose([e.standard_error for e in result.estimates], errors, rtol=1e-7)
     np.testing.assert_allclose([e.degrees_of_freedom for e in result.estimates], degrees, rtol=1e-6)
     p = 2 * scipy.stats.t.sf(np.abs([e.t for e in result.estimates]), degrees)
     np.testing.assert_allclose([e.p for e in result.estimates], p, rtol=1e-5, atol=1e-14)
     assert result.degrees_of_freedom == 8
-
-
-def test_cluster_errors_of_a_smaller_model() -> None:
-    drives = random_drives(4, inputs=4)
-    fitted = fit(gram_of(np.concatenate(drives)), ["x4", "x2"], "y")
-    found = infer_by_clusters(fitted, moments_of(drives), unit_scales(4))
-    errors, _ = by_rows([drive[:, [3, 1, 4]] for drive in drives])
-    np.testing.assert_allclose([e.standard_error for e in found.estimates], errors, rtol=1e-7)
 
 
 @pytest.mark.parametrize(("cars", "rows"), [(6, 30), (25, 30)])
@@ -59,16 +52,6 @@ def test_intervals_of_few_unequal_cars_hold(cars: int, rows: int) -> None:
             reach = scipy.stats.t.ppf(0.975, one.degrees_of_freedom) * one.standard_error
             inside.append(abs(one.value - 1) <= reach)
     assert np.mean(inside) >= 0.92
-
-
-def test_drive_effects_make_the_classical_error_too_small() -> None:
-    drives = random_drives(8, drives=30, noise=300)
-    fitted = fit(gram_of(np.concatenate(drives)), names(4)[:-1], "y")
-    naive = infer_classically(fitted, unit_scales(4)).estimates[0].standard_error
-    robust = (
-        infer_by_clusters(fitted, moments_of(drives), unit_scales(4)).estimates[0].standard_error
-    )
-    assert robust > 3 * naive
 
 
 def test_variance_inflation_is_that_of_the_inverse_correlations() -> None:
