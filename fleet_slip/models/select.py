@@ -59,7 +59,6 @@ from fleet_slip.regression.drives import (
     DriveMoments,
 )
 from fleet_slip.regression.folds import (
-    CohortFolds,
     CrossValidation,
     cross_validate,
     cross_validate_inputs,
@@ -363,12 +362,17 @@ def select(
         )
     models: list[CrossValidation] = []
     skipped: dict[str, str] = {}
-    for candidate in candidates:
+    scales = input_scales()
+    for one in candidates:
         try:
-            require_odd(candidate.signals, cohort.feature_set)
-            models.append(validate(candidate, divided, intercept=intercept))
+            require_odd(one.signals, cohort.feature_set)
+            models.append(
+                cross_validate_inputs(
+                    one.name, divided, one.signals, label, scales, intercept=intercept
+                )
+            )
         except (DataError, QuestionError) as error:
-            skipped[candidate.name] = str(error)
+            skipped[one.name] = str(error)
     searched: list[SearchedModels] = []
     for search in searches:
         if cohort.drive_count < search.fewest_drives:
@@ -397,20 +401,6 @@ def select(
         winner,
         skipped,
         searched=tuple(searched),
-        intercept=intercept,
-    )
-
-
-def validate(
-    candidate: CandidateModel, folds: CohortFolds, *, intercept: bool = True
-) -> CrossValidation:
-    """Cross-validate one candidate by exact least squares in each fold."""
-    return cross_validate_inputs(
-        candidate.name,
-        folds,
-        candidate.signals,
-        catalogue().label,
-        input_scales(),
         intercept=intercept,
     )
 
