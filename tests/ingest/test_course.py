@@ -185,38 +185,28 @@ def test_a_heading_is_a_question_and_no_line(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("north", "east"),
+    ("one", "other"),
     [
-        ("vel_north", "vel_east"),
-        ("gnss_north_mps", "gnss_east_mps"),
-        ("Vn", "Ve"),
-        ("Geschwindigkeit Nord", "Geschwindigkeit Ost"),
-        ("GpsVelN", "GpsVelE"),
-    ],
-)
-def test_strangers_call_velocities_otherwise(tmp_path: Path, north: str, east: str) -> None:
-    columns = on_time()
-    text = suggested(tmp_path, {east: columns["ve"], north: columns["vn"]})
-    course = tomllib.loads(text)["signals"]["course"]
-    unit = "m/s" if "mps" in north else "choose"
-    assert course == {"north": north, "east": east, "unit": unit}
-    assert "antenna_x_m and antenna_y_m: to be filled in" in text
-
-
-@pytest.mark.parametrize(
-    ("course", "speed"),
-    [
-        ("GPS_Course", "GPS_Speed"),
-        ("Kurs über Grund", "GPS Geschwindigkeit"),
+        *(("vel_north", "vel_east"), ("gnss_north_mps", "gnss_east_mps"), ("Vn", "Ve")),
+        *(("Geschwindigkeit Nord", "Geschwindigkeit Ost"), ("GpsVelN", "GpsVelE")),
+        *(("GPS_Course", "GPS_Speed"), ("Kurs über Grund", "GPS Geschwindigkeit")),
         ("headMot", "gSpeed"),
     ],
 )
-def test_strangers_call_a_course_otherwise(tmp_path: Path, course: str, speed: str) -> None:
+def test_strangers_call_a_course_and_velocities_otherwise(
+    tmp_path: Path, one: str, other: str
+) -> None:
     columns = on_time()
-    found = tomllib.loads(suggested(tmp_path, {course: columns["cog"], speed: columns["sog"]}))
-    expected = {"column": course, "unit": "choose", "clockwise_from_north": True}
-    assert found["signals"]["course"] == expected
-    assert found["signals"]["satellite_speed"]["column"] == speed
+    if one in {"GPS_Course", "Kurs über Grund", "headMot"}:
+        text = suggested(tmp_path, {one: columns["cog"], other: columns["sog"]})
+        expected: Columns = {"column": one, "unit": "choose", "clockwise_from_north": True}
+        assert tomllib.loads(text)["signals"]["satellite_speed"]["column"] == other
+    else:
+        text = suggested(tmp_path, {other: columns["ve"], one: columns["vn"]})
+        unit = "m/s" if "mps" in one else "choose"
+        expected = {"north": one, "east": other, "unit": unit}
+    assert tomllib.loads(text)["signals"]["course"] == expected
+    assert "antenna_x_m and antenna_y_m: to be filled in" in text
 
 
 def test_a_course_that_stands_still_while_the_car_turns_is_none(tmp_path: Path) -> None:

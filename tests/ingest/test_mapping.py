@@ -19,6 +19,7 @@ steer_fl = { column = "steer_fl_deg", unit = "deg" }
 """
 
 
+TIME = 'column = "t", unit = "s"'
 STEER = 'steer_fl = { column = "steer_fl_deg", unit = "deg" }'
 WHEEL = 'wheel_fl = { column = "v", unit = "km/h", radius_m = 0.3 }'
 
@@ -90,6 +91,21 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
         (STEER, WHEEL.replace("km/h", "rpm"), "wheel_fl needs a velocity, such as 'km/h'"),
         (STEER, WHEEL.replace(", radius_m = 0.3", ""), "add radius_m, the rolling radius"),
         (STEER, WHEEL.replace("0.3", "0"), "signals.wheel_fl.radius_m"),
+        ("negate = true", "gain = 0", "gain cannot be 0"),
+        ("negate = true", "delay_s = 11", "delay_s: must be at most 10"),
+        (STEER, "[label]\nfrom_velocities = true", "needs the signal vx"),
+        (STEER, "[label]\nsensor_x_m = 1.0", "needs the signal sideslip"),
+        ('unit = "s"', 'unit = "s", zone = "Europe/Berlin"', "without a time zone"),
+        ('unit = "s"', 'format = "%H:%M", zone = "Nowhere"', "is no time zone"),
+        ('unit = "s"', "epoch = true", "give their 'unit'"),
+        ('unit = "s"', 'unit = "s", date = { column = "d" }', "has the time of day alone"),
+        (
+            'unit = "s"',
+            'format = "%H:%M:%S", date = { column = "d", format = "%H" }',
+            "'%H' is not a strftime format of a date",
+        ),
+        (TIME, "rate_hz = 100, assumed = true, epoch = true", "give their 'unit'"),
+        ('unit = "s"', 'unit = "s", assumed = true', "an unknown rate_hz"),
     ],
 )
 def test_mistakes_are_named_by_file_key_and_reason(

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from fleet_slip.errors import AlarmError, ConfigError
+from fleet_slip.errors import AlarmError
 from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
@@ -196,38 +196,6 @@ def test_date_and_time_stand_in_columns_of_their_own(tmp_path: Path, column: str
     (drive,), counts = read(tmp_path / "log.csv", mapping)
     assert drive.metadata["started_at"] == start
     assert (counts.rows_kept, counts.ticks, counts.quarantined) == (ROWS, ROWS, {})
-
-
-@pytest.mark.parametrize(
-    ("time", "message"),
-    [
-        ('column = "t"\nunit = "s"\nzone = "Europe/Berlin"', "without a time zone"),
-        ('column = "t"\nformat = "%H:%M"\nzone = "Nowhere"', "is no time zone"),
-        ('column = "t"\nepoch = true', "give their 'unit'"),
-        ('column = "t"\nunit = "s"\ndate = { column = "d" }', "has the time of day alone"),
-        (
-            'column = "t"\nformat = "%H:%M:%S"\ndate = { column = "d", format = "%H" }',
-            "'%H' is not a strftime format of a date",
-        ),
-        ("rate_hz = 100\nassumed = true\nepoch = true", "give their 'unit'"),
-        ('column = "t"\nunit = "s"\nassumed = true', "an unknown rate_hz"),
-    ],
-)
-def test_times_that_contradict_themselves(tmp_path: Path, time: str, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        a_mapping(tmp_path, 'ay = { column = "a", unit = "g" }', time)
-
-
-@pytest.mark.parametrize(
-    ("label", "message"),
-    [
-        ("from_velocities = true", "needs the signal vx"),
-        ("sensor_x_m = 1.0", "needs the signal sideslip"),
-    ],
-)
-def test_a_label_needs_what_it_is_made_of(tmp_path: Path, label: str, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        a_mapping(tmp_path, f'ay = {{ column = "a", unit = "g" }}\n[label]\n{label}')
 
 
 def test_a_rate_that_is_assumed_is_said_at_each_ingest(tmp_path: Path) -> None:
