@@ -22,7 +22,7 @@ from fleet_slip.ingest.formats import source as budget
 from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.ingest.load import preview_logs
 from fleet_slip.ingest.mapping import Mapping
-from tests.support.measured import MeasuredLog, a_mapping, failure, read_measured, ticks
+from tests.support.measured import MeasuredLog, a_mapping, failure, own_clock, read_measured, ticks
 
 START = datetime(2024, 5, 31, 12, tzinfo=UTC)
 TIME_S = np.arange(100) / 100
@@ -46,12 +46,8 @@ def signals(ax: str, beta: str, **beta_keys: Any) -> dict[str, Any]:
     }
 
 
-OWN_CLOCK = {"column": None, "unit": None, "own_clock": True}
-
-
 def mdf_mapping(**changes: Any) -> Mapping:
-    given = {"time": OWN_CLOCK, "drive": {"day": None}, "signals": signals("a_x", "beta")}
-    return a_mapping(**{**given, **changes})
+    return own_clock(**{"signals": signals("a_x", "beta"), **changes})
 
 
 def write_mdf(folder: Path, *groups: list[Signal], version: str = "4.10", **save: Any) -> Path:

@@ -16,7 +16,7 @@ from fleet_slip.ingest.formats import mcap as mcap_log
 from fleet_slip.ingest.formats.source import OWN_TIME, Budget
 from fleet_slip.ingest.mapping import Mapping
 from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
-from tests.support.measured import a_mapping, failure, read_measured
+from tests.support.measured import failure, own_clock, read_measured
 from tests.support.reported import call
 from tests.support.ros2 import HEADER
 
@@ -76,8 +76,7 @@ def mapping(**signals: Any) -> Mapping:
         "sideslip": {"column": "/joints.velocity[1]", "unit": "deg"},
         **signals,
     }
-    clock = {"column": None, "unit": None, "own_clock": True}
-    return a_mapping(time=clock, drive={"day": None}, signals=told)
+    return own_clock(signals=told)
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
@@ -88,9 +87,7 @@ def test_messages_of_ros_2(tmp_path: Path, compression: CompressionType) -> None
 def test_json_has_the_times_at_which_it_was_published(tmp_path: Path) -> None:
     file = write_json(tmp_path / "log.mcap", [{"a": {"x": ax}} for ax in AX])
     only = {"ax": {"column": "imu.a.x", "unit": "m/s^2"}}
-    clock = {"column": None, "unit": None, "own_clock": True}
-    plain = a_mapping(time=clock, drive={"day": None}, signals=only)
-    assert read_measured(file, plain).drives["ax"].to_pylist() == AX_COUNTS
+    assert read_measured(file, own_clock(signals=only)).drives["ax"].to_pylist() == AX_COUNTS
 
 
 def write_json(

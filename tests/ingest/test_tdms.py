@@ -16,10 +16,10 @@ from nptdms import ChannelObject, TdmsWriter
 from fleet_slip.ingest.formats import matlab, tdms
 from fleet_slip.ingest.formats.reading import FileFormats, open_source
 from fleet_slip.ingest.formats.source import OWN_TIME
+from tests.support import measured
 from tests.support.measured import a_mapping, failure, physical, read_measured, ticks
 
 START = datetime(2024, 5, 31, 12, tzinfo=UTC)
-OWN_CLOCK = {"column": None, "unit": None, "own_clock": True}
 SIGNALS = {
     "ax": {"column": "ax", "unit": "m/s^2"},
     "sideslip": {"column": "beta", "unit": "deg", "longest_gap_s": 0.3},
@@ -43,7 +43,7 @@ def read(file: Path, *columns: str) -> pl.DataFrame:
 
 
 def own_clock(**changes: Any) -> Any:
-    return a_mapping(**{"time": OWN_CLOCK, "drive": {"day": None}, "signals": SIGNALS, **changes})
+    return measured.own_clock(**{"signals": SIGNALS, **changes})
 
 
 def test_groups_of_several_rates_are_one_drive(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.formats.reading import FileFormats, open_source
 from fleet_slip.ingest.mapping import Mapping, load_mapping
-from tests.support.measured import DRIVE, failure, physical, read_measured, reasons
+from tests.support.measured import DRIVE, failure, own_clock, physical, read_measured, reasons
 from tests.support.reported import call
 
 HEAD = """File created on 31/05/2024 at {created}
@@ -63,9 +63,7 @@ def mapping(**changes: Any) -> Mapping:
         "ay": {"column": "Latacc", "unit": "g"},
         "yaw_rate": {"column": "Yaw", "unit": "deg/s"},
     }
-    known = {name: value for name, value in DRIVE.items() if name != "day"}
-    whole = {"name": "m", "time": {"own_clock": True}, "drive": known, "signals": signals}
-    return Mapping.model_validate(whole | changes)
+    return own_clock(**{"signals": signals, **changes})
 
 
 def test_columns_have_their_units_and_the_clock_its_date(tmp_path: Path) -> None:
@@ -162,7 +160,7 @@ def test_a_mapping_that_reads_it_as_csv_still_does(tmp_path: Path) -> None:
     text = write(tmp_path / "a.vbo")
     lines = text.split("\n")
     csv = {"header_line": lines.index("[column names]") + 2, "data_line": lines.index("[data]") + 2}
-    clock = {"column": "time", "format": "%H%M%S%.f"}
+    clock = {"column": "time", "unit": None, "format": "%H%M%S%.f"}
     as_csv = mapping(csv={"separator": " ", **csv}, time=clock, drive=DRIVE)
     rows, also = (read_measured(tmp_path / "a.vbo", one) for one in (mapping(), as_csv))
     for name in ("tick", "ay", "yaw_rate", "vehicle_speed"):

@@ -17,6 +17,7 @@ from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
 
 TIME = {"column": "t", "unit": "s"}
+OWN_CLOCK = {"column": None, "unit": None, "own_clock": True}
 DRIVE = {"day": date(2024, 5, 31), "vehicle_id": "car", "vehicle_model": "sedan"}
 SIGNALS = {
     "ax": {"column": "ax", "unit": "m/s^2"},
@@ -92,6 +93,11 @@ def a_mapping(**changes: Any) -> Mapping:
         **changes,
     }
     return Mapping.model_validate(whole)
+
+
+def own_clock(**changes: Any) -> Mapping:
+    """A mapping of a file whose own clock has a date."""
+    return a_mapping(**{"time": OWN_CLOCK, "drive": {"day": None}, **changes})
 
 
 def csv_text(columns: dict[str, Any], separator: str = ",") -> str:
