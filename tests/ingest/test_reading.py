@@ -63,15 +63,6 @@ def test_semicolons_and_decimal_commas(tmp_path: Path) -> None:
     assert got.equals(without_names(read_text(tmp_path, GOOD).drives))
 
 
-def test_csv_and_parquet_give_the_same_counts(tmp_path: Path) -> None:
-    columns = {name: np.array(values, dtype=float) for name, values in good_columns().items()}
-    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
-    binary = read_measured(tmp_path / "log.parquet", a_mapping())
-    text = read_text(tmp_path, GOOD)
-    assert without_names(binary.drives).equals(without_names(text.drives))
-    assert binary.digest != text.digest
-
-
 def test_blocks_are_cut_at_lines_and_not_within_quotes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
