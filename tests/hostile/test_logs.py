@@ -23,7 +23,7 @@ from fleet_slip.ingest.formats import source
 from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.mapping import Mapping
 from tests.support.fuzz.logs import DBC, FORMATS, sound_file
-from tests.support.measured import a_mapping, read_measured
+from tests.support.measured import OWN_CLOCK, a_mapping, read_measured
 from tests.support.waiting import within
 
 COLUMNS = ("t", "ax", "beta")
@@ -166,7 +166,7 @@ def test_columns_that_unfold_to_many_bytes_are_not_read(
 
 # MDF
 
-MDF_MAPPING = a_mapping(time={"column": None, "unit": None, "own_clock": True})
+MDF_MAPPING = a_mapping(time=OWN_CLOCK)
 
 
 def mdf(file: Path, version: str = "4.10", outside: Path | None = None) -> Path:
@@ -199,8 +199,7 @@ def test_an_attachment_of_a_channel_is_not_read(
     with MDF(file) as log:
         assert log.get("video").attachment[0] == str(SECRET).encode()  # type: ignore[index]
     assert seen == ["secret"]
-    signals = {"ax": {"column": "video", "unit": "m/s^2"}}
-    mapping = a_mapping(time={"column": None, "unit": None, "own_clock": True}, signals=signals)
+    mapping = a_mapping(time=OWN_CLOCK, signals={"ax": {"column": "video", "unit": "m/s^2"}})
     assert read_measured(file, mapping).counts.ticks == ROWS
     assert seen == ["secret"]
 

@@ -18,7 +18,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest import drives, stream, time_bases
 from fleet_slip.ingest.formats.source import BASE, OWN_TIME, Channel, Source
 from fleet_slip.ingest.time_bases import DISORDER, HELD, ROW, merge_bases
-from tests.support.measured import MeasuredLog, a_mapping, read_measured
+from tests.support.measured import OWN_CLOCK, MeasuredLog, a_mapping, own_clock, read_measured
 
 GAP_S = 1.0
 
@@ -191,7 +191,7 @@ def test_what_becomes_of_a_log_does_not_depend_on_windows(
         )
     )
     mapping = a_mapping(
-        time={"column": None, "unit": None, "own_clock": True, "longest_gap_s": 0.15},
+        time={**OWN_CLOCK, "longest_gap_s": 0.15},
         signals={
             "ax": {"column": "ax", **keys},
             "ay": {"column": "ay", "unit": "m/s^2", "longest_gap_s": 0.4},
@@ -220,9 +220,7 @@ def test_stretches_are_numbered_in_the_order_of_time(tmp_path: Path) -> None:
         pl.DataFrame({OWN_TIME: 1.7e9 + time_s, "ax": np.sin(time_s)}),
         pl.DataFrame({OWN_TIME: 1.7e9 + shifted, "beta": np.sin(time_s)}),
     ]
-    mapping = a_mapping(
-        time={"column": None, "unit": None, "own_clock": True},
-        drive={"day": None},
+    mapping = own_clock(
         signals={
             "ax": {"column": "ax", "unit": "m/s^2"},
             "sideslip": {"column": "beta", "unit": "rad"},
