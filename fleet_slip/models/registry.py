@@ -133,6 +133,11 @@ class AliasHistory:
         self, alias: str, version: int, command: Command, *, after: int, best: int | None = None
     ) -> bool:
         """Point an alias at a version; return False if there were moves after the one given."""
+        if not re.fullmatch(IDENTIFIER_PATTERN, alias):
+            raise QuestionError(
+                f"{alias!r} cannot be an alias: use small letters, digits and _, beginning with a "
+                "letter, at most 41."
+            )
         move = AliasMove(
             alias=alias,
             version=version,
