@@ -22,7 +22,7 @@ from fleet_slip.catalogue.definitions import (
 )
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config
-from fleet_slip.errors import QuestionError
+from fleet_slip.errors import QuestionError, StorageError
 
 DIGITS = 12
 
@@ -89,16 +89,28 @@ def remember_line(line: FittedLine) -> None:
 
 def look_for_lines(where: str, find: Callable[[str], FittedLine | None]) -> None:
     """Look for unknown lines there, too, such as in a data root."""
+    _sources.pop(where, None)  # the root opened last is asked first
     _sources[where] = find
 
 
 def known_line(digest: str) -> FittedLine:
-    """Return a line. Raises `QuestionError` for an unknown one."""
-    for find in reversed(_sources.values()):
-        if digest not in _lines and (found := find(digest)) is not None:
-            remember_line(found)
+    """Return a line. Raises `QuestionError` for an unknown one, `StorageError` of the last root.
+
+    A root that was opened before, and cannot be read any more, is passed over.
+    """
+    broken: StorageError | None = None
+    for place, find in enumerate(reversed(_sources.values())):
+        if digest in _lines:
+            break
+        try:
+            found = find(digest)
+        except StorageError as error:
+            broken = broken if place else error
+        else:
+            if found is not None:
+                remember_line(found)
     if digest not in _lines:
-        raise QuestionError(
+        raise broken or QuestionError(
             f"no line {digest} is known here: its data root has it. Publish the model again."
         )
     return _lines[digest]

@@ -13,7 +13,14 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.definitions import Combination
 from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.lines import FittedLine, _lines, _sources, whole_line
+from fleet_slip.catalogue.lines import (
+    FittedLine,
+    _lines,
+    _sources,
+    known_line,
+    look_for_lines,
+    whole_line,
+)
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns
 from fleet_slip.columns.plan import ColumnPlan
@@ -229,3 +236,19 @@ def test_a_line_whose_estimate_would_not_be_exact_is_refused() -> None:
     column = features().time_columns["ay_mean_16"].definition
     with pytest.raises(QuestionError, match="exact"):
         whole_line(input_scales()["ay"], [input_scales()["ay"] * 2**40], [column])
+
+
+def test_a_root_that_is_gone_does_not_fail_the_questions_of_another(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fleet_slip.catalogue.lines._sources", dict(_sources))
+
+    def gone(digest: str) -> FittedLine | None:
+        raise StorageError(f"no credentials to look for {digest}")
+
+    look_for_lines("s3://elsewhere/data", gone)
+    with pytest.raises(StorageError, match="no credentials"):
+        known_line("0123456789ab")
+    look_for_lines(str(fleet.warehouse.root), fleet.warehouse.line)
+    with pytest.raises(QuestionError, match="no line 0123456789ab"):
+        known_line("0123456789ab")
