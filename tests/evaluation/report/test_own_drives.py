@@ -11,9 +11,7 @@ from tests.support.reported import Reported
 
 
 @pytest.fixture(scope="module")
-def evaluated(
-    reported: Reported, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, Finished]:
+def judged(reported: Reported, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Finished]:
     """A data root with a model of such drives, and what its evaluation said."""
     folder = tmp_path_factory.mktemp("own")
     root = Path(shutil.copytree(reported.root, folder / "data"))
@@ -24,17 +22,17 @@ def evaluated(
 
 @pytest.mark.long
 def test_who_cannot_be_tuned_says_so_in_a_line_and_competes(
-    evaluated: tuple[Path, Finished],
+    judged: tuple[Path, Finished],
 ) -> None:
-    _, done = evaluated
+    _, done = judged
     assert "kalman left untuned: no GPS fix" in done.stderr
     assert "ekf_class left untuned" in done.stderr
     assert "nominal" in done.stdout
 
 
 @pytest.mark.long
-def test_the_report_has_what_is_left(evaluated: tuple[Path, Finished]) -> None:
-    root, _ = evaluated
+def test_the_report_has_what_is_left(judged: tuple[Path, Finished]) -> None:
+    root, _ = judged
     done_on(root, "evaluate", "own", "--cohort", "source = 'measured'")
     done_on(root, "report", "own")
     page = (root / "report" / "report.html").read_text()
