@@ -169,21 +169,6 @@ class Facts:
         run, choice = self.data.runs["nominal"], self.data.choice
         return {name: difference(run, choice, name) for name in DRAWN_FILTERS}
 
-    def over_gps_noise(self) -> str:
-        """Tell at which noise of GPS the tuned filter is as accurate as the regression."""
-        sweep = self._evaluated.document.content.get("gps_noise")
-        if sweep is None:
-            return ""
-        levels = [level["velocity_std_mps"] for level in sweep["levels"]]
-        span = f"noises of GPS velocity from {min(levels):g} to {max(levels):g} m/s"
-        equal = sweep["equal_at_mps"].get("kalman_tuned", {}).get(self.data.choice)
-        if equal is None:
-            return f"Among {span} there is none at which both are equal. "
-        return (
-            f"It hangs on GPS: of {span}, the tuned filter is better below {equal:.3f} and the "
-            "regression above. "
-        )
-
     def in_outages(self) -> list[str]:
         """Tell the errors while satellite navigation is out."""
         found = []

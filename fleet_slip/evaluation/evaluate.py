@@ -3,14 +3,12 @@
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib.metadata import version as package_version
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from fleet_slip.arrays import FloatArray
 from fleet_slip.base import number_of
 from fleet_slip.evaluation.blind import judge_blindly
 from fleet_slip.evaluation.drives import (
@@ -20,17 +18,14 @@ from fleet_slip.evaluation.drives import (
 )
 from fleet_slip.evaluation.filters import (
     Bank,
-    FilterEstimate,
     TrainedModels,
     TuningDrives,
     filter_bank,
     train_models,
 )
 from fleet_slip.evaluation.judge import (
-    Estimate,
     EvaluatedScenario,
     compare_models,
-    error_figures,
     evaluate_drive,
     rank,
 )
@@ -38,7 +33,6 @@ from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.simulation.scenario import Scenario, load_scenario
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import Document, DocumentFolder, checksum
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -76,8 +70,6 @@ def evaluate(
     estimators = {name: one for name, (one, _) in bank.items()}
     runs = [evaluate_drive(one, estimators) for one in simulate_drives(scenarios)]
     gps = {name for name, (_, about) in bank.items() if about.get("gps")}
-    filters = {name: estimators[name] for name in bank if name in gps}
-    own = [*first.table_one.values(), first.version.reference]
     return {
         "format": 1,
         "package_version": package_version("fleet-slip"),
@@ -91,7 +83,6 @@ def evaluate(
             for row in compare_models(runs, first.table_one, fleet.table_one)
         ],
         "ranking": rank(runs, first.version.reference, gps),
-        "gps_noise": sweep_gps_noise(runs, filters, own),
     }
 
 
@@ -284,93 +275,3 @@ def keep(documents: DocumentFolder, content: Mapping[str, Any]) -> Evaluation:
         return documents.create(newest + 1, content)
 
     return Evaluation(**vars(documents.after_newest(attempt)))
-
-
-# Below which noise of satellite navigation the paper's filter is better than a regression.
-#
-# The GPS velocity of the nominal drive is drawn again from the true one, without outages, with
-# white noise of several sizes, each of which the filter knows. The regression uses no GPS.
-
-GPS_SCENARIO = "nominal"
-LEVELS_MPS = (0.01, 0.015, 0.02, 0.025, 0.03, 0.035, 0.04, 0.05, 0.06, 0.08, 0.1)
-"""Standard deviations of the GPS velocity, along and across."""
-
-DRAWS = 5
-"""Draws of the noise at each level; the same ones, scaled, at all levels."""
-
-SEED = 8
-STATED = ("gps_vx_std_mps", "gps_vy_std_mps")
-"""The filter's parameters that say how noisy GPS is."""
-
-
-def sweep_gps_noise(
-    runs: Sequence[EvaluatedScenario],
-    filters: Mapping[str, Estimate],
-    regressions: Sequence[str],
-) -> dict[str, Any] | None:
-    """Return the RMSE in deg of filters by GPS noise, and where they equal regressions.
-
-    None if the nominal drive is not among the runs.
-    """
-    run = next((run for run in runs if run.name == GPS_SCENARIO), None)
-    if run is None:
-        return None
-    known = {name: one for name, one in filters.items() if isinstance(one, FilterEstimate)}
-    by_filter = {
-        name: [rmse_deg(run.drive, one, std) for std in LEVELS_MPS] for name, one in known.items()
-    }
-    whole = {name: run.results[name].whole.rmse_deg for name in regressions}
-    errors = {name: error for name, error in whole.items() if error is not None}
-    return {
-        "scenario": GPS_SCENARIO,
-        "rate_hz": run.scenario.sensors.gps.rate_hz,
-        "draws": DRAWS,
-        "levels": [
-            {
-                "velocity_std_mps": std,
-                "rmse_deg": {name: found[level] for name, found in by_filter.items()},
-            }
-            for level, std in enumerate(LEVELS_MPS)
-        ],
-        "regressions": errors,
-        "equal_at_mps": {
-            name: {regression: equal_at_mps(found, error) for regression, error in errors.items()}
-            for name, found in by_filter.items()
-        },
-    }
-
-
-def equal_at_mps(errors_deg: Sequence[float], rmse_deg: float) -> float | None:
-    """Return the noise at which a filter's errors by `LEVELS_MPS` reach a value; else None."""
-    by_level = zip(LEVELS_MPS, errors_deg, strict=True)
-    for (low, below), (high, above) in pairwise(by_level):
-        if below <= rmse_deg <= above and below < above:
-            return low + (rmse_deg - below) / (above - below) * (high - low)
-    return None
-
-
-def rmse_deg(drive: EvaluatedDrive, one: FilterEstimate, velocity_std_mps: float) -> float:
-    """Return a filter's RMSE in deg over all draws; it believes as much more noise as there is."""
-    stated = drive.scenario.sensors.gps.velocity_std_mps
-    believed = {name: getattr(one.parameters, name) * velocity_std_mps / stated for name in STATED}
-    noisier = replace(one, parameters=one.parameters.model_copy(update=believed)).in_drive(drive)
-    generator = np.random.default_rng(SEED)
-    squares = []
-    for _ in range(DRAWS):
-        estimate = noisier({**drive.signals, **drawn_gps(drive, velocity_std_mps, generator)})
-        figures = error_figures(estimate, drive.sideslip_rad, drive.evaluated)
-        squares.append(np.nan if figures.rmse_deg is None else figures.rmse_deg**2)
-    return float(np.sqrt(np.mean(squares)))
-
-
-def drawn_gps(
-    drive: EvaluatedDrive, velocity_std_mps: float, generator: np.random.Generator
-) -> dict[str, FloatArray]:
-    """Return the true velocity with white noise at every fix, NaN between them."""
-    every = SAMPLE_RATE_HZ // drive.scenario.sensors.gps.rate_hz
-    fixes = np.arange(len(drive.time_s)) % every == 0
-    noise = velocity_std_mps * generator.standard_normal((2, len(fixes)))
-    return {
-        "gps_vx_mps": np.where(fixes, drive.vx_mps + noise[0], np.nan),
-        "gps_vy_mps": np.where(fixes, drive.vy_mps + noise[1], np.nan),
-    }
