@@ -69,9 +69,20 @@ def check_local_files(paths: Iterable[str]) -> None:
             list(executor.map(_check_local, named))
 
 
+def gone(path: str) -> StorageError:
+    """Return the error of a data file that was there when its table was opened."""
+    return StorageError(
+        f"{path} is gone. If forget --now or compact deleted it meanwhile, run the same command "
+        "again; otherwise restore it from a backup."
+    )
+
+
 def _check_local(path: str) -> None:
     with storage_errors(path):
-        status = Path(path).stat()
+        try:
+            status = Path(path).stat()
+        except FileNotFoundError:
+            raise gone(path) from None
     _check_once(path, status.st_size, status.st_mtime_ns, status.st_ino)
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import json
+import re
 import resource
 import threading
 import time
@@ -22,7 +23,7 @@ from fleet_slip.errors import (
     printable,
 )
 from fleet_slip.limits import data_needed, memory_bytes
-from fleet_slip.storage.checksums import check_local_files
+from fleet_slip.storage.checksums import check_local_files, gone
 from fleet_slip.storage.folder import Folder
 
 SPILL_LIMIT = "20GB"
@@ -138,6 +139,9 @@ _OF_FILES = (
 )
 
 
+_DELETED = re.compile(r'"(.*)/\*\*/\*\.parquet"')
+"""How DuckDB names a file that was deleted after a view was made of it: as a folder."""
+
 _STREAMED: dict[str, type[Exception]] = {
     "Conversion Error": duckdb.ConversionException,
     "Out of Range Error": duckdb.OutOfRangeException,
@@ -178,6 +182,10 @@ def database_errors(doing: str) -> Iterator[None]:
     except (duckdb.OutOfMemoryException, MemoryError) as error:
         reason = duckdb_message(error) or f"out of memory ({memory_bytes() // 2**20:,} MiB)"
         raise StorageError(f"{doing} failed: {reason}. Ask for less at once.") from None
+    except duckdb.PermissionException as error:
+        if deleted := _DELETED.search(str(error)):
+            raise gone(deleted[1]) from None
+        raise QuestionError(f"{doing} failed: {duckdb_message(error)}") from None
     except _OF_FILES as error:
         raise StorageError(f"{doing} failed: {duckdb_message(error)}. {_RESTORE}") from None
     except duckdb.Error as error:

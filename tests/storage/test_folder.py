@@ -15,7 +15,7 @@ import obstore
 import pytest
 
 import fleet_slip
-from fleet_slip.errors import StorageError
+from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.storage import objects
 from fleet_slip.storage.data_root import data_root
@@ -24,6 +24,7 @@ from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Unit, retry_conflicts
 from fleet_slip.views import connect
+from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import DAY, land, log_rows, random_counts
 from tests.support.s3_server import ACCESS_KEY, SECRET_KEY, Server
@@ -149,6 +150,20 @@ def test_a_locked_connection_reads_the_snapshot_and_nothing_else(root: Folder) -
             with pytest.raises(duckdb.PermissionException):
                 database.execute(query).fetchall()
     assert "new.csv" not in root.names()
+
+
+def test_a_session_says_that_a_file_is_gone(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    land(warehouse, "one", rows("a"))
+    with fleet_slip.open(tmp_path).session() as session:
+        with pytest.raises(QuestionError, match="disabled by configuration"):
+            session.table("FROM read_parquet('/etc/passwd')")
+        [file] = warehouse.logs.snapshot().files
+        warehouse.logs.folder.delete(file.path)
+        with pytest.raises(StorageError, match=r"is gone\. If forget --now or compact deleted it"):
+            session.table("SELECT sum(ay_mps2) FROM log")
+        with pytest.raises(StorageError, match="is gone"), database_errors("the query"):
+            session.database.execute("SELECT sum(ay_mps2) FROM log").fetchall()
 
 
 @pytest.mark.parametrize(
