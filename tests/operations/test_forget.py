@@ -235,6 +235,21 @@ def test_a_car_all_of_whose_rows_were_refused_goes_too(tmp_path: Path, subject: 
     assert not forget(warehouse, chosen).changed
 
 
+def test_a_refused_row_of_no_drive_goes_with_its_car_and_counts_as_none(
+    warehouse: Warehouse, tmp_path: Path
+) -> None:
+    columns = good_columns(50) | {"day": ["2024-05-31"] * 49 + ["unknown"]}
+    (tmp_path / "x.csv").write_text(csv_text(columns))
+    mapping = a_mapping(drive={"day": {"column": "day"}})
+    assert ingest_file(warehouse, tmp_path / "x.csv", mapping).counts.drives == 1
+    (path,) = warehouse.quarantine.snapshot().paths
+    assert pq.read_table(path).select(["drive_id", "vehicle_id"]).to_pylist() == [
+        {"drive_id": None, "vehicle_id": "car"}
+    ]
+    assert forget(warehouse, Forgettable("vehicle", "car"), now=True).drives == 1
+    assert not warehouse.quarantine.snapshot().files
+
+
 def test_retention_forgets_by_age_and_refuses_to_leave_nothing(tmp_path: Path) -> None:
     warehouse = Warehouse(LocalFolder(tmp_path))
     for month in (1, 2, 3):
