@@ -29,6 +29,7 @@ from fleet_slip.ingest.formats.source import Budget, Spool
 from fleet_slip.ingest.mapping import load_mapping
 from tests.support.logs import without_names
 from tests.support.measured import MeasuredLog, read_measured, ticks
+from tests.support.reported import call
 
 START_S = datetime(2024, 5, 31, 12, tzinfo=UTC).timestamp()
 TIME_S = np.arange(50) / 100
@@ -188,6 +189,16 @@ def test_a_trace_without_a_database_is_refused(tmp_path: Path) -> None:
         read(file, MAPPING.replace("car.dbc", "absent.dbc"))
     with pytest.raises(ConfigError, match=r"a CAN database is a file \.dbc"):
         read(file, MAPPING.replace("car.dbc", "car.xls"))
+
+
+def test_a_draft_has_the_signals_and_units_of_the_database(tmp_path: Path) -> None:
+    file = write_trace(tmp_path, [motion(i) for i in range(50)])
+    named = DBC.replace(" ax ", " AccelLong ").replace(" beta ", " SlipAngle ")
+    (tmp_path / "car.dbc").write_text(named)
+    words = ("mapping", "suggest", str(file), "--can", str(tmp_path / "car.dbc"))
+    draft = call(tmp_path, *words)
+    assert 'ax = { column = "Motion.AccelLong", unit = "m/s^2" }' in draft
+    assert 'sideslip = { column = "Motion.SlipAngle", unit = "deg" }' in draft
 
 
 def test_the_content_of_the_database_counts_and_its_path_does_not(tmp_path: Path) -> None:

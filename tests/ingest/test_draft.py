@@ -1,7 +1,10 @@
-"""Drafts of mappings, of cars whose signals are known: how many guesses are right."""
+"""Drafts of mappings: of cars whose signals are known, and of logs as departments write them."""
 
+import re
 import shlex
 import tomllib
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -9,21 +12,41 @@ import numpy as np
 import polars as pl
 import pytest
 
-from fleet_slip.errors import ConfigError, InputError, UsageError
+from fleet_slip.errors import AlarmError, ConfigError, InputError, UsageError
+from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
-from tests.support import suggested
 from tests.support.measured import read_measured
 from tests.support.reported import call
-from tests.support.suggested import DEGREES, ENGLISH, KMH, LOGS, filled_in, with_first_units
 from tests.support.textbook_car import Car, a_car
+
+TO_DEG = 180 / np.pi
+DEGREES = dict.fromkeys(("yaw_rate", "steering_wheel", "sideslip"), TO_DEG)
+KMH = dict.fromkeys(WHEELS, 3.6 * RADIUS_M)
+ENGLISH = {
+    "ax": "LongAcc", "ay": "LatAcc_obd", "yaw_rate": "YawRate", "steering_wheel": "SW_pos",
+    "wheel_fl": "VelFL", "wheel_fr": "VelFR", "wheel_rl": "VelRL", "wheel_rr": "VelRR",
+    "sideslip": "Correvit_slip_angle",
+}  # fmt: skip
+START = datetime(2024, 3, 12, 9, 14, 30, tzinfo=UTC)
+ROWS = 6000
+
+
+def filled_in(draft: str, units: bool = True) -> str:
+    """Return a draft with a day, a car, and the first of the units, where it asks for them."""
+    for line in ("day = 2024-05-31  #", 'vehicle_id = ""', 'vehicle_model = ""'):
+        draft = draft.replace(f"# {line}", line.replace('""', '"A7"'))
+    asked = r'# Choose the unit: "(.+?)"( with ([^ ]+ = [^ ]+))?( or .*)?\.\n(.*)"choose"'
+    chosen = re.sub(asked, lambda m: f'{m[5]}"{m[1]}"' + (f", {m[3]}" if m[3] else ""), draft)
+    return chosen if units else draft
 
 
 def suggest(folder: Path, file: Path, *options: str) -> dict[str, Any]:
     """Return the draft as it stands in its file, which is filled in and loads."""
     written = folder / "draft.toml"
     call(folder / "root", "mapping", "suggest", str(file), "--output", str(written), *options)
-    text = with_first_units(filled_in(written.read_text()))
+    text = filled_in(written.read_text())
     written.write_text(text)
     log = read_measured(file, load_mapping(str(written)))
     assert log.counts.quarantined == {}
@@ -32,11 +55,6 @@ def suggest(folder: Path, file: Path, *options: str) -> dict[str, Any]:
 
 def as_logged(car: Car, names: dict[str, str], factors: dict[str, float]) -> pl.DataFrame:
     return pl.DataFrame({names[n]: values * factors.get(n, 1.0) for n, values in car.items()})
-
-
-@pytest.mark.parametrize("name", LOGS)
-def test_files_of_every_format_are_guessed_right(tmp_path: Path, name: str) -> None:
-    assert suggested.wrong_guesses(LOGS[name], suggested.suggest(LOGS[name], tmp_path)) == []
 
 
 def test_a_draft_does_not_load_until_its_units_are_chosen(tmp_path: Path) -> None:
@@ -55,7 +73,7 @@ def test_a_draft_does_not_load_until_its_units_are_chosen(tmp_path: Path) -> Non
     (tmp_path / "draft.toml").unlink()
     text = call(tmp_path, "mapping", "suggest", str(tmp_path / "log.csv"))
     assert '# Choose the unit: "m/s" or "km/h" or "mph".\nvehicle_speed = {' in text
-    (tmp_path / "draft.toml").write_text(filled_in(text[text.index("name = ") :]))
+    (tmp_path / "draft.toml").write_text(filled_in(text[text.index("name = ") :], units=False))
     with pytest.raises(ConfigError, match="no unit in the file: write the right one"):
         load_mapping(str(tmp_path / "draft.toml"))
 
@@ -118,3 +136,146 @@ def test_what_cannot_be_drafted_says_so(tmp_path: Path) -> None:
         call(tmp_path, "mapping", "suggest", str(file), "--output", str(file))
     file.write_text("t,ay\n0,1\n1,x\n")
     assert "ay = { column" in call(tmp_path, "mapping", "suggest", str(file))
+
+
+def write_bench(file: Path) -> None:
+    """A test bench in Germany: cp1252, titles, a row of units, dates, commas, n.v. and -9999."""
+    car = a_car()
+    names = ["ax", "ay", "yaw_rate", "steering_wheel", *WHEELS, "sideslip"]
+    factors = {"yaw_rate": TO_DEG, "steering_wheel": TO_DEG, "sideslip": TO_DEG}
+    factors |= dict.fromkeys(WHEELS, 30 / np.pi)
+    lines = [
+        "Prüfstand Nord;;;;;;;;;",
+        "Zeitstempel;Längsbeschleunigung;Querbeschleunigung;Giergeschwindigkeit;Lenkradwinkel;"
+        "Raddrehzahl VL;Raddrehzahl VR;Raddrehzahl HL;Raddrehzahl HR;Schwimmwinkel",
+        ";[m/s²];[m/s²];[°/s];[°];[1/min];[1/min];[1/min];[1/min];[°]",
+    ]
+    for i in range(ROWS):
+        moment = (START + timedelta(milliseconds=10 * i)).strftime("%d.%m.%Y %H:%M:%S,%f")[:-3]
+        told = [f"{car[name][i] * factors.get(name, 1.0):.5f}" for name in names]
+        told[2] = "-9999.0" if i % 97 == 3 else told[2]
+        told[-1] = "n.v." if i % 50 == 7 else told[-1].replace(".", ",")
+        lines.append(";".join([moment, *(t.replace(".", ",") if t != "n.v." else t for t in told)]))
+    file.write_bytes("\r\n".join(lines).encode("cp1252"))
+
+
+def write_fleet(file: Path) -> None:
+    """Four cars in turns, with timestamps."""
+    frames = []
+    for number, name in enumerate(("A1", "B2", "C3", "D4")):
+        car = a_car(7.0 + number)
+        times = [START.replace(tzinfo=None) + timedelta(milliseconds=10 * i) for i in range(ROWS)]
+        told: dict[str, Any] = {"timestamp": times, "vehicle": [name] * ROWS, "trip": number}
+        told |= {"accel_lat (g)": car["ay"] / 9.80665, "yaw_rate (deg/s)": car["yaw_rate"] * TO_DEG}
+        told |= {f"ws_{wheel[-2:]}": car[wheel] * RADIUS_M * 3.6 for wheel in WHEELS}
+        frames.append(pl.DataFrame(told | {"StWhlAng": car["steering_wheel"] * TO_DEG}))
+    pl.concat(frames).sort("timestamp", maintain_order=True).write_parquet(file)
+
+
+def write_student(file: Path) -> None:
+    """No times, no units, single words."""
+    car = a_car()
+    speed = car["wheel_rl"] * RADIUS_M
+    vy = speed * np.tan(car["sideslip"])
+    told = {"steer": car["steering_wheel"] * TO_DEG, "yaw": car["yaw_rate"] * TO_DEG}
+    pl.DataFrame({**told, "ax": car["ax"], "ay": car["ay"], "vx": speed, "vy": vy}).write_csv(file)
+
+
+def write_bus(file: Path) -> None:
+    """UTF-16, milliseconds since 1970, magnitudes with sign bits, 65535 for no value."""
+    car = a_car()
+    told: dict[str, Any] = {"utc_ms": round(START.timestamp() * 1000) + 10 * np.arange(ROWS)}
+    for name, column in (("yaw_rate", "ESP_Gierrate"), ("steering_wheel", "LWI_Lenkradwinkel")):
+        told[f"{column} [°]" if name != "yaw_rate" else f"{column} [°/s]"] = (
+            np.abs(car[name]) * TO_DEG
+        )
+        told[column.replace("_", "_VZ_")] = (car[name] < 0).astype(int)
+    told["Querbeschl. [g]"] = car["ay"] / 9.80665
+    for wheel, place in zip(WHEELS, ("VL", "VR", "HL", "HR"), strict=True):
+        kmh = np.round(car[wheel] * RADIUS_M * 3.6, 2)
+        told[f"Radgeschw_{place}"] = np.where(np.arange(ROWS) % 311 == 5, 65535.0, kmh)
+    told["Beta [°]"] = car["sideslip"] * TO_DEG
+    file.write_bytes(pl.DataFrame(told).write_csv(separator="\t").encode("utf-16"))
+
+
+def read(file: Path, mapping: Any) -> tuple[list[MeasuredDrive], IngestCounts]:
+    """Return the drives of a file, and what became of its rows."""
+    with open_measured(file, mapping) as stream:
+        return list(stream.drives()), stream.counts
+
+
+LOGS: dict[str, tuple[Callable[[Path], None], int, set[str]]] = {
+    "bench.csv": (write_bench, 1, {"ax", "ay", "yaw_rate", "steering_wheel", *WHEELS, "sideslip"}),
+    "fleet.parquet": (write_fleet, 4, {"ay", "yaw_rate", "steering_wheel", *WHEELS}),
+    "student.csv": (write_student, 1, {"ax", "ay", "yaw_rate", "steering_wheel", "vx", "vy"}),
+    "bus.csv": (write_bus, 1, {"ay", "yaw_rate", "steering_wheel", *WHEELS, "sideslip"}),
+}
+
+
+@pytest.mark.parametrize("name", LOGS)
+def test_a_strangers_log_becomes_the_drives_that_it_has(tmp_path: Path, name: str) -> None:
+    write, drives, signals = LOGS[name]
+    write(tmp_path / name)
+    text = call(tmp_path, "mapping", "suggest", str(tmp_path / name)).partition("\n# A draft")[2]
+    mapping = tmp_path / "draft.toml"
+    mapping.write_text(f"# {filled_in(text)}", encoding="utf-8")
+    found, counts = read(tmp_path / name, load_mapping(str(mapping)))
+    assert counts.quarantined == {}
+    assert len(found) == drives
+    for number, drive in enumerate(found):
+        car = a_car(7.0 + number if drives > 1 else 8.0)
+        assert set(drive.counts) == signals
+        assert_same(drive.counts, car)
+
+
+def assert_same(counts: dict[str, Any], car: Car) -> None:
+    """Assert that what was logged is what the car did, to a thousandth of its largest value."""
+    for name in {"ay", "yaw_rate", "steering_wheel", "wheel_fl", "sideslip"} & set(counts):
+        scale = {"ay": 1e-3, "yaw_rate": 1e-4, "steering_wheel": 5e-4, "wheel_fl": 1e-2}
+        got = pl.Series(counts[name]).cast(pl.Float64).to_numpy() * scale.get(name, 1e-4)
+        present = np.isfinite(got)
+        assert present.mean() > 0.95
+        off = np.abs(got - car[name])[present].max()
+        assert off < 0.003 * np.abs(car[name]).max() + scale.get(name, 1e-4)
+
+
+DATES = {
+    "Datum": ("%d.%m.%Y", "Uhrzeit", "%H:%M:%S,%f"),
+    "date": ("%d%m%y", "time", "%H%M%S.%f"),
+    "Date": ("%m/%d/%Y", "Time of day", "%H:%M:%S.%f"),
+    "day": ("%Y-%m-%d", "clock", "%H:%M:%S.%f"),
+}
+
+
+@pytest.mark.parametrize("column", DATES)
+def test_date_and_time_stand_in_columns_of_their_own(tmp_path: Path, column: str) -> None:
+    """The log goes on over midnight: of a time of the day alone that is another drive."""
+    dated, clock, written = DATES[column]
+    car, start = a_car(), datetime(2024, 3, 20, 23, 59, 40, tzinfo=UTC)
+    lines = [f"{column};{clock};ay [m/s²];yaw_rate [°/s];speed [km/h]"]
+    for i in range(ROWS):
+        moment = start + timedelta(milliseconds=10 * i)
+        told = [car["ay"][i], car["yaw_rate"][i] * TO_DEG, car["wheel_rl"][i] * RADIUS_M * 3.6]
+        values = [f"{value:.4f}" for value in told]
+        lines.append(";".join([f"{moment:{dated}}", f"{moment:{written}}"[:-3], *values]))
+    (tmp_path / "log.csv").write_text("\n".join(lines), encoding="utf-8")
+    draft = call(tmp_path, "mapping", "suggest", str(tmp_path / "log.csv"))
+    text = draft.partition("\n# A draft")[2]
+    assert "# day = " not in text
+    (tmp_path / "m.toml").write_text(f"# {filled_in(text)}", encoding="utf-8")
+    mapping = load_mapping(str(tmp_path / "m.toml"))
+    (drive,), counts = read(tmp_path / "log.csv", mapping)
+    assert drive.metadata["started_at"] == start
+    assert (counts.rows_kept, counts.ticks, counts.quarantined) == (ROWS, ROWS, {})
+
+
+def test_a_rate_that_is_assumed_is_said_at_each_ingest(tmp_path: Path) -> None:
+    write_student(tmp_path / "log.csv")
+    text = call(tmp_path, "mapping", "suggest", str(tmp_path / "log.csv")).partition("\n# A draft")[
+        2
+    ]
+    (tmp_path / "m.toml").write_text(f"# {filled_in(text)}", encoding="utf-8")
+    assert load_mapping(str(tmp_path / "m.toml")).time.assumed
+    words = ("ingest", str(tmp_path / "log.csv"), "--mapping", str(tmp_path / "m.toml"))
+    with pytest.raises(AlarmError, match="100 Hz is assumed"):
+        call(tmp_path / "root", *words)

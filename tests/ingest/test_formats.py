@@ -17,11 +17,13 @@ import scipy.sparse
 from asammdf import MDF, Signal
 
 from fleet_slip.errors import ExtraError
+from fleet_slip.ingest.draft import draft_mapping, write_draft
 from fleet_slip.ingest.formats import matlab, mdf
 from fleet_slip.ingest.formats import source as budget
 from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.ingest.load import preview_logs
 from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.profile import profile_file
 from tests.support.measured import MeasuredLog, a_mapping, failure, own_clock, read_measured, ticks
 
 START = datetime(2024, 5, 31, 12, tzinfo=UTC)
@@ -255,6 +257,8 @@ def test_matlab(tmp_path: Path, write: Callable[[Path, dict[str, Any]], None]) -
     log = read_measured(file, own)
     assert log.drives["ax"].to_pylist() == AX_COUNTS
     assert log.drives["sideslip"].drop_null().to_pylist() == BETA_COUNTS[::2]
+    draft = write_draft(draft_mapping(file, profile_file(file)), "draft")
+    assert 'ax = { column = "Data.Vehicle.ax", ' in draft
     absent = mat_mapping(signals=signals("Data.Vehicle.ay", "gps.beta"))
     assert "Did the mapping mean 'Data.Vehicle.ax'" in failure(file, absent)
 

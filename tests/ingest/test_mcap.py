@@ -18,8 +18,19 @@ from fleet_slip.ingest.mapping import Mapping
 from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
 from tests.support.measured import failure, own_clock, read_measured
 from tests.support.reported import call
-from tests.support.ros2 import HEADER
 
+HEADER = """std_msgs/Header header
+{}
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+"""A message with a header; its other fields take the place of `{}`."""
 VECTOR = """================================================================================
 MSG: geometry_msgs/Vector3
 float64 x
@@ -136,7 +147,9 @@ def test_what_is_in_it_is_listed(tmp_path: Path) -> None:
     file = write(tmp_path / "log.mcap")
     shown = json.loads(call(tmp_path, "mapping", "suggest", str(file), "--json"))
     found = {one["channel"]: (one["rate_hz"], one["signal"]) for one in shown["channels"]}
-    assert found["/joints.velocity[1]"][0] == pytest.approx(100)
+    assert found["/joints.velocity[1]"] == (pytest.approx(100), None)
+    assert found["/imu/data.linear_acceleration.x"][1] == "ax"
+    assert found["/imu/data.angular_velocity.z"][1] == "yaw_rate"
     assert "/imu/data.header.frame_id" in found
 
 

@@ -211,6 +211,20 @@ def test_timestamps_give_time_and_day(tmp_path: Path, kind: str) -> None:
     assert ticks(log) == [i for i in range(20) if i != 7 or kind == "parquet"]
 
 
+def test_a_time_zone_and_a_time_of_the_day_are_understood(tmp_path: Path) -> None:
+    columns = {
+        "t": [f"2024-07-01 10:00:00.{i:02d}" for i in range(100)],
+        "clock": [f"10:00:00.{i:02d}" for i in range(100)],
+        **dict.fromkeys(("ax", "beta"), [1] * 100),
+    }
+    zoned = {"unit": None, "format": "%Y-%m-%d %H:%M:%S%.f", "zone": "Europe/Berlin"}
+    log = read_columns(tmp_path, columns, a_mapping(time=zoned, drive={"day": None}))
+    assert log.drives["started_at"][0].as_py() == datetime(2024, 7, 1, 8, tzinfo=UTC)
+    clock = {"column": "clock", "unit": None, "format": "%H:%M:%S%.f"}
+    log = read_columns(tmp_path, columns, a_mapping(time=clock))
+    assert log.drives["started_at"].null_count == log.counts.rows_kept == 100
+
+
 def test_polars_does_not_warn_of_a_format_in_its_own_words(
     tmp_path: Path, recwarn: pytest.WarningsRecorder
 ) -> None:

@@ -1,5 +1,6 @@
 """What a mapping can say of one column, on files with known content."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet_slip.ingest.columns import conversion_factor
 from fleet_slip.ingest.resampling import build_resampler
+from fleet_slip.ingest.suspicion import RADIUS_M
 from tests.support.measured import a_mapping, good_columns, physical, read_columns, ticks
+from tests.support.textbook_car import a_car
 
 
 def signals(**columns: dict[str, Any]) -> Any:
@@ -82,3 +86,62 @@ def test_keys_at_their_default_do_not_change_the_identity_of_a_file(tmp_path: Pa
     )
     # The digest of the release before these keys.
     assert '"gain"' not in plain.canonical_json()
+
+
+def test_the_label_is_moved_to_the_centre_of_gravity(tmp_path: Path) -> None:
+    car = a_car()
+    speed = (car["wheel_rl"] + car["wheel_rr"]) / 2 * RADIUS_M
+    vy = speed * np.tan(car["sideslip"]) + car["yaw_rate"] * 1.5
+    columns = {"r": car["yaw_rate"], "v": speed, "vy": vy, "b": np.arctan2(vy, speed)}
+    assert np.abs(columns["b"] - car["sideslip"]).max() > 0.04
+    told = {"t": np.arange(speed.size) / 100, **columns}
+    rate, moved = {"yaw_rate": {"column": "r", "unit": "rad/s"}}, {"sensor_x_m": 1.5}
+    mps: dict[str, Any] = {"column": "v", "unit": "m/s"}
+    angle = {"vehicle_speed": mps, "sideslip": {"column": "b", "unit": "rad"}}
+    pair = {"vx": mps, "vy": {"column": "vy", "unit": "m/s"}}
+    for some, label in ((angle, moved), (pair, {**moved, "from_velocities": True})):
+        log = read_columns(tmp_path, told, a_mapping(signals=rate | some, label=label))
+        assert np.abs(physical(log, "sideslip", 1e-4) - car["sideslip"]).max() < 6e-4
+
+
+UNITS = {
+    "rad": {"deg": math.pi / 180, "°": math.pi / 180, "mrad": 1e-3, "turn": 2 * math.pi},
+    "rad/s": {"deg/s": math.pi / 180, "°/s": math.pi / 180, "rpm": 2 * math.pi / 60},
+    "m/s": {"km/h": 1 / 3.6, "mph": 0.44704, "knot": 1852 / 3600, "mm/ms": 1.0},
+    "m/s^2": {"g": 9.80665, "m/s²": 1.0, "m/s2": 1.0, "m/s**2": 1.0, "cm/s^2": 0.01},
+    "m": {"cm": 0.01, "foot": 0.3048},
+    "s": {"ms": 1e-3, "µs": 1e-6, "min": 60.0},
+}
+
+
+@pytest.mark.parametrize(
+    ("si", "unit", "factor"), [(si, u, f) for si, units in UNITS.items() for u, f in units.items()]
+)
+def test_factors_are_those_of_the_definitions(si: str, unit: str, factor: float) -> None:
+    assert conversion_factor(unit, si) == pytest.approx(factor, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("unit", "si"),
+    [
+        ("km/h", "rad"),
+        ("rad", "rad/s"),
+        ("percent", "rad"),  # a ratio is no angle
+        ("Hz", "rad/s"),  # 1 Hz is 2π rad/s, not 1
+        ("m/s", "m/s^2"),
+        ("gram", "m/s^2"),
+        ("g", "m"),
+        ("degC", "rad"),
+        ("dB", "rad"),
+        ("furlongs per fortnite", "m/s"),
+        ("", "m"),
+        ("2 m", "m"),
+        ("m^99", "m"),
+        ("9^9^9^9^9", "m"),
+        ("m" * 100_000, "m"),
+        ("__import__('os')", "m"),
+    ],
+)
+def test_other_units_are_refused_with_what_is_needed(unit: str, si: str) -> None:
+    with pytest.raises(ValueError, match=r"needs an? \w+"):
+        conversion_factor(unit, si)

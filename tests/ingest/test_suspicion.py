@@ -2,7 +2,9 @@
 
 import json
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -11,12 +13,13 @@ from typer.testing import CliRunner
 
 import fleet_slip
 from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.faults import Fault
 from fleet_slip.cli.app import app
 from fleet_slip.errors import AlarmError
-from fleet_slip.ingest.stream import find_refusals
-from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_suspicions
+from fleet_slip.ingest.stream import find_refusals, open_measured
+from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_one_sided, find_suspicions
 from tests.ingest.test_folders import MAPPING as PLAIN
-from tests.support.measured import csv_text, good_columns
+from tests.support.measured import a_mapping, csv_text, good_columns
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
 
@@ -220,9 +223,11 @@ def test_few_refused_rows_are_no_suspicion() -> None:
     (together,) = find_refusals(few, 1000, {"out_of_range": 120})
     assert together.figure == "120 of 1,000 rows were refused, 120 of them: out_of_range"
     assert not list(find_refusals({("ax", "out_of_range"): 10}, 12, {"out_of_range": 10}))
-    (untimed,) = find_refusals({}, 1000, {"time_duplicate": 60, "time_backwards": 50})
-    assert (untimed.kind, untimed.signals) == ("values", ("time",))
-    assert "110 of 1,000 rows were refused, 60 of them: time_duplicate" in str(untimed)
+    for reason, hint in (("time_duplicate", True), ("time_backwards", True), ("not_a_time", False)):
+        (untimed,) = find_refusals({}, 1000, {reason: 60, "missing": 50})
+        assert (untimed.kind, untimed.signals) == ("values", ("time",))
+        assert f"110 of 1,000 rows were refused, 60 of them: {reason}" in str(untimed)
+        assert ("drive.column if the file mixes cars or trips" in untimed.remedy) == hint
     assert not list(find_refusals({}, 1000, {"no_value": 90}))
 
 
@@ -255,3 +260,82 @@ def test_rows_that_are_refused_for_their_time_call_for_attention(tmp_path: Path)
         call(tmp_path / "root", *words)
     fleet = fleet_slip.open(tmp_path / "root")
     assert fleet.sql("SELECT count(*) FROM log").fetchall() == [(100,)]
+
+
+def test_a_magnitude_without_its_sign_is_told() -> None:
+    car = a_car() | {"yaw_rate": np.abs(a_car()["yaw_rate"])}
+    long = {name: np.tile(values, 2) for name, values in car.items()}
+    found = {one.signals: one.figure for one in find_suspicions(long) if one.kind == "magnitude"}
+    assert found == {("yaw_rate",): "it is never negative in 2 min"}
+    assert not [one for one in find_suspicions(a_car()) if one.kind == "magnitude"]
+
+
+def test_a_car_on_an_oval_has_its_sign() -> None:
+    turning = {"yaw_rate": np.full(9000, 0.2) + 0.05 * np.sin(np.arange(9000))}
+    wheels = {"wheel_rl": np.full(9000, 40.0), "wheel_rr": np.full(9000, 42.0)}
+    assert list(find_one_sided(turning, None))
+    assert not list(find_one_sided({**turning, **wheels}, None))
+
+
+def cars(number: int) -> list[pl.DataFrame]:
+    """Return minutes of as many cars, each at another place of its road."""
+    return [
+        pl.DataFrame(
+            {
+                "t": np.arange(6000) / 100,
+                **{n: np.roll(a_car(8.0 + 3 * i)[n], 1700 * i) for n in LOGGED},
+                "vehicle": [f"car {i}"] * 6000,
+                "trip": [i] * 6000,
+            }
+        )
+        for i in range(number)
+    ]
+
+
+LOGGED = {
+    name: {"column": name, "unit": unit}
+    for name, unit in {
+        **{"yaw_rate": "rad/s", "steering_wheel": "rad"},
+        **dict.fromkeys(WHEELS, "rad/s"),
+    }.items()
+}
+
+
+def said_of(rows: pl.DataFrame, folder: Path, **changes: Any) -> list[Fault]:
+    rows.write_parquet(folder / "log.parquet")
+    with open_measured(folder / "log.parquet", a_mapping(signals=LOGGED, **changes)) as stream:
+        list(stream.drives())
+        return list(stream.suspicions())
+
+
+def test_a_column_of_cars_that_no_mapping_uses_is_told(tmp_path: Path) -> None:
+    """Cars that drive behind one another do as one car does: a column tells them apart."""
+    first, second = (cars(1)[0].with_columns(vehicle=pl.lit(name)) for name in ("A", "B"))
+    rows = pl.concat([first, second.with_columns(pl.col("t") + 0.005)]).sort("t")
+    (found,) = said_of(rows, tmp_path)
+    assert (found.kind, found.signals) == ("cars", ("vehicle",))
+    assert str(found).startswith("several cars in vehicle? it has 2 values")
+    assert 'vehicle_id = { column = "vehicle" }' in found.remedy
+    assert said_of(rows, tmp_path, where=[{"column": "vehicle", "one_of": ["A"]}]) == []
+    assert said_of(first, tmp_path) == []
+
+
+def test_trips_that_follow_one_another_are_drives_and_trips_in_turns_are_not(
+    tmp_path: Path,
+) -> None:
+    first, second = (cars(1)[0].with_columns(trip=pl.lit(i)) for i in (1, 2))
+    assert said_of(pl.concat([first, second.with_columns(pl.col("t") + 100)]), tmp_path) == []
+    at_once = second.with_columns(pl.col("t") + 60)  # nothing ends the first
+    (found,) = said_of(pl.concat([first, at_once]), tmp_path)
+    assert (found.signals, found.remedy) == (("trip",), 'Write column = "trip" under [drive].')
+
+
+def test_a_car_is_not_under_way_twice(tmp_path: Path) -> None:
+    """Logs of two cars one after the other, at times of the same hour."""
+    since = datetime(2024, 3, 12, 9, 14) + pl.duration(
+        microseconds=(pl.col("t") * 1e6).cast(pl.Int64)
+    )
+    both = pl.concat(f.with_columns(since.alias("t")).drop("vehicle", "trip") for f in cars(2))
+    (found,) = said_of(both, tmp_path, time={"unit": None})
+    assert str(found).startswith("repeated time? drives of one car overlap in time (1 time")
+    assert said_of(both.head(6000), tmp_path, time={"unit": None}) == []
