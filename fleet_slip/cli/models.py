@@ -13,6 +13,7 @@ from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.models.manifest import CrossValidated, LearnedFrom
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.rendering import Part, TextTable
+from fleet_slip.warehouse.condition import describe_cohort
 
 
 @command()
@@ -140,7 +141,7 @@ def _facts(version: ModelVersion) -> dict[str, str]:
         "error mean": f"{figures.error_mean_deg:+.4f} deg",
         "on board": describe_costs(manifest),
         "cross-validation": f"{number_of(figures.folds, 'fold')} by {figures.folds_by}",
-        "cohort": f"{trained.cohort}: {drives}",
+        "cohort": f"{describe_cohort(trained.cohort)}: {drives}",
         "tables": f"logs version {trained.logs_version}, grams {trained.grams_version}",
         "selected": f"model {chosen.model} of {chosen.model_list}",
         "why": chosen.reason,

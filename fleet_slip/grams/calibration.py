@@ -551,7 +551,7 @@ def calibrate(
     with open_grams(source, CALIBRATION, condition) as opened:
         found = calibration_of(opened, condition)
     if not found.cars:
-        of = "" if condition.text == ALL_DRIVES else f" of {condition.text!r}"
+        of = "" if condition.text == ALL_DRIVES else f" of {condition.shown}"
         raise DataError(f"no drive{of} has yaw rate, ay and wheel speeds. Choose another cohort.")
     return found
 

@@ -288,7 +288,7 @@ def require_training(sources: Iterable[str], condition: Condition) -> None:
     """Raise `RefusedError` if drives of a scenario are among those of a condition."""
     if SCENARIO in sources:
         raise RefusedError(
-            f"the cohort {condition.text!r} has drives of evaluation scenarios, which no model "
+            f"the cohort {condition.shown} has drives of evaluation scenarios, which no model "
             f"may be trained on. Add to the condition: AND {TRAINING_DRIVES}"
         )
 
@@ -297,13 +297,13 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
     """Return the error that tells why a condition leaves no drive."""
     if left_out := opened.count_left_out(condition):
         return NotComputedError(
-            f"all {number_of(left_out, 'drive')} of the cohort {condition.text!r} have no log: "
+            f"all {number_of(left_out, 'drive')} of the cohort {condition.shown} have no log: "
             "their cars sent Gram rows of logged signals. Use --features signals."
         )
     one = features().feature_set(features().name_of(opened.identity))
     if one.change_s:
         return DataError(
-            f"no drive of the cohort {condition.text!r} has satellite fixes {one.change_text} "
+            f"no drive of the cohort {condition.shown} has satellite fixes {one.change_text} "
             "apart, so there is no course to learn from. Choose another cohort, or map the "
             "course and ingest again: docs/course.md."
         )
@@ -314,7 +314,7 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
     ).fetchone()
     sources, campaigns = examples or ("", "")
     return DataError(
-        f"no drive matches the cohort condition {condition.text!r}. The warehouse has sources "
+        f"no drive matches the cohort condition {condition.shown}. The warehouse has sources "
         f'{sources} and campaigns {campaigns}. See the columns with: fleet-slip sql "DESCRIBE '
         'drives"'
     )

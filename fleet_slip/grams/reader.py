@@ -267,7 +267,7 @@ def cohort_files(source: Warehouse | GramReader, condition: Condition) -> set[st
     with open_grams(source, PLAIN, condition) as opened:
         found = opened.files(condition)
     if not found:
-        raise DataError(f"no drive satisfies {condition.text!r}.")
+        raise DataError(f"no drive satisfies {condition.shown}.")
     return found
 
 

@@ -257,7 +257,7 @@ def with_assumptions(warehouse: Warehouse, manifest: Manifest, selection: Select
     mappings = {name for source, name, _ in rows if source == MEASURED and name}
     assumed = kept_assumptions(warehouse.root, mappings)
     if assumed and not manifest.learned_from and selection.label_noise_deg is None:
-        assumed += ("the label has no noise: what it has is part of the RMSE",)
+        assumed += ("label noise unknown: it is part of the RMSE",)
     return manifest.model_copy(update={"assumed": assumed})
 
 

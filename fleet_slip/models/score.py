@@ -87,8 +87,8 @@ class Score(Answer):
         elif self.drives_trained:
             yield Remark(
                 f"{self.model} was trained on {self.drives_trained:,} of these "
-                f"{number_of(self.drives, 'drive')}: there the error is that of the fit. For "
-                f"new drives: fleet-slip evaluate {self.model}"
+                f"{number_of(self.drives, 'drive')}: its error there is a training error. For new "
+                f"drives: fleet-slip evaluate {self.model}"
             )
 
 
@@ -117,7 +117,7 @@ def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) 
     estimate_rad, truth_rad, rows = _estimate_rows(warehouse, manifest, condition)
     if not len(truth_rad):
         raise DataError(
-            f"no row of the cohort {condition.text!r} has {', '.join(manifest.signals)} and "
+            f"no row of the cohort {condition.shown} has {', '.join(manifest.signals)} and "
             f"{manifest.label.signal}. Choose another cohort, or a model with fewer signals."
         )
     return _figures(estimate_rad, truth_rad, rows)

@@ -357,7 +357,7 @@ def select(
     label = catalogue().label
     if not any(label in grams[0].signals for grams in divided.tables):
         raise DataError(
-            f"no drive of the cohort {cohort.condition.text!r} has the label, {label}. Where cars "
+            f"no drive of the cohort {cohort.condition.shown} has the label, {label}. Where cars "
             "log their course, learn from it: fleet-slip select --label course"
         )
     models: list[CrossValidation] = []

@@ -87,7 +87,7 @@ def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) 
     cars = [one for one in every if one is not None]
     if not cars:
         raise DataError(
-            f"cannot determine the intercept: all driving of {condition.text!r} is alike, so no "
+            f"cannot determine the intercept: all driving of {condition.shown} is alike, so no "
             "sensor offset can be estimated. Choose more drives, or a model without intercept: "
             "--no-intercept."
         )
@@ -138,7 +138,7 @@ def _levels(warehouse: Warehouse, condition: Condition, manifest: Manifest) -> D
         found = collect_sums(opened.batches(condition), {base: columns}, unnamed=True)
     if not found:
         raise DataError(
-            f"no drive of {condition.text!r} has {', '.join(columns)}, which the intercept follows "
+            f"no drive of {condition.shown} has {', '.join(columns)}, which the intercept follows "
             "from. Choose more drives, or a model that knows no intercept: --no-intercept."
         )
     return found[base]

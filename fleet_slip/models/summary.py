@@ -11,6 +11,7 @@ from fleet_slip.grams.folding import BANDS, PARTS
 from fleet_slip.regression.choice import CROSS_VALIDATION, NestedDistances
 from fleet_slip.regression.inference import Evidence
 from fleet_slip.rendering import Part, Remark, TextTable
+from fleet_slip.warehouse.condition import describe_cohort
 
 if TYPE_CHECKING:
     from fleet_slip.grams.weights import Weighed
@@ -83,7 +84,8 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
 
 
 def _shortened(condition: str, everything: bool) -> str:
-    """Return a condition; of a long one, such as one that names drives left out, its beginning."""
+    """Return a condition, of a long one its beginning."""
+    condition = condition if everything else describe_cohort(condition)
     long = not everything and len(condition) > CONDITION_WIDTH
     return f"{condition[:CONDITION_WIDTH].rstrip()} … (--all)" if long else condition
 

@@ -154,7 +154,7 @@ def monitor(
     if sum(training) < limits.min_training_days:
         raise DataError(
             f"Drift charts need {limits.min_training_days} training days; {version.reference} has "
-            f"{sum(training)} in the cohort {condition.text!r}. Choose another cohort, or a later "
+            f"{sum(training)} in the cohort {condition.shown}. Choose another cohort, or a later "
             "--since."
         )
     models = _models(manifest, feature_set, grams, training)

@@ -19,6 +19,7 @@ from typing import Any
 
 import duckdb
 
+from fleet_slip.base import number_of
 from fleet_slip.catalogue.facts import SCENARIO, TRAINING_DRIVES
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError, StorageError, printable
@@ -57,6 +58,12 @@ class Condition:
         return self.text
 
     @property
+    def shown(self) -> str:
+        """What messages call it: its text in quotes, without the hashes of drives left out."""
+        cohort, left_out = _left_out_of(self.text)
+        return f"{cohort!r}{left_out}"
+
+    @property
     def columns(self) -> frozenset[str]:
         """The columns that it asks for."""
         return columns_of(_expression(self.sql, self.text))
@@ -85,20 +92,20 @@ def asking(
     timer.daemon = True
     timer.start()
     try:
-        with reading_files(database, f"the cohort {condition.text!r}"):
+        with reading_files(database, f"the cohort {condition.shown}"):
             yield
     except StorageError as error:
         cause = error.__context__
         if isinstance(cause, duckdb.InvalidInputException):  # and every file is sound
             raise QuestionError(
-                f"the cohort {condition.text!r} cannot be asked: {duckdb_message(cause)}."
+                f"the cohort {condition.shown} cannot be asked: {duckdb_message(cause)}."
             ) from None
         raise
     except BaseException:
         if not over.is_set():
             raise
         raise QuestionError(
-            f"the cohort {condition.text!r} was not found within {limit_s:g} s. Ask for less."
+            f"the cohort {condition.shown} was not found within {limit_s:g} s. Ask for less."
         ) from None
     finally:
         timer.cancel()
@@ -233,12 +240,23 @@ def without_drives(cohort: str, model: str, hashes: Iterable[str]) -> str:
 
 
 _LEFT_OUT = re.compile(
-    r"\((.*)\) AND left\(sha256\('[^']*' \|\| drive_id\), \d+\) NOT IN \([^()]*\)", re.DOTALL
+    r"\((.*)\) AND left\(sha256\('[^']*' \|\| drive_id\), \d+\) NOT IN \(([^()]*)\)", re.DOTALL
 )
 
 
 def with_all_drives(cohort: str) -> str:
     """Return a condition as it was before `without_drives` left out some."""
+    return _left_out_of(cohort)[0]
+
+
+def describe_cohort(cohort: str) -> str:
+    """Return a condition for people, with the number of drives left out and not their hashes."""
+    return "".join(_left_out_of(cohort))
+
+
+def _left_out_of(cohort: str) -> tuple[str, str]:
+    """Return a condition with all drives, and how many drives it leaves out, nothing if none."""
+    number = 0
     while found := _LEFT_OUT.fullmatch(cohort):
-        cohort = found[1]
-    return cohort
+        cohort, number = found[1], number + 1 + found[2].count(",")
+    return cohort, f", without {number_of(number, 'faulty drive')}" if number else ""

@@ -15,7 +15,13 @@ from fleet_slip.errors import DataError, RefusedError, UnexaminedError
 from fleet_slip.models import acceptance as champion_rules
 from fleet_slip.operations import examined, quality
 from fleet_slip.operations.quality import QualityReport
-from fleet_slip.warehouse.condition import Condition, hash_drive, with_all_drives, without_drives
+from fleet_slip.warehouse.condition import (
+    Condition,
+    describe_cohort,
+    hash_drive,
+    with_all_drives,
+    without_drives,
+)
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.counted_rows import START_S, write_counted
@@ -185,6 +191,9 @@ def test_a_cohort_tells_what_it_was_before_drives_were_left_out() -> None:
     twice = without_drives(once, "fleet", [hash_drive("fleet", "b")])
     assert once != asked != twice
     assert with_all_drives(twice) == with_all_drives(once) == with_all_drives(asked) == asked
+    assert describe_cohort(once) == f"{asked}, without 1 faulty drive"
+    assert Condition(twice, "").shown == f"{asked!r}, without 2 faulty drives"
+    assert describe_cohort(asked) == asked
 
 
 def test_many_drives_are_examined_in_pieces_of_days_and_each_piece_once(
