@@ -23,10 +23,10 @@ def _():
     from fleet_slip.errors import FleetSlipError
     from fleet_slip.evaluation.watch import drive_frames
     from fleet_slip.operations.monitor import control_chart
-    from fleet_slip.pages.drawing import DESK, SHADES, STYLE, colour
+    from fleet_slip.pages.drawing import SHADES, STYLE, colour
 
     return (
-        DESK, SHADES, STYLE, Figure, FleetSlipError, LinearSegmentedColormap, alt, colour,
+        SHADES, STYLE, Figure, FleetSlipError, LinearSegmentedColormap, alt, colour,
         control_chart, drive_frames, fleet_slip, mo, mpl, np, number_of, pl,
     )  # fmt: skip
 
@@ -165,13 +165,13 @@ def _(alt, mo, terms):
 
 
 @app.cell
-def _(DESK, FleetSlipError, STYLE, control_chart, fleet, mo, mpl, name):
+def _(FleetSlipError, STYLE, control_chart, fleet, mo, mpl, name):
     mo.stop(name.value is None)
     days = [day for (day,) in fleet.sql("SELECT DISTINCT day FROM drives ORDER BY 1").fetchall()]
     try:
         _since = days[len(days) // 2] if len(days) > 8 else None
         with mpl.rc_context(STYLE):
-            drift = control_chart(fleet.monitor(name.value, since=_since), DESK)
+            drift = control_chart(fleet.monitor(name.value, since=_since))
     except FleetSlipError as error:
         drift = mo.callout(str(error), kind="warn")
     mo.vstack(

@@ -12,7 +12,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.drives import EvaluatedDrive, find_stretches
 from fleet_slip.evaluation.judge import EvaluatedScenario
 from fleet_slip.evaluation.kept import DRAWN_FILTERS, ReportData
-from fleet_slip.pages.drawing import Picture, Size, colour
+from fleet_slip.pages.drawing import BINS, WIDTH_IN, Picture, colour
 from fleet_slip.pages.page import degrees, listed, number
 
 
@@ -105,17 +105,17 @@ class DriveBlock:
         return np.where(self.run.drive.evaluated, estimate, np.nan)
 
 
-def side_slip(blocks: Sequence[DriveBlock], size: Size) -> Figure:
+def side_slip(blocks: Sequence[DriveBlock]) -> Figure:
     """Draw the blocks one above another: the angles, and beneath them the differences."""
     top_in = sum(block.height_in for block in blocks)
-    figure = Figure(figsize=(size.width_in, top_in))
+    figure = Figure(figsize=(WIDTH_IN, top_in))
     for block, reach in zip(blocks, _reaches(blocks), strict=True):
-        _draw_block(figure, block, top_in, reach, size)
+        _draw_block(figure, block, top_in, reach)
         top_in -= block.height_in
     return figure
 
 
-def _draw_block(figure: Figure, block: DriveBlock, top_in: float, reach: float, size: Size) -> None:
+def _draw_block(figure: Figure, block: DriveBlock, top_in: float, reach: float) -> None:
     angle, *strips = _panels(figure, block, top_in)
     time_s, tone = block.run.drive.time_s, "unstable" if block.shaded == "unstable" else "outage"
     marked = [one for one in block.run.sections if one.name == block.shaded]
@@ -124,19 +124,19 @@ def _draw_block(figure: Figure, block: DriveBlock, top_in: float, reach: float, 
         for one in (s for m in marked for s in find_stretches(block.run.drive, m.rows)):
             axes.axvspan(one.from_s, one.until_s, color=colour(tone), alpha=0.16, linewidth=0)
     for line in block.lines:
-        _plot(angle, time_s, block.estimate_deg(line), line, size)
-    truth = band(time_s, block.truth_deg, size.bins)
+        _plot(angle, time_s, block.estimate_deg(line), line)
+    truth = band(time_s, block.truth_deg, BINS)
     angle.plot(truth.x, truth.mean, color=colour("truth"), linewidth=1.1)
     names = [("true", "truth"), *((line.label, line.colour) for line in block.lines)]
     if marked:
         names.append(("unstable" if tone == "unstable" else "no GPS", tone))
     _legend(figure, block.title, names, top_in)
-    angle.set_ylabel("side-slip angle (deg)" if size.wide else "deg", labelpad=2)
+    angle.set_ylabel("side-slip angle (deg)", labelpad=2)
     for axes, line in zip(strips, block.all_strips, strict=True):
-        _plot(axes, time_s, block.estimate_deg(line) - block.truth_deg, line, size)
+        _plot(axes, time_s, block.estimate_deg(line) - block.truth_deg, line)
         axes.set_ylim(-reach, reach)
         axes.set_yticks([-reach / 2, 0, reach / 2])
-        _caption(axes, block, line, size)
+        _caption(axes, block, line)
     for axes in (angle, *strips[:-1]):
         axes.tick_params(labelbottom=False, bottom=False)
         axes.spines["bottom"].set_visible(False)
@@ -153,8 +153,8 @@ def _panels(figure: Figure, block: DriveBlock, top_in: float) -> Iterator[Axes]:
         yield figure.add_axes((left, bottom / height, across, STRIP_IN / height))
 
 
-def _plot(axes: Axes, x: FloatArray, y: FloatArray, line: Line, size: Size) -> None:
-    series, tone = band(x, y, size.bins), colour(line.colour)
+def _plot(axes: Axes, x: FloatArray, y: FloatArray, line: Line) -> None:
+    series, tone = band(x, y, BINS), colour(line.colour)
     axes.fill_between(series.x, series.low, series.high, color=tone, alpha=0.3, linewidth=0)
     axes.plot(series.x, series.mean, color=tone, linewidth=1.0)
 
@@ -183,12 +183,12 @@ def _legend(figure: Figure, title: str, names: Sequence[tuple[str, str]], top_in
         left += 0.07 * (len(name) + 3.5)
 
 
-def _caption(axes: Axes, block: DriveBlock, line: Line, size: Size) -> None:
+def _caption(axes: Axes, block: DriveBlock, line: Line) -> None:
     figures = block.run.results[line.estimator].whole
     text = f"{line.label} \N{MINUS SIGN} true"
     if figures.error_std_deg is not None and figures.error_mean_deg is not None:
         std, mean = degrees(figures.error_std_deg), degrees(figures.error_mean_deg, sign=True)
-        text += f": std {std}, mean {mean}" if size.wide else f": std {std}"
+        text += f": std {std}, mean {mean}"
     axes.text(
         0.0,
         1.0,
@@ -201,12 +201,13 @@ def _caption(axes: Axes, block: DriveBlock, line: Line, size: Size) -> None:
     )
 
 
-def speed(drive: EvaluatedDrive, size: Size) -> Figure:
+def speed(drive: EvaluatedDrive) -> Figure:
     """Draw the true speed of a drive."""
-    figure = Figure(figsize=(size.width_in, SPEED_IN))
-    width, kmh = size.width_in, drive.speed_mps * KMH_PER_MPS
-    axes = figure.add_axes((0.42 / width, 0.42 / SPEED_IN, 1 - 0.5 / width, 1.32 / SPEED_IN))
-    series = band(drive.time_s, kmh, size.bins)
+    figure = Figure(figsize=(WIDTH_IN, SPEED_IN))
+    kmh = drive.speed_mps * KMH_PER_MPS
+    across = 1 - 0.5 / WIDTH_IN
+    axes = figure.add_axes((0.42 / WIDTH_IN, 0.42 / SPEED_IN, across, 1.32 / SPEED_IN))
+    series = band(drive.time_s, kmh, BINS)
     axes.plot(series.x, series.mean, color=colour("model_4"), linewidth=1.3)
     axes.set_xlim(drive.time_s[0], drive.time_s[-1])
     axes.set_ylim(0, 1.05 * float(kmh.max()))
@@ -306,7 +307,7 @@ def _series(key: str, title: str, blocks: Sequence[DriveBlock]) -> Picture:
     seen = (
         "Lines over time of the true angle and of the estimates, and beneath them the differences."
     )
-    return Picture(key, title, found, seen, lambda size: side_slip(blocks, size))
+    return Picture(key, title, found, seen, lambda: side_slip(blocks))
 
 
 def _found(block: DriveBlock, named: bool) -> Iterator[str]:
@@ -337,4 +338,4 @@ def _speed(one: Drives, drive: EvaluatedDrive) -> Picture:
         f"{drive.scenario.track.length_m / 1000:.2f} km."
     )
     seen = "A line of speed over time."
-    return Picture(one.key, one.title, caption, seen, lambda size: speed(drive, size))
+    return Picture(one.key, one.title, caption, seen, lambda: speed(drive))

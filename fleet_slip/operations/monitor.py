@@ -27,7 +27,7 @@ from fleet_slip.grams.cohort import remark_left_out, sum_days
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.operations.peers import thresholds
-from fleet_slip.pages.drawing import DESK, STYLE, Size, colour
+from fleet_slip.pages.drawing import STYLE, WIDTH_IN, colour
 from fleet_slip.regression.figures import error_sums, student_t_quantile
 from fleet_slip.regression.folds import least_squares
 from fleet_slip.regression.gram import Gram
@@ -220,9 +220,9 @@ HEIGHT_IN = 3.6
 TONES = {"training": "muted", "new": "model_4", "beyond": "unstable"}
 
 
-def control_chart(chart: Chart, size: Size) -> Figure:
+def control_chart(chart: Chart) -> Figure:
     """Draw mean and standard deviation of the error over the days, in degrees."""
-    figure = Figure(figsize=(size.width_in, HEIGHT_IN), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
     above, below = figure.subplots(2, sharex=True)
     panels = (
         (above, "mean", [day.error_mean_deg for day in chart.days], chart.mean_limits),
@@ -244,10 +244,9 @@ def control_chart(chart: Chart, size: Size) -> Figure:
     above.set_title(
         "training days grey, new days blue, beyond a limit red",
         color=colour("muted"),
-        loc="right" if size.wide else "left",
-        **({} if size.wide else {"y": 1.14}),
+        loc="right",
     )
-    locator: Any = AutoDateLocator(minticks=2, maxticks=10 if size.wide else 5)  # type: ignore[no-untyped-call]
+    locator: Any = AutoDateLocator(minticks=2, maxticks=10)  # type: ignore[no-untyped-call]
     below.xaxis.set_major_locator(locator)
     below.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     return figure
@@ -256,7 +255,7 @@ def control_chart(chart: Chart, size: Size) -> Figure:
 def save_chart(chart: Chart, file: Path) -> None:
     """Draw to a file, whose suffix says the format. Raises `ConfigError`, `StorageError`."""
     with mpl.rc_context(STYLE), storage_errors(file):
-        figure = control_chart(chart, DESK)
+        figure = control_chart(chart)
         figure.suptitle(f"{chart.model}: error on each day", x=0.01, ha="left")
         try:
             # Without a date, the same chart is the same file.

@@ -14,8 +14,11 @@ import matplotlib as mpl
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-POINTS_PER_INCH = 72.0
-POINTS_PER_BIN = 1.5
+WIDTH_IN = 10.4
+"""Of a figure: at a scale of 1 its text is as large as small print on the page."""
+
+BINS = int(WIDTH_IN * 72 / 1.5)
+"""That a series over the whole width is cut into: a point and a half each."""
 
 
 @dataclass(frozen=True)
@@ -97,19 +100,6 @@ def colour(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class Size:
-    """What a figure is drawn for: its width, and whether panels fit side by side."""
-
-    width_in: float
-    wide: bool
-
-    @property
-    def bins(self) -> int:
-        """Number of bins that a series over the whole width is cut into."""
-        return int(self.width_in * POINTS_PER_INCH / POINTS_PER_BIN)
-
-
-@dataclass(frozen=True)
 class Picture:
     """One figure of the report.
 
@@ -118,25 +108,19 @@ class Picture:
         title: what it shows.
         caption: what it tells, in numbers.
         seen: what is drawn, for those who cannot see it.
-        draw: makes it at a size.
+        draw: makes it.
     """
 
     key: str
     title: str
     caption: str
     seen: str
-    draw: Callable[[Size], Figure]
+    draw: Callable[[], Figure]
 
     @property
     def alternative(self) -> str:
         """The text in place of the figure."""
         return f"{self.title}. {self.seen} {self.caption}"
-
-
-DESK = Size(10.4, wide=True)
-"""At a scale of 1 the text of a figure is as large as small print on the page."""
-
-PHONE = Size(3.75, wide=False)
 
 
 PNG_DPI = 150
@@ -145,36 +129,26 @@ PIXELS_PER_POINT = 4 / 3
 
 @dataclass(frozen=True)
 class Drawn:
-    """A picture for the page, by class: once for desks, once for phones; and as files of its own.
-
-    The files are on a light ground.
-    """
+    """A picture for the page, and as files of its own, on a light ground."""
 
     picture: Picture
-    svgs: Mapping[str, Markup]
+    svg: Markup
     svg_file: str
     png_file: bytes
 
 
 def draw(picture: Picture) -> Drawn:
-    """Draw a picture in both sizes."""
-    png, svgs = io.BytesIO(), {}
-    for kind, size in (("desk", DESK), ("phone", PHONE)):
-        stream = io.StringIO()
-        settings: Any = {**STYLE, "svg.hashsalt": f"{picture.key}-{size.wide}"}
-        with mpl.rc_context(settings):
-            figure: Figure = picture.draw(size)
-            figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
-            if kind == "desk":
-                figure.savefig(png, format="png", dpi=PNG_DPI, metadata={"Software": None})
-        svgs[kind] = _lean(stream.getvalue())
+    """Draw a picture."""
+    png, stream = io.BytesIO(), io.StringIO()
+    with mpl.rc_context({**STYLE, "svg.hashsalt": picture.key}):
+        figure = picture.draw()
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(png, format="png", dpi=PNG_DPI, metadata={"Software": None})
+    svg = _lean(stream.getvalue())
     return Drawn(
         picture,
-        {
-            kind: Markup(inline(svg, f"{picture.key}-{kind}", picture.alternative))  # noqa: S704
-            for kind, svg in svgs.items()
-        },
-        svgs["desk"].replace(f"'{FONT}'", f"'{FONT}', Verdana, sans-serif"),
+        Markup(inline(svg, picture.key, picture.alternative)),  # noqa: S704
+        svg.replace(f"'{FONT}'", f"'{FONT}', Verdana, sans-serif"),
         png.getvalue(),
     )
 
