@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from fleet_slip.ingest.log_files import Log
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.ingest.recordings import Replace
-    from fleet_slip.operations.migration import MigrationReport
+    from fleet_slip.operations.rewriting import MigrationReport
     from fleet_slip.simulation.campaign import Campaign
     from fleet_slip.simulation.job import SimulationReport
 
@@ -237,7 +237,7 @@ class LogsAndGrams(Rooted):
 
         Raises `RefusedError` if the counts are in other scales, and `ConflictError`.
         """
-        from fleet_slip.operations.migration import migrate
+        from fleet_slip.operations.rewriting import migrate
 
         with step("migrate"):
             return migrate(self.warehouse)

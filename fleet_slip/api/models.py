@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from fleet_slip.evaluation.evaluate import Evaluation
     from fleet_slip.evaluation.report import Written
     from fleet_slip.export.stepping import Estimator
-    from fleet_slip.models.diff import Difference
     from fleet_slip.models.manifest import Manifest
     from fleet_slip.models.publish import DryRun, Publication
+    from fleet_slip.models.registry import Difference
     from fleet_slip.models.score import Score
     from fleet_slip.models.select import Selection
 
@@ -209,7 +209,7 @@ class PublishedModels(Rooted):
         other: Annotated[str | ModelVersion, VERSION],
     ) -> "Difference":
         """Tell two versions apart, by their manifests and their drives. Raises as `model`."""
-        from fleet_slip.models.diff import compare_versions
+        from fleet_slip.models.registry import compare_versions
 
         return compare_versions(self.registry(), self.model(one), self.model(other))
 

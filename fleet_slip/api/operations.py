@@ -169,7 +169,7 @@ class HealthAndUpkeep(JudgedModels):
     @record_call
     def repair(self, found: "Verification") -> list[str]:
         """Rebuild what `verify` found damaged; return the paths, below the root."""
-        from fleet_slip.operations.repair import repair
+        from fleet_slip.operations.verify import repair
 
         return repair(self.warehouse, found)
 

@@ -53,7 +53,6 @@ from fleet_slip.models.search import (
     try_distances,
 )
 from fleet_slip.models.summary import summarize
-from fleet_slip.pages.notebook import notebook_table
 from fleet_slip.regression.choice import NestedDistances, Rule, Winner, Worth
 from fleet_slip.regression.drives import (
     DriveMoments,
@@ -66,7 +65,7 @@ from fleet_slip.regression.folds import (
 )
 from fleet_slip.regression.gram import GramTable, packed_position
 from fleet_slip.regression.orders import METHODS
-from fleet_slip.rendering import Answer, Part
+from fleet_slip.rendering import Answer, Part, notebook_table
 from fleet_slip.resources import find_config
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -2,11 +2,12 @@
 
 Data files with the checksums in their names and the Delta log; drives with the rule that they are
 whole; Gram rows with the logs by another path; documents with checksums; model versions with their
-tables; names with the record of what was forgotten.
+tables; names with the record of what was forgotten. What can be rebuilt is rebuilt on request.
 """
 
+import contextlib
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -35,20 +36,21 @@ from fleet_slip.grams.check import (
     stored_grams,
 )
 from fleet_slip.grams.compute import wide_grams
-from fleet_slip.grams.gram_files import is_received, named_files
+from fleet_slip.grams.gram_files import is_of_received, is_received, named_files
+from fleet_slip.grams.job import reconcile
 from fleet_slip.grams.on_board import counted_sets, impossible_rows
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import find_temporary_files, find_unreferenced
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.checksums import checksum_in, checksum_of
-from fleet_slip.storage.commits import LOG, find_commit_faults
+from fleet_slip.storage.commits import LATEST, LOG, check_commits, find_commit_faults
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.encoding import Names, read_names
 from fleet_slip.storage.folder import Folder, StoredFile
 from fleet_slip.storage.runs import find_changed_lines
 from fleet_slip.storage.storage_errors import storage_errors
-from fleet_slip.storage.table import Snapshot, Table, TableFile, on_newest
+from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, on_newest, retrying
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse
@@ -478,3 +480,89 @@ def _list_unreferenced(
 def _remark(warehouse: Warehouse, file: StoredFile, problem: str, report: Verification) -> None:
     where = str(file).removeprefix(f"{warehouse.root}/")
     report.note("unreferenced", where, problem)
+
+
+# Rebuilds what can be rebuilt: Gram rows from the logs, and checkpoints from the commits.
+#
+# Nothing is deleted. The bytes of a file that stand under another name are put back.
+
+
+def repair(warehouse: Warehouse, verification: Verification) -> list[str]:
+    """Rebuild what is damaged; return what, below the root."""
+    logs = {finding.path for finding in verification.damage if finding.kind == "log"}
+    rebuilt = _sum_up_again(warehouse, logs)
+    damaged = {finding.path for finding in verification.damage if finding.kind == "file"}
+    wrong = {f.path.removeprefix("logs/") for f in verification.damage if f.kind == "gram"}
+    rebuilt += _find_elsewhere(warehouse, damaged)
+    lost = {path.removeprefix("logs/") for path in damaged.difference(rebuilt)}
+    rebuilt += _drop_wrong(warehouse, damaged, wrong)
+    reconcile(warehouse, unreadable=lost)  # also what an interrupted repair has dropped
+    return rebuilt
+
+
+def _sum_up_again(warehouse: Warehouse, damaged: Set[str]) -> list[str]:
+    """Write the checkpoints of damaged logs again whose commits are all there, and sound."""
+    rebuilt = []
+    for table in warehouse.tables:
+        name, log = table.folder.name, table.folder / LOG
+        found = damaged & {name, f"{name}/{LOG}/{LATEST}"}
+        commits, faults = check_commits(log) if found else ([], {})
+        if not commits or commits[0].version or faults:
+            continue
+        for file in log.files():
+            if ".checkpoint." in file.name or file.name == LATEST:
+                log.remove(file)
+        delta = table.open_delta()
+        if delta is not None:
+            with storage_errors(table.folder):
+                delta.create_checkpoint()
+        rebuilt += sorted(found)
+    return rebuilt
+
+
+def _find_elsewhere(warehouse: Warehouse, damaged: Collection[str]) -> list[str]:
+    """Put back the files whose very bytes a job or a person left under another name."""
+    rebuilt = []
+    for table in warehouse.tables:
+        name = table.folder.name
+        files = table.snapshot().files
+        lost = [file for file in files if f"{name}/{file.path}" in damaged]
+        sizes = {file.size_bytes for file in lost}
+        for other in table.folder.files() if lost else ():
+            if other.size_bytes not in sizes or other.path.startswith("_delta_log/"):
+                continue
+            with contextlib.suppress(StorageError):
+                content = table.folder.read(other.path)
+                for file in lost:
+                    if checksum_in(file.path) == checksum_of(content):
+                        table.folder.put(file.path, content)
+                        rebuilt.append(f"{name}/{file.path}")
+                lost = [file for file in lost if f"{name}/{file.path}" not in rebuilt]
+    return rebuilt
+
+
+@retrying
+def _drop_wrong(warehouse: Warehouse, damaged: Collection[str], wrong: set[str]) -> list[str]:
+    """Drop the Gram files that are damaged, or have wrong rows of log files; return them."""
+    snapshot = warehouse.grams.snapshot()
+    readable = _readable_grams(warehouse).items()
+    named = {path: rows["file"].unique().to_pylist() for path, rows in readable}
+    bad = [
+        file
+        for file in snapshot.files
+        if (f"grams/{file.path}" in damaged and not is_of_received(file))
+        or not wrong.isdisjoint(named.get(file.path, ()))
+    ]
+    if bad:
+        snapshot.commit(Change(remove=bad, note={"job": "repair"}))
+    return [f"grams/{file.path}" for file in bad]
+
+
+def _readable_grams(warehouse: Warehouse) -> dict[str, pa.Table]:
+    """Return which drives and log files the Gram files name, of those that are whole."""
+    found = {}
+    for file in warehouse.grams.snapshot().files:
+        if read_whole(warehouse.grams, file).problem is None:
+            with contextlib.suppress(FleetSlipError):
+                found[file.path] = warehouse.grams.read(file.path, ["file", "drive_id"])
+    return found

@@ -11,8 +11,7 @@ from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE, catalogue
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.compute import by_sql
 from fleet_slip.grams.job import update_grams
-from fleet_slip.operations.migration import migrate
-from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.rewriting import compact, migrate
 from fleet_slip.operations.verify import verify
 from fleet_slip.resources import CONFIG_VARIABLE, folder
 from fleet_slip.views import connect

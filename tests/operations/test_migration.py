@@ -11,7 +11,7 @@ from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE, catalogue
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.check import check_grams
 from fleet_slip.grams.job import update_grams
-from fleet_slip.operations.migration import migrate
+from fleet_slip.operations.rewriting import migrate
 from fleet_slip.resources import folder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse

@@ -26,9 +26,8 @@ from fleet_slip.operations import rewriting
 from fleet_slip.operations.find_drives import find_expired
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.marked_models import marked_models
-from fleet_slip.operations.repair import repair
 from fleet_slip.operations.rewriting import compact
-from fleet_slip.operations.verify import verify
+from fleet_slip.operations.verify import repair, verify
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_batches
 from fleet_slip.storage.local import LocalFolder

@@ -13,8 +13,7 @@ import pytest
 from fleet_slip.grams.job import update_grams
 from fleet_slip.ingest.load import ingest_files
 from fleet_slip.operations.forget import forget
-from fleet_slip.operations.migration import migrate
-from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.rewriting import compact, migrate
 from fleet_slip.operations.verify import verify
 from fleet_slip.storage import encoding
 from fleet_slip.storage.local import LocalFolder

@@ -14,8 +14,7 @@ import pytest
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.find_drives import vacuum
-from fleet_slip.operations.repair import repair
-from fleet_slip.operations.verify import verify
+from fleet_slip.operations.verify import repair, verify
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change

@@ -7,8 +7,7 @@ import pytest
 from deltalake import DeltaTable
 
 from fleet_slip.errors import StorageError
-from fleet_slip.operations.repair import repair
-from fleet_slip.operations.verify import verify
+from fleet_slip.operations.verify import repair, verify
 from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import land, log_rows, path_of
