@@ -1,7 +1,7 @@
 """Checks the order of time and cuts rows, block by block, into drives: uninterrupted stretches."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property, partial
@@ -211,6 +211,8 @@ MOST_OPEN_ROWS = 2**19
 """Rows of drives that have not ended, in memory; all others wait in a temporary file."""
 MOST_PARTS = 64
 """Parts whose rows are taken out of a block at once: thousands of small frames take much memory."""
+MOST_PIECES, BUNDLED_GROUPS = 512, 128
+"""Parts whose rows are put aside one by one; of more, those of so many groups stand together."""
 
 
 @dataclass(frozen=True)
@@ -257,7 +259,11 @@ class DriveRows:
 
 
 class OpenDrives:
-    """Rows by part, as long as the part has not ended, few of them in memory."""
+    """Rows by part, as long as the part has not ended, few of them in memory.
+
+    Where thousands of parts are open at once, their rows are put aside by bundles of groups, and
+    no part is yielded before the last.
+    """
 
     def __init__(self) -> None:
         """Begin without rows."""
@@ -266,6 +272,11 @@ class OpenDrives:
         """Later blocks, of many parts."""
         self._in_memory = 0
         self._spool = Spool()
+        self._bundles: set[int] = set()
+        """Groups whose rows were put aside together, by their number over `BUNDLED_GROUPS`."""
+        self._ended: list[int] = []
+        self._group_of: dict[int, int] = {}
+        """Of each part that has rows in the file."""
 
     def add(self, rows: pl.DataFrame) -> None:
         """Keep rows that are sorted by group, and so the rows of each part stand together."""
@@ -273,7 +284,7 @@ class OpenDrives:
             return
         self._in_memory += rows.height
         one = rows["part"][0] == rows["part"][-1]
-        if self._mixed or (not one and rows["part"].n_unique() > MOST_PARTS):
+        if self._mixed or self._bundles or (not one and rows["part"].n_unique() > MOST_PARTS):
             self._mixed.append(rows)
         else:
             self._keep([rows] if one else rows.partition_by("part", maintain_order=True))
@@ -283,9 +294,15 @@ class OpenDrives:
             pieces = _by_base(run) if "base" in run.columns else [run]
             self._rows.setdefault(int(run["part"][0]), []).extend(pieces)
 
-    def take(self, parts: Sequence[int]) -> Iterator[DriveRows]:
-        """Yield the rows of parts that have any, and let go of them."""
+    def take(self, parts: Sequence[int], *, last: bool) -> Iterator[DriveRows]:
+        """Yield the rows of parts that have any, and let go of them; the last are all."""
+        if self._bundles:
+            self._ended += parts
+            if last:
+                yield from self._unbundled()
+            return
         if self._mixed and len(parts) > MOST_PARTS:
+            self._keep_mixed()
             self._put_aside()
         elif self._mixed and parts:
             mine = pl.col("part").is_in(parts)
@@ -293,8 +310,13 @@ class OpenDrives:
             self._keep(runs.partition_by("part", maintain_order=True))
             rest = (rows.filter(~mine) for rows in self._mixed)
             self._mixed = [rows for rows in rest if rows.height]
+        yield from self._joined(parts)
+
+    def _joined(self, parts: Iterable[int]) -> Iterator[DriveRows]:
+        """Yield the rows of parts that have any, of those put aside and in memory."""
         for part in parts:
             in_memory = self._rows.pop(part, [])
+            self._group_of.pop(part, None)
             self._in_memory -= sum(piece.height for piece in in_memory)
             pieces = [*map(pl.read_ipc_stream, self._spool.read(part)), *in_memory]
             if pieces and "base" not in pieces[0].columns:
@@ -306,23 +328,68 @@ class OpenDrives:
                 joined = {one: pl.concat(bases[one], how="diagonal") for one in sorted(bases)}
                 yield DriveRows(joined)
 
+    def _unbundled(self) -> Iterator[DriveRows]:
+        """Yield the rows of all parts, bundle by bundle, and in each as the parts ended."""
+        self._bundle()
+        parts = defaultdict[int, list[int]](list)
+        for part in self._ended:
+            parts[self._group_of.get(part, 0) // BUNDLED_GROUPS].append(part)
+        for bundle in sorted(parts):
+            for piece in self._spool.read(("bundle", bundle)):
+                self._mixed.append(pl.read_ipc_stream(piece))
+                self._in_memory += self._mixed[-1].height
+                if self._in_memory > MOST_OPEN_ROWS:
+                    self._keep_mixed()
+                    self._put_aside()
+            self._keep_mixed()
+            yield from self._joined(parts[bundle])
+
     def spill(self) -> None:
         """Put the rows aside if they are many. Raises `InputError` if the disk is full."""
-        if self._in_memory > MOST_OPEN_ROWS:
+        if self._in_memory <= MOST_OPEN_ROWS:
+            return
+        parts = pl.concat([rows["part"] for rows in self._mixed]) if self._mixed else pl.Series()
+        if self._bundles or parts.n_unique() > MOST_PIECES:
+            self._bundle()
+        else:
+            self._keep_mixed()
             self._put_aside()
 
-    def _put_aside(self) -> None:
+    def _keep_mixed(self) -> None:
+        """Take the blocks of many parts apart."""
         if self._mixed:
             mixed, self._mixed = pl.concat(self._mixed), []
             self._keep(mixed.partition_by("part", maintain_order=True))
+
+    def _bundle(self) -> None:
+        """Put the blocks of many parts aside by bundles, and all else by part."""
+        self._put_aside()
+        if not self._mixed:
+            return
+        rows, self._mixed = pl.concat(self._mixed), []
+        heads = rows.select("part", "group").unique("part")
+        self._group_of.update(zip(heads["part"], heads["group"], strict=True))
+        bundle = (pl.col("group") // BUNDLED_GROUPS).alias("bundle")
+        bundles = rows.with_columns(bundle).partition_by("bundle", as_dict=True, include_key=False)
+        for (number,), some in bundles.items():
+            self._bundles.add(number)
+            self._write(("bundle", number), some)
+        self._in_memory = 0
+
+    def _put_aside(self) -> None:
+        """Put the rows of each part aside."""
         for part, pieces in self._rows.items():
+            self._group_of[part] = int(pieces[0]["group"][0])
             alike = "base" not in pieces[0].columns
             for piece in [pl.concat(pieces)] if alike else pieces:
-                content = BytesIO()
-                piece.write_ipc_stream(content, compression="lz4")
-                self._spool.add(part, content.getvalue())
+                self._write(part, piece)
         self._rows.clear()
-        self._in_memory = 0
+        self._in_memory = sum(rows.height for rows in self._mixed)
+
+    def _write(self, key: Hashable, piece: pl.DataFrame) -> None:
+        content = BytesIO()
+        piece.write_ipc_stream(content, compression="lz4")
+        self._spool.add(key, content.getvalue())
 
 
 def _by_base(run: pl.DataFrame) -> list[pl.DataFrame]:

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from collections.abc import Mapping as Named
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
@@ -160,7 +160,8 @@ class MeasuredStream:
         rows, misplaced = cutter.cut(block.rows, last=last)
         self._open.add(rows)
         self._refuse(pl.concat([block.refused, misplaced]))
-        for ended in self._open.take([*cutter.ended, *(cutter.open_parts() if last else ())]):
+        parts = [*cutter.ended, *(cutter.open_parts() if last else ())]
+        for ended in self._open.take(parts, last=last):
             if ended.end_s - ended.start_s < STEP_S - TIME_EPSILON_S:
                 self._refuse(describe_refused(ended.frame, None, "too_short"))
             else:
@@ -410,8 +411,7 @@ def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]
             for name in names:
                 if name in used or names.count(name) > 1 or not is_called(words, name):
                     continue
-                column = pl.concat([batch[name] for batch in source.batches([name])])
-                values, runs = _values_and_runs(column)
+                values, runs = _values_and_runs(batch[name] for batch in source.batches([name]))
                 if values > 1 and (key == "vehicle_id" or runs > values or values > drives):
                     figure = f"it has {values:,} values, and the mapping does not use it"
                     where = f"column = {json.dumps(name, ensure_ascii=False)}"
@@ -419,14 +419,20 @@ def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]
                     yield Fault("cars", (name,), figure, f"Write {where} under [drive].")
 
 
-def _values_and_runs(column: pl.Series) -> tuple[int, int]:
+def _values_and_runs(pieces: Iterable[pl.Series]) -> tuple[int, int]:
     """Return how many names a column has, and how often one begins; none if it is a quantity."""
-    texts = column.cast(pl.String).str.strip_chars()
-    present = texts.filter(texts.is_not_null() & (texts != ""))
-    values = present.n_unique()
-    if values > min(MOST_NAMES, len(present) // LEAST_ROWS_A_NAME):
-        return 0, 0
-    return values, 1 + int((present != present.shift()).sum())
+    values, rows, runs, before = set[str](), 0, 0, None
+    for piece in pieces:
+        texts = piece.cast(pl.String).str.strip_chars()
+        present = texts.filter(texts.is_not_null() & (texts != ""))
+        values.update(present.unique())
+        if len(values) > MOST_NAMES:
+            return 0, 0
+        if len(present):
+            rows += len(present)
+            runs += int((present != present.shift()).sum()) + (present[0] != before)
+            before = present[-1]
+    return (0, 0) if len(values) > rows // LEAST_ROWS_A_NAME else (len(values), runs)
 
 
 def _overlaps(under_way: list[tuple[float, float]]) -> int:

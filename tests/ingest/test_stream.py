@@ -177,9 +177,18 @@ def test_nothing_is_left_of_a_file_that_fails_at_its_end(
     assert not list((tmp_path / "data").rglob("*.parquet"))
 
 
-@pytest.mark.parametrize(("rows", "parts"), [(4, 64), (4, 1), (9, 2), (2**20, 1), (2**20, 2)])
+@pytest.mark.parametrize(
+    ("rows", "parts", "pieces", "groups"),
+    [(4, 64, 512, 128), (4, 1, 512, 128), (9, 2, 512, 128), (2**20, 1, 512, 128),
+     (2**20, 2, 512, 128), (4, 1, 1, 1), (9, 1, 1, 2), (4, 0, 0, 128)],
+)  # fmt: skip
 def test_open_drives_that_wait_in_a_file_are_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int, parts: int
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    rows: int,
+    parts: int,
+    pieces: int,
+    groups: int,
 ) -> None:
     """Drives that alternate row by row, of which one ends early, and one that stands together."""
     columns: dict[str, list[Any]] = {**good_columns(60)}
@@ -191,6 +200,8 @@ def test_open_drives_that_wait_in_a_file_are_the_same(
     whole = read_columns(tmp_path, columns, mapping)
     monkeypatch.setattr(open_drives, "MOST_OPEN_ROWS", rows)
     monkeypatch.setattr(open_drives, "MOST_PARTS", parts)
+    monkeypatch.setattr(open_drives, "MOST_PIECES", pieces)
+    monkeypatch.setattr(open_drives, "BUNDLED_GROUPS", groups)
     spilled = read_columns(tmp_path, columns, mapping)
     assert spilled.drives.equals(whole.drives)
     assert spilled.counts == whole.counts
