@@ -1,16 +1,18 @@
 """A fleet in Python: what a notebook asks of it."""
 
 import gc
+import shutil
 import sys
 import threading
 from pathlib import Path
 
+import duckdb
 import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import QuestionError, StorageError
-from tests.support.commands import run
+from tests.support.commands import finish, run, run_on, start
 
 
 def test_opening_touches_nothing_and_the_root_follows_the_rule(
@@ -124,3 +126,112 @@ def test_threads_share_a_fleet_and_a_model(fleet: Fleet) -> None:
     for thread in threads:
         thread.join(120)
     assert answers[0] == answers[2] != answers[1] == answers[3]
+
+
+COUNT = "SELECT count(*) FROM drives"
+
+
+def test_all_queries_of_a_session_see_the_same_commits(smoke_root: Path, tmp_path: Path) -> None:
+    root = shutil.copytree(smoke_root, tmp_path / "data")
+    fleet = fleet_slip.open(root)
+    with fleet.session() as session:
+        before = session.sql(COUNT).fetchall()
+        fleet.forget(drive="smoke-2024-05-01-0000")
+        assert session.sql(COUNT).fetchall() == before
+    assert fleet.sql(COUNT).fetchall() != before
+
+
+def test_an_answer_is_computed_as_a_table_or_by_a_function(fleet: Fleet) -> None:
+    with fleet.session() as session:
+        table = session.table("SELECT drive_id FROM drives ORDER BY ALL")
+        assert table.num_rows > 1
+        assert session.compute("FROM drives", len) == table.num_rows
+
+
+def test_a_closed_session_answers_no_more(fleet: Fleet) -> None:
+    with fleet.session() as session:
+        pass
+    with pytest.raises(duckdb.ConnectionException):
+        session.database.execute("SELECT 1")
+
+
+def test_an_unlocked_session_does_what_it_is_told(fleet: Fleet, tmp_path: Path) -> None:
+    with fleet.session(unlocked=True) as session:
+        session.sql(COUNT).write_csv(str(tmp_path / "out.csv"))
+        session.table("CREATE TABLE own AS SELECT 1 AS a")
+        assert session.table("FROM own").to_pylist() == [{"a": 1}]
+        with pytest.raises(QuestionError, match="empty"):
+            session.sql("")
+    assert (tmp_path / "out.csv").exists()
+
+
+def test_what_takes_long_is_computed_when_a_query_names_it(smoke_root: Path) -> None:
+    with fleet_slip.open(smoke_root).session() as session:
+        tables = "SELECT count(*) AS n FROM duckdb_tables() WHERE table_name = 'calibration'"
+        assert session.table(tables.replace("calibration", "calib' || 'ration")).to_pylist() == [
+            {"n": 0}
+        ]
+        asked = "SELECT count(DISTINCT vehicle_id) AS cars FROM calibration"
+        first, again = (session.table(asked).to_pylist() for _ in range(2))
+        assert first == again
+        assert session.table(tables).to_pylist() == [{"n": 1}]
+
+
+def test_an_answer_from_a_damaged_file_is_none(smoke_root: Path, tmp_path: Path) -> None:
+    """A flipped bit of a count is a well-formed count."""
+    root = shutil.copytree(smoke_root, tmp_path / "data")
+    file = next((root / "logs").rglob("*.parquet"))
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.chmod(0o644)
+    file.write_bytes(content)
+    with (
+        fleet_slip.open(root).session() as session,
+        pytest.raises(StorageError, match=r"damaged|checksum"),
+    ):
+        session.table("SELECT sum(ax) FROM log_counts")
+
+
+def test_answers_are_shown_on_a_line_or_two(smoke_root: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    cohort = fleet.cohort()
+    selection = cohort.select(models="table1")
+    assert repr(selection).startswith("<Selection: ")
+    assert "RMSE" in repr(selection)
+    model = fleet.model("smoke")
+    assert repr(model).startswith("<ModelVersion smoke@1: ")
+    for answer in (selection, model, fleet.status()):
+        assert len(repr(answer)) < 500
+    assert len(repr(selection.models[0].model)) < 200  # its fractions may have 10,000 digits
+    assert "Fraction" not in repr(cohort.diagnose(model))
+
+
+def test_a_notebook_gets_a_table_with_bars(smoke_root: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    selection = fleet.cohort("campaign <> '<script>'").select(models="table1")
+    assert selection._repr_html_().count("<tr>") == 6
+    page = fleet.model("smoke")._repr_html_()
+    assert page.count("<tr>") == len(fleet.model("smoke").manifest.terms) + 2
+    assert page.count("<svg ") == page.count("<tr>") - 1
+    assert "<script>" not in selection._repr_html_() + page
+
+
+KERNEL = """
+import sys, types
+sys.modules["IPython"] = types.ModuleType("IPython")  # what DuckDB takes for a notebook
+sys.modules["IPython"].get_ipython = lambda: types.SimpleNamespace(config={"IPKernelApp": {}})
+sys.modules["ipywidgets"] = None
+from fleet_slip.warehouse.database import open_database
+print(open_database().sql("SELECT 42").fetchall())
+"""
+
+
+def test_a_notebook_needs_no_widgets() -> None:
+    assert finish(start([sys.executable, "-c", KERNEL]))[0].stdout == "[(42,)]\n"
+
+
+def test_an_answer_is_the_text_that_its_command_prints(smoke_root: Path) -> None:
+    fleet = fleet_slip.open(smoke_root)
+    answers = {"quality": fleet.quality(), "diagnose smoke": fleet.cohort().diagnose("smoke")}
+    for words, answer in answers.items():
+        assert str(answer) == run_on(smoke_root, *words.split()).stdout.rstrip()

@@ -21,12 +21,11 @@ from fleet_slip.models.acceptance import floor
 from fleet_slip.operations.night import NightReport
 from fleet_slip.regression.gram import Gram
 from tests.support.cars import counts, drive
-from tests.support.commands import Finished, run_on, start_on
+from tests.support.commands import Finished, run_on, start_on, until
 from tests.support.counted_rows import START_S, row_of, write_counted
 from tests.support.landing import Landing
 from tests.support.once import made_once
 from tests.support.state import state
-from tests.support.waiting import until
 
 FIRST = date(2026, 10, 5)
 OPTIONS = ("--models", "table1")

@@ -15,8 +15,9 @@ import fleet_slip
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.local import LocalFolder
+from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.commands import RunCommand
+from tests.support.commands import RunCommand, run_on
 
 
 def test_a_second_run_does_nothing(
@@ -276,3 +277,76 @@ def test_the_version_is_told(run_command: RunCommand) -> None:
     assert "Exit codes" in run_command("--help").stdout
     assert run_command("--version").stdout.startswith("fleet-slip ")
     assert run_command().exit_code == 2
+
+
+WORSE = ("publish", "smoke", "--features", "windows", "--nested", "ax", "--json")
+
+
+def test_candidates_wait_are_compared_and_promoted(
+    run_command: RunCommand, smoke_root: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(smoke_root, tmp_path / "data")
+    assert run_command(*WORSE).exit_code == 7
+    waiting = run_command(*WORSE, "--candidate").json
+    assert (waiting["version"], waiting["candidate"]) == (2, True)
+    assert "worse than the champion" in waiting["reason"]
+    assert run_command("show", "smoke", "--json").json["version"] == 1
+    compared = run_command("diff", "smoke@champion", "smoke@candidate")
+    assert "selected_by.asked.features" in compared.stdout and "sha256" not in compared.stdout
+    assert "8 made both, 0 only smoke@1, 0 only smoke@2" in compared.stderr
+    assert "are the same estimator" in run_command("diff", "smoke@1", "smoke@1").stderr
+    names = ("smoke@champion", "smoke@candidate")
+    better, worse = (run_command("score", name, "--json").json for name in names)
+    assert (better["model"], worse["model"]) == ("smoke@1", "smoke@2")
+    assert better["rows"] == worse["rows"]
+    assert better["rmse_deg"] < worse["rmse_deg"]
+    assert run_command("promote", "smoke@candidate").exit_code == 0
+    assert run_command("show", "smoke", "--json").json["version"] == 2
+
+
+def test_no_night_moves_a_champion_that_was_pinned_or_rolled_back(
+    run_command: RunCommand, smoke_root: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(smoke_root, tmp_path / "data")
+    assert run_command(*WORSE, "--force").exit_code == 0
+    for hold in (["pin", "smoke"], ["promote", "smoke", "--previous"]):
+        assert run_command(*hold).exit_code == 0
+        before = run_command("show", "smoke", "--json").json["version"]
+        night = run_command("publish", "smoke", "--nested", "ay,yaw_rate", "--force", "--json")
+        assert night.json["candidate"]
+        assert run_command("show", "smoke", "--json").json["version"] == before
+    assert run_command("pin", "smoke", "--off").exit_code == 0
+    night = run_command("publish", "smoke", "--nested", "ay,yaw_rate", "--force", "--json")
+    assert not night.json["candidate"]
+
+
+CAR = ("--mass", "1480", "--front-axle", "1.11", "--rear-axle", "1.67", "--radius", "0.325")
+
+
+def test_a_car_is_identified_and_its_file_is_a_vehicle(smoke_root: Path, tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    some = ("--cohort", "drive_id < 'smoke-2024-05-01-0002'")
+    done = run_on(smoke_root, "identify", "mine", *CAR, *some, "--output", str(file), "--json")
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert (found["name"], found["drives"]) == ("mine", 2)
+    assert 0.028 < found["fit_deg"] < found["held_out_deg"] < 0.06, "the label's noise is 0.029"
+    car = load_vehicle(str(file))
+    assert car.body.mass_kg == pytest.approx(1480)
+    assert car.body.yaw_inertia_kgm2 == pytest.approx(found["found"]["yaw_inertia_kgm2"])
+
+
+def test_a_car_without_labelled_drives_cannot_be_identified(smoke_root: Path) -> None:
+    done = run_on(smoke_root, "identify", "mine", *CAR, "--cohort", "drive_id = 'none'")
+    assert done.exit_code == 5
+    assert "none" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "told"), [(("Golf", *CAR), "name: "), (("mine", *CAR, "--mass", "inf"), "mass_kg: ")]
+)
+def test_what_no_car_can_have_is_a_wrong_use(
+    words: tuple[str, ...], told: str, smoke_root: Path
+) -> None:
+    done = run_on(smoke_root, "identify", *words)
+    assert (done.exit_code, told in done.stderr) == (2, True), done.stderr

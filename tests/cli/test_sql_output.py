@@ -1,5 +1,7 @@
 """Where the answer to a query goes: a table for people, whole or not, or a file."""
 
+import csv
+import io
 import json
 from pathlib import Path
 
@@ -85,3 +87,28 @@ def test_statements_on_stdin_are_answered_one_after_the_other(
     assert "only queries are allowed" in done.stderr
     assert run_command("sql", "SELECT 1; SELECT 2", root=smoke_root).exit_code == 5
     assert run_command("sql", root=smoke_root, input="").exit_code == 5
+
+
+def cells(text: str) -> list[list[str]]:
+    return list(csv.reader(io.StringIO(text)))[1:]
+
+
+def test_a_text_that_is_a_formula_is_marked_in_csv(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
+    texts = [begin + "cmd|'/C calc'!A0" for begin in "=+-@\t\r\n＝＋－＠"]
+    values = ["chr(" + ") || chr(".join(str(ord(c)) for c in text) + ")" for text in texts]
+    query = "SELECT " + ", ".join(values) + ", -1.5"
+    done = run_command("sql", query, "--csv", root=smoke_root)
+    texts = [text.replace("\r", "\n") for text in texts]  # as subprocess reads it
+    assert cells(done.stdout) == [[*("'" + text for text in texts), "-1.5"]]
+    assert f"{len(texts)} texts that begin like a formula" in done.stderr
+    exact = run_command("sql", query, "--csv", "--exact", root=smoke_root)
+    assert (cells(exact.stdout), exact.stderr) == ([[*texts, "-1.5"]], "")
+
+
+def test_other_texts_are_printed_as_they_are(run_command: RunCommand, smoke_root: Path) -> None:
+    query = "SELECT unnest(['a=b', '', NULL, '2024-05-01', ' =x'::VARCHAR]) AS a, -2 AS b"
+    done = run_command("sql", query, "--csv", root=smoke_root)
+    assert [row[0] for row in cells(done.stdout)] == ["a=b", "", "", "2024-05-01", " =x"]
+    assert done.stderr == ""

@@ -14,9 +14,9 @@ from fleet_slip.compute.cluster import ClusterExecutor, cluster_executor
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ClusterError
 from fleet_slip.storage.local import LocalFolder
+from tests.support.commands import until
 from tests.support.dask_processes import DaskProcesses, dask_processes
 from tests.support.orders import Order, obey
-from tests.support.waiting import until
 
 pytestmark = pytest.mark.long
 

@@ -17,8 +17,8 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats import reading
 from fleet_slip.ingest.formats import source as budget
 from tests.ingest.test_tdms import own_clock, wave, write
+from tests.support.commands import until
 from tests.support.measured import failure, read_measured
-from tests.support.waiting import until
 
 HARM = """
 def open_other(): open({secret!r}).read()

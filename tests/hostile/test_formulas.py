@@ -18,7 +18,7 @@ from mcap.writer import CompressionType
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.confined_reader import open_here
 from fleet_slip.ingest.formats.source import Budget
-from tests.support.waiting import within
+from tests.support.commands import within
 
 RAW = np.arange(-100, 100, dtype="i2")
 TIME_S = np.arange(RAW.size) / 100

@@ -22,9 +22,9 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats import source
 from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.mapping import Mapping
+from tests.support.commands import within
 from tests.support.fuzz.logs import DBC, FORMATS, sound_file
 from tests.support.measured import OWN_CLOCK, a_mapping, read_measured
-from tests.support.waiting import within
 
 COLUMNS = ("t", "ax", "beta")
 SECRET = 12_345.0

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from fleet_slip.ingest.suspicion import find_suspicions
-from tests.support.cars import Signals, drive
+from tests.support.cars import Signals, drive, speed_of, with_course
 from tests.support.measured import MeasuredLog, a_mapping, physical, read_columns, read_measured
 from tests.support.reported import call
-from tests.support.satellites import speed_of, with_course
 
 ROWS = 3000
 ANTENNA = {"antenna_x_m": 1.2, "antenna_y_m": -0.4}

@@ -1,6 +1,7 @@
 """The same drive in every format, written by other programs, comes out as the same counts."""
 
 import gc
+import re
 import tempfile
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -24,7 +25,17 @@ from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.ingest.load import preview_logs
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.profile import profile_file
-from tests.support.measured import MeasuredLog, a_mapping, failure, own_clock, read_measured, ticks
+from tests.support.fuzz import logs
+from tests.support.fuzz.logs import FORMATS, sound_file
+from tests.support.measured import (
+    MeasuredLog,
+    a_mapping,
+    failure,
+    own_clock,
+    physical,
+    read_measured,
+    ticks,
+)
 
 START = datetime(2024, 5, 31, 12, tzinfo=UTC)
 TIME_S = np.arange(100) / 100
@@ -361,3 +372,33 @@ def test_a_matlab_5_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     file = tmp_path / "log.mat"
     scipy.io.savemat(file, {"t": np.zeros(2**24)}, do_compression=True)
     assert "bytes need more than" in failure(file, mat_mapping())
+
+
+LINES = ("asc", "candump", "vbo")
+"""Formats of which what comes before the cut is read, as of CSV."""
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_says_the_same(tmp_path: Path, name: str) -> None:
+    file = tmp_path / f"log{FORMATS[name].suffix}"
+    file.write_bytes(sound_file(name))
+    log = read_measured(file, FORMATS[name].mapping)
+    assert ticks(log) == list(range(logs.ROWS))
+    np.testing.assert_allclose(physical(log, "ax", 0.001), logs.AX, atol=1e-6)
+    sideslip = physical(log, "sideslip", 0.0001)
+    known = np.isfinite(sideslip)
+    assert known.sum() == logs.ROWS - ("mdf4" in name)  # whose first value is marked as invalid
+    np.testing.assert_allclose(sideslip[known], np.radians(logs.BETA)[known], atol=5.1e-5)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.99])
+@pytest.mark.parametrize("name", [name for name in FORMATS if name not in LINES])
+def test_a_file_that_was_cut_is_refused(
+    tmp_path: Path, name: str, share: float, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / f"log{FORMATS[name].suffix}"
+    content = sound_file(name)
+    file.write_bytes(content[: int(share * len(content))])
+    message = failure(file, FORMATS[name].mapping)
+    assert re.search("Is it complete|ends too early|it is truncated", message)
+    assert capfd.readouterr().err == ""

@@ -1,4 +1,7 @@
+import errno
+import gzip
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,8 +16,9 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest import log_rows as checking
 from fleet_slip.ingest import time_bases
 from fleet_slip.ingest.formats import csv as csv_batches
-from fleet_slip.ingest.formats import tables
-from fleet_slip.ingest.formats.source import Budget
+from fleet_slip.ingest.formats import source, tables
+from fleet_slip.ingest.formats.csv import BLOCK_BYTES
+from fleet_slip.ingest.formats.source import Budget, Spool
 from fleet_slip.ingest.formats.tables import open_parquet
 from tests.support.logs import without_names
 from tests.support.measured import (
@@ -283,3 +287,102 @@ def test_a_list_is_refused_before_it_is_decoded(
     pq.write_table(table.slice(0, 1), tmp_path / "log.parquet")
     with pytest.raises(InputError, match=r"has the type list<.*, which is neither a number"):
         read_measured(tmp_path / "log.parquet", a_mapping())
+
+
+TEXT = csv_text(good_columns(200)).encode()
+
+
+def zstd(text: bytes) -> bytes:
+    return bytes(pa.compress(text, "zstd", asbytes=True))
+
+
+both = pytest.mark.parametrize("compress", [gzip.compress, zstd], ids=["gzip", "zstd"])
+Compress = Callable[[bytes], bytes]
+
+
+def refusal(folder: Path, content: bytes) -> str:
+    file = folder / "log.csv.gz"
+    file.write_bytes(content)
+    return failure(file, a_mapping())
+
+
+@both
+def test_compressed_text_gives_the_same_counts_under_any_name(
+    tmp_path: Path, compress: Compress
+) -> None:
+    plain = without_names(read_text(tmp_path, TEXT).drives)
+    assert without_names(read_text(tmp_path, compress(TEXT)).drives).equals(plain)
+
+
+@both
+def test_a_truncated_file_is_no_shorter_drive(tmp_path: Path, compress: Compress) -> None:
+    whole = compress(TEXT)
+    for kept in (len(whole) // 2, len(whole) - 1):
+        assert "Truncated compressed stream" in refusal(tmp_path, whole[:kept])
+
+
+def test_a_flipped_bit_is_noticed_by_the_checksum_of_gzip(tmp_path: Path) -> None:
+    content = bytearray(gzip.compress(TEXT))
+    content[-6] ^= 1  # in the CRC-32
+    assert "cannot be read" in refusal(tmp_path, bytes(content))
+
+
+@both
+def test_what_would_not_fit_into_memory_is_refused_while_it_unfolds(
+    tmp_path: Path, compress: Compress
+) -> None:
+    bomb = compress(TEXT + b"9" * (10 * BLOCK_BYTES))
+    assert len(bomb) < BLOCK_BYTES / 50
+    assert "a line is longer than" in refusal(tmp_path, bomb)
+
+
+@both
+def test_a_file_that_becomes_far_more_than_it_is_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compress: Compress
+) -> None:
+    bomb = compress(TEXT + b"1,1,1\n" * 100_000)
+    monkeypatch.setattr(source, "FREE_ROWS", 50_000)
+    assert "rows or more in" in refusal(tmp_path, bomb)
+    monkeypatch.setattr(source, "FREE_ROWS", 10**6)
+    monkeypatch.setattr(source, "FREE_BYTES", 10_000)
+    assert "bytes decompress to" in refusal(tmp_path, bomb)
+
+
+@pytest.mark.parametrize("in_memory", [1, 2**20])
+def test_pieces_come_back_by_key_and_no_file_has_a_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_memory: int
+) -> None:
+    monkeypatch.setattr(source, "IN_MEMORY_BYTES", in_memory)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    kept = Spool()
+    for number in range(10):
+        kept.add(number % 3, b"%d" % number * number)
+    assert list(kept.read(1)) == [b"1", b"4444", b"7777777"]
+    assert list(tmp_path.iterdir()) == []
+    kept.clear()
+    assert list(kept.read(1)) == []
+    kept.add(1, b"again")
+    assert list(kept.read(1)) == [b"again"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_an_error_that_names_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    kept = Spool()
+    kept._file.close()
+    kept._file = _Full()  # type: ignore[assignment]
+    with pytest.raises(InputError, match=r"no room for a temporary copy .*TMPDIR") as caught:
+        kept.add(1, b"much")
+    assert str(caught.value).startswith(str(tmp_path))
+
+
+class _Full:
+    """A file on a disk that is full."""
+
+    def seek(self, place: int) -> int:
+        return place
+
+    def write(self, _: bytes) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

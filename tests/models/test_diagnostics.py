@@ -11,8 +11,7 @@ from fleet_slip.catalogue.features import input_scales
 from fleet_slip.models.diagnose import diagnose
 from fleet_slip.regression.drives import ClusterUnit
 from tests.support.cohorts import INPUTS, LABEL, cohort_of, driven, rows_of
-from tests.support.counts import dense_fit
-from tests.support.few_cars import by_rows
+from tests.support.counts import by_rows, dense_fit
 
 COEFFICIENTS = (0.1, 0.4, 0.9, 0.2)
 

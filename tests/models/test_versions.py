@@ -7,10 +7,19 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import TypeAdapter, ValidationError
 
-from fleet_slip.errors import QuestionError, RefusedError, StorageError
+import fleet_slip
+from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
+from fleet_slip.models.manifest import MOST_DIGITS, ExactFraction, ImportedFrom, TrainedDrives
+from fleet_slip.models.publish import is_up_to_date
 from fleet_slip.models.registry import CHAMPION, AliasHistory, Registry
+from fleet_slip.operations.monitor import monitor
+from fleet_slip.operations.verify import Verification, verify_models
 from fleet_slip.storage.documents import Document, DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import PATIENCE_S
@@ -208,3 +217,57 @@ def test_a_version_and_the_champion_are_found_without_reading_the_others(
     read.clear()
     assert registry.as_table().num_rows == 20
     assert len(read) <= 3 * 20
+
+
+FRACTIONS: TypeAdapter[Fraction] = TypeAdapter(ExactFraction)
+
+
+@given(st.fractions(), st.sampled_from([0, 3990, 4000, 4400, 20000]))
+def test_a_fraction_is_the_same_again(value: Fraction, digits: int) -> None:
+    for one in (value * 10**digits, value / 10**digits - 1):
+        text = FRACTIONS.dump_python(one)
+        assert FRACTIONS.validate_python(text) == one
+
+
+def test_what_was_decimal_stays_decimal() -> None:
+    assert FRACTIONS.dump_python(Fraction(-3, 4)) == "-3/4"
+    largest = 10**MOST_DIGITS - 1
+    assert FRACTIONS.dump_python(Fraction(largest)) == f"{largest}/1"
+    assert FRACTIONS.dump_python(-Fraction(largest + 1)).startswith("-0x")
+
+
+@pytest.mark.parametrize("text", ["0x3/4", "3/0x4", "0x/0x1", "0x1/0x0", "1/0", "0X1/0x1", "1"])
+def test_other_text_is_no_fraction(text: str) -> None:
+    with pytest.raises(ValidationError):
+        FRACTIONS.validate_python(text)
+
+
+def test_hashes_of_drives_are_those_of_versions_of_before() -> None:
+    """Computed by the release in which they came."""
+    drives = np.array([1, 2], dtype=np.uint64)
+    known = [10430483359262113544, 11180994063705713938]
+    made = TrainedDrives.of("year", drives)
+    assert made.salted.tolist() == known
+    assert made.content == b"".join(one.to_bytes(8, "big") for one in known)
+    assert TrainedDrives.unpacked("year", made.content).among(drives).all()
+    assert not len(TrainedDrives.of("year", drives[:0]).salted)
+    assert TrainedDrives.of("other", drives).salted.tolist() != known
+
+
+def test_the_tables_here_are_not_those_that_made_it(smoke_root: Path, tmp_path: Path) -> None:
+    """Their numbers would be taken for those of tables here, by chance the same."""
+    home, away = fleet_slip.open(smoke_root), fleet_slip.open(tmp_path / "away")
+    made = home.model("smoke")
+    origin = ImportedFrom(reference=made.reference, sha256=made.sha256)
+    drives = home.registry().trained_drives(made.manifest)
+    assert drives is not None
+    manifest = made.manifest.model_copy(update={"imported_from": origin})
+    brought = away.registry().add(manifest, drives.content)
+    arguments = (home.warehouse, made.manifest.trained_on.cohort, "estimator", None)
+    assert is_up_to_date(made.manifest, *arguments)
+    assert not is_up_to_date(brought.manifest, *arguments)
+    with pytest.raises(DataError, match="monitor smoke --since DAY"):
+        monitor(home.warehouse, brought)
+    report = Verification()
+    verify_models(away.warehouse, {}, report)
+    assert report.findings == []

@@ -24,8 +24,7 @@ from fleet_slip.warehouse.condition import (
 )
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
-from tests.support.counted_rows import START_S, write_counted
-from tests.support.fleet_rows import rows_of_fleet
+from tests.support.counted_rows import START_S, rows_of_fleet, write_counted
 from tests.support.landing import Landing
 from tests.support.once import made_once
 

@@ -20,10 +20,9 @@ from fleet_slip.operations.peers import thresholds
 from fleet_slip.operations.quality import QualityReport, examine, examine_drives, find_wrong_labels
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.cars import TICKS, Signals, broken, counts, drive
+from tests.support.cars import TICKS, Signals, broken, counts, drive, with_course
 from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows, random_counts
-from tests.support.satellites import with_course
 
 DRIVES = 30
 

@@ -13,21 +13,29 @@ import duckdb
 import numpy as np
 import obstore
 import pytest
+from botocore.session import Session
+from obstore.exceptions import GenericError, NotFoundError
 
 import fleet_slip
-from fleet_slip.errors import QuestionError, StorageError
+from fleet_slip.errors import InputError, QuestionError, StorageError
 from fleet_slip.grams.job import update_grams
+from fleet_slip.ingest import object_inputs
+from fleet_slip.ingest.object_inputs import copy_object, find_below, find_object
 from fleet_slip.storage import objects
 from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.objects import ObjectFolder, client
+from fleet_slip.storage.storage_errors import known_meaning, meaning_of, object_errors
 from fleet_slip.storage.table import Change, Unit, retry_conflicts
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.tables import Warehouse
+from tests.ingest.test_folders import MAPPING, write_log
+from tests.support.commands import run_on
 from tests.support.logs import DAY, land, log_rows, random_counts
-from tests.support.s3_server import ACCESS_KEY, SECRET_KEY, Server
+from tests.support.s3_server import ACCESS_KEY, SECRET_KEY, Server, forget_clients
 
 
 def rows(drive: str, count: int = 20) -> object:
@@ -281,3 +289,207 @@ def test_a_missing_object_is_told_by_a_query(root: Folder) -> None:
     with pytest.raises(StorageError, match="there is no such object") as told:
         update_grams(warehouse)
     assert "Traceback" not in str(told.value)
+
+
+CONTENT = bytes(range(256)) * 1200
+
+
+@pytest.fixture
+def bucket(server: Server) -> str:
+    return server.bucket()
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that waits a second for something to come."""
+    monkeypatch.setattr(objects, "TIMEOUT_S", 1)
+    monkeypatch.setattr(objects, "RETRIES", 0)
+    forget_clients()
+
+
+def amazon(server: Server) -> Any:
+    address = server.environment["AWS_ENDPOINT_URL"]
+    keys = {"aws_access_key_id": ACCESS_KEY, "aws_secret_access_key": SECRET_KEY}
+    return Session().create_client("s3", "us-east-1", endpoint_url=address, **keys)
+
+
+def test_an_object_may_come_slowly_as_long_as_it_comes(
+    bucket: str, server: Server, hasty: None, tmp_path: Path
+) -> None:
+    obstore.put(client(bucket), "a/log.csv", CONTENT)
+    found = find_object(f"{bucket}/a/log.csv")
+    assert found is not None
+    with server.misbehaving(bytes_per_s=200_000):
+        copy_object(found, tmp_path / "log.csv")
+        assert ObjectFolder(bucket, "a").read("log.csv") == CONTENT
+    assert (tmp_path / "log.csv").read_bytes() == CONTENT
+
+
+def test_a_store_that_brings_nothing_is_given_up(
+    bucket: str, server: Server, hasty: None, tmp_path: Path
+) -> None:
+    obstore.put(client(bucket), "log.csv", CONTENT)
+    found = find_object(f"{bucket}/log.csv")
+    assert found is not None
+    with (
+        server.misbehaving(bytes_per_s=0.2),
+        pytest.raises(StorageError, match="does not answer in time"),
+    ):
+        copy_object(found, tmp_path / "log.csv")
+
+
+def test_a_flipped_bit_on_the_way_is_seen_and_fetched_again(
+    bucket: str, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    obstore.put(client(bucket), "log.csv", CONTENT)
+    found = find_object(f"{bucket}/log.csv")
+    assert found is not None
+    with server.misbehaving(flipping="log.csv"), pytest.raises(InputError, match="in 3 transfers"):
+        copy_object(found, tmp_path / "log.csv")
+    copy_once, attempts = object_inputs._copy_once, list[str]()
+
+    def flipped_first(*given: Any) -> str:
+        with server.misbehaving(flipping="(?!)" if attempts else "log.csv"):
+            attempts.append(copy_once(*given))
+        return attempts[-1]
+
+    monkeypatch.setattr(object_inputs, "_copy_once", flipped_first)
+    copy_object(found, tmp_path / "log.csv")
+    assert (tmp_path / "log.csv").read_bytes() == CONTENT
+    assert len(attempts) == 2
+
+
+def test_a_tag_that_is_no_checksum_costs_a_second_transfer(
+    bucket: str, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    obstore.put(client(bucket), "log.csv", CONTENT)
+    found = ObjectFolder.found
+    monkeypatch.setattr(
+        ObjectFolder,
+        "found",
+        lambda self, meta: found(self, {**meta, "e_tag": '"00112233445566778899aabbccddeeff"'}),
+    )
+    (one,) = find_below(f"{bucket}/")
+    with server.misbehaving() as faults:
+        copy_object(one, tmp_path / "log.csv")
+    assert len([get for get in faults.seen if "log.csv" in get]) == 2
+    assert (tmp_path / "log.csv").read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize(
+    ("name", "exit_code", "told", "drives"),
+    [
+        *((f"day/a{one}b.csv", 6, "Rename it", "0") for one in "\t\x1b\r"),
+        (f"day/{'x' * 256}.csv", 4, "invalid file name", "2"),
+    ],
+)
+def test_a_name_that_is_no_path_is_said(
+    name: str,
+    exit_code: int,
+    told: str,
+    drives: str,
+    bucket: str,
+    server: Server,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "car.toml").write_text(MAPPING.format(day="2024-05-31"))
+    for number in range(2):
+        write_log(tmp_path / f"{number}.csv", 20 + number)
+        obstore.put(client(bucket), f"day/{number}.csv", (tmp_path / f"{number}.csv").read_bytes())
+    amazon(server).put_object(Bucket=bucket[5:], Key=name, Body=b"x")
+    arguments = ("ingest", f"{bucket}/day", "--mapping", str(tmp_path / "car.toml"))
+    done = run_on(tmp_path / "root", *arguments)
+    assert done.exit_code == exit_code, done.stderr
+    assert told in done.stderr
+    if drives != "0":
+        asked = run_on(tmp_path / "root", "sql", "--csv", "SELECT count(*) AS n FROM drives")
+        assert asked.stdout.split() == ['"n"', drives]
+
+
+def test_an_object_that_is_gone_is_a_fault_of_its_own(bucket: str, tmp_path: Path) -> None:
+    obstore.put(client(bucket), "log.csv", CONTENT)
+    found = find_object(f"{bucket}/log.csv")
+    assert found is not None
+    obstore.delete(client(bucket), "log.csv")
+    with pytest.raises(InputError, match="no such object"):
+        copy_object(found, tmp_path / "log.csv")
+
+
+SECRET = "AKIDSECRETOFSOMEBODY"  # noqa: S105 - made up
+
+ANSWERS = {
+    "there are no credentials": [
+        "Generic S3 error: Error performing PUT http://169.254.169.254/latest/api/token in 3s",
+        "Generic GCS error: error sending request for url (http://metadata.google.internal/x)",
+        "Generic MicrosoftAzure error: Account must be specified",
+        "no providers in chain provided credentials",
+    ],
+    "there is no such bucket": [
+        "<Code>NoSuchBucket</Code><Message>The specified bucket does not exist</Message>",
+        "404 Not Found: ContainerNotFound",
+        "Object at location x not found: the specified bucket does not exist",
+    ],
+    "the store refuses the credentials": [
+        f"Client error with status 403 Forbidden: InvalidAccessKeyId {SECRET}",
+        "403 Forbidden: SignatureDoesNotMatch",
+        "400 Bad Request: ExpiredToken",
+        "403 Forbidden: RequestTimeTooSkewed",
+        "server returned 401 Unauthorized",
+    ],
+    "the credentials do not permit this": [
+        f"403 Forbidden: <Code>AccessDenied</Code><AWSAccessKeyId>{SECRET}</AWSAccessKeyId>",
+        "AuthorizationPermissionMismatch",
+        "Client error with status 403 Forbidden: No Body",
+    ],
+    "the endpoint is http": ["builder error: URL scheme is not allowed", "BadScheme"],
+    "does not know conditional writes": ["501 Not Implemented: If-None-Match", "NotImplemented"],
+    "answers with errors": [
+        "Server error with status 500 Internal Server Error",
+        "Server error with status 503 Service Unavailable: SlowDown",
+        "429 Too Many Requests",
+        "<Code>InternalError</Code>",
+    ],
+    "does not answer in time": ["operation timed out", "HTTP error: request or response TimedOut"],
+    "cannot be reached": [
+        "error sending request for url (http://127.0.0.1:9/bucket)",
+        "dns error: failed to lookup address information",
+        "tcp connect error: Connection refused (os error 111)",
+    ],
+    "there is no such object": ["NoSuchKey", "404 Not Found", "Object at location x not found: y"],
+}
+
+
+@pytest.mark.parametrize(
+    ("answer", "told"), [(text, told) for told, texts in ANSWERS.items() for text in texts]
+)
+def test_an_answer_is_told_by_its_most_telling_part(answer: str, told: str) -> None:
+    """Several patterns may fit: a bucket that is not there is also 404, a wrong key 403."""
+    meaning = known_meaning(OSError(answer))
+    assert meaning is not None
+    assert told in meaning
+    assert meaning_of(OSError(answer)) == meaning
+    assert "\n" not in meaning
+    assert meaning.endswith((".", "AWS_ALLOW_HTTP=true"))
+    assert SECRET not in meaning
+
+
+@pytest.mark.parametrize("answer", ["", "a surprise", "4500 bytes", "port 5000", "1429 rows"])
+def test_what_is_not_known_is_not_guessed(answer: str) -> None:
+    assert known_meaning(OSError(answer)) is None
+    assert meaning_of(OSError(answer)).startswith("the store cannot be used (OSError)")
+
+
+@pytest.mark.parametrize("kind", [GenericError, NotFoundError, OSError, ValueError])
+def test_failures_of_a_store_become_ours_with_the_place_and_without_the_answer(
+    kind: type[Exception],
+) -> None:
+    with (
+        pytest.raises(StorageError, match=r"^s3://bucket/data: the store refuses the") as told,
+        object_errors("s3://bucket/data"),
+    ):
+        raise kind(f"<Error><Code>InvalidAccessKeyId</Code>{SECRET}</Error>")
+    assert SECRET not in str(told.value)
+    assert told.value.__cause__ is None
+    assert told.value.__suppress_context__

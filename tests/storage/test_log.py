@@ -1,8 +1,12 @@
 """The history of runs."""
 
+import json
 import logging
 import os
+import socket
+import subprocess
 import sys
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +14,28 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import HIDDEN, InputError, StorageError
+from fleet_slip.operations.status import status_of
+from fleet_slip.operations.verify import Verification, verify_documents
+from fleet_slip.storage import runs as records
+from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.runs import current_run_id, publishable, recording, step
+from fleet_slip.storage.runs import (
+    Run,
+    current_run_id,
+    find_changed_lines,
+    process_began,
+    publishable,
+    read_lines,
+    recording,
+    runs_under_way,
+    state_of,
+    step,
+    write_line,
+)
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand, finish, start
+from tests.support.s3_server import Server
 
 
 def runs(root: Path) -> list[dict[str, Any]]:
@@ -136,3 +159,158 @@ def test_commands_are_recorded_and_questions_are_not(run_command: RunCommand) ->
     assert (done["command"], done["exit_code"], done["steps"]) == ("run", 0, steps)
     assert done["rows"] > 10_000
     assert (failed["command"], failed["exit_code"], failed["outcome"]) == ("gram", 5, "failed")
+
+
+@pytest.fixture
+def history(tmp_path: Path) -> Path:
+    """A file of two runs, four lines."""
+    for command in ("gram", "publish"):
+        with recording(LocalFolder(tmp_path), command, [command, "--cohort", "mass_kg > 1e3"]):
+            pass
+    (file,) = (tmp_path / "runs").iterdir()
+    return file
+
+
+def changed(file: Path) -> list[str]:
+    return [problem for _, problem in find_changed_lines(LocalFolder(file.parents[1]))]
+
+
+def test_every_flipped_bit_is_found(history: Path) -> None:
+    whole = history.read_bytes()
+    assert read_lines(whole)[1] == []
+    missed = []
+    for bit in range(len(whole) * 8):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        if not read_lines(bytes(damaged))[1]:
+            missed.append(bit)
+    assert missed == []
+
+
+@pytest.mark.parametrize("place", [0.1, 0.5, 0.9, 0.99])
+def test_a_flipped_bit_is_told_with_its_line(history: Path, place: float) -> None:
+    content = bytearray(history.read_bytes())
+    at = int(len(content) * place)
+    at += content[at] == ord("\n")
+    content[at] ^= 4
+    line = bytes(content[:at]).count(b"\n") + 1
+    history.write_bytes(content)
+    report = Verification()
+    verify_documents(LocalFolder(history.parents[1]), report)
+    ((path, problem),) = [(one.path, one.problem) for one in report.damage]
+    assert path == f"runs/{history.name}"
+    assert f"line {line} " in problem
+
+
+def test_readers_take_nothing_from_a_changed_line(history: Path) -> None:
+    root = LocalFolder(history.parents[1])
+    history.write_text(history.read_text().replace("mass_kg", "mess_kg", 1))
+    with (
+        pytest.raises(StorageError, match=r"line 2 .*or delete the line"),
+        fleet_slip.connect(history.parents[1]) as database,
+    ):
+        database.sql("SELECT run_id FROM runs").fetchall()
+    assert runs_under_way(root) == []
+    lines = history.read_text().splitlines()
+    history.write_text("\n".join(line for line in lines if "mess_kg" not in line) + "\n")
+    with fleet_slip.connect(history.parents[1]) as database:
+        assert len(database.sql("SELECT run_id FROM runs").fetchall()) == 2
+
+
+def test_a_torn_line_is_no_damage_and_skipped(history: Path) -> None:
+    whole = history.read_bytes()
+    last = whole.rstrip().rpartition(b"\n")[2]
+    for end in range(1, len(last) - 1):
+        history.write_bytes(whole + b"\n" + last[:end])
+        assert changed(history) == [], end
+
+
+def test_a_line_without_a_checksum_is_changed(history: Path) -> None:
+    record = json.loads(history.read_bytes().split(b"\n")[1])
+    del record["sha256"]
+    assert read_lines(json.dumps(record).encode()) == ([], [1])
+    assert read_lines(write_line(record))[0]
+
+
+def test_a_condition_on_a_car_is_not_kept() -> None:
+    arguments = ["select", "--cohort", "vehicle_id = 'WVW1'", "--against=drive_id <> 'd'"]
+    assert publishable(arguments) == ["select", "--cohort", "***", "***"]
+
+
+def run_of(**changes: Any) -> dict[str, Any]:
+    """A run of this process, under way."""
+    me = {"host": socket.gethostname(), "process": os.getpid(), "outcome": None}
+    return {**me, "process_began": process_began(os.getpid()), **changes}
+
+
+def test_processes_of_one_number_are_told_apart() -> None:
+    mine = process_began(os.getpid())
+    assert mine == process_began(os.getpid())
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        theirs = process_began(other.pid)
+        other.communicate()
+    assert None is not mine != theirs is not None
+    assert process_began(other.pid) != theirs
+
+
+@pytest.mark.parametrize(
+    ("changes", "state"),
+    [
+        ({}, "running"),
+        ({"process_began": "another boot/7"}, "killed"),
+        ({"process_began": None}, "running"),  # of an earlier version
+        ({"outcome": "done"}, "done"),
+        ({"host": "another", "process_began": "another boot/7"}, "running"),
+        ({"process": None, "process_began": None}, "running"),
+    ],
+)
+def test_the_state_of_a_run(changes: dict[str, Any], state: str) -> None:
+    assert state_of(run_of(**changes)) == state
+
+
+def test_where_the_system_does_not_tell_a_run_counts_as_running(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    recorded = run_of()
+    monkeypatch.setattr(records, "PROC", tmp_path)
+    assert process_began(os.getpid()) is None
+    assert state_of(recorded) == "running"
+
+
+def test_a_killed_run_whose_number_another_process_has_is_not_under_way(tmp_path: Path) -> None:
+    now = datetime.now(UTC)
+    names = [f"{now:%Y%m%dT%H%M%S.%fZ}-{letter * 8}" for letter in "ab"]
+    begun = ["another boot/7", process_began(os.getpid())]
+    lines = [
+        write_line(run_of(run_id=name, command="publish", process_began=at))
+        for name, at in zip(names, begun, strict=True)
+    ]
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    (folder / f"{now:%Y-%m}.jsonl").write_bytes(b"\n".join(lines) + b"\n")
+    assert runs_under_way(LocalFolder(tmp_path)) == names[1:]
+
+
+def runs_in(root: Folder) -> list[tuple[object, ...]]:
+    with connect(root, query="runs") as database:
+        return database.execute(
+            "SELECT arguments[1], command, outcome, rows FROM runs ORDER BY ALL"
+        ).fetchall()
+
+
+def test_status_asks_for_no_record_older_than_a_year(root: Folder, server: Server) -> None:
+    record_old(root, days=800)
+    record_old(root, days=30)
+    with server.misbehaving() as watched:
+        (last,) = status_of(Warehouse(root)).last_runs
+    assert last["started_at"] > datetime.now(UTC) - timedelta(days=31)
+    assert len({request for request in watched.seen if "/runs/" in request}) == 2
+    assert len(runs_in(root)) == 2
+
+
+def record_old(root: Folder, days: int) -> None:
+    run = Run.start("gram", [])
+    run.started_at -= timedelta(days=days)
+    run.run_id = f"{days}"
+    for line in (run.beginning(), run.end(None, 1.0)):
+        root.append(f"runs/{run.started_at:%Y-%m}.jsonl", write_line(line) + b"\n")

@@ -1,20 +1,29 @@
 """Delta tables below a data root: whole commits or nothing, and units that land once."""
 
 import hashlib
+import json
+import shutil
 import threading
+from dataclasses import replace
+from datetime import date
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import xxhash
 from deltalake import DeltaTable
 from deltalake.exceptions import DeltaError
 
-from fleet_slip.errors import ConflictError, StorageError
-from fleet_slip.storage.checksums import checksum_in, checksum_of
+from fleet_slip.errors import ConflictError, RefusedError, StorageError
+from fleet_slip.storage import table as tables
+from fleet_slip.storage.checksums import CHECKSUM_DIGITS, checksum_in, checksum_of
+from fleet_slip.storage.encoding import ROW_GROUP_ROWS, Encoding
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import Change, Unit, retry_conflicts
+from fleet_slip.storage.table import SCALE, Change, Unit, retry_conflicts
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
 
@@ -205,3 +214,88 @@ def test_what_the_delta_library_cannot_tell_of_a_unit_is_a_storage_error(
     monkeypatch.setattr(DeltaTable, "transaction_version", fail)
     with pytest.raises(StorageError, match="a commit is damaged"):
         snapshot.landed("test/one")
+
+
+COUNTS = {"ax": np.arange(5), "sideslip": np.arange(5)}
+
+
+def test_a_table_is_opened_again_after_a_commit_of_anybody(
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    land(warehouse, "one", log_rows("one", COUNTS))
+    opened: list[str] = []
+
+    def opening(uri: str, **options: Any) -> DeltaTable:
+        opened.append(uri)
+        return DeltaTable(uri, **options)
+
+    monkeypatch.setattr(tables, "DeltaTable", opening)
+    first = warehouse.logs.snapshot()
+    assert len(first.files) == 1
+    opened.clear()
+    again = Warehouse(warehouse.root).logs.snapshot()
+    assert (again is first, first.renewed() is first, opened) == (True, True, [])
+    delta = DeltaTable(first.table.uri("")[:-1])  # as another process does
+    delta.alter.set_table_properties({"by": "another"}, raise_if_not_exists=False)
+    newer = warehouse.logs.snapshot()
+    assert (newer.version, first.version) == (delta.version(), delta.version() - 1)
+    assert first.renewed() is newer
+    land(warehouse, "two", log_rows("two", COUNTS))
+    assert len(warehouse.logs.snapshot().files) == 2
+    assert len(newer.files) == len(first.files) == 1
+
+
+def test_a_table_in_the_place_of_another_is_opened(warehouse: Warehouse) -> None:
+    land(warehouse, "one", log_rows("one", COUNTS))
+    assert warehouse.logs.snapshot().rows == 5
+    shutil.rmtree(path_of(warehouse.root) / "logs")
+    assert warehouse.logs.snapshot().version is None
+    land(warehouse, "two", log_rows("two", {name: np.arange(7) for name in COUNTS}))
+    assert warehouse.logs.snapshot().rows == 7
+
+
+def test_counts_in_other_scales_are_refused_of_an_opened_table(warehouse: Warehouse) -> None:
+    land(warehouse, "one", log_rows("one", COUNTS))
+    logs = warehouse.logs
+    assert logs.snapshot().rows == 5
+    place = logs.schema.get_field_index("ax")
+    finer = logs.schema.field("ax").with_metadata({SCALE: "0.0001"})
+    schema: pa.Schema = logs.schema.set(place, finer)
+    with pytest.raises(RefusedError, match="other scales"):
+        replace(logs, schema=schema).snapshot()
+
+
+@pytest.mark.parametrize("nulls", [0, 1, 2, 5])
+def test_a_column_is_declared_to_have_no_null_if_it_has_none(nulls: int) -> None:
+    counts = [None if i < nulls else i for i in range(5)]
+    rows = pa.table({"ax": pa.array(counts, pa.int16()), "tick": pa.array(range(5), pa.int32())})
+    encoded = Encoding().encode(rows)
+    read = pq.read_table(pa.BufferReader(encoded.content))
+    assert read.to_pydict() == rows.to_pydict()
+    assert read.schema.field("ax").nullable is (nulls > 0)
+    assert not read.schema.field("tick").nullable
+    statistics = json.loads(encoded.statistics)
+    assert statistics == {"numRecords": 5, "nullCount": {"ax": nulls, "tick": 0}}
+
+
+def test_the_column_of_the_partition_is_left_to_the_folder_and_counted_all_the_same() -> None:
+    rows = pa.table({"day": [date(2024, 5, 1)] * 3, "n": [1, 2, 3]})
+    encoded = Encoding().encode(rows, omitted=["day", "not there"])
+    assert pq.read_schema(pa.BufferReader(encoded.content)).names == ["n"]
+    assert set(json.loads(encoded.statistics)["nullCount"]) == {"day", "n"}
+
+
+def test_the_encodings_are_those_asked_for_in_groups_of_a_fixed_size() -> None:
+    count = ROW_GROUP_ROWS + 1
+    columns = {"car": ["a"] * count, "ax": pa.array(range(count), pa.int32())}
+    encoding = Encoding(dictionary=("car",), delta_packed=("ax",), compression="zstd")
+    encoded = encoding.encode(pa.table(columns))
+    found = pq.read_metadata(pa.BufferReader(encoded.content))
+    assert [found.row_group(i).num_rows for i in range(found.num_row_groups)] == [count - 1, 1]
+    car, ax = (found.row_group(0).column(i) for i in range(2))
+    assert "RLE_DICTIONARY" in car.encodings
+    assert "DELTA_BINARY_PACKED" in ax.encodings
+    assert car.compression == "ZSTD"
+    assert encoded.checksum == checksum_of(encoded.content)
+    assert len(encoded.checksum) == CHECKSUM_DIGITS
+    assert encoding.encode(pa.table(columns)).checksum == encoded.checksum

@@ -83,3 +83,25 @@ def _wander(rng: np.random.Generator) -> NDArray[np.float64]:
     phases = rng.uniform(0, 2 * np.pi, 5)
     waves = np.sin(2 * np.pi * time_s[:, None] / periods_s + phases)
     return np.asarray(waves.sum(axis=1) / np.sqrt(2.5))
+
+
+FIX = 10
+NOISE_MPS = 0.03
+
+
+def speed_of(signals: Signals) -> NDArray[np.float64]:
+    wheels = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
+    return np.asarray(np.mean([signals[name] for name in wheels], axis=0) * RADIUS_M)
+
+
+def with_course(signals: Signals, rng: np.random.Generator, slip: float = 1.0) -> Signals:
+    """Return the signals with course and speed, NaN between fixes; without slip it is a heading."""
+    speed = speed_of(signals)
+    course = np.cumsum(signals["yaw_rate"]) / 100 + slip * signals["sideslip"]
+    course += NOISE_MPS / speed * rng.standard_normal(course.size)
+    fixes = np.arange(course.size) % FIX == 0
+    return {
+        **signals,
+        "course": np.where(fixes, (course + np.pi) % (2 * np.pi) - np.pi, np.nan),
+        "satellite_speed": np.where(fixes, speed, np.nan),
+    }

@@ -6,11 +6,14 @@ import inspect
 import json
 import os
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -188,3 +191,31 @@ def finish(*processes: subprocess.Popen[str]) -> list[Finished]:
         Finished(process.returncode, stdout, stderr)
         for process, (stdout, stderr) in zip(processes, told, strict=True)
     ]
+
+
+def until(condition: Callable[[], object], seconds: float = PATIENCE_S) -> None:
+    """Wait until the condition holds; an `AssertionError` if it does not in time."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, f"waited {seconds:.0f} s in vain"
+        time.sleep(0.02)
+
+
+class LateError(BaseException):
+    """Something hangs; not an `Exception`, which what hangs may catch."""
+
+
+@contextmanager
+def within(seconds: int = int(PATIENCE_S)) -> Iterator[None]:
+    """Raise `LateError` in what hangs; of the main thread."""
+
+    def stop(*_: Any) -> None:
+        raise LateError(f"not done within {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)

@@ -7,6 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fleet_slip.errors import ConfigError
+from fleet_slip.resources import config_names
 from fleet_slip.vehicle.driver import handling
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, Controls, State, constants, load_vehicle
 from fleet_slip.vehicle.tyre import cornering_stiffness
@@ -190,3 +192,76 @@ def test_every_car_understeers_at_every_mass(name: str, share: float) -> None:
     car = load_vehicle(name)
     known = handling(car.with_sprung_mass(share * car.body.sprung_mass_kg))
     assert 0.2 < math.degrees(known.understeer * GRAVITY_MPS2) < 3.0
+
+
+def error(step: float) -> float:
+    """Largest error of the final state of a hard transient, against a hundredfold finer step."""
+    start, demands = rolling(25.0), Controls(1.2, -3.0)
+    reference = Run(start, demands, seconds=1.2, step=0.00002).last
+    last = Run(start, demands, seconds=1.2, step=step).last
+    return float(np.abs(np.subtract(last, reference)).max())
+
+
+def test_the_scheme_is_of_second_order() -> None:
+    ratio = error(0.002) / error(0.001)
+    assert 3.3 < ratio < 4.7
+
+
+def test_stiff_wheels_follow_the_car_without_lag() -> None:
+    """At 3 m/s the tyre turns the wheel's speed within a fifth of a step."""
+    run = Run(rolling(3.0), Controls(0.0, 2.0), seconds=1.0)
+    fine = Run(rolling(3.0), Controls(0.0, 2.0), seconds=1.0, step=0.0002)
+    assert np.abs(run["wheel_fl"][::50] - fine["wheel_fl"][::500]).max() < 0.01
+
+
+@pytest.mark.parametrize("vx", [0.5, 1.5, 2.4, 2.6, 4.0, 8.0])
+def test_slow_cars_do_not_oscillate(vx: float) -> None:
+    run = Run(rolling(vx, vy=0.1), Controls(0.5, 0.0), seconds=4.0)
+    curvature = np.diff(run.states[1500:, :3], n=2, axis=0)
+    assert np.abs(curvature).max() < 1e-5
+
+
+@pytest.mark.parametrize("name", config_names("vehicles"))
+def test_shipped_cars_are_named_after_their_file_and_plausible(name: str) -> None:
+    car = load_vehicle(name)
+    assert car.name == name
+    body = car.body
+    assert (
+        0.85 < body.yaw_inertia_kgm2 / (body.mass_kg * body.front_axle_m * body.rear_axle_m) < 1.1
+    )
+
+
+@pytest.mark.parametrize("mass_kg", [1000.0, 1740.0])
+def test_a_load_changes_inertia_and_wheel_loads_in_proportion(mass_kg: float) -> None:
+    loaded = SEDAN.with_sprung_mass(mass_kg)
+    c = constants(loaded, 1.0)
+    factor = mass_kg / SEDAN.body.sprung_mass_kg
+    gained = (factor - 1) * SEDAN.body.sprung_yaw_inertia_kgm2
+    assert c.yaw_inertia - CAR.yaw_inertia == pytest.approx(gained)
+    assert c.mass - CAR.mass == pytest.approx(mass_kg - 1320)
+    assert 2 * (c.static_front + c.static_rear) == pytest.approx(c.mass * GRAVITY_MPS2)
+    assert c.static_front / c.static_rear == pytest.approx(CAR.static_front / CAR.static_rear)
+    assert SEDAN.body.sprung_mass_kg == 1320
+
+
+def test_other_tyres_change_stiffness_and_radius_only() -> None:
+    c = constants(SEDAN.with_tyres(stiffness_factor=0.9, rolling_radius_factor=1.02), 1.0)
+    assert c.stiffness_front == pytest.approx(0.9 * CAR.stiffness_front)
+    assert c.radius == pytest.approx(1.02 * CAR.radius)
+    assert c.friction == CAR.friction
+
+
+def test_adhesion_scales_friction_alone() -> None:
+    slippery = constants(SEDAN, 0.4)
+    changed = {f for f in CAR._fields if getattr(CAR, f) != getattr(slippery, f)}
+    assert changed == {"friction", "friction_per_load"}
+    assert slippery.friction == pytest.approx(0.4 * CAR.friction)
+
+
+@pytest.mark.parametrize("number", [0.0, -1.0, float("nan"), float("inf")])
+def test_impossible_masses_and_tyres_are_refused(number: float) -> None:
+    with pytest.raises(ConfigError, match="d_class_sedan"):
+        SEDAN.with_sprung_mass(number)
+    for factor in (number, 3.0):
+        with pytest.raises(ConfigError, match="d_class_sedan"):
+            SEDAN.with_tyres(stiffness_factor=factor)

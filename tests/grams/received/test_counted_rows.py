@@ -9,14 +9,24 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import fleet_slip
 from fleet_slip.errors import InputError, RepeatedError
-from fleet_slip.grams.on_board import COLUMNS, LONGEST_ROWS
+from fleet_slip.grams.on_board import (
+    COLUMNS,
+    INDEFINITE,
+    LONGEST_ROWS,
+    NO_ROWS,
+    PRODUCTS,
+    SUMS,
+    find_impossible,
+)
 from fleet_slip.regression.gram import Gram
 from tests.support.commands import RunCommand
-from tests.support.counted_rows import START_S, gram_of, row_of, write_counted
-from tests.support.fleet_rows import rows_of_fleet
+from tests.support.counted_rows import START_S, gram_of, row_of, rows_of_fleet, write_counted
+from tests.support.counts import table_of
 
 DAY_S = 86_400
 
@@ -72,10 +82,10 @@ def other(gram: Gram, **changed: Any) -> dict[str, Any]:
 
 
 GRAM = gram_of(2)
-PRODUCTS = np.array(GRAM.products)
+HERE = np.array(GRAM.products)
 K = len(GRAM.signals)
-INDEFINITE = PRODUCTS.copy()
-INDEFINITE[1] = int((PRODUCTS[0] * PRODUCTS[2]) ** 0.5) + 10**6
+NEGATIVE = HERE.copy()
+NEGATIVE[1] = int((HERE[0] * HERE[2]) ** 0.5) + 10**6
 TOO_LONG = (np.array(some) * (LONGEST_ROWS // 500 + 1) for some in (GRAM.sums, GRAM.products))
 LONG_SUMS, LONG_PRODUCTS = TOO_LONG
 
@@ -105,7 +115,7 @@ LONG_SUMS, LONG_PRODUCTS = TOO_LONG
         ),
         ({"sums": [10**9, *GRAM.sums[1:]]}, "sums outside the ranges"),
         ({"products": [2**50, *GRAM.products[1:]]}, "products outside the ranges"),
-        ({"products": INDEFINITE.tolist()}, "not positive semidefinite"),
+        ({"products": NEGATIVE.tolist()}, "not positive semidefinite"),
         ({"drive_id": "VIN1-20240501T100000Z"}, "of another car or day"),
     ],
 )
@@ -207,3 +217,56 @@ def test_rows_of_a_drive_go_when_its_log_comes(smoke_root: Path, tmp_path: Path)
     left = {row["drive_id"] for row in gram_rows(fleet) if row["source"] == "received"}
     assert len(left) == 1 and left.pop().startswith("VIN2")
     assert not fleet.gram().changed
+
+
+RANGES = [(-100, 100), (0, 30000), (-32767, 32767)]
+
+
+@st.composite
+def counts(draw: st.DrawFn) -> Any:
+    rows = draw(st.integers(1, 12))
+    columns = [st.one_of(st.sampled_from(r), st.integers(*r)) for r in RANGES]
+    return np.array([[draw(column) for column in columns] for _ in range(rows)], np.int64)
+
+
+@settings(max_examples=200)
+@given(counts())
+def test_what_counts_have_is_possible(rows: Any) -> None:
+    assert find_impossible(table_of([Gram.from_counts("abc", rows)]), RANGES) == {}
+
+
+@pytest.mark.parametrize("value", [-32767, 0, 1, 32767])
+def test_the_longest_drive_at_the_ends_of_the_ranges_is_possible(value: int) -> None:
+    n = 2**31 - 1
+    gram = Gram(("a", "b"), n, (n * value, n * value), (n * value**2,) * 3)
+    assert find_impossible(table_of([gram]), [(-32767, 32767)] * 2) == {}
+
+
+DRIVE = Gram.from_counts("abc", np.array([[3, 5, -7], [4, 5, 900], [-2, 8, 11], [3, 0, 1]]))
+
+
+@pytest.mark.parametrize(
+    ("field", "place", "change", "reason"),
+    [
+        ("n", 0, -4, NO_ROWS),
+        ("n", 0, 2**31, NO_ROWS),
+        ("sums", 0, 1000, SUMS),
+        ("sums", 1, -100, SUMS),
+        ("products", 0, -38, INDEFINITE),
+        ("products", 5, 2**62, PRODUCTS),
+        ("products", 5, -(2**63) + 1, PRODUCTS),
+        ("products", 1, 4 * 100 * 30000 + 1, PRODUCTS),
+        ("products", 4, 50_000, INDEFINITE),
+        ("products", 3, -50_000, INDEFINITE),
+    ],
+)
+def test_what_no_counts_have_is_told(field: str, place: int, change: int, reason: str) -> None:
+    table = table_of([DRIVE])
+    getattr(table, field).reshape(-1)[place] += np.int64(change)
+    assert find_impossible(table, RANGES) == {0: reason}
+
+
+def test_each_row_is_judged_by_itself() -> None:
+    table = table_of([DRIVE, DRIVE, DRIVE])
+    table.products[1, 4] += 50_000
+    assert find_impossible(table, RANGES) == {1: INDEFINITE}

@@ -9,17 +9,21 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import fleet_slip
+from fleet_slip.catalogue.features import FeatureCatalogue
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.errors import StorageError
 from fleet_slip.grams import gram_files
-from fleet_slip.grams.check import check_grams, grams_of
+from fleet_slip.grams.check import check_grams, differing_drives, grams_of
 from fleet_slip.grams.compute import aggregate, compute_grams
-from fleet_slip.grams.gram_files import find_backlog
+from fleet_slip.grams.gram_files import find_backlog, gram_table, is_of_received, named_files
 from fleet_slip.grams.job import update_grams
+from fleet_slip.regression.gram import Gram, packed_size
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.counted_rows import START_S, rows_of_fleet, write_counted
 from tests.support.logs import DAY, land, log_rows, random_counts
 
 NAMES = catalogue().gram_signals
@@ -145,3 +149,88 @@ def test_the_check_finds_a_gram_row_that_is_not_of_its_file(
     ):
         check_grams(warehouse, 1)
     assert DAY in rows["day"].to_pylist()
+
+
+A = Gram.from_counts(("ax", "ay"), np.array([[1, 2], [3, 5]]))
+B = Gram.from_counts(("ax", "ay"), np.array([[1, 2], [3, 6]]))
+KEY = ("ax", "ay")
+
+
+def test_a_drive_that_one_side_lacks_differs() -> None:
+    assert differing_drives({("a", KEY): A}, {("a", KEY): A}) == []
+    assert differing_drives({("a", KEY): A}, {("a", KEY): B}) == ["a"]
+    assert differing_drives({("b", KEY): A, ("a", KEY): A}, {}) == ["a", "b"]
+    assert differing_drives({}, {("a", KEY): A}) == ["a"]
+    turned = A.restrict(("ay", "ax"))
+    assert differing_drives({("a", KEY): A}, {("a", ("ay", "ax")): turned}) == []
+    assert differing_drives({("a", KEY): A}, {("a", ("ax",)): A.restrict(("ax",))}) == ["a"]
+
+
+@pytest.mark.parametrize("drives", [1, 3, 8])
+def test_files_are_chosen_evenly(warehouse: Warehouse, drives: int) -> None:
+    rng = np.random.default_rng(2)
+    for number in range(5):
+        land(warehouse, f"f{number}", log_rows(f"d{number}", random_counts(rng, 20)))
+    update_grams(warehouse)
+    seen: list[tuple[int, int]] = []
+    report = check_grams(warehouse, drives, lambda more, total: seen.append((more, total)))
+    assert (report.files, report.drives) == (min(drives, 5),) * 2
+    assert report.rows == 20 * min(drives, 5)
+    assert seen == [(1, min(drives, 5))] * min(drives, 5)
+
+
+def test_gram_rows_that_came_in_pieces_are_one_table() -> None:
+    counts = np.random.default_rng(4).integers(-9, 9, (6, 10, 2))
+    grams = [Gram.from_counts(("ax", "ay"), one) for one in counts]
+    rows = pa.table(
+        {
+            "n": [gram.n for gram in grams],
+            "sums": [gram.sums for gram in grams],
+            "products": [gram.products for gram in grams],
+        }
+    )
+    pieces = pa.concat_tables([rows.slice(0, 1), rows.slice(1, 3), rows.slice(4)])
+    assert pieces["sums"].num_chunks == 3
+    for one in (rows, pieces):
+        table = gram_table("ax,ay", one)
+        assert table.signals == ("ax", "ay")
+        assert table.products.shape == (6, packed_size(2))
+        assert [table.sums[i].tolist() for i in range(6)] == [list(g.sums) for g in grams]
+
+
+def test_rows_of_cars_are_not_read(tmp_path: Path) -> None:
+    """A year of them is 17 GB, and none is of a log."""
+    fleet = fleet_slip.open(tmp_path / "data")
+    path = tmp_path / "day"
+    write_counted(path, rows_of_fleet(3, START_S, seed=1))
+    fleet.ingest_counted(path)
+    grams = fleet.warehouse.grams.snapshot()
+    [file] = grams.files
+    assert is_of_received(file)
+    Path(str(fleet.warehouse.grams.folder), file.path).write_bytes(b"nobody reads it")
+    found = find_backlog(fleet.warehouse.logs.snapshot(), grams)
+    assert not found.missing
+    assert not found.stale
+
+
+def test_files_are_told_by_feature_set(tmp_path: Path) -> None:
+    warehouse = fleet_slip.open(tmp_path / "data").warehouse
+    schema = warehouse.grams.usual_schema
+    rows = pa.Table.from_pylist(
+        [
+            {"feature_set": name, "file": f"{name[0]}-{i % 3}"}
+            for name in ("signals", "motion-1")
+            for i in range(9)
+        ],
+        schema=schema,
+    )
+    action = warehouse.grams.write_file("signals", rows)
+    warehouse.grams.snapshot().commit(Change(add=[action]))
+    done, named = named_files(warehouse.grams.snapshot(), "motion-1")
+    assert done == {"m-0", "m-1", "m-2"}
+    assert named == done | {"s-0", "s-1", "s-2"}
+
+
+def test_no_feature_set_is_called_as_the_rows_of_cars_are() -> None:
+    with pytest.raises(ValueError, match="received"):
+        FeatureCatalogue.model_validate({"sets": {"received": {}}})

@@ -1,5 +1,6 @@
 """Exact least squares against dense float64 and exact relations."""
 
+import math
 from fractions import Fraction
 
 import numpy as np
@@ -8,8 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import DataError
+from fleet_slip.regression import exact as elimination
+from fleet_slip.regression import least_squares as exact
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.exact import eliminate, inverse_matrix, sqrt
+from fleet_slip.regression.exact import (
+    PRIMES,
+    eliminate,
+    inverse_matrix,
+    solve_by_lifting,
+    sqrt,
+    symmetric_eigenvalues,
+)
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import (
     condition_number,
@@ -144,3 +154,113 @@ def test_condition_number_is_that_of_the_correlations() -> None:
     expected = np.linalg.cond(correlations[:4, :4])
     assert condition_number(gram, inputs) == pytest.approx(expected, rel=1e-9)
     assert condition_number(gram, []) == 1.0
+
+
+def near_collinear(seed: int, size: int, bits: int) -> list[list[int]]:
+    """Sums of products of columns that differ little, label last."""
+    rng = np.random.default_rng(seed)
+    common = rng.integers(-(2**bits), 2**bits, size=(2 * size + 2, 1)).astype(object)
+    columns = common + rng.integers(-9, 10, size=(2 * size + 2, size + 1))
+    return [[int(entry) for entry in row] for row in columns.T @ columns]
+
+
+def lifted(matrix: list[list[int]]) -> list[Fraction] | None:
+    found = solve_by_lifting([row[:-1] for row in matrix[:-1]], [row[-1] for row in matrix[:-1]])
+    return None if found is None else [Fraction(x, found[1]) for x in found[0]]
+
+
+@given(st.integers(0, 10**6), st.integers(1, 12), st.integers(1, 60))
+def test_lifting_gives_the_fractions_of_elimination(seed: int, size: int, bits: int) -> None:
+    matrix = near_collinear(seed, size, bits)
+    triangle = eliminate(matrix)
+    if triangle.singular is not None:
+        assert lifted(matrix) is None
+        return
+    numerators, determinant = triangle.solve(size)
+    assert lifted(matrix) == [Fraction(x, determinant) for x in numerators]
+
+
+@pytest.mark.parametrize("prime", PRIMES)
+def test_a_matrix_that_one_prime_divides_is_lifted_by_another(prime: int) -> None:
+    assert lifted([[prime, 0, 1], [0, 3, 5], [1, 5, 0]]) == [Fraction(1, prime), Fraction(5, 3)]
+
+
+@given(st.integers(0, 10**6), st.integers(2, 9))
+def test_rows_change_places_where_a_pivot_is_zero(seed: int, size: int) -> None:
+    rng = np.random.default_rng(seed)
+    half = rng.integers(-3, 4, size=(size, size)) * rng.integers(0, 2, size=(size, size))
+    matrix = (half + half.T + 99 * np.eye(size, dtype=np.int64)[::-1]) * (1 - np.eye(size))
+    rows, right = matrix.astype(int).tolist(), list(range(1, size + 1))
+    found = solve_by_lifting(rows, right)
+    if found is None:
+        assert abs(np.linalg.det(matrix)) < 0.5
+        return
+    numerators, denominator = found
+    assert denominator > 0
+    for row, b in zip(rows, right, strict=True):
+        assert sum(a * x for a, x in zip(row, numerators, strict=True)) == denominator * b
+
+
+def test_zeros_negative_and_huge_solutions() -> None:
+    huge = 7**500
+    found = lifted([[1, 0, huge], [0, 2, -huge], [huge, -huge, 0]])
+    assert found == [Fraction(huge), Fraction(-huge, 2)]
+    assert lifted([[1, 0, 0], [0, 2, 0], [0, 0, 0]]) == [Fraction(0), Fraction(0)]
+    assert lifted([[0, 1], [1, 0]]) is None
+
+
+@pytest.mark.parametrize("intercept", [True, False])
+def test_a_fit_of_many_inputs_is_the_same_by_both_ways(
+    monkeypatch: pytest.MonkeyPatch, intercept: bool
+) -> None:
+    counts = np.random.default_rng(5).integers(-30000, 30000, size=(200, 42))
+    gram, inputs = gram_of(counts), names(41)[:-1]
+    fitted = exact.fit(gram, inputs, "y", intercept=intercept)
+    monkeypatch.setattr(exact, "MANY_INPUTS", 1000)
+    assert fitted == exact.fit(gram, inputs, "y", intercept=intercept)
+
+
+def test_of_many_inputs_too_a_dependent_one_is_named() -> None:
+    counts = np.random.default_rng(5).integers(-300, 300, size=(200, 42))
+    counts[:, 40] = counts[:, 3] + 2 * counts[:, 4]
+    with pytest.raises(DataError, match=r"x41 is a linear combination of x4, x5"):
+        exact.fit(gram_of(counts), names(41)[:-1], "y")
+
+
+@given(st.integers(1, 12), st.integers(0, 10**6))
+def test_they_are_those_of_lapack(k: int, seed: int) -> None:
+    factor = np.random.default_rng(seed).normal(size=(k, k))
+    matrix = factor + factor.T
+    largest = np.abs(matrix).sum()
+    expected = np.linalg.eigvalsh(matrix)
+    assert symmetric_eigenvalues(matrix) == pytest.approx(expected, rel=1e-13, abs=1e-15 * largest)
+
+
+def test_they_are_those_of_second_differences() -> None:
+    k = 20
+    matrix = 2 * np.eye(k) - np.eye(k, k=1) - np.eye(k, k=-1)
+    expected = [2 - 2 * math.cos(math.pi * i / (k + 1)) for i in range(1, k + 1)]
+    assert symmetric_eigenvalues(matrix) == pytest.approx(expected, rel=1e-14)
+
+
+def test_compiled_they_have_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = np.random.default_rng(3).normal(size=(60, 25))
+    matrix = np.asarray(np.corrcoef((columns + 9 * columns[:, :1]).T))
+    plain = symmetric_eigenvalues(matrix)
+    monkeypatch.setattr(elimination, "MANY", 25)
+    assert symmetric_eigenvalues(matrix) == plain
+
+
+@pytest.mark.parametrize("small", [1e-3, 1e-8, 1e-12])
+def test_small_ones_are_accurate(small: float) -> None:
+    scale = np.diag([1.0, small, small**2])
+    matrix = scale @ np.array([[1, 0.5, 0.25], [0.5, 1, 0.5], [0.25, 0.5, 1]]) @ scale
+    # The determinant, (3/4)^2 * small^6, is the product of all.
+    product = math.prod(symmetric_eigenvalues(matrix))
+    assert product == pytest.approx(0.5625 * small**6, rel=1e-14)
+
+
+def test_a_diagonal_and_a_singular_matrix_are_no_trouble() -> None:
+    assert symmetric_eigenvalues(np.diag([3.0, 0.0, -1.0])) == [-1.0, 0.0, 3.0]
+    assert symmetric_eigenvalues(np.ones((4, 4))) == pytest.approx([0, 0, 0, 4], abs=1e-14)
+    assert symmetric_eigenvalues(np.zeros((2, 2))) == [0.0, 0.0]

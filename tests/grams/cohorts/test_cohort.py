@@ -1,0 +1,180 @@
+"""Cohorts of Gram rows: which drives have which signals, their folds, and the reader."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.errors import DataError
+from fleet_slip.grams import reader
+from fleet_slip.grams.cohort import Cohort, drive_folds, load_cohort
+from fleet_slip.grams.folding import Folding, FoldKey
+from fleet_slip.grams.gram_files import hash_numbers
+from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.reader import GramReader
+from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.gram import Gram
+from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.tables import Warehouse, open_tables
+from tests.support.cohorts import INPUTS, LABEL, cohort_of, driven, rows_of
+from tests.support.logs import land, log_rows, random_counts
+
+ROWS = [("a", "ax,ay"), ("b", "ax,ay"), ("b", "ax,ay,yaw_rate"), ("c", "ax,ay,yaw_rate")]
+"""Drive b has rows of both kinds; c came without a log."""
+
+
+def hashes(names: list[str]) -> list[int]:
+    return sorted(hash_numbers(pa.array(names)).tolist())
+
+
+def cohort() -> Cohort:
+    columns = {
+        "drive_hash": hash_numbers(pa.array([drive for drive, _ in ROWS])),
+        "vehicle_hash": [7] * len(ROWS),
+        "source": ["received" if drive == "c" else "simulated" for drive, _ in ROWS],
+        "signals": [signals for _, signals in ROWS],
+        "n": [10] * len(ROWS),
+    }
+    return Cohort(
+        condition=parse_condition("true"),
+        logs_version=1,
+        grams_version=1,
+        drives=pa.table(columns),
+    )
+
+
+def test_drives_with_signals_are_those_of_rows_that_have_them_all() -> None:
+    assert cohort().hash_drives_with(["ay", "ax"]).tolist() == hashes(["a", "b", "c"])
+    assert cohort().hash_drives_with(["ay", "yaw_rate"]).tolist() == hashes(["b", "c"])
+    assert cohort().hash_drives_with(["yaw"]).tolist() == []
+
+
+def test_a_car_counts_once() -> None:
+    assert cohort().count_vehicles_with(["ax"]) == 1
+    assert cohort().count_vehicles_with(["steering_wheel"]) == 0
+    assert cohort().count_received_with(["ax"]) == 1
+    assert (cohort().rows, cohort().drive_count) == (40, 3)
+
+
+def test_the_statement_hashes_names_as_python_does(warehouse: Warehouse) -> None:
+    land(warehouse, "one", log_rows("dé", random_counts(np.random.default_rng(1), 40)))
+    update_grams(warehouse)
+    cohort = load_cohort(warehouse)
+    for name in ("drive", "vehicle"):
+        told = hash_numbers(cohort.drives[f"{name}_id"])
+        assert cohort.drives[f"{name}_hash"].to_pylist() == told.tolist()
+
+
+def test_a_part_of_a_cohort_has_the_tables_of_its_drives_alone(warehouse: Warehouse) -> None:
+    rng = np.random.default_rng(1)
+    whole = [log_rows(f"whole-{i}", random_counts(rng, 40)) for i in range(2)]
+    fewer = []
+    for i in range(3):
+        counts = random_counts(rng, 40)
+        del counts["ax"]
+        fewer.append(log_rows(f"fewer-{i}", counts))
+    land(warehouse, "one", *whole, *fewer)
+    update_grams(warehouse)
+    cohort = load_cohort(warehouse)
+    assert sorted(map(len, cohort.tables)) == [2, 3]
+    ids = np.array(cohort.drives["drive_id"].to_pylist())
+    part = cohort.part(ids == "fewer-1")
+    assert part.drives["drive_id"].to_pylist() == ["fewer-1"]
+    (table,) = part.tables
+    assert len(table) == 1
+    assert "ax" not in table.signals
+    assert cohort.part(np.char.startswith(ids, "whole")).tables[0].n.tolist() == [40, 40]
+
+
+COEFFICIENTS = (0.1, 0.4, 0.9, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("by", "column"), [("drive", "drive_id"), ("vehicle", "vehicle_id"), ("day", "day")]
+)
+def test_a_fold_holds_out_whole_drives_cars_or_days(by: FoldKey, column: str) -> None:
+    drives = driven(1, COEFFICIENTS, drives=20)
+    cohort = cohort_of(drives)
+    training, fold_of = drive_folds(cohort, INPUTS, Folding(by=by, count=4))
+    pairs = set(zip(cohort.drives[column].to_pylist(), fold_of.tolist(), strict=True))
+    assert len(pairs) == len({value for value, _ in pairs})
+    for number, gram in enumerate(training.folds.grams):
+        mine = [one for one, fold in zip(drives, fold_of, strict=True) if fold == number]
+        assert gram == Gram.from_counts((*INPUTS, LABEL), rows_of(mine))
+    assert training.folds.total.n == 20 * 80
+    table = cohort.serving(INPUTS).table
+    assert np.array_equal(training.drives.each, DriveMoments.of(table).each)
+
+
+def test_drives_without_a_signal_are_left_out_and_without_any_that_is_told() -> None:
+    cohort = cohort_of(driven(1, COEFFICIENTS))
+    training, fold = drive_folds(cohort, ["ay", "ax"], Folding(count=3))
+    assert training.drives.signals == ("ay", "ax", LABEL)
+    assert len(training.drives) == len(fold) == 12
+    with pytest.raises(DataError, match="wheel_fl"):
+        drive_folds(cohort, ["ay", "wheel_fl"], Folding(count=3))
+
+
+def land_another(warehouse: Warehouse, number: int) -> None:
+    rng = np.random.default_rng(number)
+    land(warehouse, f"f{number}", log_rows(f"d{number}", random_counts(rng, 30)))
+    update_grams(warehouse)
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """What is opened anew."""
+    found: list[object] = []
+
+    def counting(*given: Any) -> Any:
+        found.append(given)
+        return open_tables(*given)
+
+    monkeypatch.setattr(reader, "open_tables", counting)
+    return found
+
+
+def test_a_reader_takes_over_what_the_last_one_opened_until_somebody_commits(
+    warehouse: Warehouse, opened: list[object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(2):
+        land_another(warehouse, number)
+        assert [len(load_cohort(warehouse).drives) for _ in range(3)] == [number + 1] * 3
+        assert len(opened) == number + 1
+    monkeypatch.setattr(reader, "USES", 3)
+    load_cohort(warehouse)
+    load_cohort(warehouse)
+    assert len(opened) == 3
+    monkeypatch.setattr(reader, "KEPT_BYTES", 0)
+    load_cohort(warehouse)
+    load_cohort(warehouse)
+    assert len(opened) == 4
+
+
+def test_a_reader_that_failed_leaves_nothing(warehouse: Warehouse, opened: list[object]) -> None:
+    land_another(warehouse, 0)
+    with pytest.raises(DataError, match="as a query may"), GramReader(warehouse) as failing:
+        failing.opened(PLAIN, parse_condition("true"))
+        raise DataError("as a query may")
+    load_cohort(warehouse)
+    assert len(opened) == 2
+
+
+def test_threads_and_processes_have_their_own(warehouse: Warehouse, opened: list[object]) -> None:
+    land_another(warehouse, 0)
+    with ThreadPoolExecutor(4) as threads:
+        found = list(threads.map(lambda _: len(load_cohort(warehouse).drives), range(40)))
+    assert found == [1] * 40
+    load_cohort(warehouse)
+    before = len(opened)
+    child = os.fork()
+    if not child:
+        load_cohort(warehouse)
+        os._exit(len(opened) - before)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
+    load_cohort(warehouse)
+    assert len(opened) == before
