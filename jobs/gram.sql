@@ -6,8 +6,7 @@
 -- rows, "absent" is the constant 0 and not grouped by, which is faster and gives the same rows: grouped by the one
 -- dictionary column drive_id, rows are not hashed at all.
 --
--- A feature set may also divide the rows of a drive ("part"), and its features may be clipped to int16 ("clipped" says
--- how often). The set of the catalogue's own signals has neither, and constants cost nothing.
+-- Features may be clipped to int16 ("clipped" says how often). "part" is of sets that the compiled kernel alone computes.
 --
 -- INTEGER products: SMALLINT * SMALLINT would overflow. union_by_name: gives DuckDB the files' statistics, from which
 -- it knows that no sum can overflow; without it the query is three times slower.
@@ -27,7 +26,6 @@ gram AS (
     SELECT
         drive_id,
         {absent} AS absent,
-        {part} AS part,
         count(*) AS n,
         {clipped} AS clipped,
         [
@@ -45,7 +43,7 @@ SELECT
     drive.file,
     drive.day,
     {qualified_drive_columns},
-    {part_name} AS part,
+    NULL::VARCHAR AS part,
     array_to_string(list_where([{names}], [s IS NOT NULL FOR s IN gram.sums]), ',') AS signals,
     gram.n,
     gram.clipped,
@@ -53,4 +51,4 @@ SELECT
     [p FOR p IN gram.products IF p IS NOT NULL] AS products
 FROM gram
 JOIN drive USING (drive_id)
-ORDER BY drive.file, drive_id, gram.absent, gram.part
+ORDER BY drive.file, drive_id, gram.absent

@@ -5,7 +5,6 @@ from decimal import Decimal
 from fractions import Fraction
 from functools import cache, cached_property
 from importlib.resources.abc import Traversable
-from itertools import pairwise
 from typing import Any
 
 from pydantic import Field, ValidationError, field_validator, model_validator
@@ -40,35 +39,13 @@ from fleet_slip.config import Config, faults_of, load_config, load_toml
 from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.resources import config_file, folder
 
-# Feature sets and regimes of `configs/features.toml` as types.
+# Feature sets of `configs/features.toml` as types.
 #
 # A feature set is the columns of one kind of Gram row, and how a drive's rows are divided into
 # several, if they are.
 
 PLAIN = "signals"
 """The feature set whose columns are the catalogue's inputs and label themselves."""
-
-
-class Regime(Config):
-    """Bands of a signal or feature."""
-
-    of: Identifier
-    absolute: bool = False
-    bounds: tuple[Decimal, ...] = Field(min_length=1)
-
-    @model_validator(mode="after")
-    def _bounds_rise(self) -> "Regime":
-        if list(self.bounds) != sorted(set(self.bounds)):
-            raise ValueError("the bounds of a regime must rise")
-        return self
-
-    @property
-    def bands(self) -> tuple[str, ...]:
-        """What the bands are called."""
-        name = f"|{self.of}|" if self.absolute else self.of
-        edges = [f"{bound:f}".rstrip("0").rstrip(".") for bound in self.bounds]
-        middle = [f"{name} {low}-{high}" for low, high in pairwise(edges)]
-        return (f"{name} < {edges[0]}", *middle, f"{name} >= {edges[-1]}")
 
 
 class FeatureSet(Config):
@@ -81,7 +58,6 @@ class FeatureSet(Config):
     features: tuple[Identifier, ...] = ()
     windows: tuple[Identifier, ...] = ()
     calibrated: tuple[Identifier, ...] = ()
-    regimes: tuple[Identifier, ...] = ()
     block_s: Decimal | None = Field(default=None, gt=0, le=100_000)
     change_s: tuple[Decimal, ...] = ()
     """Instead of the columns, what they change by in so much time, with the course as the label;
@@ -99,7 +75,6 @@ class FeatureSet(Config):
         inputs = catalogue().feature_inputs
         unknown = ", ".join(name for name in self.signals if name not in inputs)
         ticks = self.change_ticks
-        ways = bool(self.regimes) + bool(self.block_s)
         out_of_range = any(not 0 < n <= LONGEST_TICKS for n in ticks)
         longest = f"{LONGEST_TICKS * float(SAMPLE_TIME_S):g}"
         for wrong, what in (
@@ -107,8 +82,7 @@ class FeatureSet(Config):
             (self.of is not None and not self.change_s, "a set of another has change_s"),
             (unknown, f"not input signals: {unknown}"),
             (len(set(self.columns)) < len(self.columns), "a column stands twice"),
-            (ways > 1, "a set has regimes or block_s, not both"),
-            (ticks and ways, "a set with change_s does not divide rows"),
+            (ticks and self.block_s, "a set with change_s does not divide rows"),
             (ticks and not (self.windows or self.of), "a set with change_s has windows"),
             (self.as_logged and not ticks, "only a set with change_s is as_logged"),
             (out_of_range, f"change_s is at most {longest}"),
@@ -167,7 +141,7 @@ _identities: dict[str, tuple["FeatureCatalogue", SignalCatalogue, str]] = {}
 
 
 class FeatureCatalogue(Config):
-    """All features, regimes and feature sets, in the file's order."""
+    """All features and feature sets, in the file's order."""
 
     features: dict[Identifier, Feature]
     windows: dict[Identifier, Window] = Field(default_factory=dict)
@@ -177,7 +151,6 @@ class FeatureCatalogue(Config):
     factors: dict[Identifier, Factor] = Field(default_factory=dict)
     gates: dict[Identifier, GateFamily] = Field(default_factory=dict)
     calibrated: dict[Identifier, Calibrated] = Field(default_factory=dict)
-    regimes: dict[Identifier, Regime]
     sets: dict[Identifier, FeatureSet]
 
     @model_validator(mode="after")
@@ -193,12 +166,8 @@ class FeatureCatalogue(Config):
         for name, what in ((PLAIN, "the catalogue's own signals"), (RECEIVED, "what cars sent")):
             if name in self.sets:
                 raise ValueError(f"{name!r} is the set of {what}")
-        for name, regime in self.regimes.items():
-            if regime.of not in {*self.features, *signals.feature_inputs}:
-                raise ValueError(f"regimes.{name}: {regime.of} is no input signal or feature")
         for name, one in self.sets.items():
             unknown = [f for f in one.features if f not in self.features]
-            unknown += [r for r in one.regimes if r not in self.regimes]
             known = {*self.windows, *self.gates, *self.time_columns}
             unknown += [w for w in one.windows if w not in known or w in self.calibrated]
             unknown += [c for c in one.calibrated if c not in self.calibrated]
@@ -380,13 +349,12 @@ class FeatureCatalogue(Config):
 
     def _identity(self, name: str) -> str:
         one = self.feature_set(name)
-        used = [*one.features, *(self.regimes[r].of for r in one.regimes)]
         content: dict[str, Any] = {
             "columns": list(one.columns),
             "signals": {s: str(catalogue()[s].scale) for s in catalogue().inputs},
-            "features": {f: self._definition(f) for f in used if f in self.features},
-            "regimes": {r: self.regimes[r].model_dump(mode="json") for r in one.regimes},
-            "row_folds": None,  # of sets that earlier releases had: identities stay
+            "features": {f: self._definition(f) for f in one.features},
+            "regimes": {},  # these three of sets that earlier releases had: identities stay
+            "row_folds": None,
             "lagged": False,
         }
         if line := self.line_of(name):
@@ -407,10 +375,9 @@ class FeatureCatalogue(Config):
 
     def _extras(self, one: FeatureSet) -> tuple[str, ...]:
         """Return the signals that a set is made of and that not every set knows."""
-        divided_by = [self.regimes[regime].of for regime in one.regimes]
-        used = {*one.signals, *divided_by}
-        for name in (*one.features, *divided_by):
-            used |= set(self.features[name].inputs) if name in self.features else set()
+        used = {*one.signals}
+        for name in one.features:
+            used |= set(self.features[name].inputs)
         for name in one.windows:
             used |= set(self.time_columns[name].definition.signals)
         return tuple(name for name in catalogue().extras if name in used)

@@ -116,14 +116,6 @@ class Workspace:
         registers = self._memory[place : place + columns * stride].reshape(columns, stride)
         return registers[:, :rows], self._memory[:rows]
 
-    def beside(self, first: int) -> dict[str, FloatArray]:
-        """Return the columns that the plan has beside its own, as `block` does."""
-        place, stride = self._regions[Region.REGISTER]
-        rows, begin = min(BLOCK_ROWS, self.rows - first), padded(len(self.plan.names))
-        parts = (place + (begin + i) * stride for i in range(len(self.plan.also)))
-        found = (self._memory[part : part + rows] for part in parts)
-        return dict(zip(self.plan.also, found, strict=True))
-
     def compute_block(self, first: int) -> None:
         """Compute the block that begins with a row; blocks are computed in the order of time."""
         self._run(first, 0, self._products.astype(np.int64))

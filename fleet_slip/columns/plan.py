@@ -151,19 +151,17 @@ class Code:
         self.operations.append(one)
         return len(self.operations) - 1
 
-    def assemble(self, results: Sequence[Value], also: Sequence[Value] = ()) -> "BlockProgram":
-        """Return the program with results in the first registers, then `also`, padded to tiles."""
+    def assemble(self, results: Sequence[Value]) -> "BlockProgram":
+        """Return the program with results in the first registers, padded to tiles."""
         columns: list[int] = []
         for one in results:
             if isinstance(one, int) and one not in columns:
                 columns.append(one)
             else:
                 columns.append(self._append(VectorOperation(COPY, (one,))))
-        beside = [self._append(VectorOperation(COPY, (one,))) for one in also]
         registers = {value: register for register, value in enumerate(columns)}
-        registers |= {value: padded(len(columns)) + i for i, value in enumerate(beside)}
         last = {read: number for number, one in enumerate(self.operations) for read in one.reads}
-        count, free = padded(len(columns)) + len(beside), list[int]()
+        count, free = padded(len(columns)), list[int]()
         for number, operation in enumerate(self.operations):
             if number not in registers and operation.operation not in {ADD_UP, KEEP}:
                 if not free:
@@ -171,7 +169,7 @@ class Code:
                 registers[number] = free.pop()
             # Given back after the result has a register: loops do not write what they read.
             ended = {r for r in operation.reads if isinstance(r, int) and last[r] == number}
-            free += [registers[read] for read in ended.difference(columns, beside)]
+            free += [registers[read] for read in ended.difference(columns)]
         places = [
             [(Region.REGISTER, registers[number]) if number in registers else NOWHERE]
             + [(Region.REGISTER, registers[r]) if isinstance(r, int) else r for r in one.reads]
@@ -294,15 +292,12 @@ _INTEGERS = ("+", "-", "*", "//", "nearest", "negative", "abs", "sign")
 Found = Mapping[str, int]
 
 
-def compile_plan(
-    counted: CountedColumns, names: Sequence[str], also: Sequence[str] = ()
-) -> BlockProgram:
-    """Return the program of columns, with `also`. Raises `QuestionError` for a bad divisor."""
+def compile_plan(counted: CountedColumns, names: Sequence[str]) -> BlockProgram:
+    """Return the program of columns. Raises `QuestionError` for a bad divisor."""
     writer = _Writer(counted)
     for place in sorted({*counted.places.values(), *counted.times}):
         writer.value(place)
-    results = [[writer.value(counted.places[name]) for name in some] for some in (names, also)]
-    return writer.code.assemble(*results)
+    return writer.code.assemble([writer.value(counted.places[name]) for name in names])
 
 
 class _Writer:
@@ -545,13 +540,12 @@ def _number(known: dict[Any, int], key: object) -> int:
 class ColumnPlan:
     """What to compute of a drive: columns by `names`, of `rows` (one row each) and `windows`.
 
-    `rows` has what is looked back on and tells parts; `also` of them come beside the columns.
+    `rows` has what is looked back on, too.
     """
 
     names: tuple[str, ...]
     rows: Mapping[str, Definition]
     windows: Mapping[str, Definition]
-    also: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -559,18 +553,14 @@ class ColumnPlan:
         names: Sequence[str],
         features: Mapping[str, Definition],
         windows: Mapping[str, Definition],
-        also: Sequence[str] = (),
     ) -> "ColumnPlan":
-        """Plan columns by name: of `features`, of `windows`, or logged; `also` are beside them.
+        """Plan columns by name: of `features`, of `windows`, or logged.
 
         Raises `DataError` for a feature that is defined in two ways.
         """
-        rows = {
-            name: features.get(name, plain_column(name))
-            for name in (*names, *also)
-            if name not in windows
-        }
-        return cls(tuple(names), rows_of(rows, windows), dict(windows), tuple(also))
+        single = [name for name in names if name not in windows]
+        rows = {name: features.get(name, plain_column(name)) for name in single}
+        return cls(tuple(names), rows_of(rows, windows), dict(windows))
 
     @classmethod
     def of_set(cls, known: FeatureCatalogue, name: str, fold: str | None = None) -> "ColumnPlan":
@@ -579,11 +569,10 @@ class ColumnPlan:
         For the `fold` see `FeatureCatalogue.definitions`.
         """
         one = known.feature_set(name)
-        divided_by = [known.regimes[regime].of for regime in one.regimes]
-        features = known.rows((*one.features, *divided_by))
+        features = known.rows(one.features)
         inputs = (*one.signals, *one.features, *one.windows)
         columns = (*inputs, COURSE, YAW_RATE) if one.change_ticks else one.columns
-        return cls.of(columns, features, known.definitions(name, fold), divided_by)
+        return cls.of(columns, features, known.definitions(name, fold))
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -623,9 +612,7 @@ class ColumnPlan:
     @cached_property
     def program(self) -> BlockProgram:
         """The program that computes the columns, one for equal plans. Raises `QuestionError`."""
-        return _program(
-            self.names, tuple(self.rows.items()), tuple(self.windows.items()), self.also
-        )
+        return _program(self.names, tuple(self.rows.items()), tuple(self.windows.items()))
 
 
 @lru_cache(maxsize=64)
@@ -633,6 +620,5 @@ def _program(
     names: tuple[str, ...],
     rows: tuple[tuple[str, Definition], ...],
     windows: tuple[tuple[str, Definition], ...],
-    also: tuple[str, ...],
 ) -> BlockProgram:
-    return compile_plan(CountedColumns.of(dict(rows), dict(windows)), names, also)
+    return compile_plan(CountedColumns.of(dict(rows), dict(windows)), names)

@@ -164,7 +164,7 @@ class Learner:
         if features().feature_set(name).change_ticks:
             raise DataError("changes of the course are not divided: choose three drives or more.")
         workspace = Workspace(ColumnPlan.of_set(features(), name))
-        parts = Parts.of_set(features(), features().feature_set(name))
+        parts = Parts.of_set(features().feature_set(name))
         lines = {line["drive_id"]: line for line in self.cohort.drives.to_pylist()}
         found = [
             row

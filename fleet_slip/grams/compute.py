@@ -1,11 +1,9 @@
 """Computes the Gram rows of log files: plain sets by `jobs/gram.sql`, windows by the kernel."""
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from fractions import Fraction
 from functools import partial
 from itertools import pairwise
 from math import ceil
@@ -23,7 +21,7 @@ from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.catalogue.course import COURSE_LATE
 from fleet_slip.catalogue.definitions import COUNT_BITS, Slope, rows_behind
-from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue, FeatureSet, features
+from fleet_slip.catalogue.features import PLAIN, FeatureSet, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.columns.plan import ColumnPlan
@@ -114,113 +112,36 @@ def rows_by_drive(rows: pa.Table) -> Iterator[pa.Table]:
         yield rows.slice(start, stop - start)
 
 
-# What divides a drive into several Gram rows, in SQL and for arrays: bands, blocks.
-
-UNKNOWN_PART = "unknown"
-"""Part of the rows whose regime is not known because a signal is absent."""
-
-UNKNOWN = -1
-
-BLOCK_FORMAT = "block %04d"
-"""Names that sort as numbers do."""
-
-
-@dataclass(frozen=True)
-class Bands:
-    """The bands of a signal or feature, or of its size: the least count of all but the first."""
-
-    of: str
-    absolute: bool
-    bounds: tuple[int, ...]
-    names: tuple[str, ...]
-
-    @property
-    def sql(self) -> str:
-        """The SQL of a row's band; null where the signal is."""
-        value = f"abs({self.of}::INTEGER)" if self.absolute else self.of
-        return "(" + " + ".join(f"({value} >= {bound})::INTEGER" for bound in self.bounds) + ")"
-
-    def __call__(self, counts: FloatArray) -> FloatArray:
-        """Return the band of each row, shape (rows,); NaN where the count is."""
-        size = np.abs(counts) if self.absolute else counts
-        reached = np.searchsorted(np.array(self.bounds, dtype=np.float64), size, side="right")
-        return np.where(np.isnan(counts), np.nan, reached)
-
-
 @dataclass(frozen=True)
 class Parts:
-    """How the rows of a drive are divided: by at most one of bands, blocks and times.
+    """How the rows of a drive are divided: by blocks of time, or by what they change over.
 
-    Combined bands run with the last fastest. `times` are what columns change over, if several; each
-    has all rows.
+    Of several `times` that columns change over, each has all rows.
     """
 
-    bands: tuple[Bands, ...] = ()
     block_ticks: int | None = None
     times: tuple[str, ...] = ()
 
     @classmethod
-    def of_set(cls, known: FeatureCatalogue, one: FeatureSet) -> "Parts":
+    def of_set(cls, one: FeatureSet) -> "Parts":
         """Return what divides the rows of a feature set."""
-        bands = []
-        for name in one.regimes:
-            regime = known.regimes[name]
-            scale = known.of(regime.of).exact_scale
-            # Counts are whole, so that reaching a bound is reaching the next whole count.
-            bounds = tuple(math.ceil(Fraction(bound) / scale) for bound in regime.bounds)
-            bands.append(Bands(regime.of, regime.absolute, bounds, regime.bands))
         times = tuple(f"{time_s:f} s" for time_s in one.change_s)
-        return cls(tuple(bands), one.block_ticks, times if len(times) > 1 else ())
+        return cls(one.block_ticks, times if len(times) > 1 else ())
 
-    def __bool__(self) -> bool:
-        return bool(self.bands or self.block_ticks or self.times)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the times, or of the combinations of bands."""
-        if self.times:
-            return self.times
-        names = [""]
-        for bands in self.bands:
-            names = [f"{name}, {band}".removeprefix(", ") for name in names for band in bands.names]
-        return tuple(names)
-
-    @property
-    def number_sql(self) -> str:
-        """SQL of a row's part, a number from 0; null where it is not known."""
-        if self.block_ticks:
-            return f"tick // {self.block_ticks}"
-        number = "0"
-        for bands in self.bands:
-            number = f"({number}) * {len(bands.names)} + {bands.sql}"
-        return number
-
-    def name_sql(self, number: str) -> str:
-        """Return the SQL of a part's name, given that of its number."""
-        if self.block_ticks:
-            return f"printf('{BLOCK_FORMAT}', {number} + 1)"
-        names = ", ".join(f"'{name}'" for name in self.names)
-        return f"coalesce([{names}][{number} + 1], '{UNKNOWN_PART}')"
-
-    def numbers(self, ticks: NDArray[Any], counts: Mapping[str, FloatArray]) -> IntArray:
-        """Return each row's part, (rows,), or `UNKNOWN`; `columns` are what the bands are of."""
-        if self.block_ticks:
-            return ticks.astype(np.int64) // self.block_ticks
-        number: FloatArray = np.zeros(len(ticks))
-        for bands in self.bands:
-            number = number * len(bands.names) + bands(counts[bands.of])
-        return np.where(np.isnan(number), UNKNOWN, number).astype(np.int64)
+    def numbers(self, ticks: NDArray[Any]) -> IntArray:
+        """Return the block of each row, shape (rows,); 0 where there are none."""
+        if not self.block_ticks:
+            return np.zeros(len(ticks), dtype=np.int64)
+        return ticks.astype(np.int64) // self.block_ticks
 
     def name(self, number: int) -> str | None:
-        """Return the name of a part; None where rows are not divided."""
+        """Return the name of a part, which sorts as numbers do; None where there is one."""
         if self.block_ticks:
-            return BLOCK_FORMAT % (number + 1)
-        if not (self.bands or self.times):
-            return None
-        return UNKNOWN_PART if number == UNKNOWN else self.names[number]
+            return f"block {number + 1:04}"
+        return self.times[number] if self.times else None
 
 
-# Fills in `jobs/gram.sql` for a feature set: its columns, and what divides a drive's rows.
+# Fills in `jobs/gram.sql` for a feature set.
 
 LOGS = "read_parquet(getvariable('log_files'), union_by_name => true, hive_partitioning => false)"
 
@@ -239,7 +160,8 @@ def has_statement(feature_set: str) -> bool:
     one = features().feature_set(feature_set)
     k, windows = len(one.columns), features().definitions(feature_set)
     slopes = any(isinstance(row.made, Slope) for row in rows_behind(windows).values())
-    return not (one.change_ticks or slopes) and k + k * (k + 1) // 2 <= MOST_SUMS
+    divided = one.change_ticks or one.block_ticks
+    return not (divided or slopes) and k + k * (k + 1) // 2 <= MOST_SUMS
 
 
 def gram_statement(
@@ -255,19 +177,16 @@ def gram_statement(
     if not has_statement(feature_set):
         raise QuestionError(
             f"the Gram rows of {feature_set} have no SQL: the compiled kernel alone computes "
-            "changes of the course, slopes and sets of many columns. Its columns: fleet-slip "
-            "features --sql"
+            "changes of the course, blocks of time, slopes and sets of many columns. Its columns: "
+            "fleet-slip features --sql"
         )
     names = one.columns
     windows = known.definitions(feature_set)
-    regimes = [known.regimes[name].of for name in one.regimes]
-    used = known.rows(dict.fromkeys([*one.features, *regimes]))
+    used = known.rows(one.features)
     logs = with_absent(LOGS, absent)
     rows = with_columns(logs, used, windows)
     wide = windows or any(feature.bits > COUNT_BITS for feature in used.values())
     kind = "BIGINT" if wide else "INTEGER"
-    parts = Parts.of_set(known, one)
-    absent_sql, part = "0" if whole else _absent(names), parts.number_sql if parts else "NULL"
     sums = [f"sum({name})" for name in names]
     products = [
         f"sum({a}::{kind} * {b}::{kind})" for i, a in enumerate(names) for b in names[: i + 1]
@@ -277,21 +196,15 @@ def gram_statement(
             signals.null_sql(name) if name in absent else name for name in signals.drive
         ),
         qualified_drive_columns=", ".join(f"drive.{name}" for name in signals.drive),
-        absent=absent_sql,
-        part=part,
+        absent="0" if whole else _absent(names),
         clipped="sum(clipped)::BIGINT" if used or windows else "0",
         sums=_SEPARATOR.join(sums),
         products=_SEPARATOR.join(products),
         counts=rows,
-        group=", ".join(_group(whole=whole, divided=bool(parts))),
-        part_name=parts.name_sql("gram.part") if parts else "NULL::VARCHAR",
+        # No constant, lest DuckDB hash a dictionary row by row.
+        group="drive_id" if whole else "drive_id, absent",
         names=", ".join(f"'{name}'" for name in names),
     )
-
-
-def _group(*, whole: bool, divided: bool) -> list[str]:
-    """Return the columns to group by, no constant, lest DuckDB hash a dictionary row by row."""
-    return ["drive_id", *([] if whole else ["absent"]), *(["part"] if divided else [])]
 
 
 def _absent(names: Sequence[str]) -> str:
@@ -339,7 +252,8 @@ def compute_grams(
     """
     if not files:
         return
-    wide = bool(features().feature_set(feature_set).windows)
+    one = features().feature_set(feature_set)
+    wide = bool(one.windows or one.block_ticks)
     if executor is None and not wide:
         total = sum(file.rows for file in files)
         with open_database(reading=warehouse.logs.folder) as database:
@@ -466,7 +380,7 @@ def wide_grams(
 def _rows_of_drive(
     workspace: Workspace, one: FeatureSet, drive: DriveCounts, known: Mapping[str, Any]
 ) -> Iterator[dict[str, Any]]:
-    parts = Parts.of_set(features(), one)
+    parts = Parts.of_set(one)
     try:
         if one.change_ticks:
             late = (known[COURSE_LATE] or 0) if one.in_time else 0
@@ -482,8 +396,7 @@ def gram_rows(
     found: "Mapping[Kind, PartSums]", columns: Sequence[str], parts: Parts, known: Mapping[str, Any]
 ) -> Iterator[dict[str, Any]]:
     """Yield the Gram rows of a drive's sums with what is known of it, sorted as by SQL."""
-    # As SQL does: an unknown part, which is null there, comes last.
-    for absent, part in sorted(found, key=lambda kind: (kind[0], kind[1] == UNKNOWN, kind[1])):
+    for absent, part in sorted(found):
         sums = found[absent, part]
         names = [name for i, name in enumerate(columns) if not absent >> i & 1]
         yield {
@@ -538,7 +451,7 @@ def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[
     found = {(0, 0): complete}
     first = 0
     while first < total:
-        if parts:
+        if parts.block_ticks:
             workspace.compute_block(first)
         else:
             first, lacks, rows, clipped = workspace.add_blocks(first, exact_rows, totals)
@@ -548,7 +461,7 @@ def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[
                 continue
         block, here = workspace.block(first)
         last = first + len(here)
-        numbers = parts.numbers(counts.ticks[first:last], workspace.beside(first))
+        numbers = parts.numbers(counts.ticks[first:last])
         _add_by_kind(found, block, here, numbers, exact_rows)
         first = last
     complete.add_totals(totals)

@@ -28,7 +28,7 @@ BANDS: FoldKey = "speed"
 """Whole bands of speed: neighbouring drives share a fold, so that no model sees their speed."""
 
 PARTS: FoldKey = "part"
-"""Parts of drives that the feature set divides rows into: bands of a signal, or blocks of time."""
+"""Parts of drives that the feature set divides rows into: blocks of time."""
 
 
 EACH: Literal["each"] = "each"
@@ -63,11 +63,11 @@ def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Fold
 def require_divided(feature_set: str, by: str) -> None:
     """Raise `QuestionError` if a feature set has not divided the rows of drives as folds need."""
     one = features().feature_set(feature_set)
-    if by == PARTS and not (one.regimes or one.block_s):
-        known = ", ".join(n for n, s in features().sets.items() if s.regimes or s.block_s)
+    if by == PARTS and not one.block_s:
+        known = ", ".join(name for name, other in features().sets.items() if other.block_s)
         raise QuestionError(
             f"the feature set {feature_set} does not divide the rows of a drive. Feature sets with "
-            f"bands or blocks: {known}."
+            f"blocks of time: {known}."
         )
 
 

@@ -115,8 +115,7 @@ def counted_sets() -> dict[str, CountedSet]:
     found = {}
     for name in (PLAIN, *known.sets):
         one = known.feature_set(name)
-        divided = one.regimes or one.block_ticks
-        if not divided and len(one.columns) <= MOST_COLUMNS:
+        if not one.block_ticks and len(one.columns) <= MOST_COLUMNS:
             found[known.identity(name)] = _counted(name, known.identity(name))
     return found
 
@@ -140,7 +139,7 @@ def _counted(name: str, identity: str) -> CountedSet:
         {column: _range(column, one.change_ticks) for column in one.columns},
         tuple(made_of),
         one.change_ticks,
-        Parts.of_set(known, one).times or (None,),
+        Parts.of_set(one).times or (None,),
         one.in_time,
         int.from_bytes(bytes.fromhex(digest[:16]), "little"),
     )

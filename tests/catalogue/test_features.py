@@ -193,8 +193,6 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
         ("at_least = 120000\n", "", "at_least is for a divisor that varies"),
         ('column = "speed_mps"', 'column = "ay_mps2"', "names must differ"),
         ('divided_by = "50000"', 'divided_by = "0"', "divided_by is zero"),
-        ('regimes = ["speed", "ay"]', 'regimes = ["mood"]', "unknown mood"),
-        ("block_s = 60", "block_s = 60\nregimes = ['speed']", "regimes or block_s, not both"),
         ("block_s = 60", "block_s = 0.005", "block_s must be a multiple of 0.01"),
     ],
 )
@@ -277,25 +275,6 @@ def test_a_changed_definition_never_mixes_with_the_old_rows(
     }
     old, new = with_curvature.values()
     assert 0 < new < old < 300
-
-
-def test_rows_are_divided_by_regime(warehouse: Warehouse) -> None:
-    rows = drive("a", 600, 5)
-    land(warehouse, "one", rows)
-    update_grams(warehouse, feature_set="regimes")
-    cohort = load_cohort(warehouse, "true", "regimes")
-    found: dict[str, int] = {}
-    for part, n in zip(
-        cohort.drives["part"].to_pylist(), cohort.drives["n"].to_pylist(), strict=True
-    ):
-        found[part] = found.get(part, 0) + n
-    wheels = sum(rows[f"wheel_{w}"].to_numpy().astype(int) for w in ("fl", "fr", "rl", "rr"))
-    kmps = np.floor(wheels / 4 + 0.5) * 0.0031
-    ay = np.abs(rows["ay"].to_numpy().astype(int)) * 0.001
-    fast = (kmps >= 20) & (kmps < 25) & (ay >= 1) & (ay < 2)
-    assert found["speed 20-25, |ay| 1-2"] == int(fast.sum()) > 0
-    assert found["speed < 10, |ay| < 1"] == int(((kmps < 10) & (ay < 1)).sum()) > 0
-    assert sum(found.values()) == 600
 
 
 def test_a_drive_with_several_gram_rows_is_one_drive(warehouse: Warehouse) -> None:

@@ -297,7 +297,7 @@ def test_a_set_is_not_asked_of_drives_that_no_gram_row_names(
 ) -> None:
     root = tmp_path / "data"
     assert run_command("simulate", "smoke", root=root).exit_code == 0
-    assert run_command("gram", "--features", "regimes", root=root).exit_code == 0
+    assert run_command("gram", "--features", "motion", root=root).exit_code == 0
     asked = ("select", "--features", "windows", "--nested", "ax,ay", "--cohort")
     refused = run_command(*asked, "campaign = 'smoke'", root=root)
     assert refused.exit_code == 5

@@ -114,37 +114,34 @@ def trailing_mean(values: np.ndarray, ticks: int = 16) -> np.ndarray:
     return np.array([values[max(0, i + 1 - ticks) : i + 1].mean() for i in range(len(values))])
 
 
-def test_what_a_log_remembers_is_found_and_carries_to_speeds_it_was_not_fitted_at(
+def test_what_a_log_remembers_is_found_and_carries_to_blocks_it_was_not_fitted_to(
     tmp_path: Path,
 ) -> None:
-    """From the file to `--by part`: blocks of time, and bands of speed left out of the training."""
+    """From the file to `--by part`: blocks of time left out of the training."""
     file = tmp_path / "lap.csv"
     file.write_text(csv_text(remembering_log()))
     root, models = tmp_path / "data", tmp_path / "models.toml"
     models.write_text(MODELS)
     call(root, "ingest", str(file), "--mapping", "race_car_250lm_speed")
-    for name in ("blocks", "bands"):
-        call(root, "gram", "--features", name)
-    asked = ("select", "--by", "part", "--models", str(models), "--json", "--features")
-    blocks, bands = (json.loads(call(root, *asked, name)) for name in ("blocks", "bands"))
-    assert [one["fold"] for one in blocks["models"][0]["folds"]] == ["block 0001", "block 0002"]
-    names = ["speed 15-20", "speed 20-25", "speed 25-30", "speed >= 30"]
-    assert [one["fold"] for one in bands["models"][0]["folds"]] == names
-    for found in (blocks, bands):
-        instant, remembering = found["models"]
-        assert remembering["rmse_deg"] == pytest.approx(np.degrees(NOISE_RAD), rel=0.05)
-        assert instant["rmse_deg"] > 2 * remembering["rmse_deg"]
-    fast = bands["models"][1]["folds"][-1]
-    assert fast["rmse_deg"] == pytest.approx(slow_to_fast_deg(root), rel=1e-9)
-    shown = call(root, *asked[:5], "--features", "bands")
-    assert f"{fast['rmse_deg']:.4f}" in next(row for row in shown.splitlines() if names[-1] in row)
+    call(root, "gram", "--features", "blocks")
+    asked = ("select", "--by", "part", "--models", str(models), "--json")
+    found = json.loads(call(root, *asked))
+    names = ["block 0001", "block 0002"]
+    assert [one["fold"] for one in found["models"][0]["folds"]] == names
+    instant, remembering = found["models"]
+    assert remembering["rmse_deg"] == pytest.approx(np.degrees(NOISE_RAD), rel=0.05)
+    assert instant["rmse_deg"] > 2 * remembering["rmse_deg"]
+    last = remembering["folds"][-1]
+    assert last["rmse_deg"] == pytest.approx(first_to_last_minute_deg(root), rel=1e-9)
+    shown = call(root, *asked[:5])
+    assert f"{last['rmse_deg']:.4f}" in next(row for row in shown.splitlines() if names[1] in row)
     call(root, "gram")
-    with pytest.raises(QuestionError, match=r"does not divide the rows of a drive.*bands, blocks"):
+    with pytest.raises(QuestionError, match=r"does not divide the rows of a drive.*time: blocks"):
         call(root, "select", "--by", "part")
 
 
-def slow_to_fast_deg(root: Path) -> float:
-    """Fit below 30 m/s by numpy on the columns as SQL defines them, and test above."""
+def first_to_last_minute_deg(root: Path) -> float:
+    """Fit to the first minute by numpy on the columns as SQL defines them, and test on the rest."""
     known = features()
     with connect(LocalFolder(root)) as database:
         columns = [
@@ -153,16 +150,16 @@ def slow_to_fast_deg(root: Path) -> float:
         ]
         log = database.sql("SELECT * FROM log_counts ORDER BY tick").fetchnumpy()
     beta = np.asarray(log["sideslip"], dtype=np.float64) * float(catalogue()["sideslip"].scale)
-    fast = 4 * np.asarray(log["wheel_fl"], dtype=np.int64) * 0.0031 / 4 >= 30
+    last = np.asarray(log["tick"], dtype=np.int64) >= 6000
     matrix = np.column_stack([np.ones(len(beta)), *(c / np.abs(c).max() for c in columns)])
-    weights = np.linalg.lstsq(matrix[~fast], beta[~fast], rcond=None)[0]
-    error = np.degrees(matrix[fast] @ weights - beta[fast])
+    weights = np.linalg.lstsq(matrix[~last], beta[~last], rcond=None)[0]
+    error = np.degrees(matrix[last] @ weights - beta[last])
     return float(np.sqrt(np.mean(error**2)))
 
 
 MODELS = """
 description = "One instant, and memory"
-features = "bands"
+features = "blocks"
 [[model]]
 name = "instant"
 signals = ["curvature", "ay_signed_square"]

@@ -21,6 +21,7 @@ from fleet_slip.grams import compute as statement
 from fleet_slip.grams.check import grams_of
 from fleet_slip.grams.compute import aggregate, by_sql, gram_statement, wide_grams
 from fleet_slip.grams.job import update_grams
+from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
 from tests.export.models import DEFINITIONS as OF_MODELS
 from tests.export.models import SPEED
@@ -165,14 +166,6 @@ def test_a_whole_drive_takes_the_fast_loop_to_the_same_integers() -> None:
     np.testing.assert_array_equal(fast[:, :-1], slow[:, :-1])
 
 
-PARTS: dict[str, set[str | None]] = {
-    "windows": {None},
-    "bands": {"speed < 10", "speed 10-15", "unknown"},
-    "blocks": {"block 0001", "block 0002", "block 0010"},
-}
-"""Some of the parts that the hostile drives must have."""
-
-
 def hostile_drive(name: str, rows: int, seed: int, *, null: float = 0.1) -> pa.Table:
     rng = np.random.default_rng(seed)
     counts: dict[str, Any] = random_counts(rng, rows)
@@ -187,10 +180,7 @@ def hostile_drive(name: str, rows: int, seed: int, *, null: float = 0.1) -> pa.T
     return table.set_column(at, "tick", pa.array(ticks))
 
 
-@pytest.mark.parametrize(
-    "feature_set",
-    ["bands", *(pytest.param(name, marks=pytest.mark.long) for name in ("windows", "blocks"))],
-)
+@pytest.mark.parametrize("feature_set", ["fleet", pytest.param("windows", marks=pytest.mark.long)])
 def test_gram_rows_of_the_kernel_are_those_of_the_statement(
     warehouse: Warehouse, feature_set: str
 ) -> None:
@@ -202,14 +192,32 @@ def test_gram_rows_of_the_kernel_are_those_of_the_statement(
     defined = by_sql(warehouse, files, feature_set).cast(kernel.schema)
     assert kernel.num_rows > 8
     assert sum(kernel["n"].to_pylist()) == 6101
-    parts = set(kernel["part"].to_pylist())
-    assert parts >= PARTS[feature_set]
     assert len(grams_of(kernel)) == kernel.num_rows
     assert grams_of(kernel) == grams_of(defined)
     assert kernel.sort_by("drive_id").drop_columns(["sums", "products"]).num_rows
     for name in kernel.column_names:
         assert kernel[name].to_pylist() == defined[name].to_pylist(), name
     assert aggregate(warehouse, files, feature_set=feature_set).equals(kernel)
+
+
+def test_blocks_of_time_divide_the_gram_row_of_a_whole_drive(warehouse: Warehouse) -> None:
+    """Their columns are those of `windows`, and each row is in one of them."""
+    land(warehouse, "one", hostile_drive("a", 5000, 4), hostile_drive("b", 40, 5))
+    files = warehouse.logs.snapshot().files
+    wanted = ("ay_mean_16", "curvature_mean_64", "sideslip")
+    found = []
+    for feature_set in ("blocks", "windows"):
+        rows = wide_grams(warehouse, files, feature_set)
+        totals = dict.fromkeys(("a", "b"), Gram.zero(wanted))
+        for (name, signals), gram in grams_of(rows).items():
+            if set(wanted) <= set(signals):
+                totals[name[0]] += gram.restrict(wanted)
+        found.append((sum(rows["n"].to_pylist()), totals))
+        parts = set(rows["part"].to_pylist())
+        blocks = {"block 0001", "block 0002", "block 0010"}
+        assert parts >= blocks if feature_set == "blocks" else parts == {None}
+    assert found[0] == found[1]
+    assert found[0][0] == 5040
 
 
 def test_duckdb_takes_as_many_sums_of_a_group_as_a_statement_may_have() -> None:
