@@ -15,11 +15,11 @@ A message of another feature set has the layout 3: at 44 over which time (2 byte
 delay of the course (2 bytes, signed, in quarters of a tick); at 56 which columns of the set it is
 of, 64 bytes, a bit for each, the first the lowest; sums from 120 on.
 
-Of each feature set as many
-rows are counted as no sum of products can reach 2^61 of: nothing overflows. Columns are computed by
-the steps of an exported estimator, changes of them as `fleet_slip.grams.rows.course_sums` does: a
-fix comes late, so that columns, course and yaw rate are kept of as many ticks as a change and a
-delay take, and a tick is counted once its fix is here. The C stands in `templates/`.
+Of each feature set as many rows are counted as no sum of products can reach 2^61 of: nothing
+overflows. Columns are computed by the steps of an exported estimator, changes of them as
+`fleet_slip.grams.compute.change_sums` does: a fix comes late, so that columns, course and yaw rate
+are kept of as many ticks as a change and a delay take, and a tick is counted once its fix is here.
+The C stands in `templates/`.
 """
 
 import re
