@@ -58,9 +58,6 @@ inner_loop = _compiler(nogil=True, error_model="numpy")
 
 _kept_loop = _compiler(nogil=True, error_model="numpy", cache=True)
 
-exact_loop = _compiler(nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-"""Compiles a loop over integers below 2^53, products and sums too: exact in any order."""
-
 
 def kernel(function: Function) -> Function:
     """Compile a function that is called from Python, without the GIL.

@@ -6,7 +6,7 @@ the SQL of `fleet_slip.columns.sql` says.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from fleet_slip.catalogue.definitions import limit_of
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.kernel import GAPS, run
 from fleet_slip.columns.operations import CarFact
-from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan, Region, padded
+from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan, Region
 from fleet_slip.errors import DataError
 
 _EXACT = 2**53
@@ -80,8 +80,6 @@ class Workspace:
     def __init__(self, plan: ColumnPlan) -> None:
         """Take a plan; memory is taken when a drive comes."""
         self.plan, self._program = plan, plan.program
-        size = padded(len(plan.names))
-        self._products = np.zeros((size + 1, size))
         self.rows_at_most = -1
         self.rows = 0
 
@@ -118,47 +116,12 @@ class Workspace:
 
     def compute_block(self, first: int) -> None:
         """Compute the block that begins with a row; blocks are computed in the order of time."""
-        self._run(first, 0, self._products.astype(np.int64))
-
-    def add_blocks(self, first: int, exact_rows: int, totals: NDArray[np.int64]) -> "Added":
-        """Add blocks from a row on to `totals` (`kernel.run`), until one lacks a value."""
-        return self._run(first, exact_rows, totals)
-
-    def totals(self) -> NDArray[np.int64]:
-        """Return zeros for `add_blocks`, shape (columns + 1, columns), padded."""
-        return np.zeros(self._products.shape, dtype=np.int64)
-
-    def _run(self, first: int, exact_rows: int, totals: NDArray[np.int64]) -> "Added":
-        place, stride = self._regions[Region.REGISTER]
-        found = run(
-            self._steps,
-            self._program.ratios,
-            self._memory,
-            self._flags,
-            self.rows,
-            self._regions[Region.TICK, 0],
-            first,
-            len(self.plan.names),
-            place,
-            stride,
-            exact_rows,
-            self._products,
-            totals,
-        )
-        return Added(*found)
+        program, ticks = (self._steps, self._program.ratios), self._regions[Region.TICK, 0]
+        run(*program, self._memory, self._flags, self.rows, ticks, first)
 
     def _part(self, region: Region, number: int, size: int) -> FloatArray:
         begin, stride = self._regions[region]
         return self._memory[begin + number * stride :][:size]
-
-
-class Added(NamedTuple):
-    """The first row not added, whether its block lacks a value, rows added, values clipped."""
-
-    following: int
-    lacks: bool
-    rows: int
-    clipped: int
 
 
 def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:

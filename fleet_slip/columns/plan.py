@@ -46,9 +46,6 @@ from fleet_slip.errors import QuestionError
 BLOCK_ROWS = 2**10
 """Rows of a block: small, so that its columns stay in the processor's cache."""
 
-TILE = 4
-"""Columns are padded to a multiple of this; see `product_sums`."""
-
 (
     COPY, ADD, SUBTRACT, MULTIPLY, NEGATE, ABSOLUTE, SIGN,  # the same for binary64 and int64
     LEAST, MOST, DIVIDE, NEAREST, FILL, BROADCAST, AT_LEAST, WHERE, ELSE, TO_BINARY64, CLIP, SHARE,
@@ -152,7 +149,7 @@ class Code:
         return len(self.operations) - 1
 
     def assemble(self, results: Sequence[Value]) -> "BlockProgram":
-        """Return the program with results in the first registers, padded to tiles."""
+        """Return the program with results in the first registers."""
         columns: list[int] = []
         for one in results:
             if isinstance(one, int) and one not in columns:
@@ -161,7 +158,7 @@ class Code:
                 columns.append(self._append(VectorOperation(COPY, (one,))))
         registers = {value: register for register, value in enumerate(columns)}
         last = {read: number for number, one in enumerate(self.operations) for read in one.reads}
-        count, free = padded(len(columns)), list[int]()
+        count, free = len(registers), list[int]()
         for number, operation in enumerate(self.operations):
             if number not in registers and operation.operation not in {ADD_UP, KEEP}:
                 if not free:
@@ -177,11 +174,6 @@ class Code:
             for number, one in enumerate(self.operations)
         ]
         return BlockProgram(self, np.array(places, dtype=np.int64), len(columns), count)
-
-
-def padded(columns: int) -> int:
-    """Return how many columns whole tiles have."""
-    return -(-columns // TILE) * TILE
 
 
 @dataclass(frozen=True)

@@ -337,7 +337,6 @@ def _query(
 # Drives are gone through once, in time. Columns are integers below 2^19 in binary64, whose products
 # and block sums stay below 2^53: exact in any order. Sums of blocks have 64 bits.
 
-_EXACT = 2**53
 _INT64 = 2**63
 
 
@@ -424,17 +423,17 @@ class PartSums:
         self.products = np.zeros((self.size, self.size), dtype=np.int64)
 
     def add(self, block: FloatArray, clipped: FloatArray) -> None:
-        """Add complete rows, shape (columns, rows), and what was clipped in each."""
+        """Add complete rows, shape (columns, rows), and what was clipped in each.
+
+        At most `BLOCK_ROWS`: then all sums are exact. Columns of zeros, as those of a gate that is
+        shut, are passed over.
+        """
         self.n += block.shape[1]
         self.clipped += int(clipped.sum())
         self.sums += block.sum(axis=1).astype(np.int64)
-        self.products += (block @ block.T).astype(np.int64)
-
-    def add_totals(self, totals: NDArray[np.int64]) -> None:
-        """Add what `Workspace.add_blocks` has added up: a lower triangle, and sums."""
-        lower = np.tril(totals[: self.size, : self.size])
-        self.products += lower + np.tril(lower, -1).T
-        self.sums += totals[-1, : self.size]
+        some = block.any(axis=1)
+        block = block if some.all() else block[some]
+        self.products[np.ix_(some, some)] += (block @ block.T).astype(np.int64)
 
 
 Kind = tuple[int, int]
@@ -444,64 +443,46 @@ Kind = tuple[int, int]
 def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[Kind, PartSums]:
     """Return the sums of a drive's rows, by columns missing and part; raises as `wide_grams`."""
     plan, total = workspace.plan, len(counts.ticks)
-    exact_rows = _exact_rows(total, max(plan.limits))
+    _require_64_bits(total, max(plan.limits))
     workspace.load(counts)
-    complete, totals = PartSums(len(plan.names)), workspace.totals()
-    found = {(0, 0): complete}
-    first = 0
-    while first < total:
-        if parts.block_ticks:
-            workspace.compute_block(first)
-        else:
-            first, lacks, rows, clipped = workspace.add_blocks(first, exact_rows, totals)
-            complete.n += rows
-            complete.clipped += clipped
-            if not lacks:
-                continue
-        block, here = workspace.block(first)
-        last = first + len(here)
-        numbers = parts.numbers(counts.ticks[first:last])
-        _add_by_kind(found, block, here, numbers, exact_rows)
-        first = last
-    complete.add_totals(totals)
-    return {kind: sums for kind, sums in found.items() if sums.n}
+    found: dict[Kind, PartSums] = {}
+    for first in range(0, total, BLOCK_ROWS):
+        workspace.compute_block(first)
+        block, clipped = workspace.block(first)
+        ticks = counts.ticks[first : first + len(clipped)]
+        _add_by_kind(found, block, clipped, parts.numbers(ticks))
+    return found
 
 
 def change_sums(
     workspace: Workspace, counts: DriveCounts, times: Sequence[int], late: int = 0
 ) -> dict[Kind, PartSums]:
     """Return the sums of a drive's changes, by columns missing and time; the course is `late`."""
-    exact_rows = _exact_rows(len(counts.ticks), 2 * max(workspace.plan.limits))
+    _require_64_bits(len(counts.ticks), 2 * max(workspace.plan.limits))
     workspace.load(counts)
     fixes = Fixes(workspace, counts, late)
     found: dict[Kind, PartSums] = {}
     for part, apart in enumerate(times):
         rows, columns, clipped = fixes.changes(apart)
-        _add_by_kind(found, columns, clipped, np.full(len(rows), part), exact_rows)
+        _add_by_kind(found, columns, clipped, np.full(len(rows), part))
     return found
 
 
-def _exact_rows(rows: int, largest: int) -> int:
-    """Return how many rows are summed exactly in binary64; raises for more than 64 bits hold."""
+def _require_64_bits(rows: int, largest: int) -> None:
     if rows * largest**2 >= _INT64:
         raise StorageError(f"the drive has {rows:,} rows: too many for 64-bit sums.")
-    return (_EXACT - 1) // largest**2
 
 
 def _add_by_kind(
-    found: dict[Kind, PartSums],
-    columns: FloatArray,
-    clipped: FloatArray,
-    numbers: IntArray,
-    at_once: int,
+    found: dict[Kind, PartSums], columns: FloatArray, clipped: FloatArray, numbers: IntArray
 ) -> None:
     """Add rows of several kinds, given the part of each, so many at once as are exact."""
     for (absent, part), rows in _kinds(columns, numbers):
         has = [i for i in range(len(columns)) if not absent >> i & 1]
         sums = found.setdefault((absent, part), PartSums(len(has)))
-        for first in range(0, len(rows), at_once):
-            some = rows[first : first + at_once]
-            block = columns.take(some, axis=1)
+        for first in range(0, len(rows), BLOCK_ROWS):
+            some = rows[first : first + BLOCK_ROWS]
+            block = columns if len(some) == len(clipped) else columns.take(some, axis=1)
             sums.add(block if len(has) == len(block) else block[has], clipped[some])
 
 
