@@ -21,7 +21,7 @@ from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive, Road, simulate
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.highway import FourWheelVehicle
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.support.whole_drives import simulate_drives
+from tests.support.rolling import simulate_drives
 
 ROUNDS = 5
 DRIVES = 32

@@ -23,9 +23,8 @@ from fleet_slip.vehicle.batch import LaneDrive, Road
 from fleet_slip.vehicle.driver import handling
 from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters, load_vehicle
-from tests.support.linear_bicycle import LinearBicycle
-from tests.support.open_loop import Response, steer
-from tests.support.whole_drives import Truth, simulate_drives
+from tests.support.linear_bicycle import LinearBicycle, Response, steer
+from tests.support.rolling import Truth, simulate_drives
 
 CARS = {"compact": "compact_hatchback", "sedan": "d_class_sedan", "SUV": "suv"}
 RADIUS_M = 100.0

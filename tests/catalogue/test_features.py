@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,23 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue import features as features_module
-from fleet_slip.catalogue.definitions import EXCHANGED, OFFSETS, OPPOSITE, limit_of, parity
+from fleet_slip.catalogue.definitions import (
+    EXCHANGED,
+    OFFSETS,
+    OPPOSITE,
+    WEIGHT,
+    Definition,
+    Gate,
+    limit_of,
+    parity,
+)
 from fleet_slip.catalogue.facts import CAR_NUMBERS
-from fleet_slip.catalogue.features import FeatureCatalogue, features
+from fleet_slip.catalogue.features import FeatureCatalogue, features, load_features_over
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
 from fleet_slip.columns.plan import ColumnPlan
@@ -25,6 +38,7 @@ from fleet_slip.grams import compute as gram_statement
 from fleet_slip.grams import job
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
+from fleet_slip.models.request import load_model_list
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.resources import folder
 from fleet_slip.storage.table import Change, Unit
@@ -338,3 +352,95 @@ def test_a_search_among_changes_knows_odd_and_short_columns_alone() -> None:
     assert "ax" not in found and "wheel_fl" not in found and "curvature" not in found
     assert "ay_mean_128" in found and "ay_mean_256" not in found
     assert features().searched("windows") == features().feature_set("windows").inputs
+
+
+BY = Definition(of="ay")
+SHIPPED = folder("configs") / "features.toml"
+
+knots = st.lists(st.integers(-2000, 2000), min_size=2, max_size=6, unique=True).map(sorted)
+
+
+def family(edges: list[int]) -> list[Gate]:
+    return [
+        Gate(
+            by=BY,
+            low=edges[k - 1],
+            peak=edges[k],
+            high=edges[k + 1] if k + 1 < len(edges) else None,
+        )
+        for k in range(1, len(edges))
+    ]
+
+
+def columns_of(gates: list[Gate]) -> dict[str, Definition]:
+    """A column for each gate that is its weight: what is gated is `WEIGHT` everywhere."""
+    return {
+        f"w{n}": Definition(of="full", sql=f"ay - ay + {WEIGHT}", gate=gate)
+        for n, gate in enumerate(gates)
+    }
+
+
+def weights(gates: list[Gate], at: list[int]) -> FloatArray:
+    """Weights by the kernel, shape (gates, counts)."""
+    columns = columns_of(gates)
+    drive = DriveCounts(np.arange(len(at)), {"ay": np.array(at, dtype=np.int16)})
+    return DriveColumns(ColumnPlan.of(list(columns), {}, columns), drive).compute()
+
+
+@given(knots)
+def test_weights_add_up_to_one_above_the_second_knot(edges: list[int]) -> None:
+    at = list(range(edges[1], edges[-1] + 50, 7))
+    total = weights(family(edges), at).sum(axis=0)
+    assert total.tolist() == [WEIGHT] * len(at)
+
+
+@given(knots)
+def test_a_weight_changes_by_no_more_than_its_slope(edges: list[int]) -> None:
+    """From count to count: at most WEIGHT over the distance of the knots, and a rounding."""
+    steepest = WEIGHT / min(high - low for low, high in pairwise(edges)) + 1
+    at = list(range(edges[0] - 3, edges[-1] + 4))
+    assert np.abs(np.diff(weights(family(edges), at))).max() <= steepest
+
+
+def test_members_have_the_scale_of_their_column_and_neighbours_share_a_knot() -> None:
+    known = features()
+    first, second = known.of("rear_ay_mean_16_excess_1"), known.of("rear_ay_mean_16_excess_2")
+    assert first.exact_scale == second.exact_scale == known.of("rear_ay_mean_16").exact_scale
+    gates = [
+        known.time_columns[f"rear_ay_mean_16_excess_{k}"].definition.gate for k in (1, 2, 3, 4)
+    ]
+    assert [gate.high for gate in gates if gate][:3] == [gate.peak for gate in gates if gate][1:]
+    assert gates[-1] is not None
+    assert gates[-1].high is None
+
+
+def test_a_column_without_a_gate_says_nothing_of_gates() -> None:
+    assert "gate" not in Definition(of="ay", over="mean", ticks=8).model_dump(mode="json")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('of = "ay_mean_16"\nknots = [1.0]\ncolumns = ["ay_mean_8"]', "knots"),
+        ('of = "ay_mean_16"\nknots = [1.0, 0.5]\ncolumns = ["ay_mean_8"]', "must rise"),
+        ('of = "ay_mean_16"\nknots = [0.0, 0.00001]\ncolumns = ["ay_mean_8"]', "must rise"),
+        ('of = "ay_mean_16"\nknots = [0.0, 1e9]\ncolumns = ["ay_mean_8"]', "within what"),
+        ('of = "nothing"\nknots = [0.0, 1.0]\ncolumns = ["ay_mean_8"]', "nothing"),
+        ('of = "ay_mean_16"\nknots = [0.0, 1.0]\ncolumns = ["ay"]', "ay: no column over time"),
+        ('of = "ay_mean_16_mass"\nknots = [0.0, 1.0]\ncolumns = ["ay_mean_8"]', "factor itself"),
+    ],
+)
+def test_faults_are_named(tmp_path: Path, text: str, words: str) -> None:
+    own = tmp_path / "features.toml"
+    own.write_text(f'[gates.mine]\n{text}\ndescription = "x"\n')
+    with pytest.raises(ConfigError, match=words) as caught:
+        load_features_over(SHIPPED, own)
+    assert "gates.mine" in str(caught.value)
+
+
+def test_a_family_in_a_model_list_stands_for_its_members() -> None:
+    models = {model.name: model.signals for model in load_model_list("gated").model}
+    gates = [name for name in models["all"] if name not in models["no gate"]]
+    families = ("excess", "road", "cornering")
+    assert gates == [name for family in families for name in features().members(family)]
+    assert set().union(*(models[family] for family in families)) == set(models["all"])

@@ -1,14 +1,17 @@
-"""Faulty sensors found from Gram rows: what was broken is what is named."""
+"""Faulty sensors, labels and repeated drives, found from Gram rows: what was broken is named."""
 
+import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, date, datetime, timedelta
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from fleet_slip.catalogue.faults import Fault
@@ -16,13 +19,14 @@ from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations import quality
+from fleet_slip.operations.labels import find_repeated
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.operations.quality import QualityReport, examine, examine_drives, find_wrong_labels
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import TICKS, Signals, broken, counts, drive, with_course
 from tests.support.commands import RunCommand
-from tests.support.logs import land, log_rows, random_counts
+from tests.support.logs import DAY, land, log_rows, random_counts
 
 DRIVES = 30
 
@@ -286,3 +290,180 @@ def test_a_yaw_rate_without_its_sign_is_found(warehouse: Warehouse) -> None:
     assert {name: (one.kind, one.signals) for name, one in found.items()} == {
         "d2": ("magnitude", ("yaw_rate",))
     }
+
+
+BEGAN = datetime(2024, 5, 31, 8, tzinfo=UTC)
+
+
+def drives(*told: tuple[str, str, float | None, float]) -> pa.Table:
+    """Drives by car, name, begin and duration in s."""
+    at = [None if start is None else BEGAN + timedelta(seconds=start) for _, _, start, _ in told]
+    return pa.table(
+        {
+            "vehicle_id": [car for car, *_ in told],
+            "drive_id": [name for _, name, *_ in told],
+            "started_at": pa.array(at, pa.timestamp("us", tz="UTC")),
+            "duration_s": [lasted for *_, lasted in told],
+            "source": ["measured"] * len(told),
+            "n": [0] * len(told),
+        }
+    )
+
+
+def received(car: str, start_s: float, rows: int) -> pa.Table:
+    """A drive without a log."""
+    name = f"{car}-{BEGAN + timedelta(seconds=start_s):%Y%m%dT%H%M%SZ}"
+    table = drives((car, name, None, 0.0))
+    table = table.set_column(2, "started_at", pa.nulls(1, table.schema.field(2).type))
+    table = table.set_column(3, "duration_s", pa.nulls(1, pa.float64()))
+    table = table.set_column(4, "source", [["received"]])
+    return table.set_column(5, "n", [[rows]])
+
+
+def test_the_later_of_two_drives_at_once_is_named() -> None:
+    found = find_repeated(
+        drives(
+            ("car", "long", 0, 1000),
+            ("car", "within", 100, 50),
+            ("car", "beyond", 950, 100),
+            ("car", "after", 1049.5, 10),
+            ("other", "elsewhere", 0, 1000),
+            ("car", "undated", None, 1000),
+        )
+    )
+    assert {name: fault.figure for name, fault in found.items()} == {
+        "within": "50 s are in long",
+        "beyond": "50 s are in long",
+    }
+    assert {fault.kind for fault in found.values()} == {"repeated"}
+
+
+def test_of_a_drive_without_a_log_and_a_log_at_once_that_without_is_named() -> None:
+    found = find_repeated(
+        pa.concat_tables(
+            [
+                received("car", 0, 4000),
+                drives(("car", "resampled", 0.25, 39.5), ("car", "next", 41, 100)),
+                received("car", 60, 1000),
+                received("car", 60, 3000),  # another set of signals of the same drive
+                received("car", 150, 1000),
+                received("car", 155, 1000),
+                received("other", 0, 1000),
+                received("other", 9, 1000),  # its clock has whole seconds
+            ]
+        )
+    )
+    assert {name: fault.figure for name, fault in found.items()} == {
+        "car-20240531T080000Z": "40 s are in resampled",
+        "car-20240531T080100Z": "40 s are in next",
+        "car-20240531T080235Z": "5 s are in car-20240531T080230Z",
+    }
+
+
+@pytest.mark.parametrize("start_s", [-300, 300])
+def test_one_message_of_a_day_does_not_accuse_the_drives_of_that_day(start_s: int) -> None:
+    honest = [received("car", 3600 * hour, 60_000) for hour in range(12)]
+    forged = received("car", start_s, 8_640_000)
+    assert (
+        list(find_repeated(pa.concat_tables([*honest, forged]))) == forged["drive_id"].to_pylist()
+    )
+
+
+def test_quality_names_two_recordings_of_a_car_at_once(
+    warehouse: Warehouse, run_command: RunCommand
+) -> None:
+    rng = np.random.default_rng(1)
+    known: dict[str, Any] = {"started_at": BEGAN, "duration_s": 40.0, "source": "measured"}
+    drives = [log_rows(name, random_counts(rng, 4000), **known) for name in ("front", "rear")]
+    land(warehouse, "both", *drives)
+    update_grams(warehouse)
+    told = run_command("quality", "--json")
+    assert told.exit_code == 10
+    found = [one for one in told.json["findings"] if one["kind"] == "repeated"]
+    assert [(one["drive_id"], one["figure"]) for one in found] == [("rear", "40 s are in front")]
+
+
+CARS, DAYS = 12, 3
+NIGHT = DAY + timedelta(days=DAYS - 1)
+
+
+def land_days(warehouse: Warehouse, change: Callable[[Signals], None], every: int = 1) -> None:
+    """Land three days of drives of as many cars; on the last, labels of every n-th are wrong."""
+    folder, last = two_days()
+    shutil.copytree(folder.name, str(warehouse.root))
+    changed = [s if car % every else broken(s, change) for car, s in enumerate(last)]
+    land_day(warehouse, NIGHT, changed)
+
+
+@cache
+def two_days() -> tuple[TemporaryDirectory[str], list[Signals]]:
+    """A data root with the first days, and the drives of the last."""
+    rng = np.random.default_rng(1)
+    factors = 1 + 0.1 * rng.standard_normal(CARS)
+    folder = TemporaryDirectory()
+    warehouse = Warehouse(LocalFolder(Path(folder.name)))
+    for number in range(DAYS):
+        drives = [drive(rng, gentleness=2) for _ in factors]
+        for signals, factor in zip(drives, factors, strict=True):
+            signals["sideslip"] *= factor
+        if number < DAYS - 1:
+            land_day(warehouse, DAY + timedelta(days=number), drives)
+    return folder, drives
+
+
+def land_day(warehouse: Warehouse, day: date, drives: list[Signals]) -> None:
+    rows = [
+        log_rows(f"{day}-{car:02d}", counts(one), day, vehicle_id=f"car-{car}", source="measured")
+        for car, one in enumerate(drives)
+    ]
+    land(warehouse, str(day), *rows, day=day)
+    update_grams(warehouse)
+
+
+def multiplied(factor: float) -> Callable[[Signals], None]:
+    return lambda signals: signals.update(sideslip=factor * signals["sideslip"])
+
+
+def shifted(degrees: float) -> Callable[[Signals], None]:
+    return lambda signals: signals.update(sideslip=signals["sideslip"] + math.radians(degrees))
+
+
+def iced(signals: Signals) -> None:
+    """A tenth more, and as much less zero as ice brings: nothing is wrong."""
+    multiplied(1.12)(signals)
+    shifted(0.1)(signals)
+
+
+def found(warehouse: Warehouse) -> tuple[set[str], set[date], int]:
+    findings = examine_drives(warehouse).findings
+    return {one.fault.kind for one in findings}, {one.day for one in findings}, len(findings)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        (multiplied(2), "scaled"),
+        (multiplied(1.6), "scaled"),
+        (multiplied(1 / 57.3), "scaled"),
+        (multiplied(-1), "reversed"),
+        (shifted(1), "biased"),
+    ],
+)
+def test_a_day_on_which_all_labels_are_wrong_is_found(
+    warehouse: Warehouse, change: Callable[[Signals], None], kind: str
+) -> None:
+    land_days(warehouse, change)
+    assert found(warehouse) == ({kind}, {NIGHT}, CARS)
+
+
+@pytest.mark.parametrize("change", [multiplied(3), multiplied(1 / 57.3), shifted(2)])
+def test_a_third_of_a_days_labels_is_found(
+    warehouse: Warehouse, change: Callable[[Signals], None]
+) -> None:
+    land_days(warehouse, change, every=3)
+    assert found(warehouse)[1:] == ({NIGHT}, CARS / 3)
+
+
+def test_what_roads_and_loads_change_is_no_fault(warehouse: Warehouse) -> None:
+    land_days(warehouse, iced)
+    assert find_wrong_labels(load_cohort(warehouse)) == {}

@@ -6,18 +6,25 @@ import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
 from fleet_slip.errors import StorageError
+from fleet_slip.grams import check
+from fleet_slip.grams.check import check_grams
 from fleet_slip.grams.job import update_grams
+from fleet_slip.operations import verify as verification
 from fleet_slip.operations.find_drives import vacuum
+from fleet_slip.operations.forget import forget
+from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import repair, verify
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
+from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
@@ -203,3 +210,99 @@ def test_leftovers_and_a_backlog_are_remarks(filled: Warehouse) -> None:
     report = verify(filled)
     assert not report.damage
     assert [finding.kind for finding in report.findings] == ["backlog", "unreferenced"]
+
+
+@pytest.fixture
+def three(warehouse: Warehouse) -> Warehouse:
+    """Three log files of two cars."""
+    rng = np.random.default_rng(0)
+    for number in range(3):
+        drive = log_rows(f"d{number}", random_counts(rng, 30), vehicle_id=f"car-{number % 2}")
+        land(warehouse, f"f{number}", drive)
+    update_grams(warehouse)
+    return warehouse
+
+
+def compact_and_vacuum(warehouse: Warehouse) -> None:
+    compact(warehouse)
+    vacuum(warehouse, retention_hours=0)
+
+
+def forget_now(warehouse: Warehouse) -> None:
+    forget(warehouse, Forgettable("vehicle", "car-1"), now=True)
+
+
+@pytest.fixture
+def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Does something, once or every time, when a function of a module is called."""
+
+    def patch(module: Any, name: str, act: Callable[[], Any], *, once: bool = True) -> None:
+        real = getattr(module, name)
+
+        def overtaken(*given: Any, **named: Any) -> Any:
+            if once:
+                monkeypatch.setattr(module, name, real)
+            act()
+            return real(*given, **named)
+
+        monkeypatch.setattr(module, name, overtaken)
+
+    return patch
+
+
+@pytest.mark.parametrize(
+    "job",
+    [
+        forget_now,
+        *(pytest.param(job, marks=pytest.mark.long) for job in (compact, compact_and_vacuum)),
+    ],
+)
+@pytest.mark.parametrize("moment", ["find_gram_files", "by_sql", "stored_grams", "wide_grams"])
+def test_a_check_beside_a_job_that_takes_files_away_finds_no_damage(
+    job: Callable[[Warehouse], Any],
+    moment: str,
+    three: Warehouse,
+    meanwhile: Callable[..., None],
+) -> None:
+    meanwhile(check, moment, lambda: job(three))
+    assert check_grams(three, 3).drives >= 2
+
+
+@pytest.mark.parametrize(
+    "job", [forget_now, pytest.param(compact_and_vacuum, marks=pytest.mark.long)]
+)
+@pytest.mark.parametrize("moment", ["verify_files", "verify_rows", "verify_grams"])
+def test_a_verification_beside_a_job_that_takes_files_away_finds_no_damage(
+    job: Callable[[Warehouse], Any],
+    moment: str,
+    three: Warehouse,
+    meanwhile: Callable[..., None],
+) -> None:
+    meanwhile(verification, moment, lambda: job(three))
+    assert not verify(three, full=True).damage
+
+
+def test_damage_is_damage_beside_other_jobs_too(
+    three: Warehouse, meanwhile: Callable[..., None]
+) -> None:
+    gone, *_ = three.logs.snapshot().files
+    (path_of(three.logs.folder) / gone.path).unlink()
+    rng = np.random.default_rng(1)
+    meanwhile(
+        check, "wide_grams", lambda: land(three, "more", log_rows("x", random_counts(rng, 9)))
+    )
+    with pytest.raises(StorageError, match=gone.path.rpartition("/")[2]):
+        check_grams(three, 3)
+    assert {finding.kind for finding in verify(three).damage} >= {"file"}
+
+
+def test_a_check_of_tables_that_never_rest_ends(
+    three: Warehouse, meanwhile: Callable[..., None]
+) -> None:
+    def spoil() -> None:
+        three.grams.fence()
+        raise StorageError("a file is gone")
+
+    meanwhile(check, "wide_grams", spoil, once=False)
+    with pytest.raises(StorageError, match="a file is gone"):
+        check_grams(three, 3)

@@ -1,16 +1,22 @@
 """Campaigns, scenarios, tracks and cars: what is wrong in a file is named, what is in it counts."""
 
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
+from datetime import date
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import find_config
-from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.roads import load_track
-from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.simulation.campaign import Campaign, load_campaign
+from fleet_slip.simulation.plan import DriveDraw, GridPlan
+from fleet_slip.simulation.roads import load_track, random_generator
+from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
 from fleet_slip.vehicle.parameters import load_vehicle
 
 LOAD: dict[str, Callable[[str], Any]] = {
@@ -156,3 +162,128 @@ def test_open_tracks_have_no_laps(tmp_path: Path) -> None:
     file.write_text(file.read_text().replace("laps = 0.5", "laps = 2"))
     with pytest.raises(ConfigError, match=r"laps is 2\.0, but the track 'straight' is open"):
         load_campaign(str(file))
+
+
+OF_SMOKE = find_config("campaigns", "smoke").read_text(encoding="utf-8")
+
+
+def load_text(folder: Path, text: str) -> Campaign:
+    file = folder / "campaign.toml"
+    file.write_text(text)
+    return load_campaign(str(file))
+
+
+@pytest.mark.parametrize("name", ["smoke", "fleet"])
+def test_batches_hold_each_drive_once_in_order_and_about_as_many_rows(name: str) -> None:
+    campaign = load_campaign(name)
+    for day in campaign.days()[:3]:
+        batches = campaign.batches(day)
+        assert [batch.index for batch in batches] == list(range(len(batches)))
+        assert tuple(d for b in batches for d in b.drives) == campaign.drives(day)
+        names = [drive.drive_id for batch in batches for drive in batch.drives]
+        assert len(names) == campaign.drives_per_day
+        assert all(a < b for a, b in pairwise(names))
+        rows = [sum(drive.expected_rows for drive in batch.drives) for batch in batches]
+        longest = max(drive.expected_rows for batch in batches for drive in batch.drives)
+        assert max(rows) <= campaign.rows_per_file + longest
+        assert max(rows) - min(rows) <= 2 * longest
+
+
+def test_drive_names_can_be_read() -> None:
+    drive = load_campaign("smoke").drives(date(2024, 5, 2))[3]
+    assert (drive.drive_id, drive.vehicle_id) == ("smoke-2024-05-02-0003", "smoke-0000")
+    assert drive.source == "simulated"
+
+
+def test_grid_takes_every_combination_once_before_any_twice() -> None:
+    plan = load_campaign("waterford").plan
+    assert isinstance(plan, GridPlan)
+    sensors = load_campaign("waterford").sensors
+    count = len(plan.lateral_mps2) * len(plan.speed_factor)
+    none = random_generator(0)
+    taken = [plan.assignment(DriveDraw(n, sensors, none, none)) for n in range(2 * count)]
+    times = Counter((a.limits.lateral_mps2, a.speed_factor) for a in taken[:count])
+    assert len(times) == count
+    assert set(times.values()) == {1}
+    assert taken[count:] == taken[:count]
+
+
+def test_each_day_of_a_grid_covers_the_range_of_speeds() -> None:
+    campaign = load_campaign("waterford")
+    assert isinstance(campaign.plan, GridPlan)
+    lowest, highest = min(campaign.plan.speed_factor), max(campaign.plan.speed_factor)
+    for day in campaign.days():
+        factors = sorted(drive.speed_factor for drive in campaign.drives(day))
+        ends = [lowest, *factors, highest]
+        assert max(b - a for a, b in pairwise(ends)) < (highest - lowest) / 4
+
+
+def test_cars_of_a_grid_are_its_vehicles_and_masses(tmp_path: Path) -> None:
+    text = OF_SMOKE.replace("[1320.0]", "[1000.0, 1320.0, 1740.0]")
+    campaign = load_text(tmp_path, text.replace("number_of_days = 2", "number_of_days = 6"))
+    drives = [d for day in campaign.days() for d in campaign.drives(day)]
+    masses = {(d.vehicle_id, d.vehicle.body.sprung_mass_kg) for d in drives}
+    assert masses == {("smoke-0000", 1000.0), ("smoke-0001", 1320.0), ("smoke-0002", 1740.0)}
+
+
+def test_cars_of_a_fleet_differ_and_keep_their_properties() -> None:
+    campaign = load_campaign("fleet")
+    drives = [d for day in campaign.days() for d in campaign.drives(day)]
+    cars = {(d.vehicle_id, d.vehicle, d.sensors) for d in drives}
+    assert len(cars) == len({d.vehicle_id for d in drives}) == 300
+    assert len({d.vehicle for d in drives}) == 300
+    assert len({d.sensors for d in drives}) == 300
+    assert len({d.vehicle.name for d in drives}) > 1
+    assert len({d.track.name for d in drives}) > 1
+    assert len({d.adhesion for d in drives}) == len(drives)
+    for drive in drives:
+        assert drive.limits.lateral_mps2 <= 0.61 * drive.adhesion * 9.81
+
+
+def test_random_generators_differ_by_seed_and_by_every_part_of_their_name() -> None:
+    names = [("a", "b"), ("ab",), ("b", "a"), ("a", "b", "c")]
+    drawn = [random_generator(seed, *name).random() for seed in (1, 2) for name in names]
+    assert len(set(drawn)) == 2 * len(names)
+    assert random_generator(1, "a", "b").random() == drawn[0]
+
+
+@pytest.mark.parametrize("day", [date(2024, 4, 30), date(2024, 5, 3)])
+def test_a_day_outside_the_campaign_is_refused(day: date) -> None:
+    with pytest.raises(ConfigError, match="goes from 2024-05-01 to 2024-05-02"):
+        load_campaign("smoke").batches(day)
+
+
+def test_the_scenarios_of_the_paper_come_first_in_the_order_of_its_figures() -> None:
+    papers = [scenario.paper for scenario in shipped_scenarios()]
+    figures = [paper for paper in papers if paper]
+    assert papers[: len(figures)] == figures
+    assert figures[0].startswith("Figures 1")
+    assert figures[-1].startswith("Figure 8")
+
+
+def test_a_scenario_differs_from_its_base_only_in_what_it_says() -> None:
+    base, noisy = load_scenario("nominal"), load_scenario("noise_doubled")
+    assert noisy.sensors.ax_bias_mps2 == 0.3
+    assert noisy.sensors.wheel_speed_std_rad_s == base.sensors.wheel_speed_std_rad_s
+    assert noisy.sensors.gps == base.sensors.gps
+    own = {"name", "description", "paper", "base", "drive", "sensors"}
+    assert noisy.model_dump(exclude=own) == base.model_dump(exclude=own)
+
+
+def test_failures_are_added_to_the_drive_of_the_base() -> None:
+    assert load_scenario("wheel_stuck").drive_id == load_scenario("nominal").drive_id
+    assert load_scenario("gps_tunnel").drive_id == load_scenario("gps_clear").drive_id
+    assert load_scenario("mass_1000").drive_id != load_scenario("nominal").drive_id
+
+
+def test_speed_follows_the_pace() -> None:
+    (drive,) = load_scenario("nominal").batch().drives
+    planned = replace(drive, pace=()).profile
+    factor = drive.profile.speed_mps / planned.speed_mps
+    station = planned.station_m
+    for point in drive.pace:
+        at = np.interp(point.station_m, station, factor)
+        assert at == pytest.approx(point.factor, abs=0.006)
+    # Before the first and after the last point the track is closed: both are 0.66.
+    assert factor[0] == pytest.approx(0.66)
+    assert factor.max() == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""Sensors: noise has the stated figures, counts are rounded and clipped as a CAN bus does."""
+"""Sensors: noise, counts as a CAN bus has them, and imperfections against closed forms."""
 
 from decimal import Decimal
 from fractions import Fraction
@@ -9,8 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.simulation.sensors import Gps, Sensors
+from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
+from fleet_slip.simulation.sensors import Delay, Distortion, Gps, LowPass, Pulses, Sensors, Wander
+from fleet_slip.vehicle.batch_kernel import CHANNELS
+from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections
 from tests.support.measuring import measure, quantise
 
 TICKS = 200_000
@@ -117,3 +121,164 @@ def test_counts_are_the_nearest_within_the_valid_range(name: str, values: list[f
             nearest = signal.min_count if exact < 0 else signal.max_count
             assert count == nearest
     assert clipped <= len(values) - inside
+
+
+ROWS = 3000
+TIME_S = np.arange(ROWS) / 100
+
+
+def truth(**changes: FloatArray | float) -> dict[str, FloatArray]:
+    """Return a straight drive at 20 m/s, with changes."""
+    usual = {name: np.zeros(ROWS) for name in CHANNELS}
+    usual |= {"vx_mps": np.full(ROWS, 20.0)}
+    usual |= {f"wheel_{w}_rad_s": np.full(ROWS, 60.0) for w in ("fl", "fr", "rl", "rr")}
+    return usual | {name: np.zeros(ROWS) + value for name, value in changes.items()}
+
+
+def seen(
+    of: dict[str, FloatArray], car: CarImperfections = PERFECT, **sensors: float
+) -> dict[str, FloatArray]:
+    flaws = Imperfections(car=car, sensors=SensorImperfections.model_validate(sensors))
+    return Distortion(flaws, np.random.default_rng(1), np.random.default_rng(2)).apply(of)
+
+
+def test_sensors_without_imperfections_see_the_truth() -> None:
+    of = truth(ay_mps2=3.0, leaning_ay_mps2=3.0, yaw_rate_rad_s=0.15, sideslip_rad=0.01)
+    found = seen(of)
+    for name, values in of.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    np.testing.assert_array_equal(found["gps_vx_mps"], of["vx_mps"])
+
+
+def test_a_leaning_body_adds_its_share_of_the_weight() -> None:
+    """At 4 °/g an accelerometer reads sin(4° ay/g) g more: 7 % (Milliken and Milliken 1995)."""
+    car = CarImperfections(roll_gradient_deg_per_g=4.0, pitch_gradient_deg_per_g=2.0)
+    found = seen(
+        truth(ay_mps2=5.0, leaning_ay_mps2=5.0, ax_mps2=-4.0, leaning_ax_mps2=-4.0), car=car
+    )
+    roll = np.radians(4.0 * 5.0 / 9.80665)
+    assert found["ay_mps2"][-1] == pytest.approx(
+        5.0 * np.cos(roll) + 9.80665 * np.sin(roll), abs=1e-4
+    )
+    pitch = np.radians(2.0 * -4.0 / 9.80665)
+    assert found["ax_mps2"][-1] == pytest.approx(
+        -4.0 * np.cos(pitch) + 9.80665 * np.sin(pitch), abs=1e-4
+    )
+
+
+def test_an_accelerometer_off_the_centre_feels_the_turning() -> None:
+    """A point fixed to a body has a + ω̇ × r + ω × (ω × r)."""
+    of = truth(yaw_rate_rad_s=0.5, yaw_acceleration_rad_s2=1.2, ay_mps2=2.0)
+    found = seen(of, inertial_x_m=0.4, inertial_y_m=-0.3)
+    place = np.array([0.4, -0.3, 0.0])
+    spin, spin_rate = np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.0, 1.2])
+    expected = (
+        np.array([0.0, 2.0, 0.0])
+        + np.cross(spin_rate, place)
+        + np.cross(spin, np.cross(spin, place))
+    )
+    assert found["ax_mps2"][0] == pytest.approx(expected[0])
+    assert found["ay_mps2"][0] == pytest.approx(expected[1])
+
+
+def test_a_turned_unit_mixes_the_axes() -> None:
+    found = seen(truth(ay_mps2=4.0), inertial_yaw_deg=1.0, inertial_roll_deg=0.5)
+    assert found["ax_mps2"][0] == pytest.approx(np.sin(np.radians(1.0)) * 4.0, abs=2e-3)
+    assert found["ay_mps2"][0] == pytest.approx(4.0 + 9.80665 * np.sin(np.radians(0.5)), abs=1e-3)
+
+
+def test_offsets_and_scale_of_angles() -> None:
+    found = seen(
+        truth(steering_wheel_rad=0.2, steer_fl_rad=0.01, steer_fr_rad=0.01, sideslip_rad=0.02),
+        steering_offset_deg=2.0,
+        wheel_angle_offset_fl_deg=0.1,
+        wheel_angle_scale_error=0.05,
+        label_offset_deg=-0.1,
+    )
+    assert found["steering_wheel_rad"][0] == pytest.approx(0.2 + np.radians(2.0))
+    assert found["steer_fl_rad"][0] == pytest.approx(0.0105 + np.radians(0.1))
+    assert found["steer_fr_rad"][0] == pytest.approx(0.0105)
+    assert found["sideslip_rad"][0] == pytest.approx(0.02 - np.radians(0.1))
+
+
+@pytest.mark.parametrize("latency_s", [0.01, 0.045, 0.2])
+def test_a_late_sensor_reports_what_was(latency_s: float) -> None:
+    signal = 3.0 * TIME_S
+    late = Delay(latency_s).apply(signal)
+    np.testing.assert_allclose(late[50:], (signal - 3.0 * latency_s)[50:], atol=1e-9)
+    assert late[0] == signal[0]
+
+
+@pytest.mark.parametrize("bandwidth_hz", [2.0, 10.0])
+def test_a_low_pass_passes_half_of_the_power_at_its_bandwidth(bandwidth_hz: float) -> None:
+    wave = np.sin(2 * np.pi * bandwidth_hz * TIME_S)
+    passed = LowPass(bandwidth_hz).apply(wave)[ROWS // 2 :]
+    # The trapezoidal rule warps a frequency f to tan(π f T) / (π T).
+    warped = np.tan(np.pi * bandwidth_hz / 100) / (np.pi * bandwidth_hz / 100)
+    assert np.var(passed) / np.var(wave) == pytest.approx(1 / (1 + warped**2), rel=0.02)
+    assert LowPass(bandwidth_hz).apply(np.full(10, 7.0))[-1] == 7.0
+
+
+def test_pulses_are_timed_at_any_speed() -> None:
+    speed = np.full(ROWS, 60.0)
+    found = Pulses(np.zeros(48)).apply(speed)
+    np.testing.assert_allclose(found[10:], 60.0, rtol=1e-9)
+    slow = Pulses(np.zeros(48)).apply(np.full(ROWS, 0.8))  # six pulses a second
+    np.testing.assert_allclose(slow[100:], 0.8, rtol=1e-6)
+
+
+def test_uneven_pulses_repeat_with_every_turn() -> None:
+    places = 0.02 * np.random.default_rng(3).standard_normal(48)
+    found = Pulses(places).apply(np.full(ROWS, 2 * np.pi * 10))  # a turn is ten samples
+    error = found[20:] / (2 * np.pi * 10) - 1
+    assert 0.001 < np.std(error) < 0.02
+    assert np.corrcoef(error[10:], error[:-10])[0, 1] > 0.99
+
+
+def test_a_drive_in_two_blocks_is_the_drive_in_one() -> None:
+    wave = np.sin(TIME_S)
+    of = truth(
+        ay_mps2=wave,
+        leaning_ay_mps2=wave,
+        sideslip_rad=wave / 50,
+        wheel_fl_rad_s=20 + 19 * wave,
+        steering_wheel_rad=wave,
+    )
+    sensors = SensorImperfections(
+        inertial_bandwidth_hz=10,
+        inertial_latency_s=0.013,
+        steering_latency_s=0.02,
+        wheel_pulses_per_turn=48,
+        wheel_pitch_error=0.01,
+        label_latency_s=0.045,
+        label_bandwidth_hz=8,
+    )
+    flaws = Imperfections(sensors=sensors)
+
+    def sensor() -> Distortion:
+        return Distortion(flaws, np.random.default_rng(1), np.random.default_rng(2))
+
+    whole, parted = sensor().apply(of), sensor()
+    for part in (slice(0, 7), slice(7, 1500), slice(1500, None)):
+        found = parted.apply({name: values[part] for name, values in of.items()})
+        for name, values in found.items():
+            np.testing.assert_array_equal(values, whole[name][part], err_msg=name)
+
+
+def test_lasting_errors_have_their_spread_and_forget_in_their_time() -> None:
+    errors = Wander(4, 2.0, np.random.default_rng(5)).next(200_000)
+    assert np.std(errors, axis=1) == pytest.approx(np.ones(4), rel=0.1)
+    for tau_s in (1.0, 2.0):
+        ticks = int(tau_s * 100)
+        found = [np.corrcoef(one[:-ticks], one[ticks:])[0, 1] for one in errors]
+        assert np.mean(found) == pytest.approx(np.exp(-tau_s / 2.0), abs=0.05)
+    assert abs(np.corrcoef(errors[0], errors[1])[0, 1]) < 0.15
+    assert np.abs(np.diff(errors)).max() < 0.2  # no jump from one sample to the next
+
+
+@pytest.mark.parametrize("cuts", [(1, 9, 1, 10, 11, 7, 300), (339,), (10, 10, 319)])
+def test_lasting_errors_do_not_depend_on_blocks(cuts: tuple[int, ...]) -> None:
+    whole = Wander(3, 10.0, np.random.default_rng(6)).next(400)
+    pieces = Wander(3, 10.0, np.random.default_rng(6))
+    parts = np.concatenate([pieces.next(ticks) for ticks in cuts], axis=1)
+    np.testing.assert_array_equal(parts, whole[:, : sum(cuts)])

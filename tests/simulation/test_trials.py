@@ -11,7 +11,7 @@ from fleet_slip.simulation.roads import CLASSES, SLOWEST_MPS, Manoeuvre, load_tr
 from fleet_slip.simulation.scenario import shipped_scenarios
 from fleet_slip.vehicle.batch import LaneDrive, Road
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.support.whole_drives import simulate_drives
+from tests.support.rolling import simulate_drives
 
 SEDAN = load_vehicle("d_class_sedan")
 

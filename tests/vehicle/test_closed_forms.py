@@ -12,8 +12,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections
 from fleet_slip.vehicle.parameters import constants, load_vehicle
 from fleet_slip.vehicle.tyre import cornering_stiffness
-from tests.support.linear_bicycle import LinearBicycle
-from tests.support.open_loop import steer
+from tests.support.linear_bicycle import LinearBicycle, steer
 
 CARS = ("compact_hatchback", "d_class_sedan", "suv")
 SPEED_MPS = 25.0

@@ -9,8 +9,7 @@ from fleet_slip.vehicle.dynamics import Give, GiveRates
 from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections, traits
 from fleet_slip.vehicle.integration import SECOND_ORDER, advance_give
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, constants
-from tests.support.rolling import SEDAN
-from tests.support.whole_drives import Truth, simulate_drives
+from tests.support.rolling import SEDAN, Truth, simulate_drives
 
 RIGID = Give(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 

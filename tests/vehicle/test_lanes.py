@@ -14,8 +14,7 @@ from fleet_slip.vehicle import batch_kernel
 from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
 from fleet_slip.vehicle.batch_kernel import BLOCK, CHANNELS
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
-from tests.support.rolling import SEDAN
-from tests.support.whole_drives import Truth, simulate_drives
+from tests.support.rolling import SEDAN, Truth, simulate_drives
 
 MASSES_KG = (1000.0, 1320.0, 1740.0)
 TRACKS = ("waterford_hills", "melbourne")

@@ -264,8 +264,6 @@ def test_a_band_has_a_gap_where_there_is_no_value() -> None:
 
 NOTEBOOK = Path(__file__).parents[3] / "jobs/explore.py"
 
-pytestmark = pytest.mark.tools("marimo")
-
 
 def executed(root: Path, folder: Path) -> tuple[int, str, str]:
     """Return the exit code, what was said, and the page."""
@@ -279,6 +277,7 @@ def executed(root: Path, folder: Path) -> tuple[int, str, str]:
     return done.exit_code, done.stderr, text
 
 
+@pytest.mark.tools("marimo")
 def test_every_cell_works_on_a_root_with_a_model(smoke_root: Path, tmp_path: Path) -> None:
     code, told, page = executed(smoke_root, tmp_path)
     assert code == 0, told
@@ -287,6 +286,7 @@ def test_every_cell_works_on_a_root_with_a_model(smoke_root: Path, tmp_path: Pat
     assert "image/png" in page
 
 
+@pytest.mark.tools("marimo")
 def test_without_a_model_it_says_so(smoke_root: Path, tmp_path: Path) -> None:
     ignored = shutil.ignore_patterns("models", "runs")
     root = shutil.copytree(smoke_root, tmp_path / "data", ignore=ignored)
