@@ -110,21 +110,11 @@ def _completed(
 def read_ahead(items: Iterator[Item]) -> Generator[Item, None, None]:
     """Yield items in order while a thread takes the next; errors come in their place.
 
-    Closing it waits for the one being taken. A single item needs no thread.
+    Closing it waits for the one being taken.
     """
-    first = _take(items)
-    try:
-        second = _take(items) if first else ()
-    except Exception:
-        yield from first
-        raise
-    if not second:
-        yield from first
-        return
     with ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as thread:
         taken = deque(thread.submit(_take, items) for _ in range(AHEAD))
         try:
-            yield from (*first, *second)
             while item := taken.popleft().result():
                 taken.append(thread.submit(_take, items))
                 yield from item
