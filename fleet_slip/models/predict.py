@@ -7,9 +7,8 @@ look back within a drive.
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from typing import Any
@@ -30,9 +29,6 @@ from fleet_slip.models.manifest import Manifest
 
 # Estimates of a published model, sample by sample in the order of time, from logged counts.
 
-KEPT_ROWS = 2**16
-"""Of longer drives no memory is kept: it is some 400 bytes a row."""
-
 
 @dataclass(frozen=True)
 class Predictor:
@@ -45,7 +41,6 @@ class Predictor:
     intercept: float
     coefficients: tuple[float, ...]
     scales: tuple[float, ...]
-    _idle: list[Workspace] = field(default_factory=list, repr=False, compare=False)
 
     @classmethod
     def of(cls, manifest: Manifest) -> "Predictor":
@@ -62,19 +57,6 @@ class Predictor:
         )
         plan = ColumnPlan.of(manifest.signals, manifest.features, manifest.definitions)
         return cls(plan, manifest.intercept, coefficients, scales)
-
-    @contextmanager
-    def lend_workspace(self) -> Iterator[Workspace]:
-        """Lend memory for one drive after the other; one that is not large is kept for the next."""
-        try:
-            workspace = self._idle.pop()  # no other thread has it then
-        except IndexError:
-            workspace = Workspace(self.plan)
-        try:
-            yield workspace
-        finally:
-            if workspace.rows_at_most <= KEPT_ROWS:
-                self._idle.append(workspace)
 
     def __call__(self, drive: DriveCounts, workspace: Workspace | None = None) -> FloatArray:
         """Return the estimate at each row in rad, shape (rows,); NaN where a column is missing.
@@ -224,17 +206,17 @@ def predict(manifest: Manifest, frame: Any, predictor: Predictor | None = None) 
     drives = _rows_of_each_drive(opened, rows) if plan.windows else [slice(0, rows)]
     drive = counts_of(pa.table({"tick": ticks, **counts}), plan, {})
     angle = np.empty(rows)
-    with predictor.lend_workspace() as workspace:
-        for at in drives if rows else ():
-            first = at.start if isinstance(at, slice) else at[0]
-            own = {
-                name: count
-                for name, (values, grain) in numbers.items()
-                if np.isfinite(values[first])
-                and (count := round_number(Fraction(float(values[first])), grain)) is not None
-            }
-            known = {name: values[first].as_py() for name, values in facts.items()}
-            angle[at] = predictor(drive.part(at, known, own), workspace)
+    workspace = Workspace(plan)
+    for at in drives if rows else ():
+        first = at.start if isinstance(at, slice) else at[0]
+        own = {
+            name: count
+            for name, (values, grain) in numbers.items()
+            if np.isfinite(values[first])
+            and (count := round_number(Fraction(float(values[first])), grain)) is not None
+        }
+        known = {name: values[first].as_py() for name, values in facts.items()}
+        angle[at] = predictor(drive.part(at, known, own), workspace)
     return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
 
 

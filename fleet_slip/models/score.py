@@ -11,6 +11,7 @@ from fleet_slip.base import number_of
 from fleet_slip.catalogue.facts import RECEIVED
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.compute import counts_of, drives_of_stream
@@ -147,9 +148,9 @@ def _estimate_rows(
     with (
         connect_tables(warehouse, text) as database,
         asking(database, condition),
-        predictor.lend_workspace() as workspace,
     ):
         stream = database.sql(text).to_arrow_reader(BATCH_ROWS)
+        workspace = Workspace(predictor.plan)
         for rows in drives_of_stream(stream):
             numbers = cars.get(rows["vehicle_id"][0].as_py())
             estimate = predictor(counts_of(rows, predictor.plan, None, numbers), workspace)
