@@ -95,8 +95,8 @@ def code_folder(digest: str) -> Path | None:
         _require_own(folder)
     except OSError as error:
         LOGGER.warning(
-            "there is no folder where compiled code can be kept (%s): each command compiles anew, "
-            "which takes seconds. Set NUMBA_CACHE_DIR to a folder that this user alone can write.",
+            "compiled code cannot be cached (%s): each command compiles again, which takes "
+            "seconds. Set NUMBA_CACHE_DIR to a folder that only this user can write.",
             error,
         )
         return None
@@ -148,7 +148,7 @@ def _require_own(folder: Path) -> None:
             by_others = found.st_mode & 0o022 and not found.st_mode & stat.S_ISVTX
             safe = found.st_uid in (os.getuid(), 0) and not by_others
         if not safe:
-            raise PermissionError(f"others than this user can write {one}")
+            raise PermissionError(f"other users can write {one}")
     space = os.statvfs(folder)
     if space.f_bavail * space.f_frsize < LEAST_FREE_BYTES or not os.access(folder, os.W_OK):
         raise OSError(f"{folder} cannot be written, or its disk is full")

@@ -137,7 +137,7 @@ def load_toml(file: Traversable) -> dict[str, Any]:
 def _parse_decimal(text: str) -> Decimal:
     number = Decimal(text)
     if abs(number.adjusted()) > LARGEST_EXPONENT:  # as an integer it would take all memory
-        raise ValueError(f"{text[:40]}: no number here has such an exponent")
+        raise ValueError(f"{text[:40]}: the exponent is out of range")
     return number
 
 

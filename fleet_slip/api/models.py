@@ -183,7 +183,9 @@ class PublishedModels(Rooted):
         registry = self.registry()
         if previous:
             if "@" in reference:
-                raise UsageError(f"{reference}: with previous, give the name of the model alone.")
+                raise UsageError(
+                    f"{reference}: with previous, give the model's name without a version."
+                )
             registry.require(reference)
             return registry.load(reference, registry.rollback(reference, alias))
         require_model_name(alias)
@@ -387,7 +389,7 @@ class JudgedModels(PublishedModels):
         car: VehicleParameters | Measured | None = load_vehicle(vehicle) if vehicle else None
         if any(measured.values()):
             if car is not None:
-                raise UsageError("leave out the vehicle file, or what was measured of the car.")
+                raise UsageError("give a vehicle file or measurements of the car, not both.")
             car = measured_car("measured", measured)
         with open_workers(self.root, threads) as executor:
             content = evaluate_measured(self.warehouse, versions, cohort, car, executor)

@@ -179,8 +179,8 @@ class CourseRelation:
         return Fault(
             "place",
             (COURSE,),
-            f"it is that of a place {self.lever_m:+.1f} m before the rear axle, "
-            f"and a car's centre of gravity is {LEVERS_M[0]:g} to {LEVERS_M[1]:g} m before it",
+            f"it fits a point {self.lever_m:+.1f} m forward of the rear axle; the centre of "
+            f"gravity of a car is {LEVERS_M[0]:g} to {LEVERS_M[1]:g} m forward of it",
             "Check antenna_x_m, delay_s, and whether the car drove backwards.",
         )
 

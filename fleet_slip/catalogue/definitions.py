@@ -87,7 +87,7 @@ def integer_arithmetic(sql: str) -> str:
 
 def _not_unknowable(name: str) -> str:
     if name in NOT_FACTS or name not in catalogue().drive:
-        raise ValueError(f"{name} is no fact that a car knows of itself")
+        raise ValueError(f"{name} is not a property of the car that the catalogue has")
     return name
 
 
@@ -153,10 +153,10 @@ class Gate(Config):
     @model_validator(mode="after")
     def _consistent(self) -> "Gate":
         if self.by.gate or self.by.fact:
-            raise ValueError("what opens a gate has no gate or factor itself")
+            raise ValueError("the column that opens a gate cannot have a gate or a factor")
         high = self.peak + 1 if self.high is None else self.high
         if not -limit_of(20) <= self.low < self.peak < high <= limit_of(20):
-            raise ValueError("the knots of a gate must rise, within what a column can count")
+            raise ValueError("the knots of a gate must increase, within the range of a column")
         return self
 
 
@@ -226,7 +226,9 @@ class Product(Config):
 
 def _weight(value: Fraction) -> Fraction:
     if not 0 < value <= 1 or value.denominator > LARGEST_WEIGHT:
-        raise ValueError(f"a weight is above 0, at most 1, in parts of at most {LARGEST_WEIGHT}")
+        raise ValueError(
+            f"a weight is above 0, at most 1, with a denominator up to {LARGEST_WEIGHT}"
+        )
     return value
 
 

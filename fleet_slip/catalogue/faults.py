@@ -307,7 +307,7 @@ def axes_swapped(moments: MeanMoments) -> dict[int, Fault]:
         int(drive): Fault(
             "swapped",
             ("ax", "ay"),
-            f"ax goes with the turns by {ax[drive]:.2f}, ay {ay[drive]:.2f}",
+            f"correlation with the turns: ax {ax[drive]:.2f}, ay {ay[drive]:.2f}",
             "Swap their columns.",
         )
         for drive in np.flatnonzero((ax > AGREEING) & (ay < LONE))

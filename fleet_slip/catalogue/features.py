@@ -81,8 +81,14 @@ class FeatureSet(Config):
             (self.of is None and not self.signals, "a set has signals, or is of another set"),
             (self.of is not None and not self.change_s, "a set of another has change_s"),
             (unknown, f"not input signals: {unknown}"),
+<<<<<<< HEAD
             (len(set(self.columns)) < len(self.columns), "a column stands twice"),
             (ticks and self.block_s, "a set with change_s does not divide rows"),
+=======
+            (len(set(self.columns)) < len(self.columns), "a column appears twice"),
+            (ways > 1, "a set has regimes or block_s, not both"),
+            (ticks and ways, "a set with change_s does not divide rows"),
+>>>>>>> 1deb8ed1 (Say in messages what a native engineer would write)
             (ticks and not (self.windows or self.of), "a set with change_s has windows"),
             (self.as_logged and not ticks, "only a set with change_s is as_logged"),
             (out_of_range, f"change_s is at most {longest}"),
@@ -422,7 +428,7 @@ def _made(where: str, name: str, family: ColumnFamily, known: KnownColumns) -> b
         told = faults_of(error) if isinstance(error, ValidationError) else error
         raise ValueError(f"{where}: {told}") from None
     if twice := [member for member in found if member in known.over_time]:
-        raise ValueError(f"{where}: {twice[0]} stands twice")
+        raise ValueError(f"{where}: {twice[0]} appears twice")
     known.over_time.update(found)
     return True
 

@@ -111,7 +111,7 @@ def known_line(digest: str) -> FittedLine:
                 remember_line(found)
     if digest not in _lines:
         raise broken or QuestionError(
-            f"no line {digest} is known here: its data root has it. Publish the model again."
+            f"the line {digest} is not in this data root. Publish the model again."
         )
     return _lines[digest]
 

@@ -255,8 +255,8 @@ def run_app() -> int:
     exit_code = _exit_code_of_app()
     if reason := streams.unprinted():
         say(
-            f"error: standard output: {reason}. The command was done, but its output is "
-            "incomplete.",
+            f"error: standard output: {reason}. The command finished, but its output "
+            "is incomplete.",
             logging.ERROR,
         )
         exit_code = exit_code or StorageError.exit_code

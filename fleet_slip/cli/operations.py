@@ -35,7 +35,7 @@ def status(found: "WarehouseStatus", json: Json = False) -> None:
 def quality() -> None:
     """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors, drive by drive.
 
-    Reads Gram rows only. Exit code 10 if a drive's sensors are not in order.
+    Reads Gram rows only. Exit code 10 if a drive has faulty sensors.
 
     Example: **fleet-slip quality --cohort "day >= '2024-05-02'"**
     """

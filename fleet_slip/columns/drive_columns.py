@@ -129,14 +129,14 @@ def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
     rows = len(drive.ticks)
     if (drive.ticks[1:] <= drive.ticks[:-1]).any():
         raise DataError(
-            "the ticks of a drive do not rise: it cannot be looked back on. Run: fleet-slip verify"
+            "the ticks of a drive do not increase: it has no windows. Run: fleet-slip verify"
         )
     for one in plan.windows.values():
         summed = one.over not in {None, "lag"}
         if summed and 2 * (rows + 1) * limit_of(one.of_bits) * one.ratio.numerator >= _EXACT:
-            raise DataError(f"the drive has {rows:,} rows: too many to look back on.")
+            raise DataError(f"the drive has {rows:,} rows: too many for windows.")
     if rows > plan.most_rows:
-        raise DataError(f"the drive has {rows:,} rows: too many to look back on.")
+        raise DataError(f"the drive has {rows:,} rows: too many for windows.")
     for name in plan.program.signals:
         counts = drive.counts[name]
         if counts.dtype == np.int16 or not rows:

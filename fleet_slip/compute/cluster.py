@@ -243,7 +243,7 @@ class ClusterExecutor(Executor):
         with contextlib.suppress(InvalidStateError):
             future.set_exception(
                 ClusterError(
-                    f"{self._address}: {reason}. What is done is kept: look after the cluster, and "
+                    f"{self._address}: {reason}. Finished work is kept: check the cluster, and "
                     "run the same command again."
                 )
             )

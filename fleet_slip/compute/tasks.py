@@ -67,14 +67,14 @@ def run_tasks(
     suspects: list[Item] = []
     yield from _completed(executor, function, items, lambda: in_flight(executor), suspects)
     for item in suspects:
-        LOGGER.warning(f"{name_of(item)}: its worker died; it is tried once more, alone")
+        LOGGER.warning(f"{name_of(item)}: its worker died; retrying it once, alone")
     lost: list[Item] = []
     yield from _completed(executor, function, suspects, lambda: 1, lost)
     if lost:
         more = f" and {len(lost) - NAMED_MAX} more" if len(lost) > NAMED_MAX else ""
         raise ClusterError(
             f"{', '.join(map(name_of, lost[:NAMED_MAX]))}{more}: every worker that tried it died, "
-            "often for lack of memory; see the workers' logs. All else is done. Give the workers "
+            "often out of memory; see the workers' logs. Everything else is done. Give the workers "
             "more memory, and run the same command again."
         )
 

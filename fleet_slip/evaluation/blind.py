@@ -53,14 +53,16 @@ class BlindSet(Config):
         """The plan of the campaign's cars, and what is imperfect about them."""
         plan = self.campaign.plan
         if not isinstance(plan, FleetPlan) or plan.imperfections is None:
-            raise ValueError(f"{self.campaign.name} is no campaign of a fleet with imperfections")
+            raise ValueError(
+                f"{self.campaign.name} is not a campaign of a fleet with imperfections"
+            )
         return plan, plan.imperfections
 
     @model_validator(mode="after")
     def _is_known(self) -> Self:
         _ = self._fleet
         if strange := [kind for kind in self.roads if kind not in CLASSES]:
-            raise ValueError(f"{strange[0]!r} is no class of roads: {', '.join(CLASSES)}")
+            raise ValueError(f"{strange[0]!r} is not a class of roads: {', '.join(CLASSES)}")
         return self
 
     def scenarios(self, seed: int) -> tuple[Scenario, ...]:

@@ -442,8 +442,8 @@ class Identified(Answer):
         yield TextTable(title, "what|value", values, "{0}|{1:.4g}")
         left_out = said["held_out_deg"]
         yield Remark(
-            f"the extended Kalman filter in it errs by {said['fit_deg']:.4f} deg on these drives"
-            + ("." if left_out is None else f", and by {left_out:.4f} deg on those left out.")
+            f"RMSE of the extended Kalman filter in it: {said['fit_deg']:.4f} deg on these drives"
+            + ("." if left_out is None else f", {left_out:.4f} deg on those left out.")
         )
         if self.at_bounds:
             yield Remark(

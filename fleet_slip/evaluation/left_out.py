@@ -162,7 +162,7 @@ class Learner:
         """The Gram rows of each quarter by itself, as if it were a drive."""
         name = self.asked.feature_set
         if features().feature_set(name).change_ticks:
-            raise DataError("changes of the course are not divided: choose three drives or more.")
+            raise DataError("a label-free model needs three drives or more: add some.")
         workspace = Workspace(ColumnPlan.of_set(features(), name))
         parts = Parts.of_set(features().feature_set(name))
         lines = {line["drive_id"]: line for line in self.cohort.drives.to_pylist()}
@@ -250,8 +250,8 @@ def read_measured_drives(warehouse: Warehouse, cohort: Cohort) -> list[HeldOutDr
                 drives.append(HeldOutDrive(drive, rows, trips[name]))
     if not drives:
         raise DataError(
-            "no drive of the cohort has side-slip, by which estimators are judged. Choose drives "
-            "with that label."
+            "no drive of the cohort has the side-slip angle, the reference of every RMSE. Choose "
+            "drives with that label."
         )
     return drives
 

@@ -254,7 +254,7 @@ class Competition:
                 found[name] = learner.estimate(left_out, self.cars, self._prior(learner, left_out))
             except (DataError, QuestionError) as error:
                 if name not in self._failed:
-                    LOGGER.warning("%s does not compete everywhere: %s", name, error)
+                    LOGGER.warning("%s is missing in some folds: %s", name, error)
                 self._failed.add(name)
         return found
 
@@ -316,7 +316,7 @@ class Competition:
         try:
             identified = self.identified(measured, left_out)
         except DataError as error:
-            LOGGER.warning("no car is identified: %s", error)
+            LOGGER.warning("no car identified: %s", error)
             if self.vehicle is not None:
                 cars["tuned"] = ("the vehicle's file", self.vehicle)
         else:
@@ -332,7 +332,7 @@ class Competition:
                 try:
                     tuned = one.tune(others, car, self.executor).parameters
                 except DataError as error:
-                    LOGGER.warning("%s does not compete: %s", name, error)
+                    LOGGER.warning("%s left out: %s", name, error)
                 else:
                     estimate = partial(_estimate, one, car, tuned)
                     about = tuned.model_dump(mode="json")

@@ -109,7 +109,7 @@ def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> 
         rows = database.sql(statement, params={"drive": drive_id}).to_arrow_table()
     if not rows.num_rows:
         raise QuestionError(
-            f"{drive_id!r} is no drive of the logs, and no scenario. See: "
+            f"{drive_id!r} is neither a drive nor a scenario. See: "
             'fleet-slip sql "SELECT drive_id FROM drives"'
         )
     traffic = _traffic_of(drive_id, rows["campaign"][0].as_py(), rows["day"][0].as_py())

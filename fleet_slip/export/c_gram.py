@@ -134,7 +134,7 @@ def sets_on_board(manifest: Manifest) -> tuple[OnBoard, ...]:
         has = unknown[0] if unknown else number_of(len(columns), "column")
         raise RefusedError(
             f"{manifest.name} has {has}: cars count up to {MOST_SIGNALS} columns of a feature set, "
-            "and none of what a car knows of itself. Leave that out: fleet-slip export NAME --to c"
+            "and no properties of the car. Export without them: fleet-slip export NAME --to c"
         )
     delay = _on_board_counted(DELAY)
     telling = tuple(column for column in delay.columns if column in delay_columns())

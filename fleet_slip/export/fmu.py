@@ -79,8 +79,8 @@ def _compile(sources: Mapping[str, str]) -> bytes:
     """Return the shared library for this machine."""
     if which(COMPILER) is None or machine() != "x86_64":
         raise ConfigError(
-            "an FMU has a binary for Linux on x86-64 inside: export it on such a machine, with a C "
-            f"compiler called {COMPILER}, such as: apt-get install gcc libc6-dev"
+            "an FMU contains a binary for Linux on x86-64: export it on such a machine, with the C "
+            f"compiler {COMPILER}: apt-get install gcc libc6-dev"
         )
     with TemporaryDirectory() as folder:
         for name, text in sources.items():
@@ -97,7 +97,7 @@ def _compile(sources: Mapping[str, str]) -> bytes:
             timeout=LONGEST_COMPILATION_S,
         )
         if done.returncode:
-            raise ConfigError(f"{COMPILER} cannot make the FMU's binary: {done.stderr[-500:]}")
+            raise ConfigError(f"{COMPILER} cannot compile the FMU: {done.stderr[-500:]}")
         return (Path(folder) / "library.so").read_bytes()
 
 

@@ -84,7 +84,7 @@ def require_answer(uri: str, reference: str, patience_s: float = ANSWER_S) -> No
 
 def _not_taken(reference: str, why: str) -> StorageError:
     return StorageError(
-        f"{reference} is published here, but MLflow did not take it: {why} Publish it again when "
+        f"{reference} is published here, but MLflow rejected it: {why} Publish it again when "
         "the server answers."
     )
 

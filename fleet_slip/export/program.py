@@ -284,7 +284,7 @@ def _inputs(manifest: Manifest) -> tuple[Input, ...]:
     for term in manifest.terms:
         parts = term.definition.parts if term.definition else (term,)
         if not term.inputs or any(part.sql and not parse(part.sql).inputs for part in parts):
-            raise DataError(f"the feature {term.signal} is of no signal. Publish the model again.")
+            raise DataError(f"the feature {term.signal} uses no signal. Publish the model again.")
         used |= {*term.inputs}
     return tuple(
         # -32768 is a missing count on board, so that a cyclic signal lacks its half turn there.

@@ -134,7 +134,7 @@ class Estimator:
                 missing = ", ".join(column for column in self.columns if column not in sample)
                 raise InputError(f"{name} needs {missing} in every sample.") from None
             except (TypeError, ValueError):
-                raise InputError(f"{name}: a sample has what is no number.") from None
+                raise InputError(f"{name}: a sample is not a number.") from None
             count = round(ratio) if abs(ratio) < 2**31 else None
             inside = count is not None and one.min_count <= count <= one.max_count
             found.append(count if inside else None)
@@ -179,4 +179,4 @@ def _fraction(value: Any) -> Fraction:
     try:
         return Fraction(value)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{value!r} is no number of a car.") from None
+        raise InputError(f"{value!r} is not a number.") from None

@@ -373,7 +373,7 @@ class Calibration(Answer):
         """Return the numbers of a car. Raises `QuestionError` if no drive is of it."""
         if vehicle_id not in self.cars:
             raise QuestionError(
-                f"no drive of a car {vehicle_id!r} determines its numbers. See: fleet-slip sql "
+                f"no drive of {vehicle_id!r} is enough to calibrate it. See: fleet-slip sql "
                 '"SELECT DISTINCT vehicle_id FROM drives"'
             )
         return self.cars[vehicle_id]

@@ -61,8 +61,8 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
     logs, grams = warehouse.logs.snapshot(), warehouse.grams.snapshot()
     if not logs.files:
         raise DataError(
-            f"{warehouse.root}: there are no logs, of which Gram rows are computed again. They "
-            "come with: fleet-slip run, or ingest. What cars sent is checked by: fleet-slip verify"
+            f"{warehouse.root}: no logs to compute Gram rows from. Load some: fleet-slip "
+            "ingest, or fleet-slip run. Gram rows sent by cars are checked by: fleet-slip verify"
         )
     chosen = _evenly(logs.files, count, begin)
     where = find_gram_files(warehouse, grams.files)
@@ -106,10 +106,9 @@ def _compare_ways(
     for other, found in others.items():
         if drives := differing_drives(computed, found):
             raise StorageError(
-                f"{file.path}: the Gram of drive {drives[0]} by the kernel and by {other} of "
-                f"{feature_set} differ. If the Gram job has not run since the logs changed, run: "
-                "fleet-slip gram. Otherwise the file or a library is damaged: keep both and "
-                "report it."
+                f"{file.path}: the Gram row of drive {drives[0]} ({feature_set}) differs "
+                f"between the kernel and {other}. If the logs have changed since, run: fleet-slip "
+                "gram. Otherwise the file or a library is damaged: keep both and report it."
             )
     return len(rows["drive_id"].unique())
 

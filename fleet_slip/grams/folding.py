@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field
 
+from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
 from fleet_slip.catalogue.features import features
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError, QuestionError, UsageError
@@ -73,6 +74,13 @@ def require_divided(feature_set: str, by: str) -> None:
 
 def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssignment:
     """Assign Gram rows to folds by a key's values. Raises `DataError` for one fold, or too many."""
+    if by == "drive" and len(set(values)) == 1:
+        raise DataError(
+            "cross-validation needs at least two folds, and the cohort is one drive, or one trip: "
+            f"drives of a car less than {LONGEST_PAUSE_S // 60} minutes apart. Add logs, or hold "
+            "out parts of the time: fleet-slip gram --features blocks, then fleet-slip publish "
+            "NAME --features blocks --by part"
+        )
     if count == EACH:
         if (number := len(set(values))) > MOST_FOLDS:
             raise DataError(

@@ -327,12 +327,14 @@ def _read(file: Path, content: bytes) -> pa.Table:
             raise InputError(f"{file}: has no Gram rows.")
         if rows > MOST_ROWS or unpacked_bytes > MOST_UNPACKED_BYTES:
             raise InputError(
-                f"{file}: more than {MOST_ROWS:,} Gram rows or 1 GiB of them. Divide it."
+                f"{file}: more than {MOST_ROWS:,} Gram rows, or than 1 GiB of them. Split it."
             )
         table = parquet.read()
         absent = [name for name in COLUMNS.names if name not in {*table.column_names, *OPTIONAL}]
         if absent:
-            raise InputError(f"{file}: no table of Gram rows: no column {absent[0]}. {_SEE}")
+            raise InputError(
+                f"{file}: not a table of Gram rows, column {absent[0]} is missing. {_SEE}"
+            )
         return in_schema(table, COLUMNS).combine_chunks()
     except (pa.ArrowException, OSError, ValueError, IndexError) as error:
         raise InputError(
@@ -387,7 +389,7 @@ def _refuse(
 ) -> NoReturn:
     raise error(
         f"{file}: row {row} (drive {shown(str(drive))}) {reason}. Nothing of the file was loaded: "
-        "mend the row or leave it out, and give the file again."
+        "correct or remove the row, and load the file again."
     )
 
 

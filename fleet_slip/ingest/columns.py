@@ -266,7 +266,7 @@ class TimeBase(Config):
     @classmethod
     def _zone_is_known(cls, zone: str | None) -> str | None:
         if zone is not None and zone not in available_timezones():
-            raise ValueError(f"{zone!r} is no time zone. Write it as 'Europe/Berlin'")
+            raise ValueError(f"{zone!r} is not a time zone. Write it as 'Europe/Berlin'")
         return zone
 
     @model_validator(mode="after")

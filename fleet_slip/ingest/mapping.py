@@ -119,7 +119,7 @@ class FromPath(Config):
     @classmethod
     def _has_one_place(cls, path: str) -> str:
         if path.count("{}") != 1:
-            raise ValueError("write {} once, where the value stands: '{}/*' is the folder's name")
+            raise ValueError("write {} once, in place of the value: '{}/*' is the folder's name")
         return path
 
     def find(self, file: Path) -> str:
@@ -186,7 +186,7 @@ class Mapping(Config):
     def _consistent(self) -> "Mapping":
         for condition in self.where:
             if condition.signal is not None and condition.signal not in self.signals:
-                raise ValueError(f"where: {condition.signal!r} is no signal of this mapping")
+                raise ValueError(f"where: {condition.signal!r} is not a signal of this mapping")
             if condition.signal is not None and self.signals[condition.signal].component:
                 raise ValueError(f"where: name the column of the file, not {condition.signal!r}")
         known = catalogue().signals

@@ -360,10 +360,10 @@ def _require_same_features(version: ModelVersion, feature_set: str) -> None:
     of_set = known.definitions(feature_set)
     for name, one in then.features.items():
         if known.rows([name]).get(name) != one:
-            raise DataError(f"the feature {name} of {version.reference} is not defined as then.")
+            raise DataError(f"the feature {name} has changed since {version.reference}.")
     for name, definition in then.definitions.items():
         if name not in known.inputs or (of_set.get(name) or known.definition(name)) != definition:
-            raise DataError(f"the column {name} of {version.reference} is not defined as then.")
+            raise DataError(f"the column {name} has changed since {version.reference}.")
 
 
 # A fault of all drives, such as a label with the other sign, shows in no comparison: so a few of

@@ -51,8 +51,8 @@ def with_line_fitted(
     if estimate := features().learning.get(named):
         if plan.model_list is None or plan.model_list.line is None:
             raise QuestionError(
-                f"the feature set {named} has the estimate of a line: take a list of models that "
-                "says which, such as models = learning."
+                f"the feature set {named} contains a line's estimate: choose a model list that "
+                "defines the line, such as models = learning."
             )
         models = load_model_list(plan.model_list.line)
         about = {

@@ -123,12 +123,12 @@ class Frame:
         try:
             column = self.column(name)
             if not _is_number(column.type):
-                raise InputError(f"the column {name} is of {column.type}, not of numbers.")
+                raise InputError(f"the column {name} is {column.type}, not numeric.")
             if column.type != pa.float64():
                 column = column.cast(pa.float64())
             values = column.to_numpy(zero_copy_only=False)
         except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"the column {name} is no column of numbers: {error}") from None
+            raise InputError(f"the column {name} is not numeric: {error}") from None
         if infinite := int(np.isinf(values).sum()):
             raise InputError(f"the column {name} has {infinite:,} infinite values.")
         return np.asarray(values, dtype=np.float64)
@@ -189,7 +189,7 @@ def predict(manifest: Manifest, frame: Any, predictor: Predictor | None = None) 
     predictor = predictor or Predictor.of(manifest)
     opened, signals, plan = open_frame(frame), catalogue(), predictor.plan
     if not plan.signals:
-        raise DataError(f"the columns of {manifest.name} are of no signal. Publish it again.")
+        raise DataError(f"the columns of {manifest.name} use no signal. Publish it again.")
     columns = opened.numbers(manifest.columns, f"the model {manifest.name}")
     counts = {
         name: round_chunks(
@@ -198,7 +198,7 @@ def predict(manifest: Manifest, frame: Any, predictor: Predictor | None = None) 
         for name in plan.signals
     }
     if missing := [name for name in plan.facts if name not in opened.names]:
-        raise InputError(f"{manifest.name} needs what the car knows: {', '.join(missing)}.")
+        raise InputError(f"{manifest.name} needs properties of the car: {', '.join(missing)}.")
     facts = {name: _column(opened, name) for name in plan.facts}
     numbers = _numbers(manifest, opened)
     rows = len(next(iter(counts.values())))

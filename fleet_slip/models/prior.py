@@ -41,6 +41,6 @@ def simulate_prior(
             return replace(load_cohort(warehouse, NOT_LOST, feature_set), source=None)
         except DataError as error:
             raise DataError(
-                f"prior {campaign.name}: no drive in which the driver kept the car. Check its "
-                "vehicle: fleet-slip identify names what its drives do not tell."
+                f"prior {campaign.name}: the driver lost control in all drives. Check the vehicle "
+                "file: fleet-slip identify lists the parameters it could not identify."
             ) from error

@@ -181,13 +181,13 @@ class SelectionRequest:
             )
         if self.model and (self.models or self.nested or self.ordered or self.search):
             raise UsageError(
-                "model says which inputs to take: leave it out, or models, nested, rank, "
-                "criterion, all_subsets and search, which choose."
+                "model names the inputs itself: leave out models, nested, rank, criterion, "
+                "all_subsets and search, or leave out model."
             )
         if self.rank and self.all_subsets:
             raise UsageError("a search of all subsets needs no order: leave out rank.")
         if self.most and not self.search:
-            raise UsageError("most is for a search: say how to search.")
+            raise UsageError("most limits a search: give search, too.")
         if self.cluster and not (self.ordered or self.nested):
             raise UsageError(
                 "cluster says what is independent evidence for nested, rank, criterion and "
@@ -196,11 +196,11 @@ class SelectionRequest:
         ranked = self.ordered or (self.nested and not self.search)
         if self.prior and (self.label or ranked):
             raise UsageError(
-                "a prior joins models of a list, one model or a search: leave out label, rank, "
+                "a prior works with a model list, one model or a search: leave out label, rank, "
                 "criterion, all_subsets, and nested without search."
             )
         if self.half_life is not None and self.half_life < 1:
-            raise UsageError("half_life: a whole number of days from 1 on.")
+            raise UsageError("half_life: give a whole number of days, at least 1.")
         if self.search and self.ordered:
             raise UsageError(
                 "a search is made again in every fold, and looks at folds alone: leave out rank, "
@@ -385,7 +385,7 @@ def require_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
             f"{feature_set}: {name_inputs(known)}."
         )
     if len(set(order)) < len(order):
-        raise UsageError(f"{','.join(order)}: an input stands twice.")
+        raise UsageError(f"{','.join(order)}: an input appears twice.")
     require_odd(order, feature_set)
     return order
 

@@ -140,7 +140,7 @@ def _winner(models: Sequence[CrossValidation], size: int, choice: SearchChoice) 
     rule = choice.rule
     if size == 0:
         raise DataError(
-            f"the criterion {rule.criterion} keeps no signal: none says more than chance. Choose "
+            f"the criterion {rule.criterion} selects no signal: none is better than chance. Choose "
             "more drives, other signals, or the criterion cv."
         )
     best = max(models, key=lambda model: model.sums.signed_r_squared)

@@ -125,9 +125,9 @@ def levels_of(manifest: Manifest) -> tuple[str, tuple[str, ...]]:
     there = features().feature_set(base).columns if base else ()
     if absent := [column for column in columns if column not in there]:
         raise DataError(
-            f"the intercept follows from Gram rows of {', '.join(absent)} themselves, not their "
-            f"changes: let the feature set {name} be of one that has them (of in "
-            "configs/features.toml), or choose a model that knows no intercept: --no-intercept."
+            f"the intercept needs Gram rows of {', '.join(absent)}, not only of changes: set of in "
+            f"the feature set {name} (configs/features.toml) to one that has them, or fit "
+            "without intercept: --no-intercept."
         )
     return str(base), columns
 
@@ -138,8 +138,8 @@ def _levels(warehouse: Warehouse, condition: Condition, manifest: Manifest) -> D
         found = collect_sums(opened.batches(condition), {base: columns}, unnamed=True)
     if not found:
         raise DataError(
-            f"no drive of {condition.shown} has {', '.join(columns)}, which the intercept follows "
-            "from. Choose more drives, or a model that knows no intercept: --no-intercept."
+            f"no drive of {condition.shown} has {', '.join(columns)}, which the intercept needs. "
+            "Choose more drives, or fit without intercept: --no-intercept."
         )
     return found[base]
 

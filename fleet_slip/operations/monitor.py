@@ -198,8 +198,8 @@ def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | No
     """Return the newest day of the logs as they were when the model was trained."""
     if version.manifest.imported_from is not None:
         raise DataError(
-            f"{version.reference} was trained in another data root. Say which day is the first new "
-            f"one: {_SINCE.format(name=version.manifest.name)}"
+            f"{version.reference} was trained in another data root. Give the first day of new "
+            f"drives: {_SINCE.format(name=version.manifest.name)}"
         )
     logs = warehouse.logs
     number = version.manifest.trained_on.logs_version
@@ -208,7 +208,7 @@ def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | No
     except StorageError:
         raise StorageError(
             f"{logs.folder}: version {number}, which {version.reference} was trained on, is no "
-            "longer in the Delta log. Say which day is the first new one: "
+            "longer in the Delta log. Give the first day of new drives: "
             f"{_SINCE.format(name=version.manifest.name)}"
         ) from None
     return max((file.day for file in then.files if file.day), default=None)

@@ -75,10 +75,10 @@ class QualityReport(Answer):
 
     @property
     def problem(self) -> AlarmError | None:
-        """That some drives are not in order."""
+        """That some drives have faulty sensors."""
         of = number_of(self.drives, "drive")
         found = len(self.findings)
-        return AlarmError(f"{found} of {of} are not in order") if found else None
+        return AlarmError(f"faulty sensors in {found} of {of}") if found else None
 
 
 def examine_drives(

@@ -131,7 +131,7 @@ class Verification(Answer):
             f"{number_of(self.files, 'file')} with {self.size_bytes:,} bytes and "
             f"{number_of(self.documents, 'document')} were read, the Gram rows of "
             f"{number_of(self.log_files_recomputed, 'log file')} computed again: "
-            + (f"{len(self.damage)} damaged" if self.damage else "all is as it must be")
+            + (f"{len(self.damage)} damaged" if self.damage else "no damage found")
         )
         if self.compared:
             yield TextTable("", "way|drives|equal", self.compared.ways)

@@ -84,7 +84,7 @@ SITES = {
 def require_road(name: str) -> str:
     """Return the name of a road with traffic. Raises `ConfigError` if there is none such."""
     if name not in SITES:
-        raise ConfigError(f"{name!r} is no road with traffic. Choose from: {', '.join(SITES)}")
+        raise ConfigError(f"{name!r} is not a road with traffic. Choose from: {', '.join(SITES)}")
     try:
         gymnasium.spec(SITES[name].environment)
     except gymnasium.error.Error as error:
@@ -390,7 +390,7 @@ def require_known_traffic(name: str) -> None:
     digest = hashlib.sha256(np.round(places * 1000).astype("<i4").tobytes()).hexdigest()[:16]
     if digest != REFERENCES[name]:
         raise RefusedError(
-            f"the cars of highway-env {highway_env.__version__} do not drive on its road {name!r} "
-            f"as they did when fleet_slip was made ({digest}). The file of these drives is not "
-            "written: install the version that constraints.txt names."
+            f"cars of highway-env {highway_env.__version__} drive on its road {name!r} unlike "
+            f"those of the tested version ({digest}). The drives are not written: install the "
+            "version that constraints.txt names."
         )

@@ -213,8 +213,8 @@ def _regular_file(file: Path, flags: int) -> Iterator[int]:
 
 def _no_file(path: Path) -> StorageError:
     return StorageError(
-        f"{path}: it is a link, a folder or a pipe where this program has a file. Find out who put "
-        "it there and remove it, or restore the file from a backup."
+        f"{path}: a link, a folder or a pipe instead of a regular file. Find out who put it "
+        "there and remove it, or restore the file from a backup."
     )
 
 

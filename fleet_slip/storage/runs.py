@@ -219,7 +219,9 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
     finally:
         end = run.end(error, time.monotonic() - begun)
         if _exists(root) and not _append(root, file, *([] if recorded else [run.beginning()]), end):
-            LOGGER.warning("%s: the history of runs cannot be written, and lacks this one.", root)
+            LOGGER.warning(
+                "%s: the run history cannot be written; this run is missing in it.", root
+            )
         _current.reset(token)
 
 
@@ -316,9 +318,8 @@ def add_runs(database: "duckdb.DuckDBPyConnection", root: Folder, since: str = "
         lines, changed = read_lines(content)
         if changed:
             raise StorageError(
-                f"{root}/{FOLDER}/{path}: line {changed[0]} is not what a run has written; it was "
-                "changed or damaged. Restore the file from a backup, or delete the line: the "
-                "others stand for themselves."
+                f"{root}/{FOLDER}/{path}: line {changed[0]} was changed or damaged. Restore the "
+                "file from a backup, or delete the line: no other depends on it."
             )
         found.append(pa.array(lines, pa.binary()).cast(pa.string()))
     rows = pa.chunked_array(found, pa.string())

@@ -98,14 +98,14 @@ def asking(
         cause = error.__context__
         if isinstance(cause, duckdb.InvalidInputException):  # and every file is sound
             raise QuestionError(
-                f"the cohort {condition.shown} cannot be asked: {duckdb_message(cause)}."
+                f"the cohort {condition.shown} cannot be evaluated: {duckdb_message(cause)}."
             ) from None
         raise
     except BaseException:
         if not over.is_set():
             raise
         raise QuestionError(
-            f"the cohort {condition.shown} was not found within {limit_s:g} s. Ask for less."
+            f"the cohort {condition.shown} took more than {limit_s:g} s. Simplify it."
         ) from None
     finally:
         timer.cancel()
@@ -153,9 +153,9 @@ def _parsed(text: str, columns: frozenset[str]) -> Condition:
             raise QuestionError(f"{shown} {problem}")
         sql = _written(tree)
         if sql is None or _meaning(_expression(sql, shown)) != _meaning(tree):
-            raise QuestionError(f"{shown} cannot be written out again. Say it more simply.")
+            raise QuestionError(f"{shown} is too complex. Simplify it.")
     except RecursionError:
-        raise QuestionError(f"{shown} is nested too deeply. Divide it into parts.") from None
+        raise QuestionError(f"{shown} is nested too deeply. Simplify it.") from None
     return Condition(text, f"({sql})")
 
 

@@ -181,7 +181,7 @@ def database_errors(doing: str) -> Iterator[None]:
         raise
     except (duckdb.OutOfMemoryException, MemoryError) as error:
         reason = duckdb_message(error) or f"out of memory ({memory_bytes() // 2**20:,} MiB)"
-        raise StorageError(f"{doing} failed: {reason}. Ask for less at once.") from None
+        raise StorageError(f"{doing} failed: {reason}. Select less at once.") from None
     except duckdb.PermissionException as error:
         if deleted := _DELETED.search(str(error)):
             raise gone(deleted[1]) from None
@@ -337,7 +337,7 @@ def _checked(node: dict[str, Any]) -> dict[str, Any]:
     if kind.endswith("_NODE") and kind not in QUERY_NODES:
         raise QuestionError("the query would write: only reading is allowed here.")
     if kind == "VALUE_PARAMETER":
-        raise QuestionError("the query has a parameter, and nothing gives it a value.")
+        raise QuestionError("the query has a parameter without a value.")
     if kind == "TABLE_FUNCTION":
         name = str(node["function"]["function_name"]).lower()
         if name not in TABLE_FUNCTIONS and not name.startswith(CATALOGUE_PREFIX):

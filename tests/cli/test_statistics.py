@@ -162,7 +162,7 @@ def test_diagnose_shows_both_kinds_of_errors(run_command: RunCommand, every_set:
         (["select", "--all-subsets", "--rank", "t"], 2, "needs no order"),
         (["diagnose", "nothing"], 5, "no model is called"),
         (["diagnose", "smoke", "--signals", "ay"], 2, "not both"),
-        (["diagnose", "--signals", "ay,ay"], 2, "stands twice"),
+        (["diagnose", "--signals", "ay,ay"], 2, "appears twice"),
     ],
 )
 def test_a_mistake_is_one_line_and_its_exit_code(

@@ -144,4 +144,4 @@ def test_without_a_cache_folder_it_does_its_job_and_says_what_that_costs(
     done = run(confined(service, folder, ["gram", "--features", "windows", "--json"]))
     assert done.exit_code == 0, done.stderr
     assert json.loads(done.stdout)["files_read"] == 4
-    assert done.stderr.count("no folder where compiled code can be kept") == 1
+    assert done.stderr.count("compiled code cannot be cached") == 1

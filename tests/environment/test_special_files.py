@@ -47,7 +47,7 @@ def test_a_lock_is_taken_on_a_file_only(
     other = place(tmp_path / "data/.run-smoke.lock")
     done = run_command("run", "--campaign", "smoke", "--days", "1")
     assert done.exit_code == StorageError.exit_code
-    assert ".run-smoke.lock: it is a link, a folder or a pipe" in done.stderr
+    assert ".run-smoke.lock: a link, a folder or a pipe" in done.stderr
     assert untouched(other)
 
 
@@ -88,7 +88,7 @@ def test_a_document_is_read_from_a_file_only(
         other.write_text(content)
     done = run_command("show", "sideslip")
     assert done.exit_code == StorageError.exit_code
-    assert "it is a link, a folder or a pipe" in done.stderr
+    assert "a link, a folder or a pipe" in done.stderr
 
 
 def test_a_data_file_that_is_a_pipe_is_not_waited_for(tmp_path: Path) -> None:

@@ -174,7 +174,7 @@ def test_it_says_what_it_is_of_and_is_the_same_again(archives: dict[str, bytes])
 def test_without_a_compiler_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fmu, "COMPILER", "no-such-compiler")
     version = ModelVersion(1, model_of(MODELS["signals"]), "0" * 64)
-    with pytest.raises(ConfigError, match="a C compiler called no-such-compiler"):
+    with pytest.raises(ConfigError, match="the C compiler no-such-compiler"):
         export_files(version, None, "fmu")
 
 

@@ -119,5 +119,5 @@ def test_what_mlflow_loads_takes_no_row_and_names_what_a_frame_lacks() -> None:
     assert loaded.predict(frame).shape == (0, 1)
     with pytest.raises(InputError, match="the frame lacks ay_mps2"):
         loaded.predict(frame.drop(columns="ay_mps2"))
-    with pytest.raises(InputError, match="needs what the car knows: mass_kg"):
+    with pytest.raises(InputError, match="needs properties of the car: mass_kg"):
         loaded.predict(frame.drop(columns="mass_kg"))

@@ -143,7 +143,7 @@ def test_a_server_that_does_not_answer_is_said(smoke_root: Path, tmp_path: Path)
     shutil.copytree(smoke_root, root)
     publish = [folder_of_mlflow() / "fleet-slip", "--root", root, "publish", "logged", "--mlflow"]
     done = run(*publish, "http://127.0.0.1:9", code=6)
-    assert "logged@1 is published here, but MLflow did not take it" in done.stderr
+    assert "logged@1 is published here, but MLflow rejected it" in done.stderr
     done = run(*publish, "http://me:secret@127.0.0.1:9", code=2)
     assert "has a name or password in it" in done.stderr
 
@@ -180,7 +180,7 @@ def test_a_server_that_says_nothing_is_not_waited_for(listening: bool) -> None:
         if listening:
             silent.listen()
         uri = f"http://127.0.0.1:{silent.getsockname()[1]}"
-        told = f"ours@1 is published here, but MLflow did not take it: nothing answers at {uri}"
+        told = f"ours@1 is published here, but MLflow rejected it: nothing answers at {uri}"
         with pytest.raises(StorageError, match=told):
             require_answer(uri, "ours@1", 0.2)
 

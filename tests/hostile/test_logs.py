@@ -303,7 +303,7 @@ def test_what_a_trace_unfolds_to_is_bounded(
 
 @pytest.mark.parametrize("name", ["log.asc.gz", "log.db", "log.mf4"])
 def test_only_known_traces_are_read(tmp_path: Path, name: str) -> None:
-    assert "the suffix names the format" in trace(tmp_path, name, b"\x1f\x8b" + bytes(9))
+    assert "unknown suffix. CAN traces end with" in trace(tmp_path, name, b"\x1f\x8b" + bytes(9))
 
 
 @pytest.mark.parametrize(

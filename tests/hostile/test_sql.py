@@ -219,7 +219,7 @@ def test_one_value_cannot_take_all_memory(root: Path, run_command: RunCommand) -
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_DATA, (limit, limit)),
     )
     assert result.exit_code == StorageError.exit_code
-    assert "Ask for less" in result.stderr
+    assert "Select less at once" in result.stderr
 
 
 def test_a_connection_opens_no_other_file_and_writes_none_anew(root: Path, tmp_path: Path) -> None:

@@ -117,7 +117,7 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
         (STEER, "[label]\nfrom_velocities = true", "needs the signal vx"),
         (STEER, "[label]\nsensor_x_m = 1.0", "needs the signal sideslip"),
         ('unit = "s"', 'unit = "s", zone = "Europe/Berlin"', "without a time zone"),
-        ('unit = "s"', 'format = "%H:%M", zone = "Nowhere"', "is no time zone"),
+        ('unit = "s"', 'format = "%H:%M", zone = "Nowhere"', "is not a time zone"),
         ('unit = "s"', "epoch = true", "give their 'unit'"),
         ('unit = "s"', 'unit = "s", date = { column = "d" }', "has the time of day alone"),
         (
@@ -347,7 +347,7 @@ def test_rows_that_do_not_meet_the_conditions_are_counted(
     ("where", "message"),
     [
         ("speed > 5", "write it as tables"),
-        ([{"signal": "ay", "above": 1}], "'ay' is no signal of this mapping"),
+        ([{"signal": "ay", "above": 1}], "'ay' is not a signal of this mapping"),
         ([{"signal": "ax", "one_of": ["1"]}], "'one_of' is for a column"),
         ([{"at_least": 1}], "needs either 'column' or 'signal'"),
         ([{"column": "speed"}], "needs 'at_least', 'at_most' or 'one_of'"),

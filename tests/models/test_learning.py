@@ -191,7 +191,7 @@ def test_a_drive_too_long_for_its_slope_is_refused(
     """On board a slope adds up no more from then on: the two would differ."""
     version = fleet.model("tiny")
     monkeypatch.setattr("fleet_slip.columns.plan.most_products", lambda _: 1000)
-    with pytest.raises(DataError, match="too many to look back on"):
+    with pytest.raises(DataError, match="too many for windows"):
         fleet.score(version)
 
 
@@ -226,7 +226,7 @@ def test_a_line_that_was_changed_is_refused(fleet: Fleet) -> None:
 def test_a_set_without_its_line_has_no_rows(fleet: Fleet) -> None:
     with pytest.raises(QuestionError, match="fitted first"):
         update_grams(fleet.warehouse, feature_set="tiny")
-    with pytest.raises(QuestionError, match="take a list of models"):
+    with pytest.raises(QuestionError, match="choose a model list"):
         fleet.cohort().select(features="tiny", model="ay")
     with pytest.raises(QuestionError, match="no line 0123456789ab"):
         update_grams(fleet.warehouse, feature_set="tiny_0123456789ab")

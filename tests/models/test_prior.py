@@ -115,7 +115,7 @@ def test_a_version_names_its_prior_and_is_trained_so_again(own: Path, few: str) 
 def test_what_a_prior_does_not_join_is_refused(own: Path, few: str, words: tuple[str, ...]) -> None:
     done = run_on(own, "select", "--prior", few, *words)
     assert done.exit_code == 2
-    assert "a prior joins" in done.stderr
+    assert "a prior works with" in done.stderr
     unknown = run_on(own, "select", "--model", INPUTS, "--prior", "nowhere")
     assert unknown.exit_code == 3
     assert "nowhere" in unknown.stderr
@@ -207,7 +207,7 @@ def test_a_prior_in_which_every_car_is_lost_is_refused(
     monkeypatch.setattr("fleet_slip.models.prior.NOT_LOST", "lost_control_s < 0")
     done = run_on(own, "select", "--model", INPUTS, "--prior", few)
     assert done.exit_code == 5
-    assert "prior few: no drive in which the driver kept the car" in done.stderr
+    assert "prior few: the driver lost control in all drives" in done.stderr
 
 
 def test_weights_halve_with_age() -> None:

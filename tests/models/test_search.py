@@ -118,7 +118,7 @@ def test_what_counts_as_independent_is_what_was_asked_for(
 @pytest.mark.parametrize("ranking", ["forward", ALL_SUBSETS])
 def test_where_nothing_says_more_than_chance_there_is_no_winner(ranking: str) -> None:
     cohort = cohort_of(driven(3, (0.0, 0.0, 0.0, 0.0), drives=20))
-    with pytest.raises(DataError, match="the criterion bic keeps no signal"):
+    with pytest.raises(DataError, match="the criterion bic selects no signal"):
         select_inputs(cohort, INPUTS, FIVE, Rule(ranking, "bic"), USUAL)
 
 

@@ -217,7 +217,7 @@ def test_the_command_tells_by_its_exit_code(run_command: RunCommand, warehouse: 
     assert bad.exit_code == 10
     (finding,) = bad.json["findings"]
     assert (finding["drive_id"], finding["kind"], finding["signals"]) == ("d29", "reversed", ["ay"])
-    assert "1 of 30 drives are not in order" in bad.stderr
+    assert "faulty sensors in 1 of 30 drives" in bad.stderr
     good = run_command("quality", "--cohort", "drive_id <> 'd29'")
     assert good.exit_code == 0
     assert "29 drives checked" in good.stdout

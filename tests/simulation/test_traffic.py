@@ -156,7 +156,7 @@ def test_an_unknown_road_is_named_with_file_and_key(
     assert done.exit_code == ConfigError.exit_code
     assert "short.toml" in done.stderr
     assert "plan.traffic.tracks.1" in done.stderr
-    assert "'moon' is no road with traffic. Choose from: highway, " in done.stderr
+    assert "'moon' is not a road with traffic. Choose from: highway, " in done.stderr
 
 
 def test_a_road_that_highway_env_lacks_is_named_with_file_and_key(
@@ -178,7 +178,7 @@ def test_traffic_of_another_kind_is_refused(
     monkeypatch.setattr(IDMVehicle, name, lambda *given, **named: 1.05 * decided(*given, **named))
     done = run_command("simulate", short(tmp_path, 'tracks = ["roundabout"]'))
     assert done.exit_code == RefusedError.exit_code
-    assert "do not drive on its road" in done.stderr
+    assert "drive on its road 'roundabout' unlike" in done.stderr
     assert not list((tmp_path / "data").rglob("*.parquet"))
 
 

@@ -98,7 +98,7 @@ def test_what_cannot_be_recorded_does_not_fail_the_command(
     logging.getLogger("fleet_slip").propagate = True
     with recording(LocalFolder(tmp_path), "gram", []):
         pass
-    assert "the history of runs cannot be written" in caplog.text
+    assert "the run history cannot be written" in caplog.text
     assert runs(tmp_path) == []
 
 

@@ -229,7 +229,7 @@ def test_asking_ends_when_the_time_is_over() -> None:
     endless = "SELECT count(*) FROM range(1000000) a(x), range(1000000) b(y) WHERE x * y % 7 = 3"
     with (
         duckdb.connect() as database,
-        pytest.raises(QuestionError, match="was not found within"),
+        pytest.raises(QuestionError, match="took more than"),
         asking(database, condition, limit_s=0.1),
     ):
         database.execute(endless).fetchall()
@@ -240,7 +240,7 @@ def test_asking_ends_when_the_time_is_over() -> None:
 )
 def test_a_wrong_regular_expression_is_a_wrong_question(fleet: Warehouse, condition: str) -> None:
     for folding in (None, Folding()):
-        with pytest.raises(QuestionError, match="cannot be asked"):
+        with pytest.raises(QuestionError, match="cannot be evaluated"):
             load_cohort(fleet, condition, folding=folding)
 
 

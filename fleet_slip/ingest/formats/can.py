@@ -206,8 +206,8 @@ def read_can_database(bus: CanBus, folder: Path) -> CanBus:
     file = folder / bus.database
     if file.suffix.lower() not in DATABASES:
         raise ConfigError(
-            f"{file}: a CAN database is a file {', '.join(DATABASES)}. Of ARXML canconvert, of "
-            "canmatrix, makes one."
+            f"{file}: not a CAN database ({', '.join(DATABASES)}). Convert ARXML with "
+            "canconvert, which is part of canmatrix."
         )
     content = read_named_file(file, MAX_DATABASE_BYTES)
     try:
@@ -243,8 +243,8 @@ def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
     """Yield the data frames of a trace. Raises `InputError`."""
     if budget.file.suffix.lower() not in SUFFIXES:
         raise InputError(
-            f"{shown(budget.file)}: the suffix names the format of a CAN trace: "
-            f"{', '.join(sorted(SUFFIXES))}. Name it as what it is."
+            f"{shown(budget.file)}: unknown suffix. CAN traces end with "
+            f"{', '.join(sorted(SUFFIXES))}. Rename the file."
         )
     can = load_library(budget.file, "can")
     passes_over = logging.getLogger("can.io.blf")

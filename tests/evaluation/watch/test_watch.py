@@ -104,7 +104,7 @@ def test_what_cannot_be_shown_is_told(root_to_fail_in: Path, tmp_path: Path) -> 
     fleet = fleet_slip.open(root_to_fail_in)
     with pytest.raises(UsageError, match="shown as a page"):
         fleet.watch(DRIVE, "smoke", tmp_path / "film.mp4")
-    with pytest.raises(QuestionError, match="no drive of the logs, and no scenario"):
+    with pytest.raises(QuestionError, match="neither a drive nor a scenario"):
         fleet.watch("nobody's", "smoke", tmp_path / "page.html")
 
 

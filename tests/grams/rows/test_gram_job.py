@@ -145,7 +145,7 @@ def test_the_check_finds_a_gram_row_that_is_not_of_its_file(
     warehouse.grams.snapshot().commit(Change(add=[action]))
     with pytest.raises(
         StorageError,
-        match="the Gram of drive a by the kernel and by the stored Gram rows of signals differ",
+        match=r"the Gram row of drive a \(signals\) differs between the kernel and the stored",
     ):
         check_grams(warehouse, 1)
     assert DAY in rows["day"].to_pylist()

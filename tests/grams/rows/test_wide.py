@@ -226,7 +226,7 @@ def test_duckdb_takes_as_many_sums_of_a_group_as_a_statement_may_have() -> None:
     To report upstream: `SELECT sum(i + 0), …, sum(i + 11000) FROM range(9) t(i) GROUP BY i % 3`.
     """
     for name in ("gated", "course"):
-        with pytest.raises(QuestionError, match="have no SQL"):
+        with pytest.raises(QuestionError, match="SQL cannot compute"):
             gram_statement(name)
     sums = ", ".join(f"sum(i + {n})" for n in range(statement.MOST_SUMS))
     with duckdb.connect() as database:
@@ -239,7 +239,7 @@ def test_a_drive_that_goes_back_in_time_is_refused(warehouse: Warehouse) -> None
     at = table.schema.get_field_index("tick")
     ticks = pa.array([0, 1, 1, 2], pa.int32())
     land(warehouse, "one", table.set_column(at, "tick", ticks))
-    with pytest.raises(DataError, match=r"drive d: .*ticks of a drive do not rise"):
+    with pytest.raises(DataError, match=r"drive d: .*ticks of a drive do not increase"):
         update_grams(warehouse, feature_set="windows")
 
 
@@ -263,5 +263,5 @@ def test_the_label_is_no_column_to_look_back_on() -> None:
 
 
 def test_adhesion_is_no_fact() -> None:
-    with pytest.raises(ValueError, match="adhesion is no fact that a car knows"):
+    with pytest.raises(ValueError, match="adhesion is not a property of the car"):
         Fact(name="adhesion")
