@@ -81,14 +81,8 @@ class FeatureSet(Config):
             (self.of is None and not self.signals, "a set has signals, or is of another set"),
             (self.of is not None and not self.change_s, "a set of another has change_s"),
             (unknown, f"not input signals: {unknown}"),
-<<<<<<< HEAD
-            (len(set(self.columns)) < len(self.columns), "a column stands twice"),
-            (ticks and self.block_s, "a set with change_s does not divide rows"),
-=======
             (len(set(self.columns)) < len(self.columns), "a column appears twice"),
-            (ways > 1, "a set has regimes or block_s, not both"),
-            (ticks and ways, "a set with change_s does not divide rows"),
->>>>>>> 1deb8ed1 (Say in messages what a native engineer would write)
+            (ticks and self.block_s, "a set with change_s does not divide rows"),
             (ticks and not (self.windows or self.of), "a set with change_s has windows"),
             (self.as_logged and not ticks, "only a set with change_s is as_logged"),
             (out_of_range, f"change_s is at most {longest}"),

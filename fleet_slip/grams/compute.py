@@ -175,15 +175,9 @@ def gram_statement(
     one = known.feature_set(feature_set)
     if not has_statement(feature_set):
         raise QuestionError(
-<<<<<<< HEAD
-            f"the Gram rows of {feature_set} have no SQL: the compiled kernel alone computes "
+            f"SQL cannot compute the Gram rows of {feature_set}: only the compiled kernel has "
             "changes of the course, blocks of time, slopes and sets of many columns. Its columns: "
             "fleet-slip features --sql"
-=======
-            f"SQL cannot compute the Gram rows of {feature_set}: only the compiled kernel has "
-            "changes of the course, slopes and sets of many columns. Its columns: fleet-slip "
-            "features --sql"
->>>>>>> 1deb8ed1 (Say in messages what a native engineer would write)
         )
     names = one.columns
     windows = known.definitions(feature_set)

@@ -547,7 +547,11 @@ def judge(
         if comparison.better:
             comparison = compare_unseen(registry, selection, incumbents) or comparison
     except (DataError, QuestionError) as error:
-        problems.append(f"the champion {champion.reference} cannot be compared ({error})")
+        theirs, _, _ = champion.manifest.trained_on.feature_set.partition("-")
+        problems.append(
+            f"the champion {champion.reference} cannot be compared: {str(error).rstrip('.')} (its "
+            f"feature set is {theirs}; to compare on it: --features {theirs})"
+        )
         return Judgement(tuple(problems), "")
     if comparison.contradicted:
         problems.append(

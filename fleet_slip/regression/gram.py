@@ -189,11 +189,16 @@ def _mirrored(lower: Sequence[Sequence[int]]) -> list[list[int]]:
     return [[*row, *(below[i] for below in lower[i + 1 :])] for i, row in enumerate(lower)]
 
 
+NAMES_SHOWN = 4
+
+
 def require_signals(signals: Sequence[str], wanted: Sequence[str]) -> None:
     """Raise `DataError` for a wanted signal that is absent."""
     missing = [name for name in wanted if name not in signals]
     if missing:
-        raise DataError(f"these drives lack {' and '.join(missing)}.")
+        more = len(missing) - NAMES_SHOWN
+        *some, last = missing if more <= 1 else [*missing[:NAMES_SHOWN], f"{more} more"]
+        raise DataError(f"these drives lack {', '.join(some)}{' and ' if some else ''}{last}.")
 
 
 def positions(signals: Sequence[str], wanted: Sequence[str]) -> list[int]:

@@ -154,7 +154,8 @@ def test_publish_show_score_promote_and_roll_back(
     assert "worse than the champion" in worse.stderr
     other = run_command("publish", "smoke", "--nested", "ax")  # its columns are windows
     assert other.exit_code == 7
-    assert "cannot be compared" in other.stderr
+    assert "cannot be compared: these drives lack" in other.stderr
+    assert "to compare on it: --features windows" in other.stderr
     forced = run_command("publish", "slip", *alone, "--force", "--json").json
     assert (forced["version"], forced["new"]) == (2, True)
     assert run_command("show", "slip", "--json").json["version"] == 2

@@ -228,7 +228,7 @@ def test_a_set_without_its_line_has_no_rows(fleet: Fleet) -> None:
         update_grams(fleet.warehouse, feature_set="tiny")
     with pytest.raises(QuestionError, match="choose a model list"):
         fleet.cohort().select(features="tiny", model="ay")
-    with pytest.raises(QuestionError, match="no line 0123456789ab"):
+    with pytest.raises(QuestionError, match="the line 0123456789ab is not"):
         update_grams(fleet.warehouse, feature_set="tiny_0123456789ab")
 
 
@@ -250,5 +250,5 @@ def test_a_root_that_is_gone_does_not_fail_the_questions_of_another(
     with pytest.raises(StorageError, match="no credentials"):
         known_line("0123456789ab")
     look_for_lines(str(fleet.warehouse.root), fleet.warehouse.line)
-    with pytest.raises(QuestionError, match="no line 0123456789ab"):
+    with pytest.raises(QuestionError, match="the line 0123456789ab is not"):
         known_line("0123456789ab")

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression.gram import Gram, GramTable, exact_sum
+from fleet_slip.regression.gram import Gram, GramTable, exact_sum, require_signals
 from tests.support.counts import table_of
 
 SIGNALS = ("ax", "ay", "sideslip")
@@ -148,3 +148,12 @@ def test_a_table_checks_its_shapes() -> None:
     table = GramTable(("a",), n, np.ones((2, 1), dtype=np.int64), np.ones((2, 1), dtype=np.int64))
     with pytest.raises(ValueError, match="groups"):
         table.totals(np.array([0, 2]), 2)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "told"),
+    [("b", "lack b."), ("bc", "lack b and c."), ("bcdefgh", "lack b, c, d, e and 3 more.")],
+)
+def test_absent_signals_are_named_of_many_the_first(wanted: str, told: str) -> None:
+    with pytest.raises(DataError, match=f"{told}$".replace(".", r"\.")):
+        require_signals("a", wanted)
