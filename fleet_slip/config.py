@@ -167,7 +167,7 @@ def faults_of(error: ValidationError) -> str:
         reasons = wrong.setdefault(_key_of(fault), [])
         if (said := _said(fault)) not in reasons:
             reasons.append(said)
-    faults = [f"{key}: {', or '.join(reasons)}" for key, reasons in wrong.items()]
+    faults = [f"{key and f'{key}: '}{', or '.join(reasons)}" for key, reasons in wrong.items()]
     text = "; ".join(
         fault if len(fault) <= LONGEST_FAULT else fault[:LONGEST_FAULT] + "…"
         for fault in faults[:FAULTS_SHOWN]
@@ -185,7 +185,7 @@ def _key_of(fault: ErrorDetails) -> str:
         for number, part in enumerate(place)
         if number == unknown or isinstance(part, int) or not _TRIED.search(part)
     ]
-    return ".".join(map(str, keys)) or "file"
+    return ".".join(map(str, keys))
 
 
 def _said(fault: ErrorDetails) -> str:

@@ -103,7 +103,7 @@ def find_config(kind: str, name_or_path: str) -> Traversable:
         path = Path(name_or_path)
         if _is_file(path):
             return path
-        raise ConfigError(f"{path}: no such file. Give the path of a {kind} TOML file.")
+        raise ConfigError(f"{path}: no such file. Give the path of a TOML file.")
     file = config_file(f"{kind}/{name_or_path}.toml")
     if _is_file(file) or os.path.islink(str(file)):  # noqa: PTH114 - see `config_file`
         return file

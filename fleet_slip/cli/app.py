@@ -27,6 +27,7 @@ from fleet_slip.errors import (
     FleetSlipError,
     QueryGoesOnError,
     StorageError,
+    UsageError,
     is_lack_of_memory,
 )
 from fleet_slip.limits import memory_bytes
@@ -286,8 +287,19 @@ def _exit_code_of_app() -> int:
     except SystemExit as ended:
         if ended.code == INTERRUPTED:  # typer makes it of a KeyboardInterrupt
             return _end_interrupted(ended)
+        _explain_late_options(sys.argv[1:], ended.code)
         return ended.code if isinstance(ended.code, int) else 0
     return 0
+
+
+def _explain_late_options(given: list[str], code: object) -> None:
+    """Say where the options of all commands stand, if a command did not know them."""
+    early = "--root", "--config"
+    while given and given[0] in early:
+        given = given[2:]
+    late = [option for option in early if option in given]
+    if late and code == UsageError.exit_code:
+        say(f"{late[0]} stands before the command: fleet-slip {late[0]} … {given[0]} …")
 
 
 def _end_interrupted(error: BaseException | None) -> int:

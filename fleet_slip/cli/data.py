@@ -92,9 +92,7 @@ def ingest(
         raise UsageError("give files to ingest, or --undo to remove drives.")
     elif mapping is None:
         if others:
-            raise UsageError(
-                "give --mapping: without it, files must be tables of Gram rows (docs/export.md)."
-            )
+            raise UsageError("give --mapping: only tables of Gram rows (docs/export.md) have none.")
         counted = [fleet.ingest_counted(file) for file in files]
         if json:
             print_json(counted)

@@ -336,14 +336,12 @@ def _read(file: Path, content: bytes) -> pa.Table:
                 f"{file}: not a table of Gram rows, column {absent[0]} is missing. {_SEE}"
             )
         return in_schema(table, COLUMNS).combine_chunks()
-    except (pa.ArrowException, OSError, ValueError, IndexError) as error:
-        raise InputError(
-            f"{file}: cannot be read as a table of Gram rows: {error}. {_SEE}"
-        ) from None
+    except (pa.ArrowException, OSError, ValueError, IndexError):
+        raise InputError(f"{file}: not a table of Gram rows (docs/export.md). {_SEE}") from None
 
 
 _NOTE = {"job": "receive"}
-_SEE = "docs/export.md has its columns."
+_SEE = "If it is a log, give its --mapping, as drafted by: fleet-slip mapping suggest LOG"
 
 
 def _require_checksums(file: Path, content: bytes, metadata: pq.FileMetaData) -> int:

@@ -208,6 +208,8 @@ FORGED = (
         (["select", "--models", "table9"], 3, "Known: course, estimator, gated"),
         (["select", "--by", "vehicle"], 5, "at least two folds"),
         (["show", "nothing"], 5, "no model is called"),
+        (["show", "smoke", "--root", "mine"], 2, "--root stands before the command"),
+        (["ingest", __file__], 4, "fleet-slip mapping suggest LOG"),
         (["score", "smoke@9"], 5, "has no version"),
         (["promote", "nowhere", "--previous"], 5, "no model is called"),
         (["score", "smoke", "--cohort", "mass_kg > 9000"], 5, "no row of the cohort"),
