@@ -21,8 +21,13 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.vehicle.batch import LaneDrive, Road
 from fleet_slip.vehicle.driver import handling
-from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections
-from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters, load_vehicle
+from fleet_slip.vehicle.parameters import (
+    GRAVITY_MPS2,
+    PERFECT,
+    CarImperfections,
+    VehicleParameters,
+    load_vehicle,
+)
 from tests.support.linear_bicycle import LinearBicycle, Response, steer
 from tests.support.rolling import Truth, simulate_drives
 

@@ -6,8 +6,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from fleet_slip.config import Config, ConfigT, added
-from fleet_slip.vehicle.imperfections import CarImperfections
-from fleet_slip.vehicle.parameters import VehicleParameters
+from fleet_slip.vehicle.parameters import CarImperfections, VehicleParameters
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]

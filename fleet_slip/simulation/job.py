@@ -28,7 +28,7 @@ from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, road_with
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
 from fleet_slip.storage.table import Change, Snapshot, Unit, retry_conflicts, retrying
 from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
-from fleet_slip.vehicle.imperfections import PERFECT
+from fleet_slip.vehicle.parameters import PERFECT
 from fleet_slip.warehouse.forgotten import Audit, skipped_drives
 from fleet_slip.warehouse.tables import Warehouse
 

@@ -21,9 +21,16 @@ from fleet_slip.vehicle.batch_kernel import (
     ROUTE,
 )
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
-from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections, traits
 from fleet_slip.vehicle.integration import STEP_S
-from fleet_slip.vehicle.parameters import Controls, State, VehicleParameters, constants
+from fleet_slip.vehicle.parameters import (
+    PERFECT,
+    CarImperfections,
+    Controls,
+    State,
+    VehicleParameters,
+    constants,
+    traits,
+)
 
 # The road that a lane's driver follows, as the kernel looks it up.
 

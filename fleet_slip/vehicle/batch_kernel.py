@@ -27,7 +27,6 @@ from fleet_slip.vehicle.dynamics import (
     Around,
     Give,
     GiveRates,
-    Traits,
     front_wheels,
     imperfect_derivative,
 )
@@ -42,7 +41,7 @@ from fleet_slip.vehicle.integration import (
     advance_pose,
     pose_slopes,
 )
-from fleet_slip.vehicle.parameters import Constants, Controls, State
+from fleet_slip.vehicle.parameters import Constants, Controls, State, Traits
 from fleet_slip.vehicle.tyre import arctan2
 
 # Lanes in memory: what each carries, how a drive enters and leaves it, and the blocks it records.

@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 from fleet_slip.compiling import equation
-from fleet_slip.vehicle.parameters import Constants, Controls, State
+from fleet_slip.vehicle.parameters import Constants, Controls, State, Traits
 from fleet_slip.vehicle.tyre import CREEP_SPEED_MPS, TyreForce, brush_force
 
 SMALLEST_LOAD_N = 1.0
@@ -20,35 +20,6 @@ STICTION_RAD_S = 0.1
 
 SLOWEST_DRIVE_MPS = 1.0
 """Speed below which the engine's power no longer limits its force."""
-
-
-class Traits(NamedTuple):
-    """The imperfections of a car as its equations take them, in SI units."""
-
-    half_lash: float
-    compliance: float
-    """Tangent of the road wheels' angle lost per lateral force of the front axle."""
-    toe: float
-    """Tangent of the front wheels' toe-in."""
-    rear_left: float
-    """Tangent of the rear left wheel's angle."""
-    rear_right: float
-    radius_fl: float
-    """At the load at rest."""
-    radius_fr: float
-    radius_rl: float
-    radius_rr: float
-    radius_loss: float
-    relaxes: float
-    """1 where the tyres have a relaxation length, else 0."""
-    inverse_relaxation: float
-    cold_stiffness: float
-    cooling: float
-    """Share of the cold tyres' excess of stiffness that is left after a sample."""
-    wind_force: float
-    """Lateral acceleration per speed and cross-wind, in 1/m."""
-    wind_moment: float
-    """Yaw acceleration per speed and cross-wind, in 1/m²."""
 
 
 class Around(NamedTuple):

@@ -8,8 +8,8 @@ its heading a unit vector: no search, no angle.
 from typing import NamedTuple
 
 from fleet_slip.compiling import equation
-from fleet_slip.vehicle.dynamics import Derivative, Give, GiveRates, Traits, WheelRate
-from fleet_slip.vehicle.parameters import Constants, State
+from fleet_slip.vehicle.dynamics import Derivative, Give, GiveRates, WheelRate
+from fleet_slip.vehicle.parameters import Constants, State, Traits
 
 STEP_S = 0.002
 

@@ -14,7 +14,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
 from fleet_slip.simulation.sensors import Delay, Distortion, Gps, LowPass, Pulses, Sensors, Wander
 from fleet_slip.vehicle.batch_kernel import CHANNELS
-from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections
+from fleet_slip.vehicle.parameters import PERFECT, CarImperfections
 from tests.support.measuring import measure, quantise
 
 TICKS = 200_000

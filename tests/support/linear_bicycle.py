@@ -9,7 +9,6 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.vehicle.driver import SAMPLE_S, SPEED_GAIN_1PS
 from fleet_slip.vehicle.dynamics import NO_BRAKES, Around, Give, GiveRates, imperfect_derivative
-from fleet_slip.vehicle.imperfections import CarImperfections, traits
 from fleet_slip.vehicle.integration import (
     FIRST_ORDER,
     SECOND_ORDER,
@@ -20,10 +19,12 @@ from fleet_slip.vehicle.integration import (
 )
 from fleet_slip.vehicle.parameters import (
     GRAVITY_MPS2,
+    CarImperfections,
     Controls,
     State,
     VehicleParameters,
     constants,
+    traits,
 )
 from fleet_slip.vehicle.tyre import cornering_stiffness
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections
-from fleet_slip.vehicle.parameters import constants, load_vehicle
+from fleet_slip.vehicle.parameters import PERFECT, CarImperfections, constants, load_vehicle
 from fleet_slip.vehicle.tyre import cornering_stiffness
 from tests.support.linear_bicycle import LinearBicycle, steer
 

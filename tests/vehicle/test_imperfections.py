@@ -6,9 +6,8 @@ import pytest
 from fleet_slip.vehicle.batch import LaneDrive, Road, Surface
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
 from fleet_slip.vehicle.dynamics import Give, GiveRates
-from fleet_slip.vehicle.imperfections import PERFECT, CarImperfections, traits
 from fleet_slip.vehicle.integration import SECOND_ORDER, advance_give
-from fleet_slip.vehicle.parameters import GRAVITY_MPS2, constants
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2, PERFECT, CarImperfections, constants, traits
 from tests.support.rolling import SEDAN, Truth, simulate_drives
 
 RIGID = Give(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
