@@ -19,7 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 import fleet_slip
-from fleet_slip.cli.early_exit import leave
+from fleet_slip.cli.main import leave
 from fleet_slip.cli.output import say
 from fleet_slip.cli.streams import Streams, configure_remarks
 from fleet_slip.errors import (

@@ -1,11 +1,19 @@
 """The program `fleet-slip`. It looks whether it can run here before anything large is imported."""
 
+import contextlib
+import os
 import signal
 import sys
+from typing import Any
 
-from fleet_slip.cli.early_exit import leave, tell
-from fleet_slip.errors import FleetSlipError, StorageError, is_lack_of_memory
+from fleet_slip.errors import INTERRUPTED, FleetSlipError, StorageError, is_lack_of_memory
 from fleet_slip.limits import memory_bytes, require_limits
+
+
+def leave(_signal: int, _frame: Any) -> None:
+    """End at once: what answers Ctrl-C while modules are imported, which not all survive."""
+    _tell("interrupted: nothing was done yet.")
+    os._exit(INTERRUPTED)
 
 
 def main() -> None:
@@ -16,12 +24,18 @@ def main() -> None:
         require_limits()
         from fleet_slip.cli.app import run_app  # noqa: PLC0415 - see above
     except FleetSlipError as error:
-        tell(f"error: {error}")
+        _tell(f"error: {error}")
         sys.exit(error.exit_code)
     except (ImportError, OSError, MemoryError) as error:
         if not is_lack_of_memory(error):
             raise
         allowed = f"this process may have {memory_bytes() // 2**20:,} MiB for data"
-        tell(f"error: out of memory before anything was done: {allowed}. Give it more.")
+        _tell(f"error: out of memory before anything was done: {allowed}. Give it more.")
         sys.exit(StorageError.exit_code)
     sys.exit(run_app())
+
+
+def _tell(text: str) -> None:
+    """Print a remark on stderr, by Python alone."""
+    with contextlib.suppress(OSError):
+        os.write(2, f"{text}\n".encode())
