@@ -221,9 +221,7 @@ class CarMeasures(TypedDict, total=False):
 class NightRequest:
     """What `Fleet.nightly` takes."""
 
-    landing: Annotated[
-        Path | str, Doc("Inbox folder of logs, or s3://…; new logs in it are loaded.")
-    ]
+    landing: Annotated[Path | str, Doc("Inbox folder of logs; new logs in it are loaded.")]
     mapping: Annotated[
         str,
         Doc("A mapping: of configs/mappings, or a TOML file."),

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from fleet_slip.grams.job import GramReport
     from fleet_slip.grams.on_board import CountedReport
     from fleet_slip.ingest.load import IngestReport, Preview
-    from fleet_slip.ingest.log_files import Log
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.ingest.recordings import Replace
     from fleet_slip.operations.night import NightReport
@@ -152,7 +151,7 @@ class Fleet(HealthAndUpkeep):
 
         `mapping` is a name, the path of a TOML file, or a `Mapping`. Rows that cannot be used go to
         the view `quarantine`. Of folders, at any depth, and patterns, the logs are taken that have
-        not landed unchanged. Objects are given as URLs.
+        not landed unchanged.
         Returns a report of each file read, in order; `each` gets it once the file is committed.
         Progress is in files.
         Without a cluster, threads read a folder's small files; large ones are read one by one, by
@@ -176,7 +175,7 @@ class Fleet(HealthAndUpkeep):
         with open_workers(self.root, workers) as executor, step("ingest") as figures:
             elsewhere = unless_local(executor)
             if elsewhere:  # a worker has a working directory of its own
-                logs = [one.absolute() if isinstance(one, Path) else one for one in logs]
+                logs = [one.absolute() for one in logs]
             figures.rows = 0
             warehouse = within_reach(self.warehouse, executor)
             threads = executor if folders else elsewhere
@@ -455,7 +454,7 @@ class Fleet(HealthAndUpkeep):
 
 def _chosen_logs(
     files: Iterable[Path | str] | Path | str, mapping: "str | Mapping"
-) -> "tuple[Mapping, list[Log], bool]":
+) -> "tuple[Mapping, list[Path], bool]":
     """Return a mapping, the logs that are meant, and whether these are in folders or patterns."""
     from fleet_slip.ingest.log_files import find_logs, names_several
     from fleet_slip.ingest.mapping import load_mapping

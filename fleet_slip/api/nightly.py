@@ -12,7 +12,7 @@ from fleet_slip.api.calls import NightRequest, of_step
 from fleet_slip.api.session import Training
 from fleet_slip.base import date_of, number_of
 from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError
-from fleet_slip.ingest.log_files import find_logs, is_url
+from fleet_slip.ingest.log_files import find_logs
 from fleet_slip.models.registry import CANDIDATE, ModelVersion
 from fleet_slip.operations.night import Beginning, NightReport, Nights, NightStep, State
 from fleet_slip.storage.runs import step
@@ -157,7 +157,7 @@ class Night:
 
         mapping = load_mapping(self.asked.mapping)
         landing = self.asked.landing
-        if not is_url(landing) and not Path(landing).is_dir():
+        if not Path(landing).is_dir():
             raise InputError(
                 f"{landing}: no such folder. Name the inbox folder for logs, or mount it."
             )

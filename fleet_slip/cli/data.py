@@ -38,7 +38,7 @@ def ingest(
         list[str] | None,
         typer.Argument(
             help="Measured logs (CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, TDMS, VBO), or "
-            "folders of them, of which what is new is taken; also s3://, gs:// and az://.",
+            "folders of them, of which what is new is taken.",
             show_default=False,
         ),
     ] = None,
@@ -193,9 +193,7 @@ def _show_previews(previews: "list[Preview]", json: bool) -> None:
 
 def mapping(
     _action: Annotated[Literal["suggest"], typer.Argument(metavar="suggest", show_default=False)],
-    file: Annotated[
-        str, typer.Argument(help="A measured log; also s3://, gs:// and az://.", show_default=False)
-    ],
+    file: Annotated[str, typer.Argument(help="A measured log.", show_default=False)],
     output: Annotated[
         Path | None, typer.Option(help="Write the draft to this file instead of printing it.")
     ] = None,
@@ -247,13 +245,12 @@ def _draft(file: str, can: Path | None) -> "tuple[Draft, str]":
     """Return what a log suggests, and that as a mapping."""
     from fleet_slip.ingest.draft import draft_mapping, name_of, write_draft  # noqa: PLC0415 - takes a while
     from fleet_slip.ingest.formats.can import CanBus, read_can_database  # noqa: PLC0415
-    from fleet_slip.ingest.log_files import find_logs, local_copy  # noqa: PLC0415
+    from fleet_slip.ingest.log_files import find_logs  # noqa: PLC0415
     from fleet_slip.ingest.profile import profile_file  # noqa: PLC0415
 
     bus = read_can_database(CanBus(database=str(can.absolute())), can.parent) if can else None
     logs = find_logs([file])
     if len(logs) > 1:
         raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
-    with local_copy(logs[0]) as copy:
-        draft = draft_mapping(copy, profile_file(copy, bus))
-        return draft, write_draft(draft, name_of(copy.stem), file)
+    draft = draft_mapping(logs[0], profile_file(logs[0], bus))
+    return draft, write_draft(draft, name_of(logs[0].stem))

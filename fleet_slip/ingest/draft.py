@@ -135,12 +135,9 @@ def name_of(stem: str) -> str:
     return (plain if plain[:1].isalpha() else f"log_{plain}")[:41]
 
 
-def write_draft(draft: Draft, name: str, place: Path | str | None = None) -> str:
-    """Return a mapping in TOML. It lacks what the file does not contain: the day, the car.
-
-    `place` is what a person calls the file, if that is not where it was read.
-    """
-    called = shlex.quote(shown(str(place or draft.file)))
+def write_draft(draft: Draft, name: str) -> str:
+    """Return a mapping in TOML. It lacks what the file does not contain: the day, the car."""
+    called = shlex.quote(shown(draft.file))
     parts = [_HEAD.format(file=called), f"name = {_value(name)}\n"]
     formats = draft.profile.formats
     if draft.profile.missing:

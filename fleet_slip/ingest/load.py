@@ -10,6 +10,7 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, pairwise
+from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -25,7 +26,6 @@ from fleet_slip.catalogue.signals import as_arrow, catalogue
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConflictError, InputError, RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive, drive_id
-from fleet_slip.ingest.log_files import Log, local_copies, local_copy
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.recordings import (
     FILES,
@@ -61,7 +61,7 @@ FAILURES_SHOWN = 5
 class AskedFile(NamedTuple):
     """A file to ingest, and the digest of what this very path had when it was ingested before."""
 
-    file: Log
+    file: Path
     earlier: str | None = None
 
 
@@ -149,7 +149,7 @@ class WrittenFile:
         replaced: those that give way to it.
     """
 
-    log: Log
+    log: Path
     digest: str
     report: IngestReport
     fingerprints: dict[str, int] = field(default_factory=dict)
@@ -181,7 +181,7 @@ class WrittenBatch:
 
 def ingest_files(
     warehouse: Warehouse,
-    files: Iterable[Log],
+    files: Iterable[Path],
     mapping: Mapping,
     executor: Executor | None = None,
     known: KnownFiles | None = None,
@@ -287,12 +287,11 @@ def write_batch(
     failures: list[InputError] = []
     written: list[WrittenFile] = []
     longest: list[tuple[_Judged, MeasuredDrive | None]] = []
-    copies = local_copies(asked.file for asked in files)
-    with copies as open_copy, ThreadPoolExecutor(WRITERS) as writers:
+    with ThreadPoolExecutor(WRITERS) as writers:
         batch = _Writer(warehouse, mapping, files, writers, replace)
         for asked in files:
             try:
-                with open_copy(asked.file) as file, open_measured(file, mapping) as stream:
+                with open_measured(asked.file, mapping) as stream:
                     one = batch.write(stream, asked)
             except BaseException as error:
                 for data in batch.data.values():
@@ -411,7 +410,7 @@ def _rows_of(drives: Iterable[MeasuredDrive]) -> int:
 # What would become of files: they are read as above, and nothing is written.
 
 
-def preview_logs(logs: Iterable[Log], mapping: Mapping) -> list[Preview]:
+def preview_logs(logs: Iterable[Path], mapping: Mapping) -> list[Preview]:
     """Read logs as `ingest_files` does, with the same verdict; store nothing.
 
     Raises `InputError`.
@@ -424,11 +423,11 @@ def preview_logs(logs: Iterable[Log], mapping: Mapping) -> list[Preview]:
     return previews
 
 
-def preview_log(log: Log, mapping: Mapping) -> tuple[Preview, MeasuredDrive | None]:
+def preview_log(log: Path, mapping: Mapping) -> tuple[Preview, MeasuredDrive | None]:
     """Return what would become of a log, and its longest drive. Raises `InputError`."""
     ends: dict[str, list[int]] = {name: [] for name in mapping.signal_names}
     values: Counter[str] = Counter()
-    with local_copy(log) as file, open_measured(file, mapping) as stream:
+    with open_measured(log, mapping) as stream:
         for drive in stream.drives():
             for name, counts in drive.counts.items():
                 values[name] += len(counts) - counts.null_count

@@ -18,10 +18,8 @@ import pyarrow.compute as pc
 from fleet_slip.base import number_of, shown
 from fleet_slip.errors import RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive
-from fleet_slip.ingest.log_files import Log
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.resources import cache_folder, keep_json
-from fleet_slip.storage.folder import StoredFile
 from fleet_slip.storage.table import WITHDRAWN, Change, Snapshot, Table, Unit, retry_conflicts
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse, connect_tables
@@ -179,12 +177,11 @@ def digest_of(digests: Sequence[str]) -> str:
 class KnownFiles:
     """Which content the files of this machine had when they were ingested through a mapping.
 
-    `digests` has size, time of change (of an object, the store's version) and digest by path or
-    URL.
+    `digests` has size, time of change and digest by path.
     """
 
     cache: Path
-    digests: dict[str, tuple[int, int | str, str]] = field(default_factory=dict)
+    digests: dict[str, tuple[int, int, str]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, warehouse: Warehouse, mapping: Mapping) -> "KnownFiles":
@@ -193,25 +190,25 @@ class KnownFiles:
         cache = cache_folder("ingested") / f"{about[:32]}.json"
         with suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
             files = json.loads(cache.read_bytes())["files"]
-            return cls(cache, {path: (int(s), t, str(d)) for path, (s, t, d) in files.items()})
+            return cls(cache, {path: (int(s), int(t), str(d)) for path, (s, t, d) in files.items()})
         return cls(cache)
 
-    def without_landed(self, files: Iterable[Log], warehouse: Warehouse) -> list[Log]:
+    def without_landed(self, files: Iterable[Path], warehouse: Warehouse) -> list[Path]:
         """Return the files that are not in the logs, as far as size and time of change show."""
         landed = warehouse.logs.snapshot().landed_among(len(self.digests))
 
-        def is_there(file: Log) -> bool:
+        def is_there(file: Path) -> bool:
             known = self.digests.get(_name_of(file))
             return known is not None and _state_of(file) == known[:2] and landed(FILES + known[2])
 
         return [file for file in files if not is_there(file)]
 
-    def digest_of(self, file: Log) -> str | None:
+    def digest_of(self, file: Path) -> str | None:
         """Return the digest of what a path had when it was ingested, None if it never was."""
         known = self.digests.get(_name_of(file))
         return None if known is None else known[2]
 
-    def remember(self, file: Log, digest: str) -> None:
+    def remember(self, file: Path, digest: str) -> None:
         """Keep in mind that a file is in the logs."""
         if state := _state_of(file):
             self.digests[_name_of(file)] = (*state, digest)
@@ -221,21 +218,19 @@ class KnownFiles:
         keep_json(self.cache, {"files": self.digests})
 
 
-def _name_of(log: Log) -> str:
-    return os.path.abspath(log) if isinstance(log, Path) else str(log)  # noqa: PTH100 - the faster
+def _name_of(log: Path) -> str:
+    return os.path.abspath(log)  # noqa: PTH100 - the faster
 
 
-def _state_of(log: Log) -> tuple[int, int | str] | None:
+def _state_of(log: Path) -> tuple[int, int] | None:
     """Return size and what changes when the content does; None if that is not known."""
-    if isinstance(log, StoredFile):
-        return log.size_bytes, log.identity
     with suppress(OSError):  # whoever reads it says what is wrong
         found = log.stat()
         return found.st_size, found.st_mtime_ns
     return None
 
 
-def size_of(log: Log) -> int:
+def size_of(log: Path) -> int:
     """Return the bytes of a log, 0 if that is not known."""
     return (_state_of(log) or (0, 0))[0]
 
@@ -254,11 +249,11 @@ class SameRecordings:
         self._mapping, self._replace = mapping, replace
         self._logs_have: Fingerprints | None = None
         self._batch: dict[str, int] = {}
-        self._files: dict[str, Log] = {}
+        self._files: dict[str, Path] = {}
 
     def find(
         self,
-        log: Log,
+        log: Path,
         digest: str,
         fingerprints: Named[str, int],
         name: str,

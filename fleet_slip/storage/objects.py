@@ -11,7 +11,7 @@ import os
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -78,16 +78,15 @@ KEPT_BYTES = 2**27
 """Of the objects that were fetched last, so many bytes are kept."""
 
 
-def fetch_parts(store: "ObjectStore", key: str, where: str) -> Iterator[tuple[Any, bytes]]:
-    """Yield an object's parts in order, each with what the store says of it.
+def _bytes_of(store: "ObjectStore", key: str, where: str) -> bytes:
+    """Return an object, which `where` names in errors.
 
-    The library goes on where an answer breaks off, if the object is still the same. `where` names
-    it in errors. Raises `StorageError`, as when nothing comes for `TIMEOUT_S`.
+    The library goes on where an answer breaks off, if the object is still the same. Raises
+    `StorageError`, as when nothing comes for `TIMEOUT_S`.
     """
     with object_errors(where):
-        answer = obstore.get(store, key)
-        for part in answer.stream(min_chunk_size=PART_BYTES):
-            yield answer.meta, bytes(part)
+        parts = obstore.get(store, key).stream(min_chunk_size=PART_BYTES)
+        return b"".join(bytes(part) for part in parts)
 
 
 def _fetch(store: "ObjectStore", key: str, where: str) -> bytes:
@@ -95,7 +94,7 @@ def _fetch(store: "ObjectStore", key: str, where: str) -> bytes:
     with _fetching:
         if where in _fetched:
             return _fetched[where]
-    content = b"".join(part for _, part in fetch_parts(store, key, where))
+    content = _bytes_of(store, key, where)
     require_content(key, content, where)
     with _fetching:
         _fetched[where] = content
@@ -200,8 +199,7 @@ class ObjectFolder(Folder):
         return sorted(found, key=lambda file: file.path)
 
     def read(self, path: str) -> bytes:
-        parts = fetch_parts(self._store, self._key(path), f"{self}/{path}")
-        return b"".join(part for _, part in parts)
+        return _bytes_of(self._store, self._key(path), f"{self}/{path}")
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
         """Return the content of files, None for one that is gone. Many are asked for at once."""

@@ -14,8 +14,8 @@ import fleet_slip
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import load
 from fleet_slip.ingest.load import write_batch
+from fleet_slip.ingest.log_files import find_logs
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.object_inputs import parse_url
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.tables import Warehouse
@@ -234,7 +234,6 @@ def test_a_data_root_is_no_folder_of_logs(folder: Path, inside: str) -> None:
         ingest(folder, folder.parent / "root" / inside)
 
 
-@pytest.mark.parametrize("url", ["s3://bucket/ok/../ok/f.csv", "gs://bucket/./f.csv"])
-def test_dots_in_a_bucket_are_told(url: str) -> None:
-    with pytest.raises(InputError, match=r"has no folder '\.' or '\.\.'"):
-        parse_url(url)
+def test_logs_of_an_object_store_are_to_be_copied_first() -> None:
+    with pytest.raises(InputError, match="aws s3 sync"):
+        find_logs(["s3://fleet-logs/inbox"])

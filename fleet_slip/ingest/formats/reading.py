@@ -40,6 +40,7 @@ from fleet_slip.ingest.formats.csv import (
 )
 from fleet_slip.ingest.formats.source import Budget, Channel, Source, unreadable
 from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, open_parquet
+from fleet_slip.ingest.log_files import StrayLink
 
 [_HDF5], _HDF5_AT = FORMATS["mat73"].begins, 512
 """A MATLAB file of version 7.3 becomes HDF5 there: MATLAB's own header is before it."""
@@ -72,7 +73,12 @@ class FileFormats:
 
 @contextmanager
 def require_unchanged_log(log: Path) -> Iterator[None]:
-    """Raise `InputError` if a log is no regular file, or changes while it is read."""
+    """Raise `InputError` if a log is no regular file of its folder, or changes while it is read."""
+    if isinstance(log, StrayLink):
+        raise InputError(
+            f"{shown(log)}: a symbolic link out of its folder, not followed. Give the file by its "
+            "own path."
+        )
     if not log.is_file():
         what = "is not a regular file" if log.exists() else "no such file"
         raise InputError(f"{shown(log)}: {what}. Give the path of a file.")
