@@ -19,7 +19,6 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 import fleet_slip
-from fleet_slip.cli.main import leave
 from fleet_slip.cli.output import say
 from fleet_slip.cli.streams import Streams, configure_remarks
 from fleet_slip.errors import (
@@ -266,7 +265,7 @@ def run_app() -> int:
 
 def _exit_code_of_app() -> int:
     try:
-        if signal.getsignal(signal.SIGINT) is leave:
+        if callable(signal.getsignal(signal.SIGINT)):  # not that of the start any more
             signal.signal(signal.SIGINT, signal.default_int_handler)
         app()
     except FleetSlipError as error:

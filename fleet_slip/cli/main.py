@@ -10,7 +10,7 @@ from fleet_slip.errors import INTERRUPTED, FleetSlipError, StorageError, is_lack
 from fleet_slip.limits import memory_bytes, require_limits
 
 
-def leave(_signal: int, _frame: Any) -> None:
+def _leave(_signal: int, _frame: Any) -> None:
     """End at once: what answers Ctrl-C while modules are imported, which not all survive."""
     _tell("interrupted: nothing was done yet.")
     os._exit(INTERRUPTED)
@@ -19,7 +19,7 @@ def leave(_signal: int, _frame: Any) -> None:
 def main() -> None:
     """Run the command line, and end with its exit code."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, leave)
+        signal.signal(signal.SIGINT, _leave)
     try:
         require_limits()
         from fleet_slip.cli.app import run_app  # noqa: PLC0415 - see above
