@@ -214,19 +214,6 @@ class Fleet(HealthAndUpkeep):
             figures.rows = report.rows if report.new else 0
         return report
 
-    @record_call
-    def take_back(self, what: str) -> int:
-        """Take out what was ingested from a file or through a mapping; return how many drives.
-
-        `what` is the name of either, or what a file's drives begin with, such as
-        `logger-0123456789ab`. Gram rows and refused rows go too; all can land again. Raises
-        `StorageError` and `ConflictError`.
-        """
-        from fleet_slip.operations.rewriting import take_back
-
-        with step("undo"):
-            return take_back(self.warehouse, what)
-
     def preview(
         self, files: Iterable[Path | str] | Path | str, mapping: "str | Mapping"
     ) -> "list[Preview]":

@@ -35,13 +35,13 @@ def simulate() -> None:
 def ingest(
     fleet: Fleet,
     files: Annotated[
-        list[str] | None,
+        list[str],
         typer.Argument(
             help="Measured logs (CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, TDMS, VBO), or "
             "folders of them, of which what is new is taken.",
             show_default=False,
         ),
-    ] = None,
+    ],
     mapping: Annotated[
         str | None,
         typer.Option(
@@ -62,14 +62,6 @@ def ingest(
             help="Drives of the same recordings give way, as after a correction of the mapping.",
         ),
     ] = False,
-    undo: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE|MAPPING",
-            help="Take out what came from a file or through a mapping, by its name, and no more.",
-            show_default=False,
-        ),
-    ] = None,
     cluster: Cluster = None,
     json: Json = False,
 ) -> None:
@@ -83,15 +75,8 @@ def ingest(
     """
     from fleet_slip.ingest.log_files import names_several  # noqa: PLC0415 - takes a while
 
-    others = dry_run or replace
-    if undo is not None:
-        if files or mapping or others:
-            raise UsageError("--undo only removes drives: give it alone.")
-        _take_back(fleet, undo, json)
-    elif not files:
-        raise UsageError("give files to ingest, or --undo to remove drives.")
-    elif mapping is None:
-        if others:
+    if mapping is None:
+        if dry_run or replace:
             raise UsageError("give --mapping: only tables of Gram rows (docs/export.md) have none.")
         counted = [fleet.ingest_counted(file) for file in files]
         if json:
@@ -137,23 +122,6 @@ def _require_sound(reports: "list[IngestReport]") -> None:
                 f"{report.file}: {one} Its rows are stored. Correct the mapping and repeat the "
                 "command with --replace."
             )
-
-
-def _take_back(fleet: Fleet, what: str, json: bool) -> None:
-    """Take out what came from a file or through a mapping, and say how many drives."""
-    drives = fleet.take_back(what)
-    if json:
-        print_json({"drives_taken_out": drives})
-    elif not drives:
-        say(
-            f"nothing to undo: no drive came from a file or through a mapping named {what!r}. "
-            'See: fleet-slip sql "SELECT drive_id, source_file FROM drives"'
-        )
-    else:
-        say(
-            f"{number_of(drives, 'drive')} removed with their Gram rows; to load them again, "
-            "ingest their files again"
-        )
 
 
 def _ingested(what: str, reports: "Sequence[IngestReport]") -> str:

@@ -292,7 +292,7 @@ class SameRecordings:
             such = drives[0] if len(drives) == 1 else f"{more}, {drives[0]} …"
             raise RepeatedError(
                 f"{shown(log)}: {what} and would count twice: {such} from {source}. To replace "
-                f"the old one: --replace. To remove it: fleet-slip ingest --undo {source}"
+                f"the old one: --replace. To remove it: fleet-slip forget --drive {drives[0]}"
             )
         self._batch.update(fingerprints)
         self._files[Origin.of(digest).digest] = log

@@ -9,7 +9,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from datetime import date
 from decimal import Decimal
-from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -22,10 +21,10 @@ from deltalake.transaction import AddAction
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.errors import ConflictError, FleetSlipError
+from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.gram_files import is_received, read_rows, rows_of_set, write_rows
 from fleet_slip.grams.job import land_ahead, reconcile
-from fleet_slip.ingest.recordings import MEASURED, Fingerprints, Origin, TableName, is_from
+from fleet_slip.ingest.recordings import Fingerprints, Origin, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.table import (
@@ -41,7 +40,7 @@ from fleet_slip.storage.table import (
     scales_of,
 )
 from fleet_slip.warehouse.forgotten import Forgettable
-from fleet_slip.warehouse.tables import Warehouse, connect_tables
+from fleet_slip.warehouse.tables import Warehouse
 
 
 @dataclass(frozen=True)
@@ -243,39 +242,6 @@ def drives_in(warehouse: Warehouse, logs: Snapshot) -> dict[str, set[str]]:
         file.path: found.get(file.path) or set(logs.table.read_names(file.path)["drive_id"].used)
         for file in logs.files
     }
-
-
-@retrying
-def take_back(warehouse: Warehouse, what: str) -> int:
-    """Take out what was ingested from a file, or through a mapping; return how many drives.
-
-    `what` names either, or begins the names of a file's drives. All of it goes that is there at the
-    commit, whoever replaces it meanwhile.
-    """
-    logs = warehouse.logs.snapshot()
-    drives = _drives_called(warehouse, what)
-    if warehouse.logs.snapshot().version != logs.version:
-        raise ConflictError(f"{warehouse.root}: the logs keep changing. Run it again.")
-    origins = {origin.file for drive in drives if (origin := Origin.of_drive(drive))}
-    refused = warehouse.quarantine.snapshot()
-    changes: dict[TableName, Snapshot] = {"quarantine": refused, "logs": logs}
-    for name, snapshot in changes.items() if drives else ():
-        gone = take_out(warehouse, name, snapshot, origins)
-        if gone.remove or gone.units:
-            change = Change(gone.add, gone.remove, gone.units, {"job": "undo"})
-            snapshot.commit_or_discard(change)
-    return len(drives)
-
-
-def _drives_called(warehouse: Warehouse, what: str) -> list[str]:
-    query = (
-        "SELECT drive_id FROM drives WHERE regexp_matches(drive_id, $measured) AND (source_file = "
-        "$file OR starts_with(drive_id, $what || '-') OR regexp_replace(drive_id, $measured, '') "
-        "= $what) ORDER BY ALL"
-    )
-    given = {"measured": MEASURED, "file": PurePath(what).name, "what": what}
-    with connect_tables(warehouse, query) as database:
-        return [drive for (drive,) in database.execute(query, given).fetchall()]
 
 
 # Turns small log files of a day into large ones.

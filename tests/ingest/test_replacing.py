@@ -127,28 +127,6 @@ def test_copies_that_come_together_are_told(tmp_path: Path) -> None:
     assert drives(fleet).keys() == {"a.csv", "c.csv"}
 
 
-def test_what_was_taken_in_can_be_taken_back(fleet: Fleet, tmp_path: Path) -> None:
-    before = drives(fleet)
-    assert fleet.take_back("monday.csv") == 1
-    assert drives(fleet).keys() == {"b.csv"}
-    assert fleet.sql("SELECT count(*) FROM quarantine").fetchall() == [(1,)]
-    assert fleet.take_back("monday.csv") == 0
-    assert fleet.ingest(tmp_path / "monday.csv", a_mapping())[0].new
-    assert drives(fleet) == before
-    assert fleet.take_back("test") == 2
-    assert drives(fleet) == {}
-    assert not fleet.verify(full=True).damage
-
-
-def test_a_folder_takes_in_again_what_was_taken_back(tmp_path: Path) -> None:
-    fleet = fleet_slip.open(tmp_path / "data")
-    write(tmp_path / "landing" / "a.csv", recording())
-    fleet.ingest(tmp_path / "landing", a_mapping())
-    assert fleet.ingest(tmp_path / "landing", a_mapping()) == []
-    fleet.take_back("a.csv")
-    assert [report.new for report in fleet.ingest(tmp_path / "landing", a_mapping())] == [True]
-
-
 def test_a_file_that_has_changed_replaces_what_it_had(tmp_path: Path) -> None:
     fleet = fleet_slip.open(tmp_path / "data")
     file = write(tmp_path / "landing" / "a.csv", recording())

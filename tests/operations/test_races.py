@@ -301,13 +301,11 @@ def test_the_command_says_what_may_be_left_and_finishes_when_it_is_repeated(
 
 
 LAPS = {"column": "car", "vehicle_id": "car-of-mine"}
-TAKING_AWAY: dict[str, Callable[[Fleet], int]] = {
-    "undo": lambda fleet: fleet.take_back("log.csv"),
-    "forget": lambda fleet: sum(
-        fleet.forget(drive=drive, now=True).drives
-        for (drive,) in fleet.sql("SELECT drive_id FROM drives").fetchall()
-    ),
-}
+
+
+def forget_all(fleet: Fleet) -> int:
+    drives = fleet.sql("SELECT drive_id FROM drives").fetchall()
+    return sum(fleet.forget(drive=drive, now=True).drives for (drive,) in drives)
 
 
 def corrected() -> Mapping:
@@ -327,38 +325,20 @@ def laps(tmp_path: Path) -> Fleet:
     return fleet
 
 
-@pytest.mark.parametrize("table", ["quarantine", "logs"])
-def test_what_replaced_a_file_meanwhile_goes_with_it(
-    laps: Fleet, table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_what_is_forgotten_while_it_is_replaced_is_not_doubled(
+    laps: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def replace() -> None:
-        laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
-
-    just_before_its_commit(monkeypatch, replace, table)
-    assert TAKING_AWAY["undo"](laps) >= 2
-    assert names_in(laps) == set()
-    assert laps.sql("SELECT count(*) FROM quarantine").fetchall() == [(0,)]
-    assert not laps.verify(full=True).damage
-
-
-@pytest.mark.parametrize("way", TAKING_AWAY)
-def test_what_is_taken_away_while_it_is_replaced_is_not_doubled(
-    laps: Fleet, way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is as if it had been taken away before: what was undone lands, not what is forgotten."""
-    just_before_its_commit(monkeypatch, lambda: TAKING_AWAY[way](laps))
+    just_before_its_commit(monkeypatch, lambda: forget_all(laps))
     laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
     found = laps.sql("SELECT drive_name, count(DISTINCT drive_id) FROM log GROUP BY ALL").fetchall()
     assert all(many == 1 for _, many in found)
-    assert names_in(laps) >= ({"slalom"} if way == "undo" else set())
     assert not laps.verify(full=True).damage
 
 
-@pytest.mark.parametrize("way", TAKING_AWAY)
-def test_what_was_superseded_is_no_drive(laps: Fleet, way: str, tmp_path: Path) -> None:
+def test_what_was_superseded_is_no_drive(laps: Fleet, tmp_path: Path) -> None:
     laps.gram()
     laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
-    assert TAKING_AWAY[way](laps) == 2
+    assert forget_all(laps) == 2
     assert names_in(laps) == set()
 
 
