@@ -5,7 +5,7 @@ take the road for dry and the load for the usual one. `ekf_told` knows the very 
 The tuned ones have the parameters that suit drives which the regression was trained on best.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
@@ -278,46 +278,23 @@ def filter_bank(
 
     A filter that the drives lack something for is not tuned, and a remark says so.
     """
+    found = drives.kept_or_tuned(car, executor)
+    for failing in found["failing"]:
+        LOGGER.warning("%s", failing)
+    cars = {model: Identified.load(one) for model, one in found["cars"].items()}
     bank: Bank = {}
-    cars = _identified_cars(drives, executor)
     if cars:
         identified = IdentifiedEstimate(cars, next(iter(cars)))
         bank[IDENTIFIED_NAME] = identified, identified.description()
-    before: dict[str, Config] = {}
     for one in FILTERS:
-        found = _kept_or_tuned(one, drives, car, executor)
-        if found:
-            before[one.module] = type(one.parameters).model_validate(found["parameters"])
         plain = FilterEstimate(one, one.parameters, car, weighed)
-        tuned = replace(plain, parameters=before.get(one.module, one.parameters))
-        tuned_on = {"tuned_on": drives.names if found else []}
+        best = found["parameters"].get(one.module)
+        parameters = type(one.parameters).model_validate(best) if best else one.parameters
+        tuned = replace(plain, parameters=parameters)
+        tuned_on = {"tuned_on": drives.names if best else []}
         bank[one.name] = plain, plain.description()
         bank[f"{one.name}_tuned"] = tuned, {**tuned.description(), **tuned_on}
     return bank
-
-
-def _kept_or_tuned(
-    one: Filter, drives: "TuningDrives", car: VehicleParameters, executor: Executor
-) -> Mapping[str, Any] | None:
-    key = {
-        "for_lowest": "rmse_deg",
-        "starts": [start.model_dump(mode="json") for start in (one.parameters, *one.other_starts)],
-        "tunable": list(one.tunable),
-        "drives": drives.key(),
-        "car": car.model_dump(mode="json"),
-        "program": checksum_of_sources(),
-    }
-
-    def find() -> dict[str, Any]:
-        LOGGER.info("tuning %s on %s, once", one.name, number_of(len(drives.names), "drive"))
-        best = one.tune(drives.read(), car, executor)
-        return {
-            "parameters": best.parameters.model_dump(mode="json"),
-            "rmse_deg": float(np.degrees(best.rmse_rad)),
-            "evaluations": best.evaluations,
-        }
-
-    return drives.kept_or_found(one.module, key, find, f"{one.name} left untuned")
 
 
 # The extended Kalman filter in a car that was identified from the drives a model learned from, as a
@@ -354,28 +331,6 @@ class IdentifiedEstimate:
             "told": "labelled drives",
             "parameters": {name: one.dump() for name, one in self.cars.items()},
         }
-
-
-def _identified_cars(drives: "TuningDrives", executor: Executor) -> dict[str, Identified]:
-    """Identify each class of cars among drives; none where the drives do not allow it."""
-
-    def find() -> dict[str, Any]:
-        LOGGER.info("identifying the car, once")
-        of_class: dict[str, list[LabelledDrive]] = {}
-        for (_, model, _), drive in zip(drives.known, drives.read(), strict=True):
-            if drive.car is not None:
-                of_class.setdefault(model, []).append(replace(drive, car=None))
-        cars = {
-            model: identify(
-                Measured.of(load_vehicle(model)), choose_evenly(own, DRIVES_OF_A_CLASS), executor
-            )
-            for model, own in sorted(of_class.items())
-        }
-        return {"cars": {model: one.dump() for model, one in cars.items()}}
-
-    key = {"drives": drives.key(), "program": checksum_of_sources()}
-    found = drives.kept_or_found("identified", key, find, "no car can be identified")
-    return {model: Identified.load(one) for model, one in found["cars"].items()} if found else {}
 
 
 T = TypeVar("T")
@@ -421,28 +376,49 @@ class TuningDrives:
         """The drives' names."""
         return [name for name, _, _ in self.known]
 
-    def key(self) -> list[Any]:
-        """Return what identifies these, for a JSON document."""
-        return [TUNING_S, *(list(known) for known in self.known)]
+    def kept_or_tuned(self, car: VehicleParameters, executor: Executor) -> Mapping[str, Any]:
+        """Return what suits the drives best, as it was kept below `tuned/`, else found now.
 
-    def kept_or_found(
-        self, name: str, key: Mapping[str, Any], find: Callable[[], Mapping[str, Any]], failing: str
-    ) -> Mapping[str, Any] | None:
-        """Return what was kept for a key below `tuned/` in the data root, else find and keep it.
-
-        Where the drives lack what that needs, a remark says what is `failing`, and it is None.
+        That is `parameters` by module, the identified `cars` by vehicle model, and what was not
+        found for want of a fix, wheel speeds, steering or a label, in words (`failing`).
         """
-        folder = DocumentFolder(self.warehouse.root / "tuned" / name)
+        key = {
+            "drives": [TUNING_S, *(list(known) for known in self.known)],
+            "car": car.model_dump(mode="json"),
+            "program": checksum_of_sources(),
+        }
+        folder = DocumentFolder(self.warehouse.root / "tuned")
         documents = (folder.read(number).content for number in reversed(folder.numbers()))
         found = next((content for content in documents if content["key"] == key), None)
-        if found is None:
+        return found or folder.append({"key": key, **self._tuned(car, executor)}).content
+
+    def _tuned(self, car: VehicleParameters, executor: Executor) -> dict[str, Any]:
+        many = number_of(len(self.names), "drive")
+        LOGGER.info("tuning filters and identifying the car on %s, once", many)
+        cars: dict[str, Any] = {}
+        parameters: dict[str, Any] = {}
+        failing: list[str] = []
+        try:
+            cars = {model: one.dump() for model, one in self._identified(executor)}
+        except DataError as error:
+            failing.append(f"no car can be identified: {error}")
+        for one in {one.module: one for one in reversed(FILTERS)}.values():
             try:
-                found = {"key": key, **find()}
-            except DataError as error:  # no fix, no wheel speeds, no steering, no label
-                LOGGER.warning("%s: %s", failing, error)
-                return None
-            folder.append(found)
-        return found
+                best = one.tune(self.read(), car, executor)
+                parameters[one.module] = best.parameters.model_dump(mode="json")
+            except DataError as error:
+                failing.append(f"{one.name} left untuned: {error}")
+        return {"cars": cars, "parameters": parameters, "failing": failing}
+
+    def _identified(self, executor: Executor) -> Iterator[tuple[str, Identified]]:
+        """Identify each class of cars that has a file. Raises `DataError` as `identify`."""
+        of_class: dict[str, list[LabelledDrive]] = {}
+        for (_, model, _), drive in zip(self.known, self.read(), strict=True):
+            if drive.car is not None:
+                of_class.setdefault(model, []).append(replace(drive, car=None))
+        for model, own in sorted(of_class.items()):
+            some = choose_evenly(own, DRIVES_OF_A_CLASS)
+            yield model, identify(Measured.of(load_vehicle(model)), some, executor)
 
     def read(self) -> Sequence[LabelledDrive]:
         """Return the beginning of each drive, as filters meet it: they know no bias yet."""

@@ -67,7 +67,6 @@ class Tuned(Generic[P]):
 
     parameters: P
     rmse_rad: float
-    evaluations: int
 
 
 def checksum_of_sources(folder: Path = Path(__file__).parent) -> str:
@@ -122,14 +121,12 @@ def tune(
     Each estimator's module lists its own as `TUNABLE`; "yaw_rate.gyro_std_rad_s" is a nested one.
     Raises as `rmse_rad`.
     """
-    at, evaluations = Coordinates(start, names), 0
+    at = Coordinates(start, names)
 
     def estimate(parameters: P, drive: LabelledDrive) -> FloatArray:
         return estimator(drive.signals, drive.car or car, parameters)
 
     def errors(x: FloatArray) -> FloatArray:
-        nonlocal evaluations
-        evaluations += 1
         return errors_rad(partial(estimate, at.parameters(x)), drives, executor, EVERY)
 
     there = finite(errors(np.zeros(len(names))))
@@ -138,7 +135,7 @@ def tune(
     begins += [FARTHER * sides, -FARTHER * sides]
     found = search(lambda x: errors(x)[there], at, begins)
     best = at.parameters(found.x)
-    return Tuned(best, rmse_rad(partial(estimate, best), drives, executor), evaluations)
+    return Tuned(best, rmse_rad(partial(estimate, best), drives, executor))
 
 
 ADDED = {"steer_offset_rad": 0.02, "ay_offset_mps2": 0.2}

@@ -188,7 +188,7 @@ def test_filters_compete_in_the_car_of_a_file_and_in_one_that_is_identified(
 
     def untuned(_: object, start: Any, *rest: Any) -> Tuned[Any]:
         judged.append(float(np.mean([np.isfinite(one.sideslip_rad).mean() for one in rest[1]])))
-        return Tuned(start, 0.0, 1)
+        return Tuned(start, 0.0)
 
     monkeypatch.setattr(filters, "tune", untuned)
     monkeypatch.setattr(
