@@ -12,7 +12,6 @@ app = marimo.App(width="medium", app_title="fleet-slip explore")
 def _():
     import altair as alt
     import marimo as mo
-    import matplotlib as mpl
     import numpy as np
     import polars as pl
     from matplotlib.colors import LinearSegmentedColormap
@@ -22,12 +21,11 @@ def _():
     from fleet_slip.base import number_of
     from fleet_slip.errors import FleetSlipError
     from fleet_slip.evaluation.watch import drive_frames
-    from fleet_slip.operations.monitor import control_chart
-    from fleet_slip.pages.drawing import SHADES, STYLE, colour
+    from fleet_slip.pages.drawing import SHADES, colour
 
     return (
-        SHADES, STYLE, Figure, FleetSlipError, LinearSegmentedColormap, alt, colour,
-        control_chart, drive_frames, fleet_slip, mo, mpl, np, number_of, pl,
+        SHADES, Figure, FleetSlipError, LinearSegmentedColormap, alt, colour,
+        drive_frames, fleet_slip, mo, np, number_of, pl,
     )  # fmt: skip
 
 
@@ -165,13 +163,29 @@ def _(alt, mo, terms):
 
 
 @app.cell
-def _(FleetSlipError, STYLE, control_chart, fleet, mo, mpl, name):
+def _(FleetSlipError, alt, fleet, mo, name, pl):
     mo.stop(name.value is None)
     days = [day for (day,) in fleet.sql("SELECT DISTINCT day FROM drives ORDER BY 1").fetchall()]
     try:
         _since = days[len(days) // 2] if len(days) > 8 else None
-        with mpl.rc_context(STYLE):
-            drift = control_chart(fleet.monitor(name.value, since=_since))
+        _found = fleet.monitor(name.value, since=_since)
+        drift = alt.vconcat()
+        for _figure, _limits in (("mean", _found.mean_limits), ("std", _found.std_limits)):
+            _points = pl.DataFrame(
+                {
+                    "day": [str(one.day) for one in _found.days],
+                    "error": [getattr(one, f"error_{_figure}_deg") for one in _found.days],
+                    "kind": [
+                        "training" if one.training else "beyond" if _figure in one.alarms else "new"
+                        for one in _found.days
+                    ],
+                }
+            )
+            _ends = [end for end in (_limits.lower, _limits.upper) if end is not None]
+            _y = alt.Y("error", title=f"{_figure}, deg", scale=alt.Scale(zero=False))
+            drift &= alt.Chart(_points, height=120, width=500).mark_point(filled=True).encode(
+                x="day:T", y=_y, color="kind"
+            ) + alt.Chart(pl.DataFrame({"error": _ends})).mark_rule(strokeDash=[4, 4]).encode(y=_y)
     except FleetSlipError as error:
         drift = mo.callout(str(error), kind="warn")
     mo.vstack(

@@ -13,7 +13,6 @@ from fleet_slip.cli.progress import progress
 from fleet_slip.errors import UsageError
 
 if TYPE_CHECKING:
-    from fleet_slip.operations.monitor import Chart
     from fleet_slip.operations.night import NightReport
     from fleet_slip.operations.status import WarehouseStatus
 
@@ -59,24 +58,13 @@ def calibrate(
 
 
 @command(Fleet.monitor, arguments=["model"])
-def monitor(
-    chart: "Chart",
-    plot: Annotated[
-        Path | None, typer.Option(help="Draw the chart to an SVG, PDF or PNG file.")
-    ] = None,
-    json: Json = False,
-) -> None:
+def monitor() -> None:
     """Chart a model's error on each day since it was trained, with control limits.
 
     Reads Gram rows only. Exit code 10 if a new day is beyond the limits.
 
     Example: **fleet-slip monitor waterford --since 2024-05-03**
     """
-    if plot:
-        from fleet_slip.operations.monitor import save_chart  # noqa: PLC0415 - draws
-
-        save_chart(chart, plot)
-    print_answer(chart, json)
 
 
 @command(Fleet.nightly, progress=("", "rows"), name="--model")

@@ -13,27 +13,19 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
-from pathlib import Path
 from statistics import fmean, stdev
-from typing import Any
-
-import matplotlib as mpl
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
-from matplotlib.figure import Figure
 
 from fleet_slip.catalogue.features import PLAIN, features, input_scales
-from fleet_slip.errors import AlarmError, ConfigError, DataError, StorageError
+from fleet_slip.errors import AlarmError, DataError, StorageError
 from fleet_slip.grams.cohort import remark_left_out, sum_days
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.operations.peers import thresholds
-from fleet_slip.pages.drawing import STYLE, WIDTH_IN, colour
 from fleet_slip.regression.figures import error_sums, student_t_quantile
 from fleet_slip.regression.folds import least_squares
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import LinearModel
 from fleet_slip.rendering import Answer, Part, TextTable
-from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.warehouse.condition import Condition, parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -212,53 +204,3 @@ def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | No
             f"{_SINCE.format(name=version.manifest.name)}"
         ) from None
     return max((file.day for file in then.files if file.day), default=None)
-
-
-# The control chart of a model: its error on each day, with limits.
-
-HEIGHT_IN = 3.6
-TONES = {"training": "muted", "new": "model_4", "beyond": "unstable"}
-
-
-def control_chart(chart: Chart) -> Figure:
-    """Draw mean and standard deviation of the error over the days, in degrees."""
-    figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
-    above, below = figure.subplots(2, sharex=True)
-    panels = (
-        (above, "mean", [day.error_mean_deg for day in chart.days], chart.mean_limits),
-        (below, "std", [day.error_std_deg for day in chart.days], chart.std_limits),
-    )
-    for axes, name, values, limits in panels:
-        groups: dict[str, list[tuple[date, float]]] = {}
-        for day, value in zip(chart.days, values, strict=True):
-            kind = "training" if day.training else "beyond" if name in day.alarms else "new"
-            groups.setdefault(kind, []).append((day.day, value))
-        for kind, points in groups.items():
-            days, errors = zip(*points, strict=True)
-            axes.plot(days, errors, "o", markersize=4, color=colour(TONES[kind]))
-        axes.axhline(limits.centre, color=colour("muted"), linewidth=0.7)
-        for limit in (limits.lower, limits.upper):
-            if limit is not None:
-                axes.axhline(limit, color=colour("unstable"), linewidth=0.8, linestyle="--")
-        axes.set_title(f"{name} of the error, deg", color=colour("muted"))
-    above.set_title(
-        "training days grey, new days blue, beyond a limit red",
-        color=colour("muted"),
-        loc="right",
-    )
-    locator: Any = AutoDateLocator(minticks=2, maxticks=10)  # type: ignore[no-untyped-call]
-    below.xaxis.set_major_locator(locator)
-    below.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
-    return figure
-
-
-def save_chart(chart: Chart, file: Path) -> None:
-    """Draw to a file, whose suffix says the format. Raises `ConfigError`, `StorageError`."""
-    with mpl.rc_context(STYLE), storage_errors(file):
-        figure = control_chart(chart)
-        figure.suptitle(f"{chart.model}: error on each day", x=0.01, ha="left")
-        try:
-            # Without a date, the same chart is the same file.
-            figure.savefig(file, metadata={"Date": None} if file.suffix == ".svg" else None)
-        except ValueError as error:
-            raise ConfigError(f"{file}: {error}") from None
