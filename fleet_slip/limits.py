@@ -1,12 +1,10 @@
-"""What this process may have of the system, and the least that it needs."""
+"""What this process may have of the system."""
 
 import contextlib
 import os
 import resource
 from collections.abc import Iterator
 from pathlib import Path
-
-from fleet_slip.errors import StorageError
 
 CGROUPS = Path("/sys/fs/cgroup")
 OWN_CGROUP = Path("/proc/self/cgroup")
@@ -19,7 +17,6 @@ DATA_BYTES = 2**30
 """Memory of its own, as `ulimit -d` counts it, that the libraries need to start and to end well."""
 DATA_THREAD_BYTES = 2**26
 """The same for each processor."""
-OPEN_FILES = 64
 
 
 def memory_bytes() -> int:
@@ -39,32 +36,13 @@ def data_needed() -> int:
     return DATA_BYTES + DATA_THREAD_BYTES * len(os.sched_getaffinity(0))
 
 
-def require_limits() -> None:
-    """Raise `StorageError` under limits of the shell that libraries do not survive."""
-    address_space = LIBRARIES_BYTES + THREAD_BYTES * len(os.sched_getaffinity(0))
-    unused, silent = "most of it reserved and never used", "or its libraries end it without a word"
-    for kind, flag, needed, what, why in (
-        (resource.RLIMIT_AS, "-v", address_space, "address space", unused),
-        (resource.RLIMIT_DATA, "-d", data_needed(), "data", silent),
-    ):
-        allowed, _ = resource.getrlimit(kind)
-        if allowed != resource.RLIM_INFINITY and allowed < needed:
-            raise StorageError(
-                f"this process may have {allowed // 2**20:,} MiB of {what} and needs "
-                f"{needed // 2**20:,} MiB, {why}. Raise the limit: ulimit {flag} "
-                f"{needed // 2**10}. To limit memory itself use a control group, such as "
-                "systemd's MemoryMax=."
-            )
-    data, _ = resource.getrlimit(resource.RLIMIT_DATA)
-    if data != resource.RLIM_INFINITY:
-        # Else Arrow's allocator takes a GiB of it before anybody asks, and leaves none to others.
+def spare_data() -> None:
+    """Keep Arrow's allocator from taking a GiB of what this process may have, before it is asked.
+
+    To be called before Arrow is imported.
+    """
+    if resource.getrlimit(resource.RLIMIT_DATA)[0] != resource.RLIM_INFINITY:
         os.environ.setdefault("MIMALLOC_ARENA_EAGER_COMMIT", "0")
-    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if files != resource.RLIM_INFINITY and files < OPEN_FILES:
-        raise StorageError(
-            f"this process may have {files} files open and needs {OPEN_FILES}. Raise the limit: "
-            "ulimit -n 1024"
-        )
 
 
 def _cgroup_limits() -> Iterator[int]:

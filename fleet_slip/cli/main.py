@@ -1,4 +1,4 @@
-"""The program `fleet-slip`. It looks whether it can run here before anything large is imported."""
+"""The program `fleet-slip`: what it answers while nothing large has been imported."""
 
 import contextlib
 import os
@@ -6,8 +6,8 @@ import signal
 import sys
 from typing import Any
 
-from fleet_slip.errors import INTERRUPTED, FleetSlipError, StorageError, is_lack_of_memory
-from fleet_slip.limits import memory_bytes, require_limits
+from fleet_slip.errors import INTERRUPTED, StorageError, is_lack_of_memory
+from fleet_slip.limits import memory_bytes, spare_data
 
 
 def _leave(_signal: int, _frame: Any) -> None:
@@ -21,11 +21,8 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
     try:
-        require_limits()
+        spare_data()
         from fleet_slip.cli.app import run_app  # noqa: PLC0415 - see above
-    except FleetSlipError as error:
-        _tell(f"error: {error}")
-        sys.exit(error.exit_code)
     except (ImportError, OSError, MemoryError) as error:
         if not is_lack_of_memory(error):
             raise
