@@ -54,9 +54,6 @@ def sql(
         Path | None,
         typer.Option(help="Write to a file: .parquet, .csv or .json.", show_default=False),
     ] = None,
-    limit: Annotated[
-        int | None, typer.Option(min=0, help="Take so many rows and no more.", show_default=False)
-    ] = None,
     everything: Annotated[
         bool, typer.Option("--all", help="Print all rows and columns of a table, however wide.")
     ] = False,
@@ -94,26 +91,18 @@ def sql(
     opened = fleet.session(text, scenarios=scenarios, unlocked=unsafe)
     with opened as session, _representation_errors():
         if output is not None:
-            _write(_rows(session, text, limit), output, exact)
+            _write(session.table(text), output, exact)
             return
         several = query == "-" and not unsafe
         for statement in split_statements(session.database, text) if several else [text]:
             if json:
-                print_json(_rows(session, statement, limit).to_pylist())
+                print_json(session.table(statement).to_pylist())
             elif csv:
                 sys.stdout.flush()
-                _write_csv(_rows(session, statement, limit), sys.stdout.buffer, exact)
+                _write_csv(session.table(statement), sys.stdout.buffer, exact)
                 sys.stdout.buffer.flush()
             else:
-                _show(session, statement, limit, everything)
-
-
-def _rows(session: Session, text: str, limit: int | None) -> pa.Table:
-    return session.compute(text, lambda answer: _first(answer, limit).to_arrow_table())
-
-
-def _first(answer: duckdb.DuckDBPyRelation, limit: int | None) -> duckdb.DuckDBPyRelation:
-    return answer if limit is None else answer.limit(limit)
+                _show(session, statement, everything)
 
 
 def _write(rows: pa.Table, file: Path, exact: bool) -> None:
@@ -141,11 +130,11 @@ def _write_csv(rows: pa.Table, to: Any, exact: bool) -> None:
 _CUT = re.compile(r"│ … │|\S… │|rows .*shown\)|columns .*shown\)")
 
 
-def _show(session: Session, text: str, limit: int | None, everything: bool) -> None:
+def _show(session: Session, text: str, everything: bool) -> None:
     """Print what fits of an answer, and say if that is not all."""
     width = ENDLESS if everything else shutil.get_terminal_size((160, 40)).columns
-    rows = limit if limit is not None else ENDLESS if everything else ROWS_SHOWN
-    shown = session.compute(text, lambda answer: _drawn(_first(answer, limit), width, rows))
+    rows = ENDLESS if everything else ROWS_SHOWN
+    shown = session.compute(text, lambda answer: _drawn(answer, width, rows))
     typer.echo(shown)
     if _CUT.search(shown):
         say("output truncated. Select fewer columns, or: --all")
