@@ -2,7 +2,7 @@
 # `make test` adds what the checks need, and passes every check that needs Python alone.
 # `make test-all` installs outside programs, such as a browser, and passes the checks that need them or minutes.
 # `make report` does what `make run` does, then writes ./data/report/report.html.
-# `make report MODEL=gated` adds hard driving and slippery roads before, and tells of the model with gates: ten minutes.
+# `make report MODEL=gated` adds hard driving and slippery roads before, and reports on the model with gates.
 # `make docs` builds the pages as a site, ./site/index.html; a warning is an error.
 PYTHON ?= python3
 VENV := .venv

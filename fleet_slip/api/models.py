@@ -210,7 +210,7 @@ class PublishedModels(Rooted):
         one: Annotated[str | ModelVersion, VERSION],
         other: Annotated[str | ModelVersion, VERSION],
     ) -> "Difference":
-        """Tell two versions apart, by their manifests and their drives. Raises as `model`."""
+        """Compare two versions by their manifests and their drives. Raises as `model`."""
         from fleet_slip.models.registry import compare_versions
 
         return compare_versions(self.registry(), self.model(one), self.model(other))
@@ -240,7 +240,7 @@ class PublishedModels(Rooted):
             bool, Doc("With C: also what counts Gram rows in the car, for ingest.")
         ] = False,
     ) -> list[Path]:
-        """Write a version as a program for elsewhere into a folder; return the files.
+        """Export a version as a program into a folder; return the files.
 
         Exports carry the version's checksum, the hash of its drives, and checks of made-up inputs;
         no tick of a log. Raises `RefusedError` if the angle's error has no bound or counts mean
@@ -419,7 +419,7 @@ class JudgedModels(PublishedModels):
         model: Annotated[str | ModelVersion | None, MODEL] = None,
         output: Annotated[Path | None, Doc("Folder. Default: report/ in the data root.")] = None,
     ) -> "Written":
-        """Write one page that lays our figures beside the paper's, from the latest evaluation.
+        """Write a page that compares the latest evaluation with the paper's figures.
 
         Raises `DataError` without an
         evaluation on today's data, and what `model` raises.

@@ -140,7 +140,7 @@ class HealthAndUpkeep(JudgedModels):
         workers: Workers = None,
         progress: ShowProgress | None = None,
     ) -> "Verification":
-        """Verify every byte against its checksum, and everything against everything else.
+        """Verify every byte against its checksum, and all tables against each other.
 
         Progress is in bytes. `damage` is what is wrong, after a repair what is left. Raises
         `StorageError` without a data root, and `ClusterError`.

@@ -142,7 +142,7 @@ def identify(
 
 @command(Fleet.report, arguments=["model"])
 def report(written: "Written") -> None:
-    """Write one page that lays our figures beside the paper's, from the latest evaluation.
+    """Write a page that compares the latest evaluation with the paper's figures.
 
     The page needs nothing but itself; the same figures stand beside it as SVG and PNG files.
 

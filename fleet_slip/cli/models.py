@@ -172,7 +172,7 @@ def _label_noise(figures: CrossValidated) -> str:
 
 @command(Fleet.promote, arguments=["reference"], without=["json"])
 def promote(version: ModelVersion, alias: str, previous: bool) -> None:
-    """Point an alias, the champion unless told otherwise, at a version.
+    """Point an alias, by default champion, at a version.
 
     Example: **fleet-slip promote waterford@2**
     """
@@ -197,7 +197,7 @@ def pin(version: ModelVersion, name: str, alias: str, off: bool) -> None:
 
 @command(Fleet.diff, arguments=["one", "other"])
 def diff() -> None:
-    """Tell two versions of a model apart: data, prior, signals, coefficients, figures.
+    """Compare two versions of a model: data, prior, signals, coefficients, figures.
 
     Example: **fleet-slip diff waterford@1 waterford@2**
     """
@@ -205,7 +205,7 @@ def diff() -> None:
 
 @command(Fleet.export, arguments=["model"])
 def export(files: Sequence[Path], json: Json = False) -> None:
-    """Write a version as a program for elsewhere, with checks: vectors of inputs and angles.
+    """Export a version as C, SQL, ONNX, FMU, DBC or JSON, with test vectors.
 
     Example: **fleet-slip export waterford --to c --output export**
     """

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @command(Fleet.status)
 def status(found: "WarehouseStatus", json: Json = False) -> None:
-    """Tell the warehouse's health: freshness, backlog, last runs, disk, champions.
+    """Report the warehouse's health: freshness, backlog, last runs, disk, champions.
 
     Exit code 10 if something calls for attention.
 
@@ -47,7 +47,7 @@ def calibrate(
         typer.Option(help="Show this car's numbers, and how they go on board.", show_default=False),
     ] = None,
 ) -> None:
-    """Tell from each car's own drives how its sensors are off: no label, no log row is read.
+    """Estimate the sensor errors of each car from its own drives, without label or log rows.
 
     Offsets of gyroscope, accelerometer and steering, tyre radius, steering and understeer, each
     with its uncertainty and how fast it shrinks with drives. Needs the Gram rows of: **fleet-slip
@@ -80,7 +80,7 @@ def nightly(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Do all of a night with real cars: ingest what is new, examine it, train again, verify.
+    """Run the nightly job: ingest new logs, check their sensors, train again, verify.
 
     Drives with faulty sensors train no model. The winner becomes champion if it is not worse, else
     a candidate. Killed at any moment and given again, it ends where it would have ended. Exits with
@@ -97,7 +97,7 @@ def nightly(
 
 @command(Fleet.verify, progress=("verify", "bytes"))
 def verify() -> None:
-    """Verify every byte against its checksum, and everything against everything else.
+    """Verify every byte against its checksum, and all tables against each other.
 
     Exits with 9 if there is damage that was not repaired.
 
