@@ -150,15 +150,15 @@ class CourseRelation:
     @property
     def fault(self) -> Fault | None:
         """What no course of a car does: the first of these."""
-        turns = f"it turns {self.scale:+.2f} times as the yaw rate does"
-        grows = f"the course turns {self.scale:.2f} times as the yaw rate does"
-        errs = f"a fix errs by {self.noise_mps:.2f} m/s across the car"
+        turns = f"it turns {self.scale:+.2f} times as fast as the yaw rate"
+        grows = f"the course turns {self.scale:.2f} times as fast as the yaw rate"
+        errs = f"fixes have a lateral error of {self.noise_mps:.2f} m/s"
         slips = f"beyond the yaw rate it changes by {self.slip:.2f} times what a car slips"
         most = MOST_NOISE_MPS if self.explained < LEAST_EXPLAINED else HARDLY_A_COURSE_MPS
         scaled = not SCALES[0] < self.scale < SCALES[1]
         unslipping = self.slip + 2 * self.slip_error < LEAST_SLIP
-        around = "Turn clockwise_from_north round, or swap north and east."
-        doubt = "Reflected signals? Leave out fixes that the receiver doubts, by where."
+        around = "Invert clockwise_from_north, or swap north and east."
+        doubt = "Reflected signals? Exclude doubtful fixes with where."
         units = "Check both units, and the gyroscope."
         heading = "It is a heading, of a compass or the car: map the course over ground."
         still, course = "Map the course that moves.", (COURSE,)

@@ -197,7 +197,7 @@ class Window(ColumnFamily):
         if (self.over != "running_mean") != bool(self.ticks):
             raise ValueError("ticks is for mean, sum, lag and change, which must have it")
         if len(set(self.ticks)) < len(self.ticks):
-            raise ValueError("a number of ticks stands twice")
+            raise ValueError("a number of ticks appears twice")
         if any(not 1 <= n <= LONGEST_TICKS for n in self.ticks):
             raise ValueError(f"ticks must lie in 1..{LONGEST_TICKS}")
         if bool(self.ticks) != (TICKS in self.column):
@@ -403,9 +403,9 @@ class GateFamily(ColumnFamily):
     @model_validator(mode="after")
     def _knots_rise(self) -> "GateFamily":
         if any(high <= low for low, high in pairwise(self.knots)):
-            raise ValueError("the knots of a gate must rise")
+            raise ValueError("the knots of a gate must increase")
         if len(set(self.columns)) < len(self.columns):
-            raise ValueError("a column stands twice")
+            raise ValueError("a column appears twice")
         return self
 
     def names(self, name: str) -> tuple[str, ...]:

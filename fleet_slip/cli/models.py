@@ -84,7 +84,7 @@ def _teacher(learned: LearnedFrom) -> str:
     if not learned.cars:
         return f"{told}. No intercept: it goes through the origin"
     unsure = learned.intercept_uncertainty_deg
-    uncertain = "not known how surely" if unsure is None else f"uncertain by {unsure:.2g} deg"
+    uncertain = "uncertainty unknown" if unsure is None else f"uncertain by {unsure:.2g} deg"
     return (
         f"{told}. Intercept where {number_of(learned.cars, 'car')} "
         f"{'goes' if learned.cars == 1 else 'go'} straight, {uncertain}"
@@ -165,7 +165,7 @@ def _facts(version: ModelVersion) -> dict[str, str]:
 def _label_noise(figures: CrossValidated) -> str:
     """Return how much of the RMSE is noise of the label."""
     if figures.label_noise_deg is None:
-        return "not known, and part of the RMSE"
+        return "unknown, and part of the RMSE"
     left = figures.beyond_label_noise_deg
     return f"{figures.label_noise_deg:.4f} deg, without which the RMSE is {left:.4f} deg"
 

@@ -222,9 +222,9 @@ def _ranking_table(ranking: Mapping[str, Any]) -> TextTable:
     least, ours = ranking["least_coverage"], ranking["estimator"]
     return TextTable(
         f"\n{ours} wins {ranking['won']} of {ranking['drives']} test drives by RMSE, and is within "
-        f"{ranking['close_ratio']:g} of the winner on {ranking['close']} others.\nAll compete that "
-        f"need no GPS and estimate {least:.0%} of the rows. Drives that differ in GPS alone are "
-        f"one. {ours}/3 is model 3 of Table I, trained on what {ours} was trained on.",
+        f"{ranking['close_ratio']:g} of the winner on {ranking['close']} others.\nCompared are "
+        f"estimators without GPS that cover {least:.0%} of the rows. Drives that differ only in "
+        f"GPS count once. {ours}/3 is model 3 of Table I, trained on what {ours} was trained on.",
         f"scenario|won by|RMSE deg|{ours} deg|ratio",
         (one for one in ranking["standings"] if one["same_as"] is None),
         "{scenario}|{winner}|{winner_rmse_deg:.3f}|{rmse_deg:.3f}|{ratio:.2f}",

@@ -51,9 +51,9 @@ def table_one(data: ReportData) -> ReportTable:
         f"rows. {selection.winner.reason} "
     )
     if noise is None:
-        note += "How noisy the label is, is not known: every RMSE here has its noise in it."
+        note += "The label noise is unknown; every RMSE here includes it."
     else:
-        note += f"Every RMSE here has the label's own noise in it, {degrees(noise, 4)}."
+        note += f"Every RMSE here includes the label noise, {degrees(noise, 4)}."
     caption = "Table I. Properties of the estimation models: cross-validated correlation"
     return ReportTable("table-1", caption, head, rows, left=2, note=note)
 

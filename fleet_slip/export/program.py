@@ -64,8 +64,8 @@ LARGEST_ANGLE = 2**31 - 1
 """Largest size of the angle, a word of 32 bits: what is beyond, thousands of turns, is clipped."""
 
 _TOO_LARGE = (
-    "the coefficients are so large, for what the columns can count, that no bound of the angle's "
-    "error can be stated. Publish a model with fewer or other signals."
+    "the coefficients are too large to bound the rounding error of the angle. Publish a model with "
+    "fewer or other signals."
 )
 
 

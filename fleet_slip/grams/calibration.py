@@ -184,7 +184,7 @@ LEANS = (
     "roads are banked, and may always lean to one side, which cannot be separated from the car's "
     f"own offset with fewer than {FEWEST_CARS} cars"
 )
-BEYOND = "it is beyond what 16 bits count of its grain"
+BEYOND = "it is outside the range of 16 bits"
 """Why a number is missing."""
 
 

@@ -30,17 +30,13 @@ from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms,
 NO_COURSE = "no row above 3 m/s has the yaw rate, ay and all four wheel speeds"
 NO_STEERING = "no row above 3 m/s has both steering angles beside the other signals"
 STRAIGHT = "it drove too straight: turns are hardly above noise"
-EVEN = (
-    "it drove too evenly: one over speed must differ to separate offsets of ay and of the yaw rate"
-)
+EVEN = "its speed varied too little to separate the offsets of ay and of the yaw rate"
 ALIKE = "its rows are too similar to separate the parameters"
 NO_TYRE = (
-    "ay is too noisy, or rolls too much, for how it drove: its speed comes out as that of no tyre. "
-    "Or a signal is of another unit or sign. See: fleet-slip quality"
+    "no tyre has the wheel radius that fits: ay has too much noise or roll for such driving, or a "
+    "signal has a wrong unit or sign. See: fleet-slip quality"
 )
-TIGHT_BENDS = (
-    "bends are so tight that a bank is not in proportion to them: satellite speed determines it"
-)
+TIGHT_BENDS = "its bends are too tight to separate their banking: map satellite_speed"
 """Why a number is missing."""
 
 

@@ -43,7 +43,7 @@ class Weighed(Record):
         """Why it lost weight."""
         return (
             f"its error is {self.times:.1f} times that of the median drive: robust "
-            f"takes it {self.weight:.2f} times"
+            f"gives it the weight {self.weight:.2f}"
         )
 
 

@@ -86,7 +86,7 @@ def _course(signals: "Signals") -> Iterator[Fault]:
     if correlation:
         figure = f"over 1 s it changes by {slope:+.2f} times the integral of the yaw rate"
         if correlation < -LEAST_CORRELATION:
-            remedy = "Turn clockwise_from_north, or swap north and east."
+            remedy = "Invert clockwise_from_north, or swap north and east."
             yield Fault("reversed", (COURSE,), figure, remedy)
         elif correlation < LEAST_CORRELATION:
             figure = f"its change over 1 s hardly correlates with the yaw rate ({correlation:+.2f})"
@@ -96,7 +96,7 @@ def _course(signals: "Signals") -> Iterator[Fault]:
     fast = signals[SPEED] > LEAST_SPEED_MPS if SPEED in signals else np.zeros(0, dtype=np.bool_)
     own = float(np.isfinite(course[fast]).mean()) if fast.any() else 1.0
     if own < LEAST_OF_THEIR_OWN:
-        figure = f"{1 - own:.0%} of its fixes repeat it while the car turns, or are of reversing"
+        figure = f"{1 - own:.0%} of its fixes repeat the last in a turn, or are from reversing"
         remedy = "They are left out. Map it as the receiver reports it."
         yield Fault("values", (COURSE,), figure, remedy)
     relation = _relation(signals, turned)

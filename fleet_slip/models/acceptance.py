@@ -633,7 +633,7 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
         problems.append(f"that of {cars_text} cannot be estimated from their drives")
     if late:
         problems.append(
-            "the Gram rows of some cars are corrected by another delay than they have "
+            "the Gram rows of some cars are corrected by an outdated delay "
             f"({_named(delays, late)}): run fleet-slip gram --features course, and send the new "
             "delay to cars that count on board"
         )

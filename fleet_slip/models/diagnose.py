@@ -77,8 +77,8 @@ class Diagnosis(Answer):
             for robust, naive in both
         )
         yield TextTable(
-            f"{number_of(self.drives, 'drive')}, {number_of(self.fitted.gram.n, 'row')}, worth "
-            f"{self.evidence.rows:,.0f} independent ones; R squared {self.fitted.r_squared:.4f}, "
+            f"{number_of(self.drives, 'drive')}, {number_of(self.fitted.gram.n, 'row')}, "
+            f"{self.evidence.rows:,.0f} effective; R squared {self.fitted.r_squared:.4f}, "
             f"condition number {self.condition_number:.3g} (1: independent signals)",
             f"signal|unit|coefficient|s.e. by {self.cluster}s|t|s.e. by rows|VIF",
             rows,

@@ -146,8 +146,8 @@ def _winner(models: Sequence[CrossValidation], size: int, choice: SearchChoice) 
     best = max(models, key=lambda model: model.sums.signed_r_squared)
     among = "the best subsets" if rule.ranking == ALL_SUBSETS else f"the order by {rule.ranking}"
     reason = (
-        f"{rule.criterion} keeps {size} of {len(models)} signals of {among}, taking "
-        f"{choice.evidence.kind} for independent."
+        f"{rule.criterion} keeps {size} of {len(models)} signals of {among}, with "
+        f"{choice.evidence.kind} as independent."
     )
     return Winner(models[size - 1], best, reason)
 

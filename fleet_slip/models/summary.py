@@ -145,8 +145,8 @@ def _without_label(told: "WithoutLabel") -> Iterator[Remark]:
     figures = f"learned from changes of the course over {over} s: the figures are of these changes"
     if told.noise_deg is not None:
         figures += (
-            f", which have {told.noise_deg:.4f} deg of noise where cars go straight on; the "
-            f"angle's own error over so long is at most {told.angle_at_most_deg:.3f} deg"
+            f", whose noise is {told.noise_deg:.4f} deg on straights; the angle's own error over "
+            f"these times is at most {told.angle_at_most_deg:.3f} deg"
         )
     yield Remark(f"{figures}.")
     if (side := told.one_way) is not None:

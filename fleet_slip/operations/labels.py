@@ -51,7 +51,7 @@ def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> d
     if gains is None:
         return {}
     return {
-        int(drive): Fault("reversed", (label,), f"gain {gain:.3f} on the prediction of the others")
+        int(drive): Fault("reversed", (label,), f"gain {gain:.3f} on the prediction from others")
         for drive, gain in zip(drives.rows, gains, strict=True)
         if gain < REVERSED_GAIN
     }
@@ -250,6 +250,6 @@ def find_repeated(drives: pa.Table) -> dict[str, Fault]:
         database.register("drives", drives)
         found = database.execute(read_sql("jobs", "repeated_drives.sql"), given).fetchall()
     return {
-        named: Fault("repeated", (), f"{common_s:.0f} s are in {other}")
+        named: Fault("repeated", (), f"{common_s:.0f} s overlap with {other}")
         for named, common_s, other in found
     }

@@ -210,7 +210,7 @@ class Peers:
             after = [float(worst[drive]) for worst in exchanged]
             if after and min(after) <= self.limits.limit:
                 pair = pairs[int(np.argmin(after))]
-                faults.append(Fault("swapped", pair, "exchanged, they are as in other drives"))
+                faults.append(Fault("swapped", pair, "exchanged, they match other drives"))
                 continue
             rest = np.array([worst[drive] for worst in left_out])
             # Of the sensors that explain all the rest, the one that is itself furthest off.

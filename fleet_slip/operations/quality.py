@@ -71,7 +71,7 @@ class QualityReport(Answer):
             row = "{drive_id}|{vehicle_id}|{fault.kind}|{fault.signals}|{fault.figure}"
             yield TextTable(examined, header, self.findings, row, left=5)
         else:
-            yield f"{examined}: {'no faulty sensor' if self.drives else 'none is long enough'}"
+            yield f"{examined}: {'no faulty sensor' if self.drives else 'none long enough'}"
 
     @property
     def problem(self) -> AlarmError | None:

@@ -184,7 +184,7 @@ def _unfit(root: Folder) -> Iterator[str]:
     probe = f"{TEMPORARY_PREFIX}probe-{uuid.uuid4().hex}"
     try:
         if root.create(probe, b"one") and root.create(probe, b"two"):
-            yield f"{root}: this store lets a file be made twice, so commits get lost. Use another"
+            yield f"{root}: this store creates files twice: commits can be lost. Use another"
     except FleetSlipError:
         return  # a monitor may have the right to read alone
     finally:

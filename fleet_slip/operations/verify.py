@@ -202,9 +202,9 @@ def _contradiction(file: TableFile, metadata: pq.FileMetaData) -> str | None:
         return f"has {metadata.num_rows:,} rows, the Delta log says {file.rows:,}"
     if (nulls := _null_counts(metadata)).items() - file.null_counts.items():
         wrong = [name for name, count in nulls.items() if file.null_counts.get(name) != count]
-        return f"the Delta log states other numbers of nulls of {', '.join(wrong)}"
+        return f"the null counts of {', '.join(wrong)} differ from the Delta log"
     if file.day and not file.path.startswith(f"day={file.day}/"):
-        return f"the Delta log says that it is of {file.day}"
+        return f"its folder is not that of the day in the Delta log, {file.day}"
     return None
 
 
@@ -281,7 +281,7 @@ def verify_rows(
         )
         report.note("drive", drive, problem)
     for identity, file, drive, n in twice:
-        problem = f"the Gram row {identity} of drive {drive} stands {n} times"
+        problem = f"the Gram row {identity} of drive {drive} is stored {n} times"
         report.note("gram", f"logs/{file}", problem)
 
 
@@ -301,7 +301,7 @@ def verify_grams(
     for file in grams:
         rows = warehouse.grams.read(file.path)
         for row, why in impossible_rows(rows.filter(is_received(rows)), counted_sets()):
-            problem = f"the Gram row that a car sent of drive {row['drive_id']} {why}"
+            problem = f"the Gram row of drive {row['drive_id']}, sent by a car, {why}"
             report.note("gram", f"grams/{file.path}", problem)
     where = find_gram_files(warehouse, grams)
     covered = [file for file in logs if file.path in where]
@@ -316,7 +316,7 @@ def verify_grams(
             executor, task, files, lambda f: f"the Gram rows of {f.path}"
         ):
             for drive in differing_drives(stored[file.path], computed):
-                problem = f"the stored Gram row of drive {drive} is not that of its rows"
+                problem = f"the stored Gram row of drive {drive} does not match its rows"
                 report.note("gram", f"logs/{file.path}", problem)
             report.log_files_recomputed += 1
     missing = len(logs) - len(covered)
@@ -455,7 +455,7 @@ def _report_missing_logs(
         return
     damaged = frozenset(file.path for file in grams.files).difference(file.path for file in sound)
     if gone := named_files(replace(grams, without=damaged), PLAIN)[1]:
-        problem = f"the table is gone that the Gram rows of {number_of(len(gone), 'file')} are of"
+        problem = f"the table is gone; Gram rows of {number_of(len(gone), 'file')} remain"
         report.note("log", "logs", problem)
 
 

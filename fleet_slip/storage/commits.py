@@ -116,7 +116,7 @@ class Commit:
         made = {kind: content for action in self.actions for kind, content in action.items()}
         for kind, key in (("metaData", "metadata"), ("protocol", "protocol")):
             if self.version == 0 and made.get(kind) != _object(self.parameters.get(key)):
-                return "states in two ways what the table is"
+                return "defines the table twice, differently"
         return None
 
 

@@ -422,12 +422,15 @@ def test_a_column_without_a_gate_says_nothing_of_gates() -> None:
     ("text", "words"),
     [
         ('of = "ay_mean_16"\nknots = [1.0]\ncolumns = ["ay_mean_8"]', "knots"),
-        ('of = "ay_mean_16"\nknots = [1.0, 0.5]\ncolumns = ["ay_mean_8"]', "must rise"),
-        ('of = "ay_mean_16"\nknots = [0.0, 0.00001]\ncolumns = ["ay_mean_8"]', "must rise"),
-        ('of = "ay_mean_16"\nknots = [0.0, 1e9]\ncolumns = ["ay_mean_8"]', "within what"),
+        ('of = "ay_mean_16"\nknots = [1.0, 0.5]\ncolumns = ["ay_mean_8"]', "must increase"),
+        ('of = "ay_mean_16"\nknots = [0.0, 0.00001]\ncolumns = ["ay_mean_8"]', "must increase"),
+        ('of = "ay_mean_16"\nknots = [0.0, 1e9]\ncolumns = ["ay_mean_8"]', "within the range"),
         ('of = "nothing"\nknots = [0.0, 1.0]\ncolumns = ["ay_mean_8"]', "nothing"),
         ('of = "ay_mean_16"\nknots = [0.0, 1.0]\ncolumns = ["ay"]', "ay: no column over time"),
-        ('of = "ay_mean_16_mass"\nknots = [0.0, 1.0]\ncolumns = ["ay_mean_8"]', "factor itself"),
+        (
+            'of = "ay_mean_16_mass"\nknots = [0.0, 1.0]\ncolumns = ["ay_mean_8"]',
+            "have a gate or a factor",
+        ),
     ],
 )
 def test_faults_are_named(tmp_path: Path, text: str, words: str) -> None:

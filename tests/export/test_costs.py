@@ -76,8 +76,8 @@ def test_each_kind_of_column_adds_to_the_costs() -> None:
 
 def test_what_cannot_be_exported_is_said() -> None:
     wild = model_of({"ay": Fraction(10**40)})
-    assert describe_costs(wild).startswith("cannot be exported: the coefficients are so large")
-    assert "no bound" in costs_content(wild)["error"]
+    assert describe_costs(wild).startswith("cannot be exported: the coefficients are too large")
+    assert "too large to bound" in costs_content(wild)["error"]
 
 
 COEFFICIENT = st.fractions(-1000, 1000, max_denominator=10**30)
@@ -126,5 +126,5 @@ def test_one_bit_more_would_not_fit() -> None:
 
 
 def test_what_has_no_bound_is_refused() -> None:
-    with pytest.raises(RefusedError, match="no bound"):
+    with pytest.raises(RefusedError, match="too large to bound"):
         fixed_point(Fraction(0), [Fraction(10**30)], [2**19])

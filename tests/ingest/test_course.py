@@ -224,7 +224,7 @@ def test_a_course_that_stands_still_while_the_car_turns_is_none(tmp_path: Path) 
         "yaw_rate": np.array(columns["r"]),
     }
     (found,) = (s for s in find_suspicions(signals) if "course" in s.signals)
-    assert "80% of its fixes repeat it" in found.figure
+    assert "80% of its fixes repeat the last" in found.figure
 
 
 def test_driving_backwards_has_no_course(tmp_path: Path) -> None:

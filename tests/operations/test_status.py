@@ -150,4 +150,4 @@ def test_what_is_unfit_is_said(warehouse: Warehouse, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("fleet_slip.operations.status.memory_bytes", lambda: 2**29)
     memory, store = status_of(warehouse).problems
     assert "less than 1 GiB" in memory
-    assert "lets a file be made twice" in store
+    assert "creates files twice" in store

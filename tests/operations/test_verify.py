@@ -153,7 +153,7 @@ def test_a_gram_row_that_stands_twice_is_found_and_rebuilt(filled: Warehouse) ->
     action = filled.grams.write_file("signals-twice", rows)
     filled.grams.snapshot().commit(Change(add=[action]))
     report = verify(filled)
-    assert ["stands 2 times" in finding.problem for finding in report.damage] == [True]
+    assert ["is stored 2 times" in finding.problem for finding in report.damage] == [True]
     repair(filled, report)
     assert not damaged(filled)
 

@@ -240,7 +240,7 @@ def test_the_order_and_the_size_of_counts_do_not_matter() -> None:
 
 def test_each_weight_has_its_reason() -> None:
     found = robust_weights(DriveMoments.of(drives_of(4, {7: 5.0})))
-    assert "times that of the median drive: robust takes it 0.0" in found.of(7).reason
+    assert "times that of the median drive: robust gives it the weight 0.0" in found.of(7).reason
 
 
 def test_whole_numbers_beyond_64_bits_stay_exact() -> None:
