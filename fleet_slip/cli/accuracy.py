@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def score() -> None:
     """Evaluate a model on the rows of a cohort: also the largest error and percentiles.
 
-    Example: **fleet-slip score waterford --cohort "speed_factor > 0.9"**
+    Example: fleet-slip score waterford --cohort "speed_factor > 0.9"
     """
 
 
@@ -75,7 +75,7 @@ def evaluate(
     Prints who wins each test drive. The results are kept as a JSON document below evaluations/ in
     the data root; --json prints it.
 
-    Example: **fleet-slip evaluate waterford --scenario nominal**
+    Example: fleet-slip evaluate waterford --scenario nominal
     """
     car = vehicle or any(measured.values())
     if (cohort is None and car) or (cohort is not None and (scenarios or blind)):
@@ -122,7 +122,7 @@ def identify(
     the car is fitted to the label. Its error on drives that were left out stands beside it. A
     steering wheel suffices where no angle of the road wheels is logged.
 
-    Example: **fleet-slip identify hatchback --mass 1776 --front-axle 1.19 --rear-axle 1.44**
+    Example: fleet-slip identify hatchback --mass 1776 --front-axle 1.19 --rear-axle 1.44
     """
     print_answer(found, json)
     train = f". Train with it: fleet-slip publish NAME --prior {campaign}"
@@ -146,7 +146,7 @@ def report(written: "Written") -> None:
 
     The page needs nothing but itself; the same figures stand beside it as SVG and PNG files.
 
-    Example: **fleet-slip report waterford**
+    Example: fleet-slip report waterford
     """
     say(
         f"{written.page}: {written.size_bytes / 1e6:.1f} MB, {written.figures} figures, "
@@ -160,7 +160,7 @@ def watch(file: Path) -> None:
 
     The page is one file and needs no server.
 
-    Example: **fleet-slip watch adhesion_0_4 --output slippery.html**
+    Example: fleet-slip watch adhesion_0_4 --output slippery.html
     """
     say(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
 
@@ -182,7 +182,7 @@ def explore(
 
     A marimo notebook, which runs until it is interrupted.
 
-    Example: **fleet-slip explore --headless**
+    Example: fleet-slip explore --headless
     """
     with needed("explore", "the notebook"):
         import altair  # noqa: F401, PLC0415 - an extra
@@ -206,5 +206,5 @@ def diagnose() -> None:
     Standard errors by drives, or by cars where there are several, are the ones to believe: at
     100 Hz a row says little that the one before did not say, and a car's drives share its biases.
 
-    Example: **fleet-slip diagnose waterford**
+    Example: fleet-slip diagnose waterford
     """

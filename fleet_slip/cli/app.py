@@ -94,14 +94,6 @@ each as a function."""
 COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items()}
 
 
-class Command(TyperCommand):
-    """A command whose help is plain text."""
-
-    def get_help(self, ctx: Any) -> str:
-        """Return the help without what marks examples in docstrings."""
-        return super().get_help(ctx).replace("**", "")
-
-
 class CommandGroup(TyperGroup):
     """The commands, listed from their docstrings; the one that is called is loaded."""
 
@@ -109,11 +101,7 @@ class CommandGroup(TyperGroup):
         """Add a command that has nothing but its docstring for each of `COMMANDS`."""
         super().__init__(**settings)
         for name, module in COMMANDS.items():
-            self.add_command(Command(name, help=docstrings(module)[_function(name)]))
-
-    def get_help(self, ctx: Any) -> str:
-        """Return the help without what marks examples in docstrings."""
-        return super().get_help(ctx).replace("**", "")
+            self.add_command(TyperCommand(name, help=docstrings(module)[name]))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 - of the base
         """Write the commands, group by group."""
@@ -135,7 +123,7 @@ def load_command(name: str) -> Any:
     """Return a command, with its options."""
     module = import_module(f"fleet_slip.cli.{COMMANDS[name]}")
     app = typer.Typer(rich_markup_mode=None)
-    app.command(name, cls=Command)(getattr(module, _function(name)))
+    app.command(name)(getattr(module, name))
     return get_group(app).commands[name]
 
 
@@ -152,10 +140,6 @@ def docstrings(module: str) -> Mapping[str, str]:
         for code in codes
         if not code.co_freevars
     }
-
-
-def _function(command: str) -> str:
-    return command.replace("-", "_")
 
 
 app = typer.Typer(
@@ -236,9 +220,9 @@ def options(
     Logs of many cars become exact Gram matrices; from these every model, cohort and fold follows
     without reading a row again; the winner becomes a numbered model version.
 
-    Without logs: **fleet-slip run --campaign smoke**
+    Without logs: fleet-slip run --campaign smoke
 
-    With logs of your own: **fleet-slip mapping suggest LOG**, then **fleet-slip learn**
+    With logs of your own: fleet-slip mapping suggest LOG, then fleet-slip learn
     """
     configure_remarks()
     if config is not None:

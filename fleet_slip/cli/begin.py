@@ -60,9 +60,9 @@ def publish(
     The options are those of select. A model that is there is trained again as its champion was, but
     for what is asked for.
 
-    Try it first: **fleet-slip publish waterford --dry-run**
+    Try it first: fleet-slip publish waterford --dry-run
 
-    Example: **fleet-slip publish wet --cohort "adhesion < 0.8"**
+    Example: fleet-slip publish wet --cohort "adhesion < 0.8"
     """
     require_model_name(name)
     recipe = recipe_for(fleet.registry(), name, SelectionRequest(**asked), cohort)
@@ -96,7 +96,7 @@ def run(report: RunReport, fleet: Fleet, everything: All = False, json: Json = F
     second run of the campaign at the same time waits for the first. A nightly run appends the next
     day with --through today.
 
-    Example: **fleet-slip run --campaign smoke**
+    Example: fleet-slip run --campaign smoke
     """
     if json:
         return print_json(report)
@@ -117,7 +117,7 @@ def learn(report: LearnReport, fleet: Fleet, everything: All = False) -> None:
     It trains on the side-slip angle of the mapping, else on the course over ground. At its end it
     says what it assumed, and what to type next. Draft the mapping with: fleet-slip mapping suggest
 
-    Example: **fleet-slip learn golf logs/ --mapping golf.toml**
+    Example: fleet-slip learn golf logs/ --mapping golf.toml
     """
     print_parts(report.parts(everything))
     if report.changed and report.publication:
@@ -186,11 +186,11 @@ def _faster_half(fleet: Fleet, campaign: str) -> str | None:
 def select(everything: All = False) -> None:
     """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only.
 
-    Compare a list of models: **fleet-slip select --models table1**
+    Compare a list of models: fleet-slip select --models table1
 
-    Find an order and a place to stop: **fleet-slip select --rank backward --criterion bic**
+    Find an order and a place to stop: fleet-slip select --rank backward --criterion bic
 
-    Choose among many columns: **fleet-slip select --features windows --search exchange --most 12**
+    Choose among many columns: fleet-slip select --features windows --search exchange --most 12
 
-    Search all subsets: **fleet-slip select --all-subsets --criterion cv**
+    Search all subsets: fleet-slip select --all-subsets --criterion cv
     """

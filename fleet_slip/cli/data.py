@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 def simulate() -> None:
     """Simulate what is missing of a campaign and write it to the logs.
 
-    Example: **fleet-slip simulate waterford --days 2**
+    Example: fleet-slip simulate waterford --days 2
     """
 
 
@@ -71,7 +71,7 @@ def ingest(
 
     Rows that cannot be used go to the quarantine with a reason: fleet-slip sql "FROM quarantine"
 
-    Example: **fleet-slip ingest drive.csv --mapping logger.toml --dry-run**
+    Example: fleet-slip ingest drive.csv --mapping logger.toml --dry-run
     """
     from fleet_slip.ingest.log_files import names_several  # noqa: PLC0415 - takes a while
 
@@ -175,7 +175,7 @@ def mapping(
     Channels are guessed by name, unit and values. Each guess has its reason as a comment, for a
     person to check; signs, and which wheel is which, a dry run of the ingest shows.
 
-    Example: **fleet-slip mapping suggest drive.mf4**
+    Example: fleet-slip mapping suggest drive.mf4
     """
     if output is not None and output.exists():
         raise UsageError(f"{output} exists. Choose another name, or remove it.")

@@ -41,9 +41,9 @@ def gram(
     A feature set that is asked for the first time costs one pass over the logs; from then on only
     new files are read.
 
-    Every set: **fleet-slip gram --features all**
+    Every set: fleet-slip gram --features all
 
-    Example: **fleet-slip gram --features windows**
+    Example: fleet-slip gram --features windows
     """
     names = fleet.warehouse.feature_sets() if features == ALL_SETS else (features,)
     if sql:
@@ -97,10 +97,10 @@ def features(
     """List the features and feature sets of configs/features.toml.
 
     Features are integer functions of the logged counts, such as yaw rate over speed. Compute the
-    Gram rows of a set with: **fleet-slip gram --features NAME**, then use it with: **fleet-slip
-    select --features NAME**
+    Gram rows of a set with: fleet-slip gram --features NAME, then use it with: fleet-slip
+    select --features NAME
 
-    Example: **fleet-slip features --sql ay_mean_16**
+    Example: fleet-slip features --sql ay_mean_16
     """
     known = known_features()
     named = {name: known.feature_set(name) for name in (PLAIN, *known.sets)}

@@ -27,7 +27,7 @@ def models(
 ) -> None:
     """List the published model versions.
 
-    Example: **fleet-slip models**
+    Example: fleet-slip models
     """
     rows = fleet.models(name).to_pylist()
     if json:
@@ -60,7 +60,7 @@ def show(version: ModelVersion, everything: All = False, json: Json = False) -> 
 
     With --all, coefficients to the last digit, and the SQL of features.
 
-    Example: **fleet-slip show waterford**
+    Example: fleet-slip show waterford
     """
     if json:
         from fleet_slip.export.costs import costs_content  # noqa: PLC0415 - compiled code
@@ -174,7 +174,7 @@ def _label_noise(figures: CrossValidated) -> str:
 def promote(version: ModelVersion, alias: str, previous: bool) -> None:
     """Point an alias, by default champion, at a version.
 
-    Example: **fleet-slip promote waterford@2**
+    Example: fleet-slip promote waterford@2
     """
     name = version.manifest.name
     say(
@@ -189,7 +189,7 @@ def promote(version: ModelVersion, alias: str, previous: bool) -> None:
 def pin(version: ModelVersion, name: str, alias: str, off: bool) -> None:
     """Keep an alias where it is: publications become candidates, until promote or pin --off.
 
-    Example: **fleet-slip pin waterford**
+    Example: fleet-slip pin waterford
     """
     done = "is pinned to version {}" if not off else "is version {}; publications may move it"
     say(f"{name}@{alias} {done.format(version.version)}")
@@ -199,7 +199,7 @@ def pin(version: ModelVersion, name: str, alias: str, off: bool) -> None:
 def diff() -> None:
     """Compare two versions of a model: data, prior, signals, coefficients, figures.
 
-    Example: **fleet-slip diff waterford@1 waterford@2**
+    Example: fleet-slip diff waterford@1 waterford@2
     """
 
 
@@ -207,7 +207,7 @@ def diff() -> None:
 def export(files: Sequence[Path], json: Json = False) -> None:
     """Export a version as C, SQL, ONNX, FMU, DBC or JSON, with test vectors.
 
-    Example: **fleet-slip export waterford --to c --output export**
+    Example: fleet-slip export waterford --to c --output export
     """
     if json:
         print_json({"files": [str(path) for path in files]})

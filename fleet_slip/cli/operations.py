@@ -23,7 +23,7 @@ def status(found: "WarehouseStatus", json: Json = False) -> None:
 
     Exit code 10 if something calls for attention.
 
-    Example: **fleet-slip status --max-age-hours 26**
+    Example: fleet-slip status --max-age-hours 26
     """
     print_answer(found, json)
     for problem in found.problems:
@@ -36,7 +36,7 @@ def quality() -> None:
 
     Reads Gram rows only. Exit code 10 if a drive has faulty sensors.
 
-    Example: **fleet-slip quality --cohort "day >= '2024-05-02'"**
+    Example: fleet-slip quality --cohort "day >= '2024-05-02'"
     """
 
 
@@ -50,10 +50,10 @@ def calibrate(
     """Estimate the sensor errors of each car from its own drives, without label or log rows.
 
     Offsets of gyroscope, accelerometer and steering, tyre radius, steering and understeer, each
-    with its uncertainty and how fast it shrinks with drives. Needs the Gram rows of: **fleet-slip
-    gram --features calibration**. SQL sees the same: **fleet-slip sql "FROM calibration"**
+    with its uncertainty and how fast it shrinks with drives. Needs the Gram rows of: fleet-slip
+    gram --features calibration. SQL sees the same: fleet-slip sql "FROM calibration"
 
-    Example: **fleet-slip calibrate**
+    Example: fleet-slip calibrate
     """
 
 
@@ -63,7 +63,7 @@ def monitor() -> None:
 
     Reads Gram rows only. Exit code 10 if a new day is beyond the limits.
 
-    Example: **fleet-slip monitor waterford --since 2024-05-03**
+    Example: fleet-slip monitor waterford --since 2024-05-03
     """
 
 
@@ -86,7 +86,7 @@ def nightly(
     a candidate. Killed at any moment and given again, it ends where it would have ended. Exits with
     10 if something calls for attention, else with the code of the first step that failed.
 
-    Example: **fleet-slip nightly --landing /srv/logs --mapping logger.toml --model fleet**
+    Example: fleet-slip nightly --landing /srv/logs --mapping logger.toml --model fleet
     """
     if output is not None:
         from fleet_slip.operations.night import write_summary  # noqa: PLC0415 - loaded by now
@@ -101,7 +101,7 @@ def verify() -> None:
 
     Exits with 9 if there is damage that was not repaired.
 
-    Example: **fleet-slip verify --full**
+    Example: fleet-slip verify --full
     """
 
 
@@ -112,7 +112,7 @@ def compact() -> None:
     Replaced files and leftovers of killed jobs go when they are old enough. Readers and jobs are
     not disturbed.
 
-    Example: **fleet-slip compact**
+    Example: fleet-slip compact
     """
 
 
@@ -142,7 +142,7 @@ def forget(
     Train them again with `fleet-slip publish NAME`. With --now it exits with 12 while anything may
     be left: repeat it.
 
-    Example: **fleet-slip forget --vehicle car-7 --now**
+    Example: fleet-slip forget --vehicle car-7 --now
     """
     if expired or retention is not None:
         if not expired or allow or now or any(subject.values()):
@@ -171,5 +171,5 @@ def migrate() -> None:
 
     It can be repeated after any interruption.
 
-    Example: **fleet-slip migrate**
+    Example: fleet-slip migrate
     """

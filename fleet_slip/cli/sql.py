@@ -76,7 +76,7 @@ def sql(
     shows what fits of columns and rows; --all shows all. --csv, --json and --output give numbers to
     the last digit. Several statements on stdin are answered one after the other.
 
-    Example: **fleet-slip sql "SELECT vehicle_id, count(*) AS drives FROM drives GROUP BY ALL"**
+    Example: fleet-slip sql "SELECT vehicle_id, count(*) AS drives FROM drives GROUP BY ALL"
     """
     if query == "-" and sys.stdin is not None and sys.stdin.isatty():
         raise UsageError('give a query: fleet-slip sql "FROM drives"; or pipe statements to it.')

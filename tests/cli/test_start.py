@@ -67,7 +67,7 @@ def test_every_command_is_listed_in_its_own_words() -> None:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_help_of_a_command_has_an_example_that_can_be_typed(name: str) -> None:
     command = load_command(name)
-    examples = re.findall(r"\*\*(fleet-slip .+?)\*\*", command.help or "")
+    examples = re.findall(r": (fleet-slip [^:]+?)(?:\n\n|, then|$)", command.help or "")
     own = [words for words in map(shlex.split, examples) if name in words]
     assert own, examples
     for words in own:
