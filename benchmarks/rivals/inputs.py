@@ -11,7 +11,7 @@ from benchmarks.rivals.learners import Fit, FittedLearner, Names, one_thread
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts, as_counts
+from fleet_slip.columns.drive_columns import DriveCounts, as_counts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.drives import EvaluatedDrive
@@ -87,7 +87,7 @@ class Inputs:
     def values(self, drive: DriveCounts) -> FloatArray:
         """Return physical values, shape (rows, columns), NaN where missing. Raises `DataError`."""
         scales = np.array(list(self.scales.values()))
-        return np.asarray((DriveColumns(self.plan, drive).compute() * scales[:, None]).T)
+        return np.asarray((compute_columns(self.plan, drive) * scales[:, None]).T)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ Gram rows, scores, evaluations and predictions come through it, and it computes 
 the SQL of `fleet_slip.columns.sql` says.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,29 +74,43 @@ def as_counts(
 class Workspace:
     """The memory of a plan's columns, for one drive after the other and one thread.
 
-    `rows` are of the drive loaded last, `rows_at_most` those that memory was taken for.
+    `rows_at_most` are those that memory was taken for.
     """
 
     def __init__(self, plan: ColumnPlan) -> None:
         """Take a plan; memory is taken when a drive comes."""
         self.plan, self._program = plan, plan.program
         self.rows_at_most = -1
-        self.rows = 0
 
-    def load(self, drive: DriveCounts) -> None:
-        """Take a drive. Raises `DataError` for one that cannot be looked back on."""
+    def blocks(self, drive: DriveCounts) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
+        """Yield a drive's columns block by block: which rows, values and how often clipped.
+
+        Values have the shape (columns, rows), NaN where missing; their memory is used again. Raises
+        `DataError` for a drive that cannot be looked back on.
+        """
+        rows, columns = len(drive.ticks), len(self.plan.names)
+        self._load(drive, rows)
+        place, stride = self._regions[Region.REGISTER]
+        registers = self._memory[place : place + columns * stride].reshape(columns, stride)
+        program, ticks = (self._steps, self._program.ratios), self._regions[Region.TICK, 0]
+        for first in range(0, rows, BLOCK_ROWS):
+            run(*program, self._memory, self._flags, rows, ticks, first)
+            size = min(BLOCK_ROWS, rows - first)
+            yield slice(first, first + size), registers[:, :size], self._memory[:size]
+
+    def _load(self, drive: DriveCounts, rows: int) -> None:
         _require_exact(self.plan, drive)
-        program, self.rows = self._program, len(drive.ticks)
-        if self.rows > self.rows_at_most:
-            self.rows_at_most = self.rows
-            self._steps, self._regions = program.steps(self.rows), program.regions(self.rows)
+        program = self._program
+        if rows > self.rows_at_most:
+            self.rows_at_most = rows
+            self._steps, self._regions = program.steps(rows), program.regions(rows)
             self._memory = np.zeros(self._regions[-1, 0])
         for number, name in enumerate(program.signals):
-            counts = self._part(Region.SIGNAL, number, self.rows)
+            counts = self._part(Region.SIGNAL, number, rows)
             counts[:] = drive.counts[name]
             if name in drive.present:
                 counts[~drive.present[name]] = np.nan
-        self._part(Region.TICK, 0, self.rows)[:] = drive.ticks
+        self._part(Region.TICK, 0, rows)[:] = drive.ticks
         for number, one in enumerate(program.of_car):
             known = (
                 one.count(drive.facts[one.name])
@@ -106,18 +120,6 @@ class Workspace:
             self._part(Region.OF_CAR, number, 1)[:] = np.nan if known is None else known
         self._flags = np.zeros((2, max(program.slots, program.kinds, 1)), dtype=np.bool_)
         self._flags[GAPS] = not drive.whole
-
-    def block(self, first: int) -> tuple[FloatArray, FloatArray]:
-        """Return the last block's columns, (columns, rows) with NaN, and its clipping."""
-        place, stride = self._regions[Region.REGISTER]
-        rows, columns = min(BLOCK_ROWS, self.rows - first), len(self.plan.names)
-        registers = self._memory[place : place + columns * stride].reshape(columns, stride)
-        return registers[:, :rows], self._memory[:rows]
-
-    def compute_block(self, first: int) -> None:
-        """Compute the block that begins with a row; blocks are computed in the order of time."""
-        program, ticks = (self._steps, self._program.ratios), self._regions[Region.TICK, 0]
-        run(*program, self._memory, self._flags, self.rows, ticks, first)
 
     def _part(self, region: Region, number: int, size: int) -> FloatArray:
         begin, stride = self._regions[region]
@@ -145,21 +147,9 @@ def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
             raise DataError(f"{name} has counts beyond 16 bits.")
 
 
-class DriveColumns:
-    """The columns of one drive; `clipped`, (rows,), counts those that `compute` clipped."""
-
-    def __init__(self, plan: ColumnPlan, drive: DriveCounts) -> None:
-        """Take a drive. Raises `DataError` for one that cannot be looked back on."""
-        self._workspace = Workspace(plan)
-        self._workspace.load(drive)
-        self.clipped = np.zeros(len(drive.ticks))
-
-    def compute(self) -> FloatArray:
-        """Return all columns, shape (columns, rows), NaN where missing; count what was clipped."""
-        out = np.empty((len(self._workspace.plan.names), len(self.clipped)))
-        for first in range(0, len(self.clipped), BLOCK_ROWS):
-            self._workspace.compute_block(first)
-            block, clipped = self._workspace.block(first)
-            out[:, first : first + block.shape[1]] = block
-            self.clipped[first : first + block.shape[1]] = clipped
-        return out
+def compute_columns(plan: ColumnPlan, drive: DriveCounts) -> FloatArray:
+    """Return all columns of a drive, (columns, rows), NaN where missing; raises as `blocks`."""
+    found = np.empty((len(plan.names), len(drive.ticks)))
+    for rows, block, _ in Workspace(plan).blocks(drive):
+        found[:, rows] = block
+    return found

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray, IntArray, float_column
 from fleet_slip.catalogue.definitions import Definition
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
-from fleet_slip.columns.drive_columns import DriveColumns, as_counts
+from fleet_slip.columns.drive_columns import as_counts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
 from fleet_slip.evaluation.drives import simulate_drives
@@ -264,7 +264,7 @@ def gates_on(
         {},
         {f"gate_{number}": by for number, (by, _) in enumerate(gates.values())},
     )
-    columns = DriveColumns(plan, as_counts(signals, plan.signals, facts)).compute()
+    columns = compute_columns(plan, as_counts(signals, plan.signals, facts))
     return {
         name: np.interp(column, sorted(knots), np.linspace(0, 1, len(knots)))
         for (name, (_, knots)), column in zip(gates.items(), columns, strict=True)

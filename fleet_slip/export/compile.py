@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalogue.signals import COUNT_MAX
-from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
+from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program, write_program
 from fleet_slip.grams.compute import counts_of
 from fleet_slip.models.manifest import Manifest
@@ -81,7 +81,7 @@ def angles_by_kernel(
     """Return the angle of each tick, by the columns of the kernel and exact integers."""
     predictor = Predictor.of(manifest)
     drive = drive_counts(program, predictor, car, samples)
-    return angles_of_columns(program, DriveColumns(predictor.plan, drive).compute())
+    return angles_of_columns(program, compute_columns(predictor.plan, drive))
 
 
 def drive_counts(

@@ -444,13 +444,9 @@ def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[
     """Return the sums of a drive's rows, by columns missing and part; raises as `wide_grams`."""
     plan, total = workspace.plan, len(counts.ticks)
     _require_64_bits(total, max(plan.limits))
-    workspace.load(counts)
     found: dict[Kind, PartSums] = {}
-    for first in range(0, total, BLOCK_ROWS):
-        workspace.compute_block(first)
-        block, clipped = workspace.block(first)
-        ticks = counts.ticks[first : first + len(clipped)]
-        _add_by_kind(found, block, clipped, parts.numbers(ticks))
+    for rows, block, clipped in workspace.blocks(counts):
+        _add_by_kind(found, block, clipped, parts.numbers(counts.ticks[rows]))
     return found
 
 
@@ -459,7 +455,6 @@ def change_sums(
 ) -> dict[Kind, PartSums]:
     """Return the sums of a drive's changes, by columns missing and time; the course is `late`."""
     _require_64_bits(len(counts.ticks), 2 * max(workspace.plan.limits))
-    workspace.load(counts)
     fixes = Fixes(workspace, counts, late)
     found: dict[Kind, PartSums] = {}
     for part, apart in enumerate(times):
@@ -514,19 +509,17 @@ class Fixes:
         self.ticks = drive.ticks.astype(np.int64)
         whole, self.gain = split_late(late)
         self.at, self.course = _fixes(drive, self.ticks, whole)
-        self.yaw_rate = np.empty(workspace.rows)  # of all rows, NaN where it is missing
+        self.yaw_rate = np.empty(len(self.ticks))  # of all rows, NaN where it is missing
         values: list[FloatArray] = []
         clipped: list[FloatArray] = []
         self.first_clipped = np.zeros(0)
-        for first in range(0, workspace.rows, BLOCK_ROWS):
-            workspace.compute_block(first)
-            block, here = workspace.block(first)
-            self.yaw_rate[first : first + block.shape[1]] = block[-1]
-            begin, end = np.searchsorted(self.at, (first, first + block.shape[1]))
-            fixed = self.at[begin:end] - first
+        for rows, block, here in workspace.blocks(drive):
+            self.yaw_rate[rows] = block[-1]
+            begin, end = np.searchsorted(self.at, (rows.start, rows.stop))
+            fixed = self.at[begin:end] - rows.start
             values.append(block[:-2].take(fixed, axis=1))
             clipped.append(here[fixed])
-            self.first_clipped = here[:1].copy() if first == 0 else self.first_clipped
+            self.first_clipped = self.first_clipped if rows.start else here[:1].copy()
         self.counts, self.clipped = np.concatenate(values, axis=1), np.concatenate(clipped)
 
     def changes(self, apart: int) -> tuple[IntArray, FloatArray, FloatArray]:

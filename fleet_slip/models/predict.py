@@ -21,7 +21,7 @@ from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalogue.facts import round_number
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue, round_chunks, valid_values
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
-from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
+from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.compute import counts_of
@@ -65,13 +65,10 @@ class Predictor:
         that cannot be looked back on.
         """
         workspace = workspace or Workspace(self.plan)
-        workspace.load(drive)
         coefficients, scales = np.array(self.coefficients), np.array(self.scales)
         estimate: FloatArray = np.full(len(drive.ticks), self.intercept)
-        for first in range(0, len(estimate), BLOCK_ROWS):
-            workspace.compute_block(first)
-            columns = workspace.block(first)[0]
-            add_terms(columns, coefficients, scales, estimate[first : first + BLOCK_ROWS])
+        for rows, columns, _ in workspace.blocks(drive):
+            add_terms(columns, coefficients, scales, estimate[rows])
         return estimate
 
 

@@ -28,7 +28,7 @@ from fleet_slip.catalogue.definitions import (
 from fleet_slip.catalogue.facts import CAR_NUMBERS
 from fleet_slip.catalogue.features import FeatureCatalogue, features, load_features_over
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
+from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.columns.sql import with_columns
 from fleet_slip.config import load_config
@@ -151,7 +151,7 @@ def computed_by_kernel(logged: dict[str, Any]) -> dict[str, list[float | None]]:
     known = features().features
     rows = features().rows(known)
     drive = DriveCounts(np.arange(len(logged["ay"])), {name: logged[name] for name in INPUTS})
-    columns = DriveColumns(ColumnPlan.of(tuple(known), rows, {}), drive).compute()
+    columns = compute_columns(ColumnPlan.of(tuple(known), rows, {}), drive)
     return {
         name: [None if np.isnan(value) else value for value in column]
         for name, column in zip(known, columns, strict=True)
@@ -334,9 +334,9 @@ def test_what_is_odd_has_the_opposite_columns_in_a_mirrored_drive(name: str) -> 
         numbers: dict[str, int] = {name: offset if name in OFFSETS else 500 for name in CAR_NUMBERS}
         whole = {name: values.astype(np.int16) for name, values in counts.items()}
         facts = {"mass_kg": 1400.0, "vehicle_model": "suv"}
-        return DriveColumns(
+        return compute_columns(
             plan, DriveCounts(np.arange(400), whole, numbers=numbers, facts=facts)
-        ).compute()
+        )
 
     found = [
         (name, np.array_equal(one, -two, equal_nan=True))
@@ -384,7 +384,7 @@ def weights(gates: list[Gate], at: list[int]) -> FloatArray:
     """Weights by the kernel, shape (gates, counts)."""
     columns = columns_of(gates)
     drive = DriveCounts(np.arange(len(at)), {"ay": np.array(at, dtype=np.int16)})
-    return DriveColumns(ColumnPlan.of(list(columns), {}, columns), drive).compute()
+    return compute_columns(ColumnPlan.of(list(columns), {}, columns), drive)
 
 
 @given(knots)

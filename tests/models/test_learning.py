@@ -22,7 +22,7 @@ from fleet_slip.catalogue.lines import (
     whole_line,
 )
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.drive_columns import DriveColumns
+from fleet_slip.columns.drive_columns import compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, QuestionError, StorageError
 from fleet_slip.export.compile import compile_program, make_checks
@@ -112,7 +112,7 @@ def test_each_drive_has_the_estimate_of_a_line_that_was_fitted_without_it(fleet:
     names = (*INNER, label)
     plan = ColumnPlan.of(names, {}, {n: features().time_columns[n].definition for n in INNER})
     rows = {
-        str(drive.facts["drive_id"]): DriveColumns(plan, drive).compute()
+        str(drive.facts["drive_id"]): compute_columns(plan, drive)
         for file in fleet.warehouse.logs.snapshot().files
         for drive in read_drives(fleet.warehouse, file, plan)
     }

@@ -9,7 +9,7 @@ import pytest
 import fleet_slip
 from fleet_slip.catalogue.facts import CAR_NUMBERS
 from fleet_slip.catalogue.features import features
-from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts
+from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.calibration import calibrate
@@ -114,9 +114,7 @@ def test_gram_rows_have_the_bits_of_the_rows(filled: Warehouse) -> None:
     for at, row in enumerate(cohort.drives.to_pylist()):
         known = numbers[row["vehicle_id"]]
         assert known["ay_offset"] != 0
-        columns = DriveColumns(
-            plan_of(WANTED), counts_of_drive(filled, row["drive_id"], known)
-        ).compute()
+        columns = compute_columns(plan_of(WANTED), counts_of_drive(filled, row["drive_id"], known))
         assert not np.isnan(columns).any()
         by_rows = Gram.from_counts(WANTED, columns.T.astype(np.int64).astype(object))
         assert table.restrict(WANTED).row(at) == by_rows
@@ -133,7 +131,7 @@ def test_sums_over_folds_are_those_of_the_drives(filled: Warehouse) -> None:
 
 def test_a_new_car_takes_running_means_and_is_usual(filled: Warehouse) -> None:
     names = ("slowness", "yaw_rate_bias", "yaw_rate_offset_slowness", "understeer_ay")
-    rows = DriveColumns(plan_of(names), counts_of_drive(filled, "car-0-0", {})).compute()
+    rows = compute_columns(plan_of(names), counts_of_drive(filled, "car-0-0", {}))
     np.testing.assert_array_equal(rows[2], rows[0] * rows[1])
     assert not rows[3].any()
     usual = features().time_columns["understeer_ay"].definition.number

@@ -74,7 +74,6 @@ def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers(late: int) -
     table = hostile_drive("a", 6000, 7)
     plan = ColumnPlan.of_set(features(), "course")
     workspace, counts = Workspace(plan), counts_of(table, plan, {})
-    workspace.load(counts)
     rows, columns, _ = Fixes(workspace, counts, late).changes(APART)
     expected = plain_changes(table, late)
     assert len(expected) > 40
@@ -130,7 +129,6 @@ def test_the_label_is_the_change_of_the_side_slip_angle() -> None:
     counts["yaw_rate"] = np.rint(r * 10_000).astype(np.int16)
     plan = ColumnPlan.of_set(features(), "course")
     workspace, loaded = Workspace(plan), counts_of(log_rows("a", counts), plan, {})
-    workspace.load(loaded)
     rows, columns, _ = Fixes(workspace, loaded).changes(APART)
     rows, columns = rows[1:], columns[:, 1:]
     assert len(rows) == 460

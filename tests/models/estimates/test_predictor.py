@@ -8,7 +8,7 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.columns.drive_columns import DriveColumns, DriveCounts, Workspace
+from fleet_slip.columns.drive_columns import DriveCounts, Workspace, compute_columns
 from fleet_slip.columns.plan import BLOCK_ROWS
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
@@ -36,7 +36,7 @@ def test_blocks_of_rows_have_the_bits_of_the_whole_drive() -> None:
     for rows, seed in ((3 * BLOCK_ROWS + 7, 1), (BLOCK_ROWS, 2), (1, 3), (BLOCK_ROWS + 1, 4)):
         drive = drive_of(rows, seed)
         expected = np.full(rows, predictor.intercept)
-        columns = DriveColumns(predictor.plan, drive).compute()
+        columns = compute_columns(predictor.plan, drive)
         for column, coefficient, scale in zip(
             columns, predictor.coefficients, predictor.scales, strict=True
         ):
