@@ -207,8 +207,8 @@ def _latest(
     return latest, np.where(heads, before, shifted)
 
 
-MOST_OPEN_ROWS = 2**19
-"""Rows of drives that have not ended, in memory; all others wait in a temporary file."""
+MOST_OPEN_VALUES = 2**22
+"""Values of drives that have not ended, in memory; all others wait in a temporary file."""
 MOST_PARTS = 64
 """Parts whose rows are taken out of a block at once: thousands of small frames take much memory."""
 MOST_PIECES, BUNDLED_GROUPS = 512, 128
@@ -270,7 +270,7 @@ class OpenDrives:
         self._rows: dict[int, list[pl.DataFrame]] = {}
         self._mixed: list[pl.DataFrame] = []
         """Later blocks, of many parts."""
-        self._in_memory = 0
+        self._in_memory, self._width = 0, 0
         self._spool = Spool()
         self._bundles: set[int] = set()
         """Groups whose rows were put aside together, by their number over `BUNDLED_GROUPS`."""
@@ -282,7 +282,7 @@ class OpenDrives:
         """Keep rows that are sorted by group, and so the rows of each part stand together."""
         if rows.is_empty():
             return
-        self._in_memory += rows.height
+        self._in_memory, self._width = self._in_memory + rows.height, rows.width
         one = rows["part"][0] == rows["part"][-1]
         if self._mixed or self._bundles or (not one and rows["part"].n_unique() > MOST_PARTS):
             self._mixed.append(rows)
@@ -338,15 +338,19 @@ class OpenDrives:
             for piece in self._spool.read(("bundle", bundle)):
                 self._mixed.append(pl.read_ipc_stream(piece))
                 self._in_memory += self._mixed[-1].height
-                if self._in_memory > MOST_OPEN_ROWS:
+                if self._is_full:
                     self._keep_mixed()
                     self._put_aside()
             self._keep_mixed()
             yield from self._joined(parts[bundle])
 
+    @property
+    def _is_full(self) -> bool:
+        return self._in_memory * self._width > MOST_OPEN_VALUES
+
     def spill(self) -> None:
         """Put the rows aside if they are many. Raises `InputError` if the disk is full."""
-        if self._in_memory <= MOST_OPEN_ROWS:
+        if not self._is_full:
             return
         parts = pl.concat([rows["part"] for rows in self._mixed]) if self._mixed else pl.Series()
         if self._bundles or parts.n_unique() > MOST_PIECES:

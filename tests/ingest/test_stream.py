@@ -203,7 +203,7 @@ def test_open_drives_that_wait_in_a_file_are_the_same(
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 200)
     mapping = a_mapping(drive={"column": "run"}, time={"longest_gap_s": 0.1})
     whole = read_columns(tmp_path, columns, mapping)
-    monkeypatch.setattr(open_drives, "MOST_OPEN_ROWS", rows)
+    monkeypatch.setattr(open_drives, "MOST_OPEN_VALUES", 8 * rows)
     monkeypatch.setattr(open_drives, "MOST_PARTS", parts)
     monkeypatch.setattr(open_drives, "MOST_PIECES", pieces)
     monkeypatch.setattr(open_drives, "BUNDLED_GROUPS", groups)
