@@ -100,25 +100,26 @@ class Workspace:
 
     def _load(self, drive: DriveCounts, rows: int) -> None:
         _require_exact(self.plan, drive)
-        program = self._program
+        program, code = self._program, self._program.code
         if rows > self.rows_at_most:
             self.rows_at_most = rows
             self._steps, self._regions = program.steps(rows), program.regions(rows)
             self._memory = np.zeros(self._regions[-1, 0])
-        for number, name in enumerate(program.signals):
+        for number, name in enumerate(code.signals):
             counts = self._part(Region.SIGNAL, number, rows)
             counts[:] = drive.counts[name]
             if name in drive.present:
                 counts[~drive.present[name]] = np.nan
         self._part(Region.TICK, 0, rows)[:] = drive.ticks
-        for number, one in enumerate(program.of_car):
+        for number, one in enumerate(code.of_car):
             known = (
                 one.count(drive.facts[one.name])
                 if isinstance(one, CarFact)
                 else drive.numbers.get(one.name)
             )
             self._part(Region.OF_CAR, number, 1)[:] = np.nan if known is None else known
-        self._flags = np.zeros((2, max(program.slots, program.kinds, 1)), dtype=np.bool_)
+        summed = max(len(code.summed), len(code.kinds), 1)
+        self._flags = np.zeros((2, summed), dtype=np.bool_)
         self._flags[GAPS] = not drive.whole
 
     def _part(self, region: Region, number: int, size: int) -> FloatArray:
@@ -139,7 +140,7 @@ def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
             raise DataError(f"the drive has {rows:,} rows: too many for windows.")
     if rows > plan.most_rows:
         raise DataError(f"the drive has {rows:,} rows: too many for windows.")
-    for name in plan.program.signals:
+    for name in plan.program.code.signals:
         counts = drive.counts[name]
         if counts.dtype == np.int16 or not rows:
             continue

@@ -173,45 +173,24 @@ class Code:
             + [NOWHERE] * (MOST_READ - len(one.reads))
             for number, one in enumerate(self.operations)
         ]
-        return BlockProgram(self, np.array(places, dtype=np.int64), len(columns), count)
+        return BlockProgram(self, np.array(places, dtype=np.int64), count)
 
 
 @dataclass(frozen=True)
 class BlockProgram:
     """Operations with `places`, (steps, 5, 2): region and number of what each writes and reads.
 
-    The first `columns` of the `registers` are columns.
+    The columns are in the first `registers`.
     """
 
     code: Code
     places: NDArray[np.int64]
-    columns: int
     registers: int
 
     @cached_property
     def ratios(self) -> FloatArray:
         """The ratio of each step, shape (steps, 4)."""
         return np.array([one.ratio for one in self.code.operations])
-
-    @cached_property
-    def signals(self) -> tuple[str, ...]:
-        """The signals that it reads, in the order of their numbers."""
-        return tuple(self.code.signals)
-
-    @cached_property
-    def of_car(self) -> tuple[CarFact | CarCount, ...]:
-        """What it reads of a car, in the order of their numbers."""
-        return tuple(self.code.of_car)
-
-    @property
-    def slots(self) -> int:
-        """How many values it sums up over a drive."""
-        return len(self.code.summed)
-
-    @property
-    def kinds(self) -> int:
-        """How many windows of different lengths it has."""
-        return len(self.code.kinds)
 
     def regions(self, rows: int) -> NDArray[np.int64]:
         """Return each region's begin and stride for so many rows, and the memory's size last."""
@@ -282,14 +261,6 @@ _INTEGERS = ("+", "-", "*", "//", "nearest", "negative", "abs", "sign")
 """Those that there are for int64, too."""
 
 Found = Mapping[str, int]
-
-
-def compile_plan(counted: CountedColumns, names: Sequence[str]) -> BlockProgram:
-    """Return the program of columns. Raises `QuestionError` for a bad divisor."""
-    writer = _Writer(counted)
-    for place in sorted({*counted.places.values(), *counted.times}):
-        writer.value(place)
-    return writer.code.assemble([writer.value(counted.places[name]) for name in names])
 
 
 class _Writer:
@@ -613,4 +584,8 @@ def _program(
     rows: tuple[tuple[str, Definition], ...],
     windows: tuple[tuple[str, Definition], ...],
 ) -> BlockProgram:
-    return compile_plan(CountedColumns.of(dict(rows), dict(windows)), names)
+    counted = CountedColumns.of(dict(rows), dict(windows))
+    writer = _Writer(counted)
+    for place in sorted({*counted.places.values(), *counted.times}):
+        writer.value(place)
+    return writer.code.assemble([writer.value(counted.places[name]) for name in names])
