@@ -9,33 +9,14 @@ from functools import partial
 from rich.progress import (
     BarColumn,
     Progress,
-    ProgressColumn,
-    Task,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.text import Text
 
 from fleet_slip.cli.output import say
 from fleet_slip.cli.streams import drawing_on, stderr
-
-
-class _Rate(ProgressColumn):
-    """Speed of a task in its unit."""
-
-    def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        unit = task.fields.get("unit", "")
-        return Text(f"{_short(speed)} {unit}/s" if speed else "")
-
-
-def _short(value: float) -> str:
-    for limit, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if value >= limit:
-            return f"{value / limit:.1f}{suffix}"
-    return f"{value:.0f}"
 
 
 @contextmanager
@@ -49,7 +30,7 @@ def progress(doing: str, unit: str) -> Iterator[Callable[[int, int], None]]:
 def progress_of_steps(
     unit: str, first: str | None = None
 ) -> Iterator[Callable[[str, int, int], None]]:
-    """Show bars with rate and time left on stderr while steps are done, if a person watches.
+    """Show bars with the time left on stderr while steps are done, if a person watches.
 
     Yields the callback: what is being done, how much is done, and how much there is. At Ctrl-C a
     line says how much of each step was done.
@@ -59,7 +40,6 @@ def progress_of_steps(
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.percentage:>3.0f}%"),
-        _Rate(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         console=console,
@@ -70,7 +50,7 @@ def progress_of_steps(
     reached: dict[str, tuple[int, int]] = {}
 
     def begin(doing: str) -> None:
-        begun[doing] = bar.add_task(doing, total=None, unit=unit)
+        begun[doing] = bar.add_task(doing, total=None)
 
     def show(doing: str, done: int, total: int) -> None:
         if doing not in begun:
