@@ -92,7 +92,7 @@ def evaluate(
             model, cohort, others, vehicle=vehicle, threads=threads, **measured
         )
     else:
-        with progress("simulate scenarios", "rows") as show:
+        with progress("simulate scenarios") as show:
             found = fleet.evaluate(
                 model, others, scenarios=scenarios, threads=threads, progress=show
             )

@@ -88,7 +88,7 @@ def publish(
         raise answer.problem
 
 
-@command(Fleet.run, progress=("", "rows"))
+@command(Fleet.run, progress="")
 def run(report: RunReport, fleet: Fleet, everything: All = False, json: Json = False) -> None:
     """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
 
@@ -110,7 +110,7 @@ def run(report: RunReport, fleet: Fleet, everything: All = False, json: Json = F
                 say(f"  {line}")
 
 
-@command(Fleet.learn, arguments=["name", "logs"], progress=("", "units"))
+@command(Fleet.learn, arguments=["name", "logs"], progress="")
 def learn(report: LearnReport, fleet: Fleet, everything: All = False) -> None:
     """Make a model of measured logs: ingest, gram, select, publish. Repeat it when logs are added.
 

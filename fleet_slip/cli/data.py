@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from fleet_slip.ingest.load import IngestReport, Preview
 
 
-@command(Fleet.simulate, arguments=["campaign"], progress=("simulate {campaign}", "rows"))
+@command(Fleet.simulate, arguments=["campaign"], progress="simulate {campaign}")
 def simulate() -> None:
     """Simulate what is missing of a campaign and write it to the logs.
 
@@ -97,7 +97,7 @@ def ingest(
                     seen.add((one.kind, one.signals))
                     say(f"{report.file}: looks wrong: {one}", logging.WARNING)
 
-        with progress("ingest", "files") as show:
+        with progress("ingest") as show:
             reports = fleet.ingest(
                 files,
                 mapping,

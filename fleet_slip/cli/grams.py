@@ -69,7 +69,7 @@ def gram(
 def _run_gram(
     fleet: Fleet, executor: Executor, feature_set: str, cohort: str | None
 ) -> "GramReport":
-    with progress(f"gram {feature_set}", "rows") as show:
+    with progress(f"gram {feature_set}") as show:
         return fleet.gram(feature_set, cohort=cohort, workers=executor, progress=show)
 
 

@@ -67,7 +67,7 @@ def monitor() -> None:
     """
 
 
-@command(Fleet.nightly, progress=("", "rows"), name="--model")
+@command(Fleet.nightly, progress="", name="--model")
 def nightly(
     report: "NightReport",
     output: Annotated[
@@ -95,7 +95,7 @@ def nightly(
     print_answer(report, json)
 
 
-@command(Fleet.verify, progress=("verify", "bytes"))
+@command(Fleet.verify, progress="verify")
 def verify() -> None:
     """Verify every byte against its checksum, and all tables against each other.
 
@@ -105,7 +105,7 @@ def verify() -> None:
     """
 
 
-@command(Fleet.compact, progress=("compact", "days"))
+@command(Fleet.compact, progress="compact")
 def compact() -> None:
     """Turn the small log files of each day into large ones, and remove files out of use.
 
@@ -147,7 +147,7 @@ def forget(
     if expired or retention is not None:
         if not expired or allow or now or any(subject.values()):
             raise UsageError("give --expired alone, or with --retention.")
-        with progress("retain", "files") as show:
+        with progress("retain") as show:
             print_answer(fleet.retain(retention, progress=show), json)
     elif allow:
         if now:
@@ -158,7 +158,7 @@ def forget(
         else:
             say("its new rows are accepted again from now on; what was forgotten stays forgotten")
     else:
-        with progress("forget", "files") as show:
+        with progress("forget") as show:
             report = fleet.forget(**subject, now=now, progress=show)
         print_answer(report, json)
         if now:

@@ -61,7 +61,7 @@ def command(
     *calls: Callable[..., Any],
     arguments: Collection[str] = (),
     without: Collection[str] = (),
-    progress: tuple[str, str] = ("", ""),
+    progress: str | None = None,
     echo: Collection[str] = (),
     **names: str,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -73,8 +73,8 @@ def command(
     With `--json` the document of the answer is printed, with the options of `echo` beside it,
     instead of calling the function, unless that has a parameter `json`. Its other parameters are
     options of its own, values of options, or `fleet`. While calls work their `progress` is shown:
-    what is done, with options in braces, and its unit. What changes the warehouse leaves a record.
-    The `problem` of an answer is raised when all is printed.
+    what is done, with options in braces, or "" where calls name their steps. What changes the
+    warehouse leaves a record. The `problem` of an answer is raised when all is printed.
 
     A function whose first parameter is `fleet` makes the calls, or others, and prints JSON, too.
     One without a parameter that is no option has nothing to add to the parts of an `Answer`.
@@ -127,7 +127,7 @@ def command(
             with record or nullcontext():
                 if first == "fleet":
                     return show(**known | {"fleet": fleet})
-                with _doing(fleet, asked, typed, *progress) as working:
+                with _doing(fleet, asked, typed, progress) as working:
                     answer = fleet
                     for call in calls:
                         taken = _parameters_of(call)
@@ -154,7 +154,7 @@ def command(
 
 @contextmanager
 def _doing(
-    fleet: Any, asked: Collection[str], typed: Mapping[str, Any], doing: str, unit: str
+    fleet: Any, asked: Collection[str], typed: Mapping[str, Any], doing: str | None
 ) -> Iterator[dict[str, Any]]:
     """Yield what calls need while they work: where tasks run, what shows how far they are."""
     found: dict[str, Any] = {}
@@ -162,11 +162,11 @@ def _doing(
         if "workers" in asked:
             where = typed.get("cluster") or typed.get("threads")
             found["workers"] = stack.enter_context(open_workers(fleet.root, where))
-        if unit:
+        if doing is not None:
             from fleet_slip.cli import progress as bars  # noqa: PLC0415 - others wait for no bar
 
             named = doing.format(**typed)
-            bar = bars.progress(named, unit) if named else bars.progress_of_steps(unit)
+            bar = bars.progress(named) if named else bars.progress_of_steps()
             found["progress"] = stack.enter_context(bar)
         yield found
 

@@ -1,6 +1,5 @@
 """Progress of long work on stderr."""
 
-import logging
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,25 +14,23 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from fleet_slip.cli.output import say
 from fleet_slip.cli.streams import drawing_on, stderr
 
 
 @contextmanager
-def progress(doing: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+def progress(doing: str) -> Iterator[Callable[[int, int], None]]:
     """Show a bar while one thing is done; see `progress_of_steps`."""
-    with progress_of_steps(unit, doing) as show:
+    with progress_of_steps() as show:
+        show(doing, 0, None)
         yield partial(show, doing)
 
 
 @contextmanager
-def progress_of_steps(
-    unit: str, first: str | None = None
-) -> Iterator[Callable[[str, int, int], None]]:
+def progress_of_steps() -> Iterator[Callable[[str, int, int | None], None]]:
     """Show bars with the time left on stderr while steps are done, if a person watches.
 
-    Yields the callback: what is being done, how much is done, and how much there is. At Ctrl-C a
-    line says how much of each step was done.
+    Yields the callback: what is being done, how much is done, and how much there is, if
+    that is known.
     """
     console = stderr()
     bar = Progress(
@@ -47,29 +44,11 @@ def progress_of_steps(
         disable=not console.is_terminal or bool(os.environ.get("CI")),
     )
     begun: dict[str, TaskID] = {}
-    reached: dict[str, tuple[int, int]] = {}
 
-    def begin(doing: str) -> None:
-        begun[doing] = bar.add_task(doing, total=None)
-
-    def show(doing: str, done: int, total: int) -> None:
+    def show(doing: str, done: int, total: int | None) -> None:
         if doing not in begun:
-            begin(doing)
-        reached[doing] = done, total
+            begun[doing] = bar.add_task(doing, total=None)
         bar.update(begun[doing], completed=done, total=total)
 
-    try:
-        with drawing_on(console), bar:
-            if first is not None:
-                begin(first)
-            yield show
-    except KeyboardInterrupt:
-        for doing, (done, total) in reached.items():
-            say(f"{doing}: {_how_far(done, total, unit)}.", logging.WARNING)
-        raise
-
-
-def _how_far(done: int, total: int, unit: str) -> str:
-    if done >= total:
-        return f"all {total:,} {unit} were done"
-    return f"{done:,} of {total:,} {unit} were done, {total - done:,} were not"
+    with drawing_on(console), bar:
+        yield show

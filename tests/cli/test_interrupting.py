@@ -14,7 +14,6 @@ import pytest
 
 import fleet_slip
 from fleet_slip.cli import app as program
-from fleet_slip.cli.progress import progress, progress_of_steps
 from fleet_slip.storage.runs import LOGGER
 from tests.support.commands import PATIENCE_S, run
 
@@ -25,30 +24,6 @@ def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     remarks: list[str] = []
     monkeypatch.setattr(LOGGER, "log", lambda _level, text, **_: remarks.append(text))
     return remarks
-
-
-def test_what_is_done_and_what_is_not_is_said(said: list[str]) -> None:
-    with pytest.raises(KeyboardInterrupt), progress("ingest", "files") as show:
-        show(37, 1200)
-        raise KeyboardInterrupt
-    assert said == ["ingest: 37 of 1,200 files were done, 1,163 were not."]
-
-
-def test_each_step_is_told(said: list[str]) -> None:
-    with pytest.raises(KeyboardInterrupt), progress_of_steps("rows") as show:
-        show("simulate", 500, 500)
-        show("gram", 0, 500)
-        raise KeyboardInterrupt
-    assert said == [
-        "simulate: all 500 rows were done.",
-        "gram: 0 of 500 rows were done, 500 were not.",
-    ]
-
-
-def test_nothing_is_said_of_work_that_ends(said: list[str]) -> None:
-    with progress("gram", "rows") as show:
-        show(500, 500)
-    assert said == []
 
 
 def test_the_command_ends_with_130_and_may_be_given_again(
