@@ -94,34 +94,20 @@ def test_only_what_the_history_may_keep_is_kept(tmp_path: Path) -> None:
     assert vehicle not in text
 
 
-def test_running_twice_does_nothing_twice(tmp_path: Path) -> None:
-    fleet = fleet_slip.open(tmp_path / "data")
-    steps: list[str] = []
-    first = fleet.run(
-        "smoke", days=1, models="table1", progress=lambda step, *_: steps.append(step)
-    )
-    assert first.changed
-    assert first.publication
-    assert first.publication.new
-    assert {*steps} >= {"simulate smoke", "gram signals"}
-    second = fleet.run("smoke", days=1, models="table1")
-    assert not second.changed
-    assert second.publication
-    assert second.publication.version == first.publication.version
-    assert second.selection is None
-    assert fleet.sql("SELECT command FROM runs").fetchall() == [("run",), ("run",)]
-
-
 def test_running_again_selects_again_where_anything_is_new(tmp_path: Path) -> None:
     """The list, the worth, and the tables: each is asked for before the champion is kept unseen."""
     fleet, short = fleet_slip.open(tmp_path / "data"), tmp_path / "short.toml"
     short.write_text('description = "One"\n[[model]]\nname = "1"\nsignals = ["ay"]\n')
 
+    steps: list[str] = []
+
     def selects(**changes: Any) -> bool:
         asked = {"days": 1, "models": "table1", **changes}
-        return fleet.run("smoke", **asked).selection is not None
+        report = fleet.run("smoke", progress=lambda step, *_: steps.append(step), **asked)
+        return report.selection is not None
 
     assert [selects(), selects()] == [True, False]
+    assert {*steps} >= {"simulate smoke", "gram signals"}
     assert selects(worth="50%")
     assert selects(name="other")
     assert not selects()

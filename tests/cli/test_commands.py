@@ -217,6 +217,17 @@ FORGED = (
         (["ingest", "none.csv", "--mapping", "unknown"], 3, "Known: race_car_250lm"),
         (["sql", "COPY (SELECT 1) TO 'stolen.csv'"], 5, "only queries are allowed"),
         (["publish", "Bad Name!"], 2, "cannot be the name of a model"),
+        (["gram", "--features", "mood"], 5, "Feature sets: signals, motion"),
+        (["select", "--nested", "curvature"], 5, "not an input"),
+        (["select", "--rank", "luck"], 5, "Known rankings: declared"),
+        (["select", "--criterion", "luck"], 5, "Known criteria: cv, cp"),
+        (["select", "--models", "table1", "--rank", "t"], 2, "leave out models"),
+        (["select", "--all-subsets", "--rank", "t"], 2, "needs no order"),
+        (["select", "--model", "ax, vx"], 5, "vx is not an input"),
+        (["select", "--model", "ax", "--search", "exchange"], 2, "search"),
+        (["diagnose", "nothing"], 5, "no model is called"),
+        (["diagnose", "smoke", "--signals", "ay"], 2, "not both"),
+        (["diagnose", "--signals", "ay,ay"], 2, "appears twice"),
     ],
 )
 def test_a_mistake_is_one_line_and_its_exit_code(

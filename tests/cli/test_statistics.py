@@ -9,33 +9,15 @@ from pathlib import Path
 import duckdb
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import fleet_slip
 from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.cli.app import app
-from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import TICKS, counts, drive
-from tests.support.commands import Finished, RunCommand, done_on
+from tests.support.commands import RunCommand, done_on
 from tests.support.logs import land, log_rows
 from tests.support.once import made_once
-
-
-@pytest.fixture
-def run_command(tmp_path: Path) -> RunCommand:
-    """Run a command in this process, on roots that other tests share, too."""
-
-    def invoke(*arguments: str, root: Path | None = None) -> Finished:
-        data = str(root or tmp_path / "data")
-        done = CliRunner().invoke(app, ["--root", data, *arguments])
-        if isinstance(done.exception, FleetSlipError):
-            return Finished(done.exception.exit_code, done.stdout, f"error: {done.exception}")
-        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
-        return Finished(done.exit_code, done.stdout, done.stderr)
-
-    return invoke
 
 
 @pytest.fixture(scope="session")
@@ -151,29 +133,6 @@ def test_diagnose_shows_both_kinds_of_errors(run_command: RunCommand, every_set:
     assert report["effective_rows"] < report["rows"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "exit_code", "message"),
-    [
-        (["gram", "--features", "mood"], 5, "Feature sets: signals, motion"),
-        (["select", "--nested", "curvature"], 5, "not an input"),
-        (["select", "--rank", "luck"], 5, "Known rankings: declared"),
-        (["select", "--criterion", "luck"], 5, "Known criteria: cv, cp"),
-        (["select", "--models", "table1", "--rank", "t"], 2, "leave out models"),
-        (["select", "--all-subsets", "--rank", "t"], 2, "needs no order"),
-        (["diagnose", "nothing"], 5, "no model is called"),
-        (["diagnose", "smoke", "--signals", "ay"], 2, "not both"),
-        (["diagnose", "--signals", "ay,ay"], 2, "appears twice"),
-    ],
-)
-def test_a_mistake_is_one_line_and_its_exit_code(
-    run_command: RunCommand, every_set: Path, arguments: list[str], exit_code: int, message: str
-) -> None:
-    done = run_command(*arguments, root=every_set)
-    assert done.exit_code == exit_code, done
-    assert message in done.stderr.replace("\n", " ")
-    assert done.stdout == ""
-
-
 def test_features_are_listed(run_command: RunCommand) -> None:
     assert "curvature" in run_command("features").stdout
     assert "motion" in run_command("features", "--sets").stdout
@@ -222,11 +181,6 @@ def test_one_model_is_taken_without_a_list(run_command: RunCommand, every_set: P
     (model,) = given["models"]
     assert model["name"] == given["winner"] == "given"
     assert model["coefficients"] == listed["models"][0]["coefficients"]
-    done = run_command("select", "--model", "ax, vx", root=every_set)
-    assert done.exit_code in (3, 5)
-    assert "vx is not an input" in done.stderr
-    done = run_command("select", "--model", "ax", "--search", "exchange", root=every_set)
-    assert done.exit_code != 0
 
 
 def test_nested_models_have_their_distances_from_the_null_one_on(

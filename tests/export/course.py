@@ -21,30 +21,27 @@ START_S = 1_714_557_600
 COLUMNS = ("steering_mean_16", "ay_mean_16", "ay_square_mean_8", "yaw_rate_speed_mean_8")
 DRIVER = """
 #include <stdio.h>
-#include "any_gram.h"
+#include "PREFIX_gram.h"
 
 int main(void)
 {
-    static any_gram gram;
-    static uint8_t message[ANY_GRAM_LONGEST_MESSAGE];
+    static PREFIX_gram gram;
+    static uint8_t message[UPPER_GRAM_LONGEST_MESSAGE];
     struct { uint8_t vehicle[16]; uint64_t start_s; int64_t late; uint64_t ticks; } drive;
     while (fread(&drive, sizeof drive, 1U, stdin) == 1U) {
-        any_gram_start(&gram, (int32_t)drive.late);
+        PREFIX_gram_start(&gramLATE);
         for (uint64_t i = 0U; i < drive.ticks; i++) {
             int32_t logged;
-            any_gram_sample sample;
+            PREFIX_gram_sample sample;
             if (fread(&logged, sizeof logged, 1U, stdin) != 1U) { return 1; }
             if (fread(&sample, sizeof sample, 1U, stdin) != 1U) { return 1; }
-            if (logged != 0) {
-                any_gram_add(&gram, &sample);
-            } else {
-                any_gram_pass(&gram);
-            }
+            if (logged != 0) { PREFIX_gram_add(&gram, &sample); }
+            PASS
         }
         uint32_t size = 0U;
         uint32_t part = 0U;
         do {
-            size = any_gram_message(&gram, part, drive.vehicle, drive.start_s, message);
+            size = PREFIX_gram_message(&gram, part, drive.vehicle, drive.start_s, message);
             (void)fwrite(message, 1U, size, stdout);
             part++;
         } while (size > 0U);
@@ -52,6 +49,13 @@ int main(void)
     return 0;
 }
 """
+
+
+def gram_driver(prefix: str, *, course: bool = True) -> str:
+    """A program that reads drives, each tick after whether it was logged, and writes messages."""
+    text = DRIVER.replace("UPPER", prefix.upper()).replace("LATE", ", (int32_t)drive.late" * course)
+    passed = "if (logged == 0) { PREFIX_gram_pass(&gram); }" if course else ""
+    return text.replace("PASS", passed).replace("PREFIX", prefix)
 
 
 def learned(columns: Sequence[str] = COLUMNS, feature_set: str = "course") -> Manifest:
@@ -114,5 +118,5 @@ def write_counter(folder: Path, sets: tuple[OnBoard, ...]) -> None:
 def build(folder: Path, sets: tuple[OnBoard, ...], *options: str) -> Counter:
     """Compile what counts some feature sets."""
     write_counter(folder, sets)
-    (folder / "driver.c").write_text(DRIVER)
+    (folder / "driver.c").write_text(gram_driver("any"))
     return Counter(compile_c(folder, ["any_gram.c", "driver.c"], *options), sets)

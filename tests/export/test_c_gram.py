@@ -18,6 +18,7 @@ from fleet_slip.grams.on_board import counted_sets
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.regression.gram import Gram
 from tests.export.compiled import compile_c, needs_cc, run_compiled
+from tests.export.course import gram_driver
 from tests.export.models import MODELS, model_of
 from tests.support.counted_rows import parse_messages
 
@@ -26,41 +27,13 @@ pytestmark = needs_cc
 SIGNALS = catalogue().gram_signals
 MISSING = -(2**15)
 
-DRIVER = """
-#include <stdio.h>
-#include "sideslip_any_gram.h"
-
-int main(void)
-{
-    static sideslip_any_gram gram;
-    static uint8_t message[SIDESLIP_ANY_GRAM_LONGEST_MESSAGE];
-    struct { uint8_t vehicle[16]; uint64_t start_s; uint64_t rows; } drive;
-    while (fread(&drive, sizeof drive, 1U, stdin) == 1U) {
-        sideslip_any_gram_start(&gram);
-        for (uint64_t i = 0U; i < drive.rows; i++) {
-            sideslip_any_gram_sample sample;
-            if (fread(&sample, sizeof sample, 1U, stdin) != 1U) { return 1; }
-            sideslip_any_gram_add(&gram, &sample);
-        }
-        uint32_t size = 0U;
-        uint32_t part = 0U;
-        do {
-            size = sideslip_any_gram_message(&gram, part, drive.vehicle, drive.start_s, message);
-            (void)fwrite(message, 1U, size, stdout);
-            part++;
-        } while (size > 0U);
-    }
-    return 0;
-}
-"""
-
 
 def build_counter(folder: Path, *options: str) -> Path:
     """A program that reads drives and writes messages."""
     version = ModelVersion(1, model_of(MODELS["signals"], name="any"), "0" * 64)
     for name, content in export_files(version, None, "c", with_gram=True).items():
         (folder / name).write_bytes(content)
-    (folder / "driver.c").write_text(DRIVER)
+    (folder / "driver.c").write_text(gram_driver("sideslip_any", course=False))
     return compile_c(folder, ["sideslip_any_gram.c", "driver.c"], *options)
 
 
@@ -71,11 +44,11 @@ def counter(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def count_drives(counter: Path, drives: Sequence[tuple[str, int, Any]]) -> bytes:
     """The messages of drives: a car, when it began, and counts, shape (rows, signals)."""
-    given = b"".join(
-        struct.pack("<16sQQ", car.encode(), start_s, len(counts))
-        + np.asarray(counts, np.int16).tobytes()
-        for car, start_s, counts in drives
-    )
+    given = b""
+    for car, start_s, counts in drives:
+        rows = np.zeros(len(counts), [("logged", "<i4"), ("counts", "<i2", len(SIGNALS))])
+        rows["logged"], rows["counts"] = 1, counts
+        given += struct.pack("<16sQqQ", car.encode(), start_s, 0, len(rows)) + rows.tobytes()
     return run_compiled([counter], given=given)
 
 

@@ -19,21 +19,8 @@ from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.measured import a_mapping, csv_text, good_columns
+from tests.support.measured import MAPPING_TEXT, a_mapping, csv_text, good_columns
 from tests.support.reported import call
-
-MAPPING = """name = "car"
-[time]
-column = "t"
-unit = "s"
-[drive]
-day = {day}
-vehicle_id = "A7"
-vehicle_model = "sedan"
-[signals]
-ax = {{ column = "ax", unit = "m/s^2" }}
-sideslip = {{ column = "beta", unit = "deg" }}
-"""
 
 
 @pytest.fixture
@@ -41,7 +28,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A landing folder of five logs, in folders of their own; the cache is the test's."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
-    (tmp_path / "car.toml").write_text(MAPPING.format(day="2024-05-31"))
+    (tmp_path / "car.toml").write_text(MAPPING_TEXT)
     for i in range(5):
         write_log(tmp_path / "landing" / f"day {i % 2}" / f"{i}.csv", rows=20 + i)
     (tmp_path / "landing" / "notes.txt").write_text("none of it")

@@ -4,7 +4,6 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import fleet_slip
@@ -12,17 +11,7 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import RepeatedError
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.storage.table import Change, Snapshot
-from tests.support.measured import SIGNALS, a_mapping, csv_text
-
-ROWS = 600
-
-
-def recording(seed: int = 1, rows: int = ROWS) -> dict[str, list[str]]:
-    """A drive with noise, as sensors have it, and a row for the quarantine."""
-    noise = np.random.default_rng(seed).normal(size=(2, rows)).cumsum(axis=1) / 50
-    ax, beta = ([f"{x:.3f}" for x in np.clip(some, -9, 9)] for some in noise)
-    ax[100] = "broken"
-    return {"t": [f"{i / 100:.2f}" for i in range(rows)], "ax": ax, "beta": beta}
+from tests.support.measured import SIGNALS, a_mapping, csv_text, recording
 
 
 def write(file: Path, columns: dict[str, list[str]]) -> Path:

@@ -9,17 +9,15 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from typer.testing import CliRunner
 
 import fleet_slip
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.faults import Fault
-from fleet_slip.cli.app import app
 from fleet_slip.errors import AlarmError
 from fleet_slip.ingest.stream import find_refusals, open_measured
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_one_sided, find_suspicions
-from tests.ingest.test_folders import MAPPING as PLAIN
-from tests.support.measured import a_mapping, csv_text, good_columns
+from tests.support.commands import run_on
+from tests.support.measured import MAPPING_TEXT, a_mapping, csv_text, good_columns
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
 
@@ -185,14 +183,13 @@ def test_one_angle_of_the_road_wheels_and_a_speed_of_the_bus_are_looked_at() -> 
 def test_ingest_says_what_looks_wrong_and_goes_on(tmp_path: Path) -> None:
     car = a_car()
     file, mapping = write_car(tmp_path, {**car, "ay": -car["ay"]})
-    words = ["--root", str(tmp_path / "root"), "ingest", file, "--mapping", mapping, "--json"]
-    done = CliRunner().invoke(app, words)
-    assert isinstance(done.exception, AlarmError)  # as a dry run, `quality` and a night
-    assert "Its rows are stored." in str(done.exception)
+    done = run_on(tmp_path / "root", "ingest", file, "--mapping", mapping, "--json")
+    assert done.exit_code == AlarmError.exit_code  # as a dry run, `quality` and a night
+    assert "Its rows are stored." in done.stderr
     (told,) = [line for line in done.stderr.splitlines() if "looks wrong: reversed ay?" in line]
     assert told.startswith(file)
     assert told.endswith("Write negate = true.")
-    (report,) = json.loads(done.stdout)
+    (report,) = done.json
     assert [(one["kind"], one["signals"]) for one in report["suspicions"]] == [("reversed", ["ay"])]
     assert report["new"]
     again = json.loads(call(tmp_path / "root", "ingest", file, "--mapping", mapping, "--json"))
@@ -203,9 +200,9 @@ def test_a_unit_that_lies_so_much_that_rows_are_refused_is_told(tmp_path: Path) 
     car = a_car()
     file, mapping = write_car(tmp_path, {**car, "yaw_rate": 57.3 * car["yaw_rate"]})
     command = ("ingest", file, "--mapping", mapping, "--json")
-    ended = CliRunner().invoke(app, ["--root", str(tmp_path / "root"), *command])
-    assert isinstance(ended.exception, AlarmError)  # most rows are refused
-    (report,) = json.loads(ended.stdout)
+    ended = run_on(tmp_path / "root", *command)
+    assert ended.exit_code == AlarmError.exit_code  # most rows are refused
+    (report,) = ended.json
     (found,) = report["suspicions"]
     assert (found["kind"], found["signals"]) == ("scaled", ["yaw_rate"])
     refused = report["quarantined"]["out_of_range"]
@@ -240,11 +237,9 @@ def test_files_that_land_together_say_it_once(tmp_path: Path) -> None:
     write_car(logs, {name: v[:4000] for name, v in other.items()})
     (logs / "car.csv").rename(logs / "short.csv")
     write_car(logs, {**car, "ay": -car["ay"]})
-    words = ["--root", str(tmp_path / "root"), "ingest", str(logs), "--mapping", mapping, "--json"]
-    done = CliRunner().invoke(app, words)
-    assert isinstance(done.exception, AlarmError)
-    reports = json.loads(done.stdout)
-    found = {Path(one["file"]).name: len(one["suspicions"]) for one in reports}
+    done = run_on(tmp_path / "root", "ingest", logs, "--mapping", mapping, "--json")
+    assert done.exit_code == AlarmError.exit_code
+    found = {Path(one["file"]).name: len(one["suspicions"]) for one in done.json}
     assert found == {"car.csv": 1, "short.csv": 0}
     with pytest.raises(AlarmError, match="1 suspicion, see above"):
         call(tmp_path / "root", "ingest", str(logs), "--mapping", mapping, "--dry-run")
@@ -254,7 +249,7 @@ def test_rows_that_are_refused_for_their_time_call_for_attention(tmp_path: Path)
     columns = {name: [f"{v}" for v in values] for name, values in good_columns(300).items()}
     columns["t"] = [f"{i // 3 / 100:.2f}" for i in range(300)]
     (tmp_path / "log.csv").write_text(csv_text(columns))
-    (tmp_path / "test.toml").write_text(PLAIN.format(day="2024-05-31"))
+    (tmp_path / "test.toml").write_text(MAPPING_TEXT)
     words = ("ingest", str(tmp_path / "log.csv"), "--mapping", str(tmp_path / "test.toml"))
     with pytest.raises(AlarmError, match="200 of 300 rows were refused"):
         call(tmp_path / "root", *words)

@@ -5,12 +5,10 @@ from datetime import date
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.facts import TRAINING_DRIVES
-from fleet_slip.cli.app import app
 from fleet_slip.errors import DataError, RefusedError, UnexaminedError
 from fleet_slip.models import acceptance as champion_rules
 from fleet_slip.operations import examined, quality
@@ -148,10 +146,10 @@ _FLOOR = champion_rules.floor
 
 
 def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_columns(
-    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fleet: Fleet, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     choice = ("--nested", "ay,yaw_rate", "--worth", "0.0001deg")
-    command = ("--root", str(tmp_path / "data"), "publish", "m", *choice, "--dry-run")
+    command = ("publish", "m", *choice, "--dry-run")
     asked = fleet.cohort("day = DATE '2026-10-05'").select(nested="ay,yaw_rate", worth="0.0001deg")
     for name, bound, told in (
         ("max_columns_per_drive", 0.1, r"columns? on 4 drives, more than 0\.1 a drive"),
@@ -164,11 +162,11 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
         dry = fleet.would_publish("m", asked)
         assert (dry.refused, dry.publishes, dry.reason) == (True, False, str(refused.value))
         assert fleet.would_publish("m", asked, candidate=True).candidate
-        said = CliRunner().invoke(app, command)
-        assert "winner: " in said.stdout and isinstance(said.exception, RefusedError)
+        said = run_command(*command)
+        assert "winner: " in said.stdout and said.exit_code == RefusedError.exit_code
         monkeypatch.setattr(champion_rules, "floor", _FLOOR)
     assert not fleet.models().num_rows
-    assert "m would be published. " in CliRunner().invoke(app, command).output
+    assert "m would be published. " in run_command(*command).stderr
     assert fleet.publish("m", asked).new
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import pyarrow as pa
 import pytest
 
@@ -19,18 +18,9 @@ from fleet_slip.operations.forget import forget
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.forgotten import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file
+from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file, recording
 
-ROWS = 3000
-
-
-def recording(seed: int = 1) -> dict[str, Any]:
-    """A drive of 30 s with noise, as sensors have it, and a row for the quarantine."""
-    noise = np.random.default_rng(seed).normal(size=(2, ROWS)).cumsum(axis=1) / 20
-    ax = [f"{x:.3f}" for x in np.clip(noise[0], -9, 9)]
-    ax[100] = "broken"
-    beta = [f"{x:.3f}" for x in np.clip(noise[1], -9, 9)]
-    return {"t": [f"{i / 100:.2f}" for i in range(ROWS)], "ax": ax, "beta": beta}
+ROWS = 600
 
 
 def write(folder: Path, columns: dict[str, Any], name: str = "monday.csv") -> Path:
@@ -183,13 +173,6 @@ def two_cars(folder: Path) -> tuple[list[MeasuredDrive], pa.Table]:
 
 def cars(rows: pa.Table) -> set[str]:
     return set(rows["vehicle_id"].cast(pa.string()).to_pylist())
-
-
-def test_without_a_record_all_rows_are_kept(tmp_path: Path) -> None:
-    drives, refused = two_cars(tmp_path)
-    audit = Audit(LocalFolder(tmp_path / "data"))
-    assert keep_drives(drives, audit) == drives
-    assert keep_refused(refused, audit) == refused
 
 
 @pytest.mark.parametrize("kind", ["vehicle", "drive"])

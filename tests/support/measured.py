@@ -132,6 +132,14 @@ def good_columns(rows: int = 20) -> dict[str, Any]:
     }
 
 
+def recording(seed: int = 1, rows: int = 600) -> dict[str, list[str]]:
+    """A drive with noise, as sensors have it, and a row for the quarantine."""
+    noise = np.random.default_rng(seed).normal(size=(2, rows)).cumsum(axis=1) / 50
+    ax, beta = ([f"{x:.3f}" for x in np.clip(some, -9, 9)] for some in noise)
+    ax[100] = "broken"
+    return {"t": [f"{i / 100:.2f}" for i in range(rows)], "ax": ax, "beta": beta}
+
+
 def ticks(log: MeasuredLog) -> list[int]:
     return list(log.drives["tick"].to_pylist())
 

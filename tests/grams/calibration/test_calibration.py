@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from typer.testing import CliRunner
 
 from fleet_slip.catalogue.facts import CAR_NUMBERS
 from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.cli.app import app
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration import CalibratedNumber, CarEvidence, calibrate, roads_of
 from fleet_slip.grams.car_estimates import (
@@ -36,6 +34,7 @@ from fleet_slip.views import connect
 from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support import cars
+from tests.support.commands import done_on
 from tests.support.logs import land, log_rows
 
 DAY = date(2024, 5, 1)
@@ -347,8 +346,7 @@ def test_a_warehouse_says_what_is_missing_and_forgets(warehouse: Warehouse) -> N
             one = found.car(car)[name]  # type: ignore[index]
             assert one.uncertainty is not None
             assert abs(one.value - value) < 5 * one.uncertainty
-    printed = CliRunner().invoke(app, ["--root", str(warehouse.root), "calibrate"])
-    assert "10 cars or more separate the two" in printed.output
+    assert "10 cars or more separate the two" in str(done_on(warehouse.root, "calibrate"))
     with pytest.raises(QuestionError, match="delta"):
         found.car("delta")
     with pytest.raises(DataError, match="no drive of"):
