@@ -1,6 +1,6 @@
 """Figures of merit from exact sums of predictions and labels.
 
-Distribution functions: normal, Student's t, F and chi-square, instead of all of SciPy.
+The distribution function of Student's t instead of all of SciPy.
 """
 
 import math
@@ -9,9 +9,6 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 
-import numpy as np
-
-from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Record
 from fleet_slip.regression import exact
 from fleet_slip.regression.gram import Gram
@@ -130,17 +127,6 @@ def error_sums(model: LinearModel, gram: Gram, training_mean: Fraction | None = 
 
 
 _TINY = 1e-300
-_erfc = np.vectorize(math.erfc, otypes=[np.float64])
-
-
-def normal_density(x: FloatArray | float) -> FloatArray:
-    """Return the density of the standard normal distribution."""
-    return np.asarray(np.exp(-0.5 * np.square(x)) / math.sqrt(2 * math.pi), dtype=np.float64)
-
-
-def normal_cdf(x: FloatArray | float) -> FloatArray:
-    """Return the distribution function of the standard normal distribution."""
-    return np.asarray(0.5 * _erfc(-np.asarray(x) / math.sqrt(2)), dtype=np.float64)
 
 
 def student_t_two_sided(t: float, degrees: float) -> float:

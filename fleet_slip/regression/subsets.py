@@ -15,7 +15,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,6 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Record
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.figures import normal_cdf, normal_density
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Evidence
 from fleet_slip.regression.least_squares import Fit, correlation_matrix, dependence, fit
@@ -44,30 +42,6 @@ class Problem:
         return np.asarray(np.log1p(self.excess / (self.rows - self.inputs - 1)))
 
 
-@cache
-def expected_squares(k: int) -> tuple[float, ...]:
-    """Return E[Z_(l:k)^2] for l = 1..k, the expected order statistics of k squared normals.
-
-    Integral of z^2 k! / ((l-1)! (k-l)!) (1-F)^(l-1) F^(k-l) dF, F = 2 Phi(z) - 1, by trapezia.
-    """
-    z = np.linspace(0.0, 12.0, 6001)
-    inside = normal_cdf(z) - normal_cdf(-z)
-    outside = 2 * normal_cdf(-z)
-    weight = 2 * normal_density(z) * z**2 * (z[1] - z[0])
-    result = []
-    factor = float(k)
-    for rank in range(1, k + 1):
-        result.append(float(np.sum(factor * weight * outside ** (rank - 1) * inside ** (k - rank))))
-        factor *= (k - rank) / rank
-    return tuple(result)
-
-
-def _cic(problem: Problem, squares: Sequence[float]) -> FloatArray:
-    """Return x + 2 sum_{l<=j} of squares, which are those that k chance effects have in order."""
-    penalties = np.cumsum([0.0, *squares])[problem.size.astype(np.intp)]
-    return np.asarray(problem.excess + 2 * penalties)
-
-
 CRITERIA: dict[str, Callable[[Problem], FloatArray]] = {
     # C_p = RSS / sigma^2 - n + 2(j + 1) = x + 2j - k + 1 (Mallows 1973)
     "cp": lambda p: p.excess + 2 * p.size - p.inputs + 1,
@@ -81,10 +55,6 @@ CRITERIA: dict[str, Callable[[Problem], FloatArray]] = {
     "bic-likelihood": lambda p: p.rows * p.log_rss + (p.size + 1) * math.log(p.rows),
     # Risk inflation: x + 2 j ln k (Foster and George 1994)
     "ric": lambda p: p.excess + 2 * p.size * math.log(max(p.inputs, 1)),
-    # Covariance inflation: x + 2 sum_{l<=j} E[Z_(l:k)^2] (Tibshirani and Knight 1999)
-    "cic": lambda p: _cic(p, expected_squares(p.inputs)),
-    # The same with E[Z_(l:k)^2] = 2 ln(k / l), about twice the exact penalty
-    "cic-log": lambda p: _cic(p, [2 * math.log(p.inputs / i) for i in range(1, p.inputs + 1)]),
     # Adjusted R^2, to be maximised: ln(RSS / RSS_full) - ln(n - j - 1) (Theil 1961)
     "adjusted-r2": lambda p: p.log_rss - np.log(p.rows - p.size - 1),
 }

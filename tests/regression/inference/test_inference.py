@@ -15,7 +15,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.choice import nested_fits
 from fleet_slip.regression.drives import DriveMoments, serving_drives
-from fleet_slip.regression.figures import incomplete_beta, normal_cdf, normal_density
+from fleet_slip.regression.figures import incomplete_beta
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import (
     Evidence,
@@ -108,12 +108,6 @@ def test_serving_drives_stacks_tables() -> None:
 @given(st.floats(0.05, 1e4), st.floats(0.05, 1e4), st.floats(0.0, 1.0))
 def test_incomplete_beta_equals_scipy(a: float, b: float, x: float) -> None:
     assert incomplete_beta(a, b, x) == pytest.approx(betainc(a, b, x), rel=1e-8, abs=1e-12)
-
-
-@given(st.floats(-40, 40))
-def test_normal_distribution_equals_scipy(x: float) -> None:
-    assert normal_cdf(x) == pytest.approx(scipy.stats.norm.cdf(x), rel=1e-12)
-    assert normal_density(x) == pytest.approx(scipy.stats.norm.pdf(x), rel=1e-12)
 
 
 AGREEMENT = 1e-9
