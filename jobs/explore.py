@@ -21,10 +21,10 @@ def _():
     from fleet_slip.base import number_of
     from fleet_slip.errors import FleetSlipError
     from fleet_slip.evaluation.watch import drive_frames
-    from fleet_slip.pages.drawing import SHADES, colour
+    from fleet_slip.pages.drawing import colour
 
     return (
-        SHADES, Figure, FleetSlipError, LinearSegmentedColormap, alt, colour,
+        Figure, FleetSlipError, LinearSegmentedColormap, alt, colour,
         drive_frames, fleet_slip, mo, np, number_of, pl,
     )  # fmt: skip
 
@@ -107,13 +107,16 @@ def _(mo, trained, training):
 
 @app.cell
 def _(
-    Figure, LinearSegmentedColormap, SHADES, colour, drive, drive_frames, fleet, mo, name, np
+    Figure, LinearSegmentedColormap, colour, drive, drive_frames, fleet, mo, name, np
 ):  # fmt: skip
     mo.stop(name.value is None, mo.md("No model yet: `fleet-slip publish`."))
     frames = drive_frames(fleet.warehouse, drive.value, fleet.model(name.value))
     error = frames.estimate_deg - frames.sideslip_deg
-    # As in the report; the hundredth of the points beyond the bound have the last colour.
-    shades = LinearSegmentedColormap.from_list("error", [colour(one) for one in SHADES])
+    # From far below to far above; the hundredth of points beyond the bound have the last colour.
+    shades = LinearSegmentedColormap.from_list(
+        "error",
+        ["#08519c", "#3d85c6", "#9dbfe0", "#c9cdd2", "#f2b183", "#de7426", "#8c3500"],
+    )
     bound = max(float(np.nanquantile(abs(error), 0.99)), 0.01)
     error_map = Figure(figsize=(9, 4.5), layout="constrained")
     _axes = error_map.subplots()

@@ -41,6 +41,7 @@ from fleet_slip.evaluation.judge import Estimate, evaluate_drive
 from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.predict import Predictor
 from fleet_slip.models.request import load_model_list
 from fleet_slip.simulation.scenario import load_scenario
 
@@ -98,7 +99,10 @@ def train(
     fleet: fleet_slip.Fleet, manifest: Manifest, rows: int, wanted: Callable[[str], bool]
 ) -> Iterator[tuple[str, Rival]]:
     """Yield each rival by name."""
-    yield manifest.name, Rival(PublishedEstimate.of(manifest), 8 * (len(manifest.terms) + 1))
+    yield (
+        manifest.name,
+        Rival(PublishedEstimate(Predictor.of(manifest)), 8 * (len(manifest.terms) + 1)),
+    )
     cohort = load_cohort(fleet.warehouse, manifest.trained_on.cohort)
     windows = Inputs.of_model(manifest, all_signals())
     numbers = calibrate(fleet.warehouse).counts() if windows.plan.numbers else None

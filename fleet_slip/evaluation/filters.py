@@ -36,12 +36,10 @@ from fleet_slip.evaluation.single_track import (
     read_drive,
 )
 from fleet_slip.grams.cohort import Cohort, load_cohort
-from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.request import load_model_list
 from fleet_slip.models.select import Selection, select
-from fleet_slip.regression.least_squares import LinearModel
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.runs import LOGGER
@@ -63,12 +61,6 @@ class LinearEstimate:
     intercept: float
     coefficients: Mapping[str, float]
 
-    @classmethod
-    def of(cls, model: LinearModel) -> "LinearEstimate":
-        """Return the estimator of a model of physical values."""
-        weights = model.weights
-        return cls(model.offset, {catalogue()[name].column: weights[name] for name in weights})
-
     def __call__(self, signals: Signals) -> FloatArray:
         """Return intercept + sum of coefficient times signal."""
         terms = [weight * signals[column] for column, weight in self.coefficients.items()]
@@ -86,11 +78,6 @@ class PublishedEstimate:
 
     predictor: Predictor
     facts: Mapping[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, manifest: Manifest) -> "PublishedEstimate":
-        """Return the estimator that a manifest publishes. Raises `RefusedError` as `Predictor`."""
-        return cls(Predictor.of(manifest))
 
     def in_drive(self, drive: EvaluatedDrive) -> "PublishedEstimate":
         """Return the estimator in the car of a drive, which knows its facts."""
@@ -125,7 +112,8 @@ class TrainedModels:
         }
         bank: Bank = {}
         for name, model in zip(self.table_one.values(), self.selection.models, strict=True):
-            fitted = LinearEstimate.of(model.model)
+            weights = {catalogue()[name].column: one for name, one in model.model.weights.items()}
+            fitted = LinearEstimate(model.model.offset, weights)
             about = {
                 **trained,
                 "table_one": model.name,
@@ -151,7 +139,7 @@ class TrainedModels:
                 if not term.logged
             },
         }
-        bank[version.reference] = PublishedEstimate.of(manifest), about
+        bank[version.reference] = PublishedEstimate(Predictor.of(manifest)), about
         return bank
 
 

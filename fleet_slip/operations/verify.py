@@ -65,7 +65,6 @@ DamageKind: TypeAlias = Literal[
     "name",
     "unreferenced",
     "backlog",
-    "unchecked",
 ]
 
 
@@ -73,8 +72,8 @@ DamageKind: TypeAlias = Literal[
 class Damage:
     """One thing that is not as it must be, or that is worth knowing.
 
-    `kind` is where damage is, or a remark: "unreferenced", "backlog" or "unchecked". `path` is a
-    file below the root, a drive or a model version.
+    `kind` is where damage is, or a remark: "unreferenced" or "backlog". `path` is a file below the
+    root, a drive or a model version.
     """
 
     kind: DamageKind
@@ -84,7 +83,7 @@ class Damage:
     @property
     def damage(self) -> bool:
         """Whether something is lost, or would be computed wrongly."""
-        return self.kind not in {"unreferenced", "backlog", "unchecked"}
+        return self.kind not in {"unreferenced", "backlog"}
 
 
 @dataclass

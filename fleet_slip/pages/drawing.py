@@ -46,20 +46,10 @@ PALETTE: Mapping[str, Colour] = {
     "kalman_tuned": Colour("#7a5c48", "#d0a98c"),
     "unstable": Colour("#b3261e", "#ff7a70"),
     "outage": Colour("#8a8f98", "#7d8590"),
-    "below_3": Colour("#08519c", "#6baeff"),
-    "below_2": Colour("#3d85c6", "#4f8fd8"),
-    "below_1": Colour("#9dbfe0", "#3d5f85"),
-    "near_0": Colour("#c9cdd2", "#565d66"),
-    "above_1": Colour("#f2b183", "#855637"),
-    "above_2": Colour("#de7426", "#d97f3a"),
-    "above_3": Colour("#8c3500", "#ffae70"),
 }
 
 FONT = "DejaVu Sans"
 """Ships with matplotlib, so that figures are the same everywhere."""
-
-SHADES = ("below_3", "below_2", "below_1", "near_0", "above_1", "above_2", "above_3")
-"""Colours of differences, from far below to far above."""
 
 STYLE: Any = {
     "svg.fonttype": "none",

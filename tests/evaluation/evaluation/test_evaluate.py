@@ -23,6 +23,7 @@ from fleet_slip.evaluation.filters import FILTERS, FilterEstimate, PublishedEsti
 from fleet_slip.evaluation.identify import checksum_of_sources
 from fleet_slip.evaluation.judge import EvaluatedScenario, Signals, evaluate_drive, rank
 from fleet_slip.evaluation.single_track import read_drive
+from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.score import score
 from fleet_slip.simulation.scenario import Scenario, load_scenario
@@ -160,7 +161,7 @@ def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
     (drive,) = simulate_drives([load_scenario("nominal")])
     assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.signals)
     manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
-    estimate = PublishedEstimate.of(manifest)(drive.signals)
+    estimate = PublishedEstimate(Predictor.of(manifest))(drive.signals)
     assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
 
 
