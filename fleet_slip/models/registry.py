@@ -500,12 +500,18 @@ class Difference(Answer):
     drives: tuple[int, int, int] | None
 
     def parts(self) -> Iterator[Part]:
-        """Return a table of what differs, and the numbers of drives."""
+        """Return a table of what differs, and the numbers of drives.
+
+        Of a term that one has alone it shows the coefficient.
+        """
         one, other = self.one.reference, self.other.reference
+        theirs = [{term.signal for term in two.manifest.terms} for two in (self.one, self.other)]
+        once = tuple(f"terms.{signal}." for signal in theirs[0] ^ theirs[1])
         rows = [
             [name, _shown(a), _shown(b)]
             for name, (a, b) in self.facts.items()
             if not name.endswith(("_exact", "sha256"))  # for machines: --json
+            and (not name.startswith(once) or name.endswith(".coefficient"))
         ]
         if not rows:
             yield Remark(f"{one} and {other} are the same estimator from the same data")

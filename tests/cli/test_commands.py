@@ -307,6 +307,8 @@ def test_candidates_wait_are_compared_and_promoted(
     assert run_command("show", "smoke", "--json").json["version"] == 1
     compared = run_command("diff", "smoke@champion", "smoke@candidate")
     assert "selected_by.asked.features" in compared.stdout and "sha256" not in compared.stdout
+    once = [line.split()[0] for line in compared.stdout.splitlines() if "terms.ay_bias." in line]
+    assert once == ["terms.ay_bias.coefficient"], "of a term of one alone"
     assert "8 made both, 0 only smoke@1, 0 only smoke@2" in compared.stderr
     assert "are the same estimator" in run_command("diff", "smoke@1", "smoke@1").stderr
     names = ("smoke@champion", "smoke@candidate")
