@@ -119,7 +119,6 @@ COMMANDS = (
     Command("simulate", (), SIMULATE),
     Command("ingest", (SIMULATE,), INGEST),
     Command("replace", (*LOGS, ("gram",)), REPLACE),
-    Command("undo", (*LOGS, ("gram",)), ("ingest", "--undo", "log.csv")),
     Command("gram", LOGS, ("gram",)),
     Command("gram of features", (*LOGS, ("gram",)), ("gram", "--features", "all")),
     Command("select", (*LOGS, ("gram",)), ("select", "--json")),

@@ -171,14 +171,6 @@ def _has_car(table: Table, path: str) -> bool:
     return False
 
 
-def named_findings(root: str, source_file: str) -> list[str]:
-    """Return what is there of a file, although a command that names it has ended with 0."""
-    with fleet_slip.connect(root) as database:
-        query = "SELECT drive_id FROM drives WHERE source_file = $file"
-        there = database.execute(query, {"file": source_file}).fetchall()
-    return [f"named: {drive} is there" for (drive,) in there]
-
-
 def version_findings(root: str) -> list[str]:
     """Return the versions that do not follow from the Gram rows that they name."""
     warehouse = warehouse_at(root)

@@ -73,15 +73,12 @@ class Pair:
             first.end()
             return []
         second = self._run(root, self.second)
-        named = self._look_for_named(root, self.second, second)
         migrated = self.second == "migrate"
         found = self._look(root, second, self.second, migrated, "while the first had stopped")
-        found += named
         first.go_on(schedule.die_after)
         ended = first.end()
         done = _done(self.second, second) + _done(self.first, ended)
         found += _harm(self.first, ended) + _harm(self.second, second)
-        found += self._look_for_named(root, self.first, ended)
         if "repair" not in self._both:
             migrated |= self.first == "migrate" and "migrate" in done
             if schedule.die_after != 0:  # else nothing has changed since
@@ -122,13 +119,6 @@ class Pair:
                 lambda: _findings(root, environments, committed, gone, forgotten)
             ).result
         ]
-
-    @staticmethod
-    def _look_for_named(root: str, name: str, outcome: Outcome) -> list[str]:
-        """Return what is left of `later.csv` just after a command has taken it out."""
-        if name != "undo" or not _done(name, outcome):
-            return []
-        return list(forked(lambda: checks.named_findings(root, "later.csv")).result)
 
     def _settle(self, root: str) -> list[str]:
         """Give both commands again until both are done; return what keeps failing."""

@@ -52,7 +52,6 @@ COMMANDS: Mapping[str, tuple[str, ...]] = {
     "simulate": ("simulate", "{campaign}", "--threads", "1"),
     "ingest": ("ingest", "{new}", "--mapping", "{mapping}"),
     "replace": ("ingest", "{later}", "--mapping", "{fixed}", "--replace"),
-    "undo": ("ingest", "--undo", "later.csv"),
     "gram": ("gram",),
     "publish": PUBLISH,
     "promote": ("promote", "sideslip@1"),
@@ -67,7 +66,7 @@ LEFT_BY_KILLED = ("ingest", "simulate", "compact")
 """Commands that were killed before their first commit, where `vacuum` comes in."""
 
 SETTLING = (
-    *("repair", "migrate", "simulate", "ingest", "replace", "undo"),
+    *("repair", "migrate", "simulate", "ingest", "replace"),
     *("compact", "publish", "promote", "vacuum"),
 )
 """In this order commands are given again; then `gram`, and what forgets comes last."""
