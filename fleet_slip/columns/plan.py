@@ -41,7 +41,7 @@ from fleet_slip.errors import QuestionError
 
 # The operations of a program over blocks of rows: whole numbers, and one of four ratios or limits.
 #
-# `kernel` runs them, `program` writes them; `block_arithmetic` and `lookback` define them.
+# `kernel` defines and runs them; below, a program of them is written.
 
 BLOCK_ROWS = 2**10
 """Rows of a block: small, so that its columns stay in the processor's cache."""
@@ -75,7 +75,7 @@ class Region(IntEnum):
     """Parts of a program's memory.
 
     The first counts columns clipped by row; `OF_CAR` is what is known of the car; signals, sums,
-    counts, values, begins and ticks are of all rows (`lookback`).
+    counts, values, begins and ticks are of all rows.
     """
 
     CLIPPED = 0
