@@ -221,7 +221,7 @@ class PublishedModels(Rooted):
         """Return a version that estimates a drive sample by sample, as a car does.
 
         `car` is what the car knows of itself, by name: drive columns such as `mass_kg`, and numbers
-        of the view `calibration`, in SI units. Raises `InputError` for what the version does not
+        of `Fleet.calibrate`, in SI units. Raises `InputError` for what the version does not
         use, and what `export` and `model` raise.
         """
         from fleet_slip.export.stepping import Estimator

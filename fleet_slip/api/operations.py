@@ -102,7 +102,7 @@ class HealthAndUpkeep(JudgedModels):
         from fleet_slip.grams.calibration import calibrate
         from fleet_slip.warehouse.condition import parse_cohort
 
-        return calibrate(self.warehouse, parse_cohort(cohort))
+        return calibrate(self.warehouse, parse_cohort(cohort), receivers=True)
 
     def monitor(
         self,

@@ -24,7 +24,6 @@ from fleet_slip.errors import (
 from fleet_slip.models.request import COURSE, DEFAULT_MODELS, Label, load_model_list
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.runs import step
-from fleet_slip.views import add_calibration
 from fleet_slip.warehouse.database import database_errors, interruptible, one_query, reading_files
 
 if TYPE_CHECKING:
@@ -53,7 +52,6 @@ class Session:
     def sql(self, query: str) -> duckdb.DuckDBPyRelation:
         """Return the answer as a relation; what is made of it keeps the connection open."""
         text = query if self.unlocked else one_query(self.database, query)
-        add_calibration(self.database, query)
         with database_errors("the query"):
             relation: duckdb.DuckDBPyRelation | None = self.database.sql(text)
         if relation is None:

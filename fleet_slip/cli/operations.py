@@ -50,8 +50,8 @@ def calibrate(
     """Estimate the sensor errors of each car from its own drives, without label or log rows.
 
     Offsets of gyroscope, accelerometer and steering, tyre radius, steering and understeer, each
-    with its uncertainty and how fast it shrinks with drives. Needs the Gram rows of: fleet-slip
-    gram --features calibration. SQL sees the same: fleet-slip sql "FROM calibration"
+    with its uncertainty. Needs the Gram rows of: fleet-slip
+    gram --features calibration.
 
     Example: fleet-slip calibrate
     """

@@ -10,6 +10,7 @@ differ, is that of the whole fleet; how much a car's driving determines is its o
 the same roads again, so that there is a limit to what more of them determine.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -18,14 +19,13 @@ from statistics import median, pstdev
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.course import COLUMNS, turned_scale
-from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, CAR_NUMBERS, NumberName
+from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, CAR_NUMBERS, DELAY, NumberName
 from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.car_estimates import (
     KINDS,
@@ -47,8 +47,7 @@ from fleet_slip.grams.reader import (
 )
 from fleet_slip.grams.receiver_delay import (
     LASTING_S,
-    RECEIVER_DELAY,
-    SPREAD,
+    NO_RECEIVERS,
     ReceiverDelays,
     receiver_delays,
 )
@@ -361,6 +360,7 @@ class Calibration(Answer):
         missing: why, of each car.
         logs_version, grams_version: versions of the Delta tables that were read.
         evidence: sums and variances that the numbers came from.
+        receivers: how late satellite receivers are, by the Gram rows of `delay` that there are.
     """
 
     cars: Mapping[str, Mapping[NumberName, CalibratedNumber]]
@@ -368,6 +368,7 @@ class Calibration(Answer):
     logs_version: int
     grams_version: int
     evidence: CarEvidence
+    receivers: ReceiverDelays = NO_RECEIVERS
 
     def car(self, vehicle_id: str) -> Mapping[NumberName, CalibratedNumber]:
         """Return the numbers of a car. Raises `QuestionError` if no drive is of it."""
@@ -412,6 +413,14 @@ class Calibration(Answer):
         )
         if not any(one.uncertainty for cars in self.cars.values() for one in cars.values()):
             yield Remark("no car has two drives: uncertainties cannot be estimated")
+        types = self._types_of_receivers()
+        if types:
+            yield TextTable(
+                "\nhow late types of satellite receivers are",
+                "type|cars|delay s|+-|differs by",
+                ({"name": name, **one} for name, one in types.items()),
+                "{name}|{cars:,}|{delay_s:.3f}|{uncertainty_s:.2g}|{spread_s:.2g}",
+            )
 
     def _of_car(self, car: str) -> Iterator[Part]:
         yield TextTable(
@@ -427,6 +436,21 @@ class Calibration(Answer):
             names = [name for name, why in missing.items() if why == reason]
             are = "is" if len(names) == 1 else "are"
             yield Remark(f"{', '.join(names)} {are} missing: {reason}")
+        if delay := self.receivers.cars.get(car):
+            yield Remark(f"its satellite receiver is late by {delay}")
+
+    def _types_of_receivers(self) -> dict[str, dict[str, float]]:
+        cars = Counter(one.receiver for one in self.receivers.cars.values())
+        return {
+            name: {
+                "cars": cars[name],
+                "delay_s": one.mean,
+                "uncertainty_s": hypot(one.mean_error, LASTING_S),
+                "spread_s": one.spread,
+                "spread_uncertainty_s": one.spread_error,
+            }
+            for name, one in self.receivers.types.items()
+        }
 
     def _remarks_on_roads(self) -> Iterator[Remark]:
         if self.evidence.roads.hide_offsets:
@@ -455,25 +479,20 @@ class Calibration(Answer):
                 "uncertainty": roads.uncertainty,
                 "cars": roads.cars,
             },
+            "receivers": {
+                "cars": {
+                    car: {
+                        "receiver": one.receiver,
+                        "delay_s": one.value,
+                        "uncertainty_s": one.uncertainty,
+                        "drives": one.drives,
+                        "rows": one.rows,
+                    }
+                    for car, one in self.receivers.cars.items()
+                },
+                "types": self._types_of_receivers(),
+            },
         }
-
-
-TABLE = pa.schema(
-    [
-        ("vehicle_id", pa.string()),
-        ("receiver", pa.string()),
-        ("number", pa.string()),
-        ("value", pa.float64()),
-        ("uncertainty", pa.float64()),
-        ("unit", pa.string()),
-        ("count", pa.int64()),
-        ("grain", pa.float64()),
-        ("drives", pa.int64()),
-        ("rows", pa.int64()),
-        ("cars", pa.int64()),
-    ]
-)
-"""The table `calibration`. A row of a type of receiver has no `vehicle_id`, but `cars`."""
 
 
 def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
@@ -497,59 +516,24 @@ def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
     return Calibration(cars, missing, opened.logs_version, opened.grams_version, evidence)
 
 
-def calibration_table(opened: OpenedGrams, of_delay: OpenedGrams) -> pa.Table:
-    """Return the table `calibration` that SQL sees: a row for each car and number.
-
-    Of the Gram rows that there are: none are required. `of_delay` are those of the set `delay`:
-    how late satellite receivers are, also a row for each type, and one for its spread.
-    """
-    delays = receiver_delays(of_delay.batches(parse_condition(ALL_DRIVES)))
-    found = calibration_of(opened, parse_condition(ALL_DRIVES))
-    rows = [
-        {
-            "vehicle_id": car,
-            "number": name,
-            **vars(one),
-            "unit": CAR_NUMBERS[name].unit,
-            "grain": float(CAR_NUMBERS[name].grain),
-        }
-        for car, numbers in found.cars.items()
-        for name, one in numbers.items()
-    ]
-    return pa.Table.from_pylist([*rows, *_rows_of_delay(delays)], schema=TABLE)
-
-
-def _rows_of_delay(delays: ReceiverDelays) -> Iterator[dict[str, Any]]:
-    rows = [{"vehicle_id": car, **vars(one)} for car, one in delays.cars.items()]
-    for name, one in delays.types.items():
-        cars = [car for car in delays.cars.values() if car.receiver == name]
-        of_type = {
-            "receiver": name,
-            "cars": len(cars),
-            "drives": sum(car.drives for car in cars),
-            "rows": sum(car.rows for car in cars),
-        }
-        error = hypot(one.mean_error, LASTING_S)
-        rows.append({**of_type, "value": one.mean, "uncertainty": error})
-        spread = {"number": SPREAD, "value": one.spread, "uncertainty": one.spread_error}
-        rows.append({**of_type, **spread})
-    grain = float(SAMPLE_TIME_S)
-    for row in rows:
-        count = round(row["value"] / grain)
-        yield {"number": RECEIVER_DELAY, "unit": "s", "count": count, "grain": grain, **row}
-
-
 def calibrate(
-    source: Warehouse | GramReader, condition: str | Condition = ALL_DRIVES
+    source: Warehouse | GramReader,
+    condition: str | Condition = ALL_DRIVES,
+    *,
+    receivers: bool = False,
 ) -> Calibration:
     """Return the numbers of every car that has drives of a cohort, from their Gram rows.
 
-    Drives without a label count as others do. Raises `QuestionError` for an invalid condition,
-    and `DataError` if no drive satisfies it or the Gram rows of `calibration` are missing.
+    Drives without a label count as others do; `receivers` asks how late these are, too. Raises
+    `QuestionError` for an invalid condition, and `DataError` if no drive satisfies it or the Gram
+    rows of `calibration` are missing.
     """
     condition = parse_condition(condition)
     with open_grams(source, CALIBRATION, condition) as opened:
         found = calibration_of(opened, condition)
+        if receivers and DELAY in features().sets:
+            of_delay = replace(opened, identity=features().identity(DELAY))
+            found = replace(found, receivers=receiver_delays(of_delay.batches(condition)))
     if not found.cars:
         of = "" if condition.text == ALL_DRIVES else f" of {condition.shown}"
         raise DataError(f"no drive{of} has yaw rate, ay and wheel speeds. Choose another cohort.")

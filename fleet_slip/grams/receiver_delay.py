@@ -28,9 +28,6 @@ from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import Pooled, pool
 from fleet_slip.storage.table import Snapshot
 
-RECEIVER_DELAY = "receiver_delay"
-SPREAD = f"{RECEIVER_DELAY}_spread"
-"""What the view `calibration` calls it, and by how much cars of one type of receiver differ."""
 SPAN, STEP, STEPS = 40, 5, 12
 """Ticks of the integral, between two lags, and how many lags there are beside the first. Receivers
 of 5 Hz have fixes that are so far apart."""
@@ -64,6 +61,11 @@ class ReceiverDelay:
     differing: float
     receiver: str | None = None
 
+    def __str__(self) -> str:
+        if self.uncertainty is None:
+            return f"{1000 * self.value:.0f} ms, from too few drives"
+        return f"{1000 * self.value:.0f} +- {1000 * self.uncertainty:.0f} ms"
+
 
 @dataclass(frozen=True)
 class ReceiverDelays:
@@ -71,6 +73,9 @@ class ReceiverDelays:
 
     cars: dict[str, ReceiverDelay]
     types: dict[str, Pooled]
+
+
+NO_RECEIVERS = ReceiverDelays({}, {})
 
 
 def delay_columns() -> tuple[str, ...]:

@@ -640,7 +640,7 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
     if problems:
         raise RefusedError(
             f"{manifest.name} was not published: a late course looks like side-slip, and "
-            f"{'; '.join(problems)}. The view calibration has receiver_delay of each car. Choose "
+            f"{'; '.join(problems)}. fleet-slip calibrate --car NAME says it. Choose "
             "other cars, add drives, or set the receiver type (receiver in the mapping). "
             f"To publish it anyway: fleet-slip publish {manifest.name} --label "
             "course --force"
@@ -649,14 +649,8 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
 
 
 def _named(delays: Mapping[str, ReceiverDelay], cars: Sequence[str]) -> str:
-    shown = ", ".join(f"{car}: {_said(delays[car])}" for car in cars[:NAMED])
+    shown = ", ".join(f"{car}: {delays[car]}" for car in cars[:NAMED])
     return f"{shown}, and {len(cars) - NAMED} more" if len(cars) > NAMED else shown
-
-
-def _said(one: ReceiverDelay) -> str:
-    if one.uncertainty is None:
-        return f"{1000 * one.value:.0f} ms, from too few drives"
-    return f"{1000 * one.value:.0f} +- {1000 * one.uncertainty:.0f} ms"
 
 
 def require_sound_course(

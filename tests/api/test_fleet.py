@@ -165,18 +165,6 @@ def test_an_unlocked_session_does_what_it_is_told(fleet: Fleet, tmp_path: Path) 
     assert (tmp_path / "out.csv").exists()
 
 
-def test_what_takes_long_is_computed_when_a_query_names_it(smoke_root: Path) -> None:
-    with fleet_slip.open(smoke_root).session() as session:
-        tables = "SELECT count(*) AS n FROM duckdb_tables() WHERE table_name = 'calibration'"
-        assert session.table(tables.replace("calibration", "calib' || 'ration")).to_pylist() == [
-            {"n": 0}
-        ]
-        asked = "SELECT count(DISTINCT vehicle_id) AS cars FROM calibration"
-        first, again = (session.table(asked).to_pylist() for _ in range(2))
-        assert first == again
-        assert session.table(tables).to_pylist() == [{"n": 1}]
-
-
 def test_an_answer_from_a_damaged_file_is_none(smoke_root: Path, tmp_path: Path) -> None:
     """A flipped bit of a count is a well-formed count."""
     root = shutil.copytree(smoke_root, tmp_path / "data")

@@ -36,7 +36,6 @@ velocity_std_mps = 0.03
 time_between_outages_s = 60.0
 outage_duration_s = 5.0
 """
-DELAYS = "SELECT value, uncertainty, drives FROM calibration WHERE number = 'receiver_delay'"
 
 
 LateFleet = Callable[..., Fleet]
@@ -69,12 +68,18 @@ def test_the_delay_is_found_with_its_uncertainty(
     late_fleet: LateFleet, tmp_path: Path, delay_s: float
 ) -> None:
     fleet = late_fleet(tmp_path, delay_s)
-    with fleet.session(DELAYS) as session:
-        ((value, uncertainty, drives),) = session.sql(DELAYS).fetchall()
-    assert drives == 8
-    assert abs(value - delay_s) < 0.005
-    assert 0 < uncertainty < 0.005
-    assert abs(value - delay_s) < 3 * uncertainty + 0.001
+    fleet.gram("calibration")
+    found = fleet.calibrate()
+    (car,), (one,) = found.receivers.cars, found.receivers.cars.values()
+    assert one.drives == 8
+    assert abs(one.value - delay_s) < 0.005
+    assert one.uncertainty is not None
+    assert 0 < one.uncertainty < 0.005
+    assert abs(one.value - delay_s) < 3 * one.uncertainty + 0.001
+    assert found.as_dict()["receivers"]["cars"][car]["delay_s"] == one.value
+    assert f"its satellite receiver is late by {1000 * one.value:.0f} +- " in str(
+        [*found.parts(car)]
+    )
 
 
 def test_a_car_of_few_drives_is_as_sure_as_usual_drives_make_it() -> None:
