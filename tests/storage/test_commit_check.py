@@ -95,7 +95,7 @@ def change(file: Path, old: str, new: str) -> None:
         (1, '"fleet_slip"', '"fleet_slop"', "states no checksum"),
         (1, '"txn"', '"uxn"', "never writes"),
         (3, '"job', '"jbb', "does not match the checksum"),
-        (0, '"name":"logs"', '"name":"logr"', "in two ways"),
+        (0, '"name":"logs"', '"name":"logr"', "twice, differently"),
     ],
 )
 def test_damage_that_no_other_check_sees_is_told(
