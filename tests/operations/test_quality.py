@@ -332,8 +332,8 @@ def test_the_later_of_two_drives_at_once_is_named() -> None:
         )
     )
     assert {name: fault.figure for name, fault in found.items()} == {
-        "within": "50 s are in long",
-        "beyond": "50 s are in long",
+        "within": "50 s overlap with long",
+        "beyond": "50 s overlap with long",
     }
     assert {fault.kind for fault in found.values()} == {"repeated"}
 
@@ -354,9 +354,9 @@ def test_of_a_drive_without_a_log_and_a_log_at_once_that_without_is_named() -> N
         )
     )
     assert {name: fault.figure for name, fault in found.items()} == {
-        "car-20240531T080000Z": "40 s are in resampled",
-        "car-20240531T080100Z": "40 s are in next",
-        "car-20240531T080235Z": "5 s are in car-20240531T080230Z",
+        "car-20240531T080000Z": "40 s overlap with resampled",
+        "car-20240531T080100Z": "40 s overlap with next",
+        "car-20240531T080235Z": "5 s overlap with car-20240531T080230Z",
     }
 
 
@@ -380,7 +380,9 @@ def test_quality_names_two_recordings_of_a_car_at_once(
     told = run_command("quality", "--json")
     assert told.exit_code == 10
     found = [one for one in told.json["findings"] if one["kind"] == "repeated"]
-    assert [(one["drive_id"], one["figure"]) for one in found] == [("rear", "40 s are in front")]
+    assert [(one["drive_id"], one["figure"]) for one in found] == [
+        ("rear", "40 s overlap with front")
+    ]
 
 
 CARS, DAYS = 12, 3
