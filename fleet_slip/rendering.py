@@ -122,6 +122,10 @@ class Answer(Record):
         )
         return "\n".join(text for some in texts for text in some if text)
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the same."""
+        return f"<pre>{escape(str(self))}</pre>"
+
 
 def wrap_lines(text: str, width: int) -> str:
     """Return text whose lines break between words; a line that is indented is kept to be copied."""
@@ -173,33 +177,3 @@ def _paragraphs(header: Sequence[str], rows: Sequence[Sequence[str]], width: int
             lines += [f"{name:<{wide}}  {first}", *(" " * (wide + 2) + one for one in more)]
         lines.append("")
     return "\n".join(line.rstrip() for line in lines)
-
-
-# What a notebook shows of an answer.
-
-
-def notebook_table(
-    title: str, header: Sequence[str], rows: Sequence[Sequence[str]], sizes: Sequence[float]
-) -> str:
-    """Return rows of text as HTML, each with a bar as long as its size beside the largest."""
-    largest = max((abs(size) for size in sizes), default=0.0) or 1.0
-    names = "".join(f"<th>{escape(name)}</th>" for name in header)
-    lines = "".join(
-        f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}<td>{_bar(size / largest)}</td>"
-        "</tr>"
-        for row, size in zip(rows, sizes, strict=True)
-    )
-    return (
-        f"<table><caption>{escape(title)}</caption><thead><tr>{names}<th></th></tr></thead>"
-        f"<tbody>{lines}</tbody></table>"
-    )
-
-
-def _bar(part: float) -> str:
-    """Return a drawing of a share from -1 to 1, to the left or to the right of its middle."""
-    length = 60 * abs(part)
-    return (
-        '<svg width="122" height="10" role="img" aria-hidden="true">'
-        f'<rect x="{61 - (length if part < 0 else 0):.1f}" y="1" width="{length:.1f}" height="8" '
-        'fill="#4269d0"/></svg>'
-    )

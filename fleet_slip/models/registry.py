@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
+from html import escape
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar, overload
 
 import numpy as np
@@ -20,7 +21,7 @@ from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier
 from fleet_slip.config import Config, parse_document
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.models.manifest import Manifest, TrainedDrives, checksum_of_drives
-from fleet_slip.rendering import Answer, Part, Remark, TextTable, notebook_table
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.storage.folder import Folder
 
@@ -197,11 +198,10 @@ class ModelVersion:
         )
 
     def _repr_html_(self) -> str:
-        terms = self.manifest.terms
-        rows = [[term.column, term.unit, f"{term.coefficient:.6g}"] for term in terms]
-        rows.append(["intercept", self.manifest.label.unit, f"{self.manifest.intercept:.6g}"])
-        sizes = [*(term.coefficient * float(term.scale) for term in terms), 0.0]
-        return notebook_table(repr(self)[1:-1], ["signal", "unit", "coefficient"], rows, sizes)
+        terms = [(one.column, one.unit, one.coefficient) for one in self.manifest.terms]
+        terms.append(("intercept", self.manifest.label.unit, self.manifest.intercept))
+        table = TextTable("", "signal|unit|coefficient", terms, "{0}|{1}|{2:.6g}", left=2)
+        return f"<pre>{escape(repr(self)[1:-1])}\n{escape(table.text())}</pre>"
 
     @property
     def reference(self) -> str:

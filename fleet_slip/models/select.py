@@ -65,7 +65,7 @@ from fleet_slip.regression.folds import (
 )
 from fleet_slip.regression.gram import GramTable, packed_position
 from fleet_slip.regression.orders import METHODS
-from fleet_slip.rendering import Answer, Part, notebook_table
+from fleet_slip.rendering import Answer, Part
 from fleet_slip.resources import find_config
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -246,21 +246,6 @@ class Selection(Answer):
             f"{len(self.models)} models; {self.cohort.drive_count:,} drives where "
             f"{self.cohort.condition.text}>"
         )
-
-    def _repr_html_(self) -> str:
-        best = sorted(self.models, key=lambda model: model.pooled.rmse)[:10]
-        rows = [
-            [
-                one.name,
-                f"{len(one.signals)}",
-                f"{one.correlation:.4f}",
-                f"{one.pooled.rmse_deg:.4f}",
-            ]
-            for one in best
-        ]
-        header = ["model", "signals", "correlation", "RMSE deg"]
-        title = f"winner: {self.winner.model.name}. {self.winner.reason}"
-        return notebook_table(title, header, rows, [one.pooled.rmse_deg for one in best])
 
     def parts(self, everything: bool = False) -> Iterator[Part]:
         """Return the winner and why, the best models or all, and how sure that is."""
