@@ -17,6 +17,7 @@ from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
+from fleet_slip.ingest.vocabulary import unit_called
 from tests.support.measured import read_measured
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
@@ -113,6 +114,14 @@ def test_names_from_strangers_stay_names(tmp_path: Path) -> None:
     rows = rows.with_columns(pl.col(odd).alias("ax\n"))
     rows.write_parquet(tmp_path / "log.parquet")
     assert suggest(tmp_path, tmp_path / "log.parquet")["signals"]["ay"]["column"] == odd
+
+
+@pytest.mark.parametrize(
+    ("named", "unit"),
+    [("Unit_DegreOfArcPerSecon", "deg/s"), ("Unit_ForceOfGravi", "g"), ("Unit_Furlong", None)],
+)
+def test_units_of_databases_are_known(named: str, unit: str | None) -> None:
+    assert unit_called(named) == unit
 
 
 @pytest.mark.parametrize("stem", ["2024-05-30_car", "Fahrt über Köln", "_", "x" * 90])
