@@ -130,7 +130,7 @@ def test_every_column_is_documented(run_command: RunCommand, smoke_root: Path) -
 
 
 def test_python_sees_the_same_views_in_si_units(smoke_root: Path) -> None:
-    with fleet_slip.connect(smoke_root) as database:
+    with fleet_slip.connect(smoke_root, query="log, log_counts") as database:
         worst = database.execute(
             "SELECT max(abs(c.ax * 0.001 - l.ax_mps2)), "
             "max(abs(l.sideslip_rad - atan2(vy_mps, vx_mps))) "

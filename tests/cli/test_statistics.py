@@ -16,7 +16,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import TICKS, counts, drive
 from tests.support.commands import RunCommand, done_on
-from tests.support.logs import land, log_rows
+from tests.support.logs import ask, land, log_rows
 from tests.support.once import made_once
 
 
@@ -86,10 +86,8 @@ def test_a_model_names_the_rows_that_it_was_made_of(
     report = run_command("select", "--models", "table1", "--json", root=every_set).json
     model = report["models"][1]
     assert model["drives"] == report["drives"] == 8
-    with fleet_slip.connect(every_set) as database:
-        row = database.execute(
-            f"SELECT count(DISTINCT drive_id), sum(n) FROM grams WHERE {model['gram_rows']}"
-        ).fetchone()
+    counted = f"SELECT count(DISTINCT drive_id), sum(n) FROM grams WHERE {model['gram_rows']}"
+    (row,) = ask(every_set, counted)
     assert row == (model["drives"], model["rows"])
 
 
@@ -109,7 +107,7 @@ def test_a_published_model_with_features_explains_and_evaluates_them(
     score = run_command("score", "curved", "--json", root=own_set).json
     assert score["rows"] == shown["trained_on"]["rows"]
     assert abs(score["error_mean_deg"]) < 1e-9  # an OLS fit has no mean error on its own rows
-    with fleet_slip.connect(own_set) as database:
+    with fleet_slip.connect(own_set, query="log_counts") as database:
         rows = database.sql("FROM log_counts").to_arrow_table()
     computed = duckdb.connect()
     computed.register("log_counts", rows)
@@ -231,7 +229,7 @@ def test_a_model_through_the_origin_is_published_as_one(
     assert exported["model"]["manifest"]["through_origin"] is True
     assert exported["program"]["angle"]["intercept"] == "0"
     scored = run_command("score", "straight", "--json", root=root).json
-    with fleet_slip.connect(root) as database:
+    with fleet_slip.connect(root, query="log") as database:
         terms = " + ".join(
             f"{value!r} * {one}"
             for one, value in zip(

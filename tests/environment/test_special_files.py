@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-import fleet_slip
 from fleet_slip.errors import StorageError
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import recording
 from tests.support.commands import RunCommand
+from tests.support.logs import ask
 from tests.support.manifests import manifest, publish
 
 Place = Callable[[Path], Path]
@@ -68,8 +68,7 @@ def test_the_history_is_written_to_files_only_and_read_from_files_only(
         other.write_text('{"run_id":"of-another"}')
     with recording(LocalFolder(tmp_path), "gram", []):
         pass
-    with fleet_slip.connect(tmp_path) as database:
-        assert database.sql("SELECT run_id FROM runs").fetchall() == []
+    assert ask(tmp_path, "SELECT run_id FROM runs") == []
     if other.is_file():
         assert other.read_text() == '{"run_id":"of-another"}'
 

@@ -179,7 +179,7 @@ ENDLESS = (
 
 @pytest.mark.parametrize("endless", ENDLESS)
 def test_an_endless_query_can_be_interrupted(root: Path, endless: str) -> None:
-    with connect(root) as database:
+    with connect(root, query="log") as database:
         timer = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
         with pytest.raises(KeyboardInterrupt), database_errors("the query"):
             timer.start()  # here, for it may come before the query on a busy machine
@@ -189,7 +189,7 @@ def test_an_endless_query_can_be_interrupted(root: Path, endless: str) -> None:
 
 @pytest.mark.timeout(60)
 def test_an_interruption_before_the_query_begins_is_not_lost(root: Path) -> None:
-    with connect(root) as database:
+    with connect(root, query="log") as database:
         relation = database.sql(ENDLESS[-1])
         begun = threading.Event()
 
@@ -227,7 +227,7 @@ def test_a_connection_opens_no_other_file_and_writes_none_anew(root: Path, tmp_p
     data = root / next(name for name in before if name.endswith(".parquet"))
     secret = tmp_path / "secret.csv"
     secret.write_text("a\n1\n")
-    with connect(root) as database:
+    with connect(root, query="log") as database:
         for attack in (
             f"FROM read_csv('{secret}')",
             f"FROM '{secret}'",

@@ -14,8 +14,8 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.rewriting import compact, migrate
 from fleet_slip.operations.verify import verify
 from fleet_slip.resources import CONFIG_VARIABLE, folder
-from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.logs import ask
 from tests.support.measured import a_mapping, csv_text, ingest_file, physical, read_columns, ticks
 
 ROWS = 300
@@ -84,11 +84,6 @@ def clear_caches() -> Iterator[None]:
     features.cache_clear()
 
 
-def ask(warehouse: Warehouse, query: str) -> list[tuple[Any, ...]]:
-    with connect(warehouse.root) as database:
-        return database.execute(query).fetchall()
-
-
 def test_extras_are_stored_in_their_units(tmp_path: Path) -> None:
     log = read_columns(tmp_path, columns_of(), a_mapping(signals={**PLAIN, **EXTRA}))
     assert physical(log, "brake_pressure", 1000)[:3] == pytest.approx([0, 1e5, 2e5])
@@ -127,20 +122,20 @@ def test_a_file_has_the_columns_of_extras_only_where_a_drive_has_them(
     ingest_file(warehouse, write(tmp_path / "a.csv"), a_mapping(signals=PLAIN))
     (plain,) = warehouse.logs.snapshot().files
     assert not set(catalogue().extras) & set(plain.null_counts)
-    assert ask(warehouse, "SELECT count(*), count(steer), count(gear) FROM log_counts") == [
+    assert ask(warehouse.root, "SELECT count(*), count(steer), count(gear) FROM log_counts") == [
         (ROWS, 0, 0)
     ]
     ingest_file(
         warehouse, write(tmp_path / "b.csv", 1), a_mapping(name="two", signals={**PLAIN, **EXTRA})
     )
     found = "SELECT count(*), count(steer_rad), max(gear_number), max(throttle_position) FROM log"
-    assert ask(warehouse, found) == [(2 * ROWS + 1, ROWS + 1, 5.0, 1.0)]
+    assert ask(warehouse.root, found) == [(2 * ROWS + 1, ROWS + 1, 5.0, 1.0)]
     update_grams(warehouse)
-    assert set(ask(warehouse, "SELECT signals FROM grams")) == {
+    assert set(ask(warehouse.root, "SELECT signals FROM grams")) == {
         ("ax,sideslip",), ("ax,steer_fl,steer_fr,sideslip",),
     }  # fmt: skip
     compact(warehouse)
-    assert ask(warehouse, found) == [(2 * ROWS + 1, ROWS + 1, 5.0, 1.0)]
+    assert ask(warehouse.root, found) == [(2 * ROWS + 1, ROWS + 1, 5.0, 1.0)]
     assert not list(verify(warehouse, full=True).damage)
 
 
@@ -162,18 +157,18 @@ def test_features_may_use_extras(
     )
     update_grams(warehouse, feature_set="one_angle")
     ((names, n, sums),) = ask(
-        warehouse,
+        warehouse.root,
         "SELECT signals, n, sums FROM grams "
         "WHERE starts_with(feature_set, 'one_angle') AND contains(signals, 'steer_doubled')",
     )
     assert (names, n) == ("ax,steer,steer_doubled,sideslip", ROWS + 1)
     assert sums[2] == 2 * sums[1]
-    ((total,),) = ask(warehouse, "SELECT sum(steer) FROM log_counts")
+    ((total,),) = ask(warehouse.root, "SELECT sum(steer) FROM log_counts")
     assert sums[1] == total
     late = by_sql(warehouse, warehouse.logs.snapshot().files, "looks_back").to_pylist()
     assert {row["n"]: row["signals"] for row in late}[ROWS] == "ax,steer_late_1,sideslip"
     ((plain, rows),) = ask(
-        warehouse,
+        warehouse.root,
         "SELECT signals, n FROM grams WHERE starts_with(feature_set, 'one_angle') "
         "AND NOT contains(signals, 'steer')",
     )
@@ -191,11 +186,11 @@ def test_a_data_root_of_before_takes_what_has_no_extras_and_asks_to_migrate_for_
     catalogue.cache_clear()
     ingest_file(warehouse, write(tmp_path / "a.csv"), a_mapping(signals=PLAIN))
     update_grams(warehouse)
-    grams = ask(warehouse, "SELECT * FROM grams")
+    grams = ask(warehouse.root, "SELECT * FROM grams")
     monkeypatch.delenv(CATALOGUE_VARIABLE)
     catalogue.cache_clear()
     now = Warehouse(warehouse.root)
-    assert ask(now, "SELECT * FROM grams") == grams
+    assert ask(now.root, "SELECT * FROM grams") == grams
     assert update_grams(now).files_read == 0
     ingest_file(now, write(tmp_path / "b.csv", 1), a_mapping(signals=PLAIN))
     extended = a_mapping(name="two", signals={**PLAIN, **only("steer")})
@@ -203,9 +198,9 @@ def test_a_data_root_of_before_takes_what_has_no_extras_and_asks_to_migrate_for_
     (tmp_path / "c.csv").write_text(csv_text(late), encoding="utf-8")
     with pytest.raises(RefusedError, match=r"has not: steer\. Add them with: fleet-slip migrate"):
         ingest_file(now, tmp_path / "c.csv", extended)
-    assert ask(now, "SELECT count(*) FROM quarantine") == [(0,)]
+    assert ask(now.root, "SELECT count(*) FROM quarantine") == [(0,)]
     migrate(now)
     ingest_file(now, tmp_path / "c.csv", extended)
-    assert ask(now, "SELECT count(*), count(steer), count(gear) FROM log_counts") == [
+    assert ask(now.root, "SELECT count(*), count(steer), count(gear) FROM log_counts") == [
         (3 * ROWS, ROWS - 1, 0)
     ]

@@ -70,7 +70,7 @@ def test_a_log_without_wheel_speeds_gives_its_model_through_the_shipped_mapping(
     again = ingest_file(warehouse, file, load_mapping("race_car_250lm"))
     assert [(one.new, one.drives_forgotten) for one in (report, again)] == [(True, 0), (False, 0)]
     update_grams(warehouse)
-    with connect(warehouse.root) as database:
+    with connect(warehouse.root, query="drives, log") as database:
         answer = database.sql("SELECT vehicle_id, mass_kg, adhesion, rows FROM drives").fetchall()
         assert answer == [("250lm", None, None, 20_000)]
         rows = database.sql("FROM log ORDER BY tick").to_arrow_table()
@@ -143,7 +143,7 @@ def test_what_a_log_remembers_is_found_and_carries_to_blocks_it_was_not_fitted_t
 def first_to_last_minute_deg(root: Path) -> float:
     """Fit to the first minute by numpy on the columns as SQL defines them, and test on the rest."""
     known = features()
-    with connect(LocalFolder(root)) as database:
+    with connect(LocalFolder(root), query="log_counts") as database:
         columns = [
             np.array(database.sql(column_query(known, name)).fetchnumpy()[name], dtype=np.float64)
             for name in REMEMBERED

@@ -79,7 +79,7 @@ def test_drives_of_a_car_are_one_piece_of_evidence_unless_told_otherwise() -> No
 def test_the_campaigns_noise_is_what_the_label_differs_from_the_truth_by(smoke_root: Path) -> None:
     warehouse = Warehouse(LocalFolder(smoke_root))
     stated = label_noise_deg(warehouse, load_cohort(warehouse))
-    with connect(smoke_root) as database:
+    with connect(smoke_root, query="log") as database:
         off = database.sql(
             "SELECT degrees(sideslip_rad - atan2(vy_mps, vx_mps)) AS off FROM log "
             "WHERE source = 'simulated' AND vx_mps > 15"

@@ -20,15 +20,14 @@ from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.logs import DAY, land, log_rows, path_of, random_counts
+from tests.support.logs import DAY, ask, land, log_rows, path_of, random_counts
 
 ALL_LOGS = "SELECT * FROM log_counts ORDER BY ALL"
 ALL_GRAMS = "SELECT * EXCLUDE file FROM grams ORDER BY ALL"
 
 
 def answers(warehouse: Warehouse) -> list[object]:
-    with fleet_slip.connect(warehouse.root) as database:
-        return [database.execute(query).fetchall() for query in (ALL_LOGS, ALL_GRAMS)]
+    return [ask(warehouse.root, query) for query in (ALL_LOGS, ALL_GRAMS)]
 
 
 @pytest.fixture
@@ -94,7 +93,7 @@ def test_large_files_are_left_alone_and_small_ones_fill_up_to_the_target(six: Wa
 def test_a_query_that_began_before_is_not_disturbed_by_compaction_and_vacuum(
     six: Warehouse,
 ) -> None:
-    reader = fleet_slip.connect(six.root)
+    reader = fleet_slip.connect(six.root, query=ALL_LOGS)
     before = reader.execute(ALL_LOGS).fetchall()
     cursor = duckdb.connect().execute(
         "SELECT drive_id, tick FROM read_parquet($1)", [six.logs.snapshot().paths]

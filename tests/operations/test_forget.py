@@ -15,7 +15,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import fleet_slip
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.grams import job
@@ -30,7 +29,7 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.forgotten import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
-from tests.support.logs import land, log_rows, random_counts
+from tests.support.logs import ask, land, log_rows, random_counts
 from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file
 
 CARS = ("alfa", "beta", "gamma")
@@ -84,11 +83,8 @@ def test_afterwards_every_coefficient_is_that_of_a_world_where_the_car_never_dro
     assert (report.drives, report.rows, report.files_rewritten) == (3, 600, 3)
     assert coefficients(warehouse) == coefficients(without)
     assert with_all != coefficients(without)
-    query = "SELECT * EXCLUDE file FROM grams ORDER BY ALL"
-    with fleet_slip.connect(warehouse.root) as one, fleet_slip.connect(without.root) as two:
-        assert one.execute(query).fetchall() == two.execute(query).fetchall()
-        logs = "FROM log_counts ORDER BY ALL"
-        assert one.execute(logs).fetchall() == two.execute(logs).fetchall()
+    for query in ("SELECT * EXCLUDE file FROM grams ORDER BY ALL", "FROM log_counts ORDER BY ALL"):
+        assert ask(warehouse.root, query) == ask(without.root, query)
 
 
 def test_a_car_is_found_in_files_with_and_without_compute_grams_and_no_other_is_opened(
@@ -206,9 +202,7 @@ def test_a_gram_job_under_way_does_not_bring_a_forgotten_drive_back(
 
     monkeypatch.setattr(job, "compute_grams", overtaken)
     update_grams(warehouse)
-    with fleet_slip.connect(warehouse.root) as database:
-        cars = database.execute("SELECT DISTINCT vehicle_id FROM grams").fetchall()
-    assert cars == [("alfa",)]
+    assert ask(warehouse.root, "SELECT DISTINCT vehicle_id FROM grams") == [("alfa",)]
 
 
 @pytest.mark.parametrize("subject", ["vehicle", "drive"])
@@ -262,8 +256,7 @@ def test_retention_forgets_by_age_and_refuses_to_leave_nothing(tmp_path: Path) -
     report = retain(warehouse, retention, date(2024, 3, 2))
     assert (report.before, report.forgotten.drives) == (date(2024, 1, 17), 1)
     assert not retain(warehouse, retention, date(2024, 3, 2)).forgotten.changed
-    with fleet_slip.connect(tmp_path) as database:
-        days = database.execute("SELECT DISTINCT day FROM grams ORDER BY ALL").fetchall()
+    days = ask(warehouse.root, "SELECT DISTINCT day FROM grams ORDER BY ALL")
     assert days == [(date(2024, 2, 1),), (date(2024, 3, 1),)]
 
 

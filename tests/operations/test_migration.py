@@ -20,7 +20,7 @@ from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.counted_rows import gram_of, row_of, write_counted
-from tests.support.logs import land, log_rows
+from tests.support.logs import ask, land, log_rows
 
 SHIPPED = (folder("configs") / "signals.toml").read_text()
 
@@ -65,18 +65,13 @@ def small_counts(seed: int, rows: int = 40) -> dict[str, Any]:
     return {n: rng.integers(-9000, 9000, rows).astype(np.int16) for n in catalogue().signals}
 
 
-def fetch(warehouse: Warehouse, query: str) -> list[tuple[Any, ...]]:
-    with connect(warehouse.root) as database:
-        return database.execute(query).fetchall()
-
-
 def test_a_new_signal_is_null_in_old_files(warehouse: Warehouse, use: Use) -> None:
     land(warehouse, "old", log_rows("old", small_counts(1)))
     update_grams(warehouse)
-    before = fetch(warehouse, "SELECT sums, products FROM grams")
+    before = ask(warehouse.root, "SELECT sums, products FROM grams")
     use(NEW_SIGNAL)
     now = Warehouse(warehouse.root)
-    assert fetch(now, "SELECT count(*), count(tyre_pressure_pa) FROM log") == [(40, 0)]
+    assert ask(now.root, "SELECT count(*), count(tyre_pressure_pa) FROM log") == [(40, 0)]
     with pytest.raises(RefusedError, match=r"has not: tyre_pressure.*fleet-slip migrate"):
         land(now, "new", log_rows("new", small_counts(2)))
     report = migrate(now)
@@ -84,11 +79,11 @@ def test_a_new_signal_is_null_in_old_files(warehouse: Warehouse, use: Use) -> No
     assert not migrate(now).changed
     land(now, "new", log_rows("new", small_counts(2)))
     assert update_grams(now).files_read == 1
-    signals = dict(fetch(now, "SELECT drive_id, signals FROM grams"))
+    signals = dict(ask(now.root, "SELECT drive_id, signals FROM grams"))
     assert "tyre_pressure" in str(signals["new"])
     assert "tyre_pressure" not in str(signals["old"])
-    assert fetch(now, "SELECT sums, products FROM grams WHERE drive_id = 'old'") == before
-    assert fetch(now, "SELECT count(*), count(tyre_pressure) FROM log_counts") == [(80, 40)]
+    assert ask(now.root, "SELECT sums, products FROM grams WHERE drive_id = 'old'") == before
+    assert ask(now.root, "SELECT count(*), count(tyre_pressure) FROM log_counts") == [(80, 40)]
     check_grams(now, 10)
 
 
@@ -99,9 +94,8 @@ def test_grams_of_old_files_alone_are_the_same_with_a_new_signal(
     use(NEW_SIGNAL)
     now = Warehouse(warehouse.root)
     update_grams(now)
-    (signals, first), *_ = fetch(
-        now, "SELECT signals, sums[1] FROM grams WHERE feature_set = 'signals'"
-    )
+    first_rows = "SELECT signals, sums[1] FROM grams WHERE feature_set = 'signals'"
+    (signals, first), *_ = ask(now.root, first_rows)
     assert "tyre_pressure" not in str(signals)
     catalogue.cache_clear()
     assert first == small_counts(1)["ax"].sum()
@@ -116,8 +110,8 @@ def test_a_retired_signal_stays_in_old_files_and_is_not_asked_for(
     now = Warehouse(warehouse.root)
     land(now, "new", log_rows("new", small_counts(2)))
     assert not migrate(now).changed
-    assert fetch(now, "SELECT count(*), count(station_m) FROM log") == [(80, 80)]
-    assert "lateral_offset_m" not in [row[0] for row in fetch(now, "DESCRIBE log")]
+    assert ask(now.root, "SELECT count(*), count(station_m) FROM log") == [(80, 80)]
+    assert "lateral_offset_m" not in [row[0] for row in ask(now.root, "DESCRIBE log")]
 
 
 def test_counts_of_another_scale_are_refused(warehouse: Warehouse, use: Use) -> None:
@@ -134,7 +128,7 @@ def test_counts_of_another_scale_are_refused(warehouse: Warehouse, use: Use) -> 
         with pytest.raises(RefusedError, match=r"ax 0.001 -> 0.002.*another data root"):
             touch()
     use(SHIPPED)
-    assert fetch(warehouse, "SELECT count(*) FROM log") == [(80,)]
+    assert ask(warehouse.root, "SELECT count(*) FROM log") == [(80,)]
 
 
 def test_the_nightly_job_goes_on_after_a_signal_was_added(

@@ -21,11 +21,10 @@ from fleet_slip.models.select import answer_request
 from fleet_slip.operations.monitor import Chart, Limits, monitor
 from fleet_slip.regression.figures import student_t_quantile
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import counts, drive
 from tests.support.commands import RunCommand
-from tests.support.logs import DAY, land, log_rows
+from tests.support.logs import DAY, ask, land, log_rows
 
 TRAINING_DAYS = 6
 
@@ -72,11 +71,8 @@ def test_the_error_of_a_day_is_what_its_rows_say(trained: tuple[Warehouse, Model
     manifest = version.manifest
     estimate = " + ".join(f"{t.coefficient!r} * {t.column}" for t in manifest.terms)
     error = f"degrees({manifest.intercept!r} + {estimate} - {manifest.label.column})"
-    with connect(warehouse.root) as database:
-        expected = database.execute(
-            f"SELECT avg({error}), stddev_samp({error}), count(*) FROM log WHERE day = $day",
-            {"day": chart.days[-1].day},
-        ).fetchone()
+    figures = f"SELECT avg({error}), stddev_samp({error}), count(*) FROM log WHERE day = $day"
+    (expected,) = ask(warehouse.root, figures, {"day": chart.days[-1].day})
     last = chart.days[-1]
     assert (last.error_mean_deg, last.error_std_deg, last.rows) == pytest.approx(expected, rel=1e-9)
     assert [day.training for day in chart.days] == [True] * TRAINING_DAYS + [False]
@@ -96,10 +92,8 @@ def test_a_training_day_is_judged_by_a_model_that_it_did_not_make(
         for b, term in zip(model.model.coefficients, version.manifest.terms, strict=True)
     )
     error = f"degrees({model.model.offset!r} + {estimate} - sideslip_rad)"
-    with connect(warehouse.root) as database:
-        expected = database.execute(
-            f"SELECT avg({error}), stddev_samp({error}) FROM log WHERE day = $day", {"day": DAY}
-        ).fetchone()
+    figures = f"SELECT avg({error}), stddev_samp({error}) FROM log WHERE day = $day"
+    (expected,) = ask(warehouse.root, figures, {"day": DAY})
     assert (first.error_mean_deg, first.error_std_deg) == pytest.approx(expected, rel=1e-9)
 
 

@@ -37,7 +37,7 @@ from fleet_slip.warehouse.forgotten import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.operations.test_forget import CARS, drive, fill, mentions
 from tests.support.commands import RunCommand, run
-from tests.support.logs import land, path_of
+from tests.support.logs import ask, land, path_of
 from tests.support.measured import SIGNALS, a_mapping, csv_text, good_columns, ingest_file
 
 BETA = Forgettable("vehicle", "beta")
@@ -59,9 +59,7 @@ def just_before_its_commit(
 
 
 def cars_in(warehouse: Warehouse, view: str) -> set[str]:
-    with fleet_slip.connect(warehouse.root, query=view) as database:
-        rows = database.execute(f"SELECT DISTINCT vehicle_id FROM {view}").fetchall()
-    return {row[0] for row in rows}
+    return {car for (car,) in ask(warehouse.root, f"SELECT DISTINCT vehicle_id FROM {view}")}
 
 
 def measured(folder: Path, *cars: str) -> Path:
@@ -175,8 +173,7 @@ def test_a_simulation_under_way_does_not_bring_a_forgotten_drive_back(
     drives = {spec.drive_id for batch in batches for spec in batch.drives}
     assert (report.drives, report.drives_forgotten) == (len(drives) - 1, 1)
     assert not again.changed
-    with fleet_slip.connect(tmp_path) as database:
-        found = database.execute("SELECT DISTINCT drive_id FROM log").fetchall()
+    found = ask(warehouse.root, "SELECT DISTINCT drive_id FROM log")
     assert {row[0] for row in found} == drives - {gone.drive_id}
     assert len(list(tmp_path.glob("logs/day=*/*.parquet"))) == len(warehouse.logs.snapshot().files)
 

@@ -26,10 +26,9 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.objects import ObjectFolder, client
 from fleet_slip.storage.storage_errors import known_meaning, meaning_of, object_errors
 from fleet_slip.storage.table import Change, Unit, retry_conflicts
-from fleet_slip.views import connect
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.logs import DAY, land, log_rows, random_counts
+from tests.support.logs import DAY, ask, land, log_rows, random_counts
 from tests.support.s3_server import ACCESS_KEY, SECRET_KEY, Server, forget_clients
 
 
@@ -112,8 +111,7 @@ def test_units_land_once_where_answers_are_lost(root: Folder, server: Server) ->
     with server.misbehaving(failing=0.1), ThreadPoolExecutor(3) as executor:
         list(executor.map(bring, [n // 2 for n in range(12)]))  # each is brought twice
     assert logs.snapshot().rows == 6 * 20
-    with connect(root) as database:
-        found = database.execute("SELECT drive_id, count(*) FROM log GROUP BY 1").fetchall()
+    found = ask(root, "SELECT drive_id, count(*) FROM log GROUP BY 1")
     assert sorted(found) == [(f"d{n}", 20) for n in range(6)]
 
 
@@ -142,7 +140,7 @@ def test_a_locked_connection_reads_the_snapshot_and_nothing_else(root: Folder) -
     land(warehouse, "one", rows("a"))
     update_grams(warehouse)
     root.put("other.csv", b"a,b\n1,2\n")
-    with fleet_slip.connect(str(root)) as database:
+    with fleet_slip.connect(str(root), query="log") as database:
         assert database.execute("SELECT count(*) FROM log").fetchone() == (20,)
         for query in (
             f"FROM read_csv('{root}/other.csv')",

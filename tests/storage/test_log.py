@@ -35,11 +35,12 @@ from fleet_slip.storage.runs import (
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand, finish, start
+from tests.support.logs import ask
 from tests.support.s3_server import Server
 
 
 def runs(root: Path) -> list[dict[str, Any]]:
-    with fleet_slip.connect(root) as database:
+    with fleet_slip.connect(root, query="runs") as database:
         rows = database.sql("FROM runs ORDER BY run_id").to_arrow_table().to_pylist()
     return list(rows)
 
@@ -205,16 +206,12 @@ def test_a_flipped_bit_is_told_with_its_line(history: Path, place: float) -> Non
 def test_readers_take_nothing_from_a_changed_line(history: Path) -> None:
     root = LocalFolder(history.parents[1])
     history.write_text(history.read_text().replace("mass_kg", "mess_kg", 1))
-    with (
-        pytest.raises(StorageError, match=r"line 2 .*or delete the line"),
-        fleet_slip.connect(history.parents[1]) as database,
-    ):
-        database.sql("SELECT run_id FROM runs").fetchall()
+    with pytest.raises(StorageError, match=r"line 2 .*or delete the line"):
+        ask(history.parents[1], "SELECT run_id FROM runs")
     assert runs_under_way(root) == []
     lines = history.read_text().splitlines()
     history.write_text("\n".join(line for line in lines if "mess_kg" not in line) + "\n")
-    with fleet_slip.connect(history.parents[1]) as database:
-        assert len(database.sql("SELECT run_id FROM runs").fetchall()) == 2
+    assert len(ask(history.parents[1], "SELECT run_id FROM runs")) == 2
 
 
 def test_a_torn_line_is_no_damage_and_skipped(history: Path) -> None:

@@ -11,6 +11,7 @@ import pyarrow as pa
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.table import Change, Unit
+from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
 
 DAY = date(2024, 5, 1)
@@ -19,6 +20,12 @@ DAY = date(2024, 5, 1)
 def path_of(folder: Folder) -> Path:
     """Return where a folder of a file system is."""
     return Path(str(folder))
+
+
+def ask(root: Folder | Path, query: str, given: Any = None) -> list[tuple[Any, ...]]:
+    """Return the answer to a query, for which no view is opened that it does not name."""
+    with connect(root, query=query) as database:
+        return database.execute(query, given).fetchall()
 
 
 def without_names(drives: pa.Table) -> pa.Table:

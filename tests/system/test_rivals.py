@@ -72,7 +72,7 @@ def test_a_rival_sees_on_a_drive_what_it_was_trained_on(smoke_root: Path) -> Non
     assert drawn.names == names
     estimate = LearnedEstimate(inputs, FittedLearner(lambda rows: rows[:, 1], 0))
     drive_id = str(drawn.trip[0])
-    with connect(smoke_root) as database:
+    with connect(smoke_root, query="log") as database:
         rows = database.sql(
             "SELECT ay_mps2 FROM log WHERE drive_id = $id ORDER BY time_s", params={"id": drive_id}
         ).fetchnumpy()

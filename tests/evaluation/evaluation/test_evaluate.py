@@ -200,7 +200,7 @@ def test_filters_know_the_mass_where_the_model_does() -> None:
 def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None:
     scenario = load_scenario("nominal")
     (drive,) = simulate_drives([scenario])
-    with connect(root, scenarios=True) as database:
+    with connect(root, query="log", scenarios=True) as database:
         alone = read_drive(database, scenario.drive_id)
     expected = kalman.estimate(alone.signals, scenario.car, kalman.FilterNoise())
     found = FilterEstimate(FILTERS[0], FILTERS[0].parameters, scenario.car)(drive.signals)
