@@ -5,7 +5,7 @@
 Their processor times are added to FILE by commit, beside that of a yardstick, work that is always
 the same, and drawn over commits. One that takes a fifth longer than the last five records, both in
 yardsticks, is named at the end, as is every figure marked in a page that is more than a fifth
-another (`tests/support/page_figures.py`), and the exit code is 1. The others are run by name:
+another (`tests/support/bench_record.py`), and the exit code is 1. The others are run by name:
 billion and growth need a folder and time, peers and weka other programs.
 """
 
@@ -16,15 +16,16 @@ from pathlib import Path
 
 from benchmarks.usage import measured
 from tests.support.bench_record import (
+    PageFigure,
     Record,
     add_record,
     commit,
     draw,
+    page_figures,
     read_records,
     slower_than,
     yardstick,
 )
-from tests.support.page_figures import PageFigure, page_figures
 
 COMMANDS = (
     "start",

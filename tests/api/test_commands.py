@@ -19,7 +19,9 @@ from tests.support.s3_server import ServerApart, forget_clients
 DAY = date(2024, 5, 1)
 
 
-@pytest.fixture(scope="module", params=["folder", "object store"])
+@pytest.fixture(
+    scope="module", params=["folder", pytest.param("object store", marks=pytest.mark.long)]
+)
 def filled(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Fleet]:

@@ -21,25 +21,28 @@ from tests.support.once import made_once
 
 
 @pytest.fixture(scope="session")
-def every_set(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
-    """A data root with the smoke campaign, its model and all feature sets."""
+def more_sets(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
+    """A data root with the smoke campaign, its model and two more feature sets."""
 
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
-        done_on(root, "gram", "--features", "all")
+        for name in ("motion", "blocks"):
+            done_on(root, "gram", "--features", name)
 
-    return made_once(tmp_path_factory, "every-set", make)
+    return made_once(tmp_path_factory, "more-sets", make)
 
 
 @pytest.fixture
-def own_set(every_set: Path, tmp_path: Path) -> Path:
+def own_set(more_sets: Path, tmp_path: Path) -> Path:
     """A copy of it, to publish in."""
-    return shutil.copytree(every_set, tmp_path / "copy")
+    return shutil.copytree(more_sets, tmp_path / "copy")
 
 
-def test_all_sets_are_up_to_date(run_command: RunCommand, every_set: Path) -> None:
-    reports = run_command("gram", "--features", "all", "--json", root=every_set).json
-    assert [report["files_read"] for report in reports] == [0] * len(reports)
+@pytest.mark.long
+def test_all_sets_are_made_and_up_to_date(run_command: RunCommand, own_set: Path) -> None:
+    for done in (False, True):
+        reports = run_command("gram", "--features", "all", "--json", root=own_set).json
+        assert (sum(report["files_read"] for report in reports) == 0) == done
     assert [report["feature_set"] for report in reports] == [
         features().identity(name)
         for name in (PLAIN, *features().sets)
@@ -48,11 +51,11 @@ def test_all_sets_are_up_to_date(run_command: RunCommand, every_set: Path) -> No
 
 
 def test_a_criterion_chooses_from_a_ranking_and_says_how_sure(
-    run_command: RunCommand, every_set: Path
+    run_command: RunCommand, more_sets: Path
 ) -> None:
     nested = ("--nested", "ax,ay,yaw_rate,steering_wheel,steer_fl")
     arguments = ("select", *nested, "--rank", "backward", "--criterion", "bic")
-    report = run_command(*arguments, "--json", root=every_set).json
+    report = run_command(*arguments, "--json", root=more_sets).json
     choice = report["choice"]
     assert sorted(choice["order"]) == ["ax", "ay", "steer_fl", "steering_wheel", "yaw_rate"]
     best = min(range(6), key=lambda j: choice["criterion_values"][j])
@@ -61,16 +64,16 @@ def test_a_criterion_chooses_from_a_ranking_and_says_how_sure(
     assert choice["effective_rows"] < report["rows"] / 10
     winner = report["models"][best - 1]
     assert abs(choice["honest"]["correlation"] - winner["correlation"]) < 0.01
-    table = run_command(*arguments, root=every_set).stdout
+    table = run_command(*arguments, root=more_sets).stdout
     assert "order by backward" in table
     assert "selection repeated inside every fold" in table
 
 
 def test_all_subsets_report_the_best_of_every_size(
-    run_command: RunCommand, every_set: Path
+    run_command: RunCommand, more_sets: Path
 ) -> None:
     report = run_command(
-        "select", "--all-subsets", "--nested", "ax,ay,yaw_rate,steer_fl", "--json", root=every_set
+        "select", "--all-subsets", "--nested", "ax,ay,yaw_rate,steer_fl", "--json", root=more_sets
     ).json
     subsets = report["choice"]["subsets"]
     assert [one["size"] for one in subsets] == [0, 1, 2, 3, 4]
@@ -81,13 +84,13 @@ def test_all_subsets_report_the_best_of_every_size(
 
 
 def test_a_model_names_the_rows_that_it_was_made_of(
-    run_command: RunCommand, every_set: Path
+    run_command: RunCommand, more_sets: Path
 ) -> None:
-    report = run_command("select", "--models", "table1", "--json", root=every_set).json
+    report = run_command("select", "--models", "table1", "--json", root=more_sets).json
     model = report["models"][1]
     assert model["drives"] == report["drives"] == 8
     counted = f"SELECT count(DISTINCT drive_id), sum(n) FROM grams WHERE {model['gram_rows']}"
-    (row,) = ask(every_set, counted)
+    (row,) = ask(more_sets, counted)
     assert row == (model["drives"], model["rows"])
 
 
@@ -122,9 +125,9 @@ def test_a_published_model_with_features_explains_and_evaluates_them(
     assert not again["new"]
 
 
-def test_diagnose_shows_both_kinds_of_errors(run_command: RunCommand, every_set: Path) -> None:
+def test_diagnose_shows_both_kinds_of_errors(run_command: RunCommand, more_sets: Path) -> None:
     arguments = ("diagnose", "--signals", "ay,steer_fl")
-    report = run_command(*arguments, "--json", root=every_set).json
+    report = run_command(*arguments, "--json", root=more_sets).json
     for naive, robust in zip(report["by_rows"], report["by_clusters"], strict=True):
         assert naive["value"] == robust["value"]
         assert robust["standard_error"] > naive["standard_error"]
@@ -159,34 +162,34 @@ def test_a_number_of_folds_that_cannot_be_is_named(
     "extra", [("--models", "table1"), pytest.param(("--rank", "t"), marks=pytest.mark.long)]
 )
 def test_as_many_folds_as_drives_leave_out_each(
-    run_command: RunCommand, every_set: Path, extra: tuple[str, ...]
+    run_command: RunCommand, more_sets: Path, extra: tuple[str, ...]
 ) -> None:
     """Hashed, some folds would have two drives and others none."""
     five = ("select", "--cohort", "drive_id < 'smoke-2024-05-02-0001'", *extra, "--json")
-    found = run_command(*five, "--folds", "5", root=every_set).json
+    found = run_command(*five, "--folds", "5", root=more_sets).json
     assert (found["drives"], found["folds"]["count"]) == (5, 5)
-    each = run_command(*five, "--folds", "each", root=every_set).json
+    each = run_command(*five, "--folds", "each", root=more_sets).json
     assert found["models"] == each["models"]
-    many = run_command("select", "--folds", "1000", *extra, "--json", root=every_set).json
+    many = run_command("select", "--folds", "1000", *extra, "--json", root=more_sets).json
     assert many["folds"]["count"] == many["drives"] == 8
-    fewer = run_command(*five, "--folds", "3", root=every_set).json
+    fewer = run_command(*five, "--folds", "3", root=more_sets).json
     assert fewer["folds"]["count"] <= 3
 
 
-def test_one_model_is_taken_without_a_list(run_command: RunCommand, every_set: Path) -> None:
-    given = run_command("select", "--model", "ax, ay,yaw_rate", "--json", root=every_set).json
-    listed = run_command("select", "--models", "table1", "--json", root=every_set).json
+def test_one_model_is_taken_without_a_list(run_command: RunCommand, more_sets: Path) -> None:
+    given = run_command("select", "--model", "ax, ay,yaw_rate", "--json", root=more_sets).json
+    listed = run_command("select", "--models", "table1", "--json", root=more_sets).json
     (model,) = given["models"]
     assert model["name"] == given["winner"] == "given"
     assert model["coefficients"] == listed["models"][0]["coefficients"]
 
 
 def test_nested_models_have_their_distances_from_the_null_one_on(
-    run_command: RunCommand, every_set: Path
+    run_command: RunCommand, more_sets: Path
 ) -> None:
     arguments = ("select", "--nested", "ax,ay,yaw_rate,steer_fl")
-    plain = run_command(*arguments, "--json", root=every_set).json
-    ranked = run_command(*arguments, "--rank", "declared", "--json", root=every_set).json
+    plain = run_command(*arguments, "--json", root=more_sets).json
+    ranked = run_command(*arguments, "--rank", "declared", "--json", root=more_sets).json
     found = plain["nested"]
     for name in ("contributions", "distances_to_full", "expected_distances", "effective_rows"):
         assert found[name] == ranked["choice"][name]
@@ -195,13 +198,13 @@ def test_nested_models_have_their_distances_from_the_null_one_on(
     assert found["distances_to_full"][-1] == 0
     assert found["null"]["signals"] == []
     assert found["null"]["rmse_deg"] > plain["models"][-1]["rmse_deg"]
-    table = run_command(*arguments, root=every_set).stdout
+    table = run_command(*arguments, root=more_sets).stdout
     assert "distance D of equation (2)" in table
     assert re.search(r"^0 +\(none\)", table, re.MULTILINE)
-    by_cars = run_command(*arguments, "--cluster", "vehicle", root=every_set)
+    by_cars = run_command(*arguments, "--cluster", "vehicle", root=more_sets)
     assert "cluster-robust errors need at least two vehicles" in by_cars.stderr
     parts = run_command(
-        *arguments, "--features", "blocks", "--by", "part", "--json", root=every_set
+        *arguments, "--features", "blocks", "--by", "part", "--json", root=more_sets
     )
     assert "Fold by drive" in parts.json["nested"]["left_out"]
 

@@ -2,12 +2,15 @@
 
 import os
 import resource
+import shlex
+import shutil
 from pathlib import Path
 
 import pytest
 
 from fleet_slip import limits
-from tests.support.commands import COMMAND, run
+from fleet_slip.errors import StorageError
+from tests.support.commands import COMMAND, Finished, run
 
 pytestmark = pytest.mark.long
 
@@ -75,3 +78,80 @@ def test_data_gets_what_the_libraries_leave_of_a_limit_of_data(
     hard = {resource.RLIMIT_AS: resource.RLIM_INFINITY, resource.RLIMIT_DATA: 2 * 10**9}
     monkeypatch.setattr(resource, "getrlimit", lambda kind: (hard[kind], hard[kind]))
     assert limits.memory_bytes() == 2 * 10**9 - limits.DATA_BYTES // 2
+
+
+FULL = Path("/dev/full")
+STORAGE = StorageError.exit_code
+
+needs_a_full_device = pytest.mark.skipif(not FULL.exists(), reason="no /dev/full on this system")
+
+
+def run_in_shell(root: Path, arguments: str, redirection: str) -> Finished:
+    """Run the command with bash's redirection; its own exit code, not that of the pipe's end."""
+    command = f"{shlex.quote(COMMAND)} --root {shlex.quote(str(root))} {arguments} {redirection}"
+    done = run(["bash", "-c", f"{command}; exit ${{PIPESTATUS[0]}}"])
+    assert "Traceback" not in done.stderr + done.stdout, done
+    assert "Exception ignored" not in done.stderr, done
+    return done
+
+
+@pytest.mark.parametrize(
+    ("redirection", "exit_code"),
+    [
+        pytest.param(">/dev/full", STORAGE, marks=needs_a_full_device),
+        (">&-", STORAGE),
+        ("2>&-", 0),
+        pytest.param("2>/dev/full", 0, marks=needs_a_full_device),
+        ("| head -0", 0),
+        ("2>&1 | head -0", 0),
+    ],
+)
+def test_a_job_is_done_whatever_its_streams_are(
+    smoke_root: Path, tmp_path: Path, redirection: str, exit_code: int
+) -> None:
+    root = shutil.copytree(smoke_root, tmp_path / "data")
+    done = run_in_shell(root, "publish other --models table1", redirection)
+    assert done.exit_code == exit_code
+    assert (root / "models/other/versions/1.json").exists()
+    if exit_code:
+        assert "error: standard output:" in done.stderr
+
+
+def test_a_whole_job_is_done_without_any_stream(tmp_path: Path) -> None:
+    done = run_in_shell(tmp_path / "data", "run --campaign smoke --days 1", "<&- >&- 2>&-")
+    assert done.exit_code == STORAGE
+    assert (tmp_path / "data/models/smoke/versions/1.json").exists()
+
+
+@needs_a_full_device
+@pytest.mark.parametrize(
+    "arguments", ["models --json", "sql 'SELECT 1' --csv", "sql 'SELECT 1'", "--help", "--version"]
+)
+def test_an_answer_that_cannot_be_printed_is_no_success(tmp_path: Path, arguments: str) -> None:
+    done = run_in_shell(tmp_path, arguments, ">/dev/full")
+    assert done.exit_code == STORAGE
+    assert done.stderr.count("No space left on device") == 1
+
+
+def test_wrong_usage_keeps_its_exit_code_without_streams(tmp_path: Path) -> None:
+    assert run_in_shell(tmp_path, "no-such-command", "2>&-").exit_code == 2
+    assert run_in_shell(tmp_path, "sql -", "<&- 2>&1").exit_code == 5
+
+
+def test_a_reader_that_has_enough_is_no_failure(tmp_path: Path) -> None:
+    done = run_in_shell(tmp_path, "sql 'FROM range(200000)' --csv", "| head -2")
+    assert (done.exit_code, done.stdout.splitlines(), done.stderr) == (0, ['"range"', "0"], "")
+
+
+def test_a_closed_stream_is_not_taken_by_a_data_file(tmp_path: Path) -> None:
+    """The first file that a process opens gets the number of a stream that is closed."""
+    code = (
+        "import os, sys; from fleet_slip.cli.streams import Streams; Streams(); "
+        "data = os.open(sys.argv[1], os.O_WRONLY | os.O_CREAT); assert data > 2, data; "
+        "print('result', flush=True); print('remark', file=sys.stderr, flush=True)"
+    )
+    python = shlex.quote(str(Path(COMMAND).with_name("python")))
+    file = tmp_path / "data"
+    command = f"{python} -c {shlex.quote(code)} {shlex.quote(str(file))} <&- >&- 2>&-"
+    assert run(["bash", "-c", command]).exit_code == 0
+    assert file.read_bytes() == b""

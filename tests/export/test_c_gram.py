@@ -1,26 +1,39 @@
-"""Gram rows counted by exported C are those of the warehouse's job, bit for bit."""
+"""Gram rows, and changes of the course, counted by exported C are those of the kernel."""
 
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
 from subprocess import run
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
 
+import fleet_slip
+from fleet_slip.catalogue.features import FeatureSet, features
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.errors import UsageError
+from fleet_slip.errors import RefusedError, UsageError
+from fleet_slip.export.c_gram import sets_on_board
 from fleet_slip.export.files import export_files
+from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.on_board import counted_sets
 from fleet_slip.models.registry import ModelVersion
+from fleet_slip.models.straight_on import PLANE
 from fleet_slip.regression.gram import Gram
-from tests.export.compiled import compile_c, needs_cc, run_compiled
-from tests.export.course import gram_driver
+from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.tables import Warehouse
+from tests.export.compiled import SANITIZED, can_sanitize, compile_c, needs_cc, run_compiled
+from tests.export.course import COLUMNS, Counter, build, gram_driver, learned
 from tests.export.models import MODELS, model_of
-from tests.support.counted_rows import parse_messages
+from tests.grams.rows.test_course_sums import hostile_drive
+from tests.support.counted_rows import parse_messages, rows_of_messages, write_counted
+from tests.support.logs import land
 
 pytestmark = needs_cc
 
@@ -137,3 +150,138 @@ def test_external_names_of_long_models_differ_in_31_characters(tmp_path: Path) -
     symbols = [line.split()[-1] for line in listed.stdout.splitlines() if "sideslip_" in line]
     assert len(symbols) == 3 * 5
     assert len({symbol[:31] for symbol in symbols}) == len(symbols)
+
+
+@pytest.fixture(scope="module")
+def of_course(tmp_path_factory: pytest.TempPathFactory) -> Counter:
+    return build(tmp_path_factory.mktemp("course"), sets_on_board(learned()), "-O2")
+
+
+def valid(table: pa.Table) -> pa.Table:
+    """A drive whose counts are in the ranges of their signals, as a log's are."""
+    for name, one in catalogue().signals.items():
+        counts = table[name].cast(pa.int32())
+        counts = pc.max_element_wise(counts, one.min_count, skip_nulls=False)
+        counts = pc.min_element_wise(counts, one.max_count, skip_nulls=False).cast(pa.int16())
+        table = table.set_column(table.schema.get_field_index(name), name, counts)
+    return table
+
+
+def grams_of(rows: list[dict[str, Any]], columns: Sequence[str]) -> dict[Any, Gram]:
+    """The Gram of each part and set of columns, of some columns alone."""
+    found: dict[Any, Gram] = {}
+    for row in rows:
+        names = tuple(filter(None, row["signals"].split(",")))
+        whole = Gram(names, row["n"], tuple(row["sums"]), tuple(row["products"]))
+        few = whole.restrict(tuple(name for name in columns if name in names))
+        key = row["part"], few.signals, row["course_late"] or 0
+        found[key] = found[key] + few if key in found else few
+    return found
+
+
+def kernel_rows(folder: Folder, table: pa.Table, name: str, late: int) -> list[dict[str, Any]]:
+    """What `gram --features` says of the log."""
+    warehouse = Warehouse(folder)
+    if not warehouse.logs.snapshot().files:
+        land(warehouse, "one", table)
+    files = warehouse.logs.snapshot().files
+    rows = aggregate(warehouse, files, feature_set=name, late={"car-1": late})
+    if "course_late" not in rows.column_names:
+        rows = rows.append_column("course_late", pa.nulls(len(rows), pa.int64()))
+    found: list[dict[str, Any]] = rows.to_pylist()
+    return found
+
+
+def received_rows(root: Path, content: bytes) -> list[dict[str, Any]]:
+    """The Gram rows that the messages of a drive become."""
+    root.mkdir()
+    fleet = fleet_slip.open(root / "data")
+    fleet.ingest_counted(write_counted(root / "rows", rows_of_messages(content)))
+    found: list[dict[str, Any]] = fleet.sql("SELECT * FROM grams").to_arrow_table().to_pylist()
+    return found
+
+
+@pytest.mark.parametrize(("late", "every"), [(0, 10), (-40, 10), (-11, 5), (1, 1), (200, 20)])
+def test_received_rows_are_those_of_the_log(
+    tmp_path: Path, of_course: Counter, late: int, every: int
+) -> None:
+    """With fixes that fail, holes, missing values, standing cars and a course that goes round."""
+    table = valid(hostile_drive("a", 5000, 7, every=every))
+    came = received_rows(tmp_path / "cars", of_course.messages(table, late))
+    logs = LocalFolder(tmp_path / "logs")
+    for one in of_course.sets:
+        delay = late if one.of.in_time else 0
+        mine = [row for row in came if row["feature_set"] == one.of.identity]
+        expected = grams_of(kernel_rows(logs, table, one.of.name, delay), one.columns)
+        if one.complete:
+            expected = {k: v for k, v in expected.items() if len(k[1]) in (0, len(one.columns))}
+        assert grams_of(mine, one.columns) == expected, one.of.name
+        changes = [gram for (_, names, _), gram in expected.items() if names and one.of.times]
+        assert bool(changes) == bool(one.of.times)
+        assert not changes or sum(gram.n for gram in changes) > 20
+
+
+@pytest.fixture
+def three(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A set of changes over several times, with a gate."""
+    windows = ("ay_mean_16", *PLANE, features().members("cornering")[0])
+    few = FeatureSet(description="few", signals=("ax", "ay", "yaw_rate"), windows=windows)
+    times = (Decimal("3.5"), Decimal(4), Decimal(5))
+    three = FeatureSet(description="three", of="few", features=("curvature",), change_s=times)
+    monkeypatch.setitem(features().sets, "few", few)
+    monkeypatch.setitem(features().sets, "three", three)
+    counted_sets.cache_clear()
+    yield "three"
+    counted_sets.cache_clear()
+
+
+def test_several_times_are_parts_of_the_drive(tmp_path: Path, three: str) -> None:
+    sets = sets_on_board(learned(("ay_mean_16",), three))[:2]
+    counted = build(tmp_path, sets)
+    table = valid(hostile_drive("a", 5000, 3))
+    came = received_rows(tmp_path / "cars", counted.messages(table, 9))
+    mine = [row for row in came if row["feature_set"] == features().identity(three)]
+    assert {row["part"] for row in mine} == {"3.5 s", "4 s", "5 s"}
+    expected = kernel_rows(LocalFolder(tmp_path / "logs"), table, three, 9)
+    assert grams_of(mine, sets[1].columns) == grams_of(expected, sets[1].columns)
+
+
+def test_nothing_overflows(tmp_path: Path, of_course: Counter) -> None:
+    """Not with counts beyond all ranges, and delays that no receiver has."""
+    if not can_sanitize():
+        pytest.skip("the compiler's sanitizers are not here")
+    sanitized = build(tmp_path, of_course.sets, *SANITIZED)
+    rows, width = 3000, 1 + len(of_course.signals)
+    random = np.random.default_rng(1)
+    samples = random.integers(-(2**31), 2**31, (rows, width)).astype(np.int32)
+    samples[500:] //= 2**16
+    samples[:, 0] = random.random(rows) < 0.99
+    for late in (-(2**31), 2**31 - 1, 7):
+        given = struct.pack("<16sQqQ", b"VIN", 2**64 - 1, late, rows) + samples.tobytes()
+        assert run_compiled([sanitized.program], given=given)
+
+
+def test_an_export_counts_what_teaches_the_model_again() -> None:
+    version = ModelVersion(1, learned(), "0" * 64)
+    files = export_files(version, None, "c", with_gram=True)
+    header = files["sideslip_any_gram.h"].decode()
+    assert "int32_t course_count;" in header and "_gram_pass(" in header
+    sizes = [one.columns for one in sets_on_board(version.manifest)[1:]]
+    assert set(sizes[-1]) == {*COLUMNS, *PLANE, catalogue().label}, "the columns themselves"
+    assert sizes[0] == (
+        *(
+            "ay",
+            "yaw_rate",
+            "curvature",
+            *sorted(COLUMNS, key=features().feature_set("course").columns.index),
+        ),
+        *("turned", "straight", "straight_course", catalogue().label),
+    )
+
+
+def test_what_a_car_is_not_told_it_cannot_count() -> None:
+    with pytest.raises(RefusedError, match="has ay_mean_16_mass: cars count up to 32 columns"):
+        sets_on_board(learned(("ay_mean_16_mass",), "course_fleet"))
+    many = features().feature_set("course").windows[:30]
+    with pytest.raises(RefusedError, match="up to 32 columns"):
+        sets_on_board(learned(many))

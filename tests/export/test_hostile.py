@@ -24,8 +24,8 @@ from fleet_slip.export.templating import different
 from fleet_slip.models.registry import ModelVersion
 from tests.export import plain
 from tests.export.compiled import compile_c, needs_cc
+from tests.export.engines import by_duckdb, by_sqlite
 from tests.export.models import LONGEST, MODELS, TEXTS, hostile_version, model_of
-from tests.export.sql_rows import by_duckdb, by_sqlite
 
 EMPTY = model_of(MODELS["every_kind"], name="empty")
 

@@ -44,9 +44,8 @@ from fleet_slip.models.manifest import Manifest, ModelTerm
 from fleet_slip.models.registry import ModelVersion
 from tests.export import plain
 from tests.export.compiled import build_driver, drive, needs_cc
+from tests.export.engines import by_duckdb, by_sqlite, open_session, run_drives
 from tests.export.models import cars, export_texts
-from tests.export.onnx_drives import open_session, run_drives
-from tests.export.sql_rows import by_duckdb, by_sqlite
 from tests.support.manifests import manifest
 
 SIGNALS = ("ay", "yaw_rate", "wheel_fl")

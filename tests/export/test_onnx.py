@@ -15,8 +15,8 @@ from fleet_slip.export.files import export_files
 from fleet_slip.export.onnx import FloatName, error_bound
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
+from tests.export.engines import in_si, open_session, run_drives
 from tests.export.models import CARS, DEFINITIONS, MODELS, hostile_drive, model_of
-from tests.export.onnx_drives import in_si, open_session, run_drives
 
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])

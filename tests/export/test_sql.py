@@ -9,6 +9,7 @@ import pytest
 
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
+from tests.export.engines import by_sqlite
 from tests.export.models import (
     DEFINITIONS,
     MODELS,
@@ -16,7 +17,6 @@ from tests.export.models import (
     hostile_version,
     model_of,
 )
-from tests.export.sql_rows import by_sqlite
 
 MANIFESTS = [model_of(of, name=name) for name, of in MODELS.items()] + [hostile_version().manifest]
 

@@ -5,8 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.bench_record import Record, add_record, draw, read_records, slower_than
-from tests.support.page_figures import PageFigure, page_figures
+from tests.support.bench_record import (
+    PageFigure,
+    Record,
+    add_record,
+    draw,
+    page_figures,
+    read_records,
+    slower_than,
+)
 
 
 def test_what_takes_longer_in_yardsticks_is_named(tmp_path: Path) -> None:

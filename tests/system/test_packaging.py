@@ -52,6 +52,7 @@ def files_in(folder: Path) -> dict[Path, bytes]:
     }
 
 
+@pytest.mark.long
 def test_the_wheel_learns_from_logs_away_from_the_checkout(
     site: Path, smoke_root: Path, tmp_path: Path
 ) -> None:

@@ -1,10 +1,13 @@
-"""Exported ONNX graphs, run by onnxruntime on cars side by side."""
+"""Exported ONNX graphs and SQL, run by other engines on drives of counts."""
 
+import sqlite3
 from collections.abc import Sequence
 from typing import Any
 
+import duckdb
 import numpy as np
 import onnxruntime
+import polars as pl
 
 from fleet_slip.export.compile import Sample
 from fleet_slip.export.files import export_files
@@ -49,3 +52,20 @@ def run_drives(
 def in_si(program: Program, samples: Sequence[Sample], dtype: str) -> Any:
     counts = np.array([[np.nan if n is None else n for n in row] for row in samples], float)
     return (counts * [float(one.scale) for one in program.signals]).astype(dtype)
+
+
+def by_duckdb(statement: str, log: pl.DataFrame) -> dict[tuple[str, int], int | None]:
+    with duckdb.connect() as database:
+        database.register("log", log.to_arrow())
+        rows = database.sql(f"SELECT drive_id, tick, angle FROM ({statement})").fetchall()
+    return {(drive, tick): angle for drive, tick, angle in rows}
+
+
+def by_sqlite(statement: str, log: pl.DataFrame) -> dict[tuple[str, int], int | None]:
+    database = sqlite3.connect(":memory:")
+    database.execute(f"CREATE TABLE log ({', '.join(log.columns)})")
+    database.executemany(f"INSERT INTO log VALUES ({', '.join('?' * log.width)})", log.rows())
+    # SQLite computes a column again wherever it is named, unless told otherwise: docs/export.md.
+    rows = database.execute(statement.replace(" AS (\n", " AS MATERIALIZED (\n")).fetchall()
+    database.close()
+    return {(drive, tick): angle for drive, tick, angle, _ in rows}
