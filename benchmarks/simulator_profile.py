@@ -9,12 +9,10 @@ import argparse
 import tempfile
 import time
 from collections.abc import Callable
-from datetime import date
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from benchmarks.harness import durations
 from fleet_slip.catalogue.signals import catalogue
@@ -23,16 +21,15 @@ from fleet_slip.simulation.job import lane_drive, simulate_logs, tabulate
 from fleet_slip.simulation.sensors import Recorder
 from fleet_slip.storage.checksums import checksum_of
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import Change
 from fleet_slip.vehicle.batch import LaneDrive, simulate_blocks
 from fleet_slip.warehouse.tables import Warehouse
 
 ROUNDS = 5
 
 
-def best(function: Callable[[], Any], clock: Callable[[], float] = time.thread_time) -> float:
+def best(function: Callable[[], Any]) -> float:
     """Return the shortest time of some calls, in s."""
-    return min(durations(function, ROUNDS, clock))
+    return min(durations(function, ROUNDS, time.thread_time))
 
 
 def drive(drives: list[LaneDrive]) -> None:
@@ -83,21 +80,7 @@ def stages(batch: Batch, warehouse: Warehouse) -> tuple[int, dict[str, float]]:
         "encode: signals": best(lambda: warehouse.logs.encode(rows.select(signals))),
         "encode: tick and metadata": best(lambda: warehouse.logs.encode(rows.select(others))),
         "checksum (again in encode)": best(lambda: checksum_of(encoded.content)),
-        "write and flush (elapsed)": best(
-            lambda: warehouse.logs.put("profile", encoded, batch.day), time.perf_counter
-        ),
-        "commit (elapsed)": _commit_s(warehouse, rows, batch.day),
     }
-
-
-def _commit_s(warehouse: Warehouse, rows: pa.Table, day: date) -> float:
-    numbers = iter(range(ROUNDS))
-
-    def commit() -> None:
-        action = warehouse.logs.write_file(f"commit-{next(numbers)}", rows.slice(0, 100), day)
-        warehouse.logs.snapshot().commit(Change(add=[action]))
-
-    return best(commit, time.perf_counter)
 
 
 def main() -> None:

@@ -49,7 +49,8 @@ CALLS = 40
 SETTLING = 5
 """So often everything is given again at the end."""
 DELETED = "a file was deleted during a look"
-"""What a reader may meet: it asks again."""
+GONE = r"\.parquet.* is gone|No such file|No files found"
+"""What a reader may meet, and what errors say of it: it asks again."""
 
 Arguments = tuple[str, ...]
 
@@ -98,13 +99,7 @@ class Soak:
             with database_errors("looking"):
                 return checks.readers_findings(self.root, {}, "both")
         except StorageError as error:  # `forget --now` deletes replaced files, whoever reads them
-            return [DELETED] if _is_gone(str(error)) else [str(error)]
-
-
-def _is_gone(message: str) -> bool:
-    """Whether a message is of a data file that is not there any more."""
-    paths = re.findall(r"/[^\s\"':]+\.parquet", message)
-    return bool(paths) and not any(Path(path).exists() for path in paths)
+            return [DELETED if re.search(GONE, str(error)) else str(error)]
 
 
 def _fail_at(call: int, code: int) -> None:
