@@ -1,7 +1,7 @@
 """Checks the order of time and cuts rows, block by block, into drives: uninterrupted stretches."""
 
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property, partial
@@ -261,148 +261,103 @@ class DriveRows:
 class OpenDrives:
     """Rows by part, as long as the part has not ended, few of them in memory.
 
-    Where thousands of parts are open at once, their rows are put aside by bundles of groups, and
+    Where hundreds of parts are open at once, their rows are put aside by bundles of groups, and
     no part is yielded before the last.
     """
 
     def __init__(self) -> None:
         """Begin without rows."""
-        self._rows: dict[int, list[pl.DataFrame]] = {}
-        self._mixed: list[pl.DataFrame] = []
-        """Later blocks, of many parts."""
-        self._in_memory, self._width = 0, 0
+        self._blocks: list[pl.DataFrame] = []
+        self._in_memory = 0
         self._spool = Spool()
-        self._bundles: set[int] = set()
-        """Groups whose rows were put aside together, by their number over `BUNDLED_GROUPS`."""
+        self._bundled = False
         self._ended: list[int] = []
         self._group_of: dict[int, int] = {}
         """Of each part that has rows in the file."""
 
     def add(self, rows: pl.DataFrame) -> None:
-        """Keep rows that are sorted by group, and so the rows of each part stand together."""
-        if rows.is_empty():
-            return
-        self._in_memory, self._width = self._in_memory + rows.height, rows.width
-        one = rows["part"][0] == rows["part"][-1]
-        if self._mixed or self._bundles or (not one and rows["part"].n_unique() > MOST_PARTS):
-            self._mixed.append(rows)
-        else:
-            self._keep([rows] if one else rows.partition_by("part", maintain_order=True))
-
-    def _keep(self, runs: Iterable[pl.DataFrame]) -> None:
-        for run in runs:
-            pieces = _by_base(run) if "base" in run.columns else [run]
-            self._rows.setdefault(int(run["part"][0]), []).extend(pieces)
+        """Keep rows with their part."""
+        if rows.height:
+            self._blocks.append(rows)
+            self._in_memory += rows.height * rows.width
 
     def take(self, parts: Sequence[int], *, last: bool) -> Iterator[DriveRows]:
         """Yield the rows of parts that have any, and let go of them; the last are all."""
-        if self._bundles:
-            self._ended += parts
-            if last:
-                yield from self._unbundled()
+        if not self._bundled:
+            yield from self._take(parts)
             return
-        if self._mixed and len(parts) > MOST_PARTS:
-            self._keep_mixed()
-            self._put_aside()
-        elif self._mixed and parts:
-            mine = pl.col("part").is_in(parts)
-            runs = pl.concat([rows.filter(mine) for rows in self._mixed])
-            self._keep(runs.partition_by("part", maintain_order=True))
-            rest = (rows.filter(~mine) for rows in self._mixed)
-            self._mixed = [rows for rows in rest if rows.height]
-        yield from self._joined(parts)
+        self._ended += parts
+        if last:
+            yield from self._unbundled()
 
-    def _joined(self, parts: Iterable[int]) -> Iterator[DriveRows]:
-        """Yield the rows of parts that have any, of those put aside and in memory."""
-        for part in parts:
-            in_memory = self._rows.pop(part, [])
-            self._group_of.pop(part, None)
-            self._in_memory -= sum(piece.height for piece in in_memory)
-            pieces = [*map(pl.read_ipc_stream, self._spool.read(part)), *in_memory]
-            if pieces and "base" not in pieces[0].columns:
-                yield DriveRows({0: pl.concat(pieces)})
-            elif pieces:
-                bases = defaultdict[int, list[pl.DataFrame]](list)
-                for piece in pieces:
-                    bases[piece["base"][0]].append(piece)
-                joined = {one: pl.concat(bases[one], how="diagonal") for one in sorted(bases)}
-                yield DriveRows(joined)
+    def _take(self, parts: Sequence[int]) -> Iterator[DriveRows]:
+        for start in range(0, len(parts), MOST_PARTS):
+            some = parts[start : start + MOST_PARTS]
+            found = self._let_go(some)
+            for part in some:
+                self._group_of.pop(part, None)
+                put_aside = map(pl.read_ipc_stream, self._spool.read(part))
+                if pieces := [*put_aside, *found[part]]:
+                    yield DriveRows(_by_base(pieces))
+
+    def _let_go(self, parts: Sequence[int]) -> dict[int, list[pl.DataFrame]]:
+        """Take the rows of parts out of memory."""
+        found = defaultdict[int, list[pl.DataFrame]](list)
+        mine = pl.col("part").is_in(parts)
+        for _ in range(len(self._blocks)):
+            rows = self._blocks.pop(0)
+            for run in rows.filter(mine).partition_by("part", maintain_order=True):
+                found[run["part"][0]].append(run)
+            self._in_memory -= rows.height * rows.width
+            self.add(rows.filter(~mine))
+        return found
 
     def _unbundled(self) -> Iterator[DriveRows]:
         """Yield the rows of all parts, bundle by bundle, and in each as the parts ended."""
-        self._bundle()
-        parts = defaultdict[int, list[int]](list)
+        self._put_aside(bundled=True)
+        bundles = defaultdict[int, list[int]](list)
         for part in self._ended:
-            parts[self._group_of.get(part, 0) // BUNDLED_GROUPS].append(part)
-        for bundle in sorted(parts):
+            bundles[self._group_of.get(part, 0) // BUNDLED_GROUPS].append(part)
+        for bundle, parts in sorted(bundles.items()):
             for piece in self._spool.read(("bundle", bundle)):
-                self._mixed.append(pl.read_ipc_stream(piece))
-                self._in_memory += self._mixed[-1].height
-                if self._is_full:
-                    self._keep_mixed()
-                    self._put_aside()
-            self._keep_mixed()
-            yield from self._joined(parts[bundle])
-
-    @property
-    def _is_full(self) -> bool:
-        return self._in_memory * self._width > MOST_OPEN_VALUES
+                self.add(pl.read_ipc_stream(piece))
+                if self._in_memory > MOST_OPEN_VALUES:
+                    self._put_aside(bundled=False)
+            yield from self._take(parts)
 
     def spill(self) -> None:
         """Put the rows aside if they are many. Raises `InputError` if the disk is full."""
-        if not self._is_full:
-            return
-        parts = pl.concat([rows["part"] for rows in self._mixed]) if self._mixed else pl.Series()
-        if self._bundles or parts.n_unique() > MOST_PIECES:
-            self._bundle()
-        else:
-            self._keep_mixed()
-            self._put_aside()
+        if self._in_memory > MOST_OPEN_VALUES:
+            parts = pl.concat([rows["part"] for rows in self._blocks]).n_unique()
+            self._bundled |= parts > MOST_PIECES
+            self._put_aside(bundled=self._bundled)
 
-    def _keep_mixed(self) -> None:
-        """Take the blocks of many parts apart."""
-        if self._mixed:
-            mixed, self._mixed = pl.concat(self._mixed), []
-            self._keep(mixed.partition_by("part", maintain_order=True))
-
-    def _bundle(self) -> None:
-        """Put the blocks of many parts aside by bundles, and all else by part."""
-        self._put_aside()
-        if not self._mixed:
+    def _put_aside(self, *, bundled: bool) -> None:
+        """Put all rows aside, by bundles or by parts."""
+        if not self._blocks:
             return
-        rows, self._mixed = pl.concat(self._mixed), []
+        rows = pl.concat(self._blocks)
+        self._blocks, self._in_memory = [], 0
         heads = rows.select("part", "group").unique("part")
         self._group_of.update(zip(heads["part"], heads["group"], strict=True))
-        bundle = (pl.col("group") // BUNDLED_GROUPS).alias("bundle")
-        bundles = rows.with_columns(bundle).partition_by("bundle", as_dict=True, include_key=False)
-        for (number,), some in bundles.items():
-            self._bundles.add(number)
-            self._write(("bundle", number), some)
-        self._in_memory = 0
-
-    def _put_aside(self) -> None:
-        """Put the rows of each part aside."""
-        for part, pieces in self._rows.items():
-            self._group_of[part] = int(pieces[0]["group"][0])
-            alike = "base" not in pieces[0].columns
-            for piece in [pl.concat(pieces)] if alike else pieces:
-                self._write(part, piece)
-        self._rows.clear()
-        self._in_memory = sum(rows.height for rows in self._mixed)
-
-    def _write(self, key: Hashable, piece: pl.DataFrame) -> None:
-        content = BytesIO()
-        piece.write_ipc_stream(content, compression="lz4")
-        self._spool.add(key, content.getvalue())
+        key = (pl.col("group") // BUNDLED_GROUPS if bundled else pl.col("part")).alias("key")
+        pieces = rows.with_columns(key).partition_by("key", as_dict=True, include_key=False)
+        for (number,), piece in pieces.items():
+            content = BytesIO()
+            piece.write_ipc_stream(content, compression="lz4")
+            self._spool.add(("bundle", number) if bundled else number, content.getvalue())
 
 
-def _by_base(run: pl.DataFrame) -> list[pl.DataFrame]:
+def _by_base(pieces: list[pl.DataFrame]) -> dict[int, pl.DataFrame]:
     """Return the rows of each time base, with those columns that have a value there."""
-    bases = run.drop("part").partition_by("base", maintain_order=True)
-    return [
-        rows.select(column for column in rows if column.null_count() < rows.height)
-        for rows in bases
-    ]
+    if "base" not in pieces[0].columns:
+        return {0: pl.concat(pieces)}
+    bases = defaultdict[int, list[pl.DataFrame]](list)
+    for piece in pieces:
+        for rows in piece.drop("part").partition_by("base", maintain_order=True):
+            some = rows.select(column for column in rows if column.null_count() < rows.height)
+            bases[rows["base"][0]].append(some)
+    return {one: pl.concat(bases[one], how="diagonal") for one in sorted(bases)}
 
 
 _SECONDS_PER_DAY = 86_400

@@ -185,7 +185,7 @@ def test_nothing_is_left_of_a_file_that_fails_at_its_end(
 @pytest.mark.parametrize(
     ("rows", "parts", "pieces", "groups"),
     [(4, 64, 512, 128), (4, 1, 512, 128), (9, 2, 512, 128), (2**20, 1, 512, 128),
-     (2**20, 2, 512, 128), (4, 1, 1, 1), (9, 1, 1, 2), (4, 0, 0, 128)],
+     (2**20, 2, 512, 128), (4, 1, 1, 1), (9, 1, 1, 2), (4, 1, 0, 128)],
 )  # fmt: skip
 def test_open_drives_that_wait_in_a_file_are_the_same(
     tmp_path: Path,

@@ -141,7 +141,7 @@ def read_in(
         patched.enter_context(mock.patch.object(time_bases, "open_source", opened))
         patched.enter_context(mock.patch.object(time_bases, "BATCH_ROWS", max(batch // 2, 1)))
         patched.enter_context(mock.patch.object(time_bases, "WINDOW_ROWS", window))
-        patched.enter_context(mock.patch.object(drives, "MOST_PARTS", batch % 3))
+        patched.enter_context(mock.patch.object(drives, "MOST_PARTS", 1 + batch % 3))
         patched.enter_context(mock.patch.object(drives, "MOST_OPEN_VALUES", 40 * window))
         patched.enter_context(mock.patch.object(drives, "MOST_PIECES", batch % 5))
         patched.enter_context(mock.patch.object(drives, "BUNDLED_GROUPS", 1 + batch % 2))
