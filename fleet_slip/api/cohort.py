@@ -76,7 +76,7 @@ class FleetCohort(Rooted):
     def select(self, request: SelectionRequest) -> "Selection":
         """Compare models by cross-validation and choose one; `Fleet.publish` takes the answer.
 
-        Drives that are not in order are left out: see `examine`, and `examined` of the answer. Gram
+        Drives with faulty sensors are left out: see `examine`, and `examined` of the answer. Gram
         rows that the usual list needs are made, where they are missing and that takes seconds.
         Raises what `examine` raises, `UsageError` for options that do not go together or an invalid
         list, and `DataError` if no model can be fitted.

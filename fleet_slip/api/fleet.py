@@ -362,7 +362,7 @@ class Fleet(HealthAndUpkeep):
     ) -> "LearnReport":
         """Make a model of measured logs: ingest, gram, select and publish.
 
-        It is trained on the drives of this mapping, without those that are not in order; on their
+        It is trained on the drives of this mapping, without faulty ones; on their
         side-slip angle, or on the course where the mapping has no such angle. What is done is not
         done again. Drives give way to those of a corrected mapping. Files that cannot be used are
         passed over and are the `problem` of the report; so is a refusal.

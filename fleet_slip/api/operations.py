@@ -85,7 +85,7 @@ class HealthAndUpkeep(JudgedModels):
     ) -> "QualityReport":
         """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors by drive.
 
-        Drives are compared with each other, by Gram rows alone; `findings` are those not in order.
+        Drives are compared with each other, by Gram rows alone; `findings` are the faulty ones.
         Raises what `FleetCohort` raises.
         """
         from fleet_slip.operations.quality import examine_drives

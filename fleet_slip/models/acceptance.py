@@ -406,7 +406,7 @@ def require_sound_drives(
     for term in manifest.terms:
         used |= set(term.definition.signals) if term.definition else {term.signal}
     for (_, signals), examples in found.items():
-        # Beside a champion, whose drives are in order, half of them are enough.
+        # Beside a champion, whose drives have no faults, half of them are enough.
         if used.isdisjoint(signals) or 2 * len(examples) + (made is not None) <= looked_at:
             continue
         raise RefusedError(

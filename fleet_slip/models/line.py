@@ -43,7 +43,7 @@ def with_line_fitted(
 ) -> SelectionRequest:
     """Return a request of a set with a line, which is fitted if none is kept; others as they are.
 
-    `asked` is the cohort, `condition` what of it is in order. The Gram rows of the set, and those
+    `asked` is the cohort, `condition` what of it has no fault. The Gram rows of the set, and those
     that the line needs, are made. Raises as `answer_request`.
     """
     plan = SelectionPlan.of(request)

@@ -60,7 +60,7 @@ class Score(Answer):
     rows_without: int = 0
     """Of the cohort, that tell nothing of the model: the label or a signal is missing."""
     examined: str = ""
-    """Which drives were left out since they are not in order, as a sentence."""
+    """Which drives were left out for faulty sensors, as a sentence."""
     model: str = ""
     cohort: str = ""
 

@@ -215,7 +215,7 @@ class Selection(Answer):
         label_noise_deg: of the label, which every error has in it; None where it is not known.
         request, asked: what was asked for, and of which drives.
         remark: why another list than the usual one was compared.
-        examined: which drives were left out since they are not in order, as a sentence.
+        examined: which drives were left out for faulty sensors, as a sentence.
     """
 
     cohort: Cohort

@@ -1,4 +1,4 @@
-"""Which drives of a cohort may train a model: those that were examined and are in order.
+"""Which drives of a cohort may train a model: those that were examined and have no fault.
 
 Drives are examined once: what was found is kept in the user's cache, as hashes of drives, as long
 as Gram rows and thresholds are what they were. Many drives are examined in pieces of whole days, so
@@ -64,9 +64,9 @@ class Examined:
     """What was found.
 
     Attributes:
-        cohort: the condition without the drives that are not in order.
+        cohort: the condition without the faulty drives.
         drives: how many were long enough to be examined.
-        found: the fault of each drive that is not in order, by its hash.
+        found: the fault of each faulty drive, by its hash.
         missing: how many measured drives were not, since they have no Gram rows.
         missing_rows: how many rows of the logs are to be read for these.
         made: how many drives' Gram rows were made to examine them.
@@ -95,7 +95,7 @@ class Examined:
         )
 
     def __str__(self) -> str:
-        """Return what is left out, and what was not examined; nothing if all are in order."""
+        """Return what is left out, and what was not examined; nothing if none is faulty."""
         said = []
         if self.made:
             drives = number_of(self.made, "measured drive")
@@ -131,7 +131,7 @@ class Examined:
             ) from None
 
     def findings(self, warehouse: Warehouse) -> tuple[SensorFault, ...]:
-        """Return the drives that are not in order by name, by day and drive."""
+        """Return the faulty drives by name, by day and drive."""
         if not self.found:
             return ()
         query = "SELECT DISTINCT drive_id, vehicle_id, day FROM grams ORDER BY day, drive_id"
@@ -159,7 +159,7 @@ class _Piece(NamedTuple):
 
 
 def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
-    """Examine the drives of a cohort like `quality`; return it without those not in order.
+    """Examine the drives of a cohort like `quality`; return it without the faulty ones.
 
     Drives without Gram rows of `signals` are not examined, and counted. Of a condition on rows all
     drives are examined. Raises what `examine_drives` raises; where no drive is measured there is

@@ -35,11 +35,11 @@ LEAST_EXPLAINED = 0.5
 """Part of the label's variance that the relation must explain, else signs mean nothing."""
 
 REVERSED_GAIN = -0.5
-"""A label on its prediction: 1 in order, -1 reversed."""
+"""A label on its prediction: 1 without a fault, -1 reversed."""
 
 
 def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> dict[int, Fault]:
-    """Return the drives in order whose label contradicts that of the others, with the fault.
+    """Return otherwise sound drives whose label contradicts that of the others, with the fault.
 
     The fewer drives are the reversed ones; of two halves, the one without the first drive, since
     drives come in the order of their names, which begin with the day.

@@ -106,7 +106,7 @@ class NightReport(Answer):
 
     Attributes:
         before: what the root had when the night first began.
-        faults: the drives whose sensors are not in order; `new_faults` came with this night. The
+        faults: the drives with faulty sensors; `new_faults` came with this night. The
             summary names them.
         chart: the errors of the champion of before on the days since it was trained, if there are
             enough days to tell what is usual.

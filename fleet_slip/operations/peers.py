@@ -36,11 +36,11 @@ class StatusThresholds(Config):
 
 
 class QualityThresholds(Config):
-    """When `quality` finds a drive's sensors not in order.
+    """When `quality` finds a drive's sensors faulty.
 
     Attributes:
         min_rows: shorter drives are not examined.
-        min_drives: fewest drives in order of a vehicle model to compare others with.
+        min_drives: fewest drives without faults of a vehicle model to compare others with.
         min_correlation: a sign of turning contradicts the others at less than minus this.
         limit: how many spreads from the cohort's median a figure may be.
         offset_floor_counts, gain_floor, noise_floor: least spread of the figures between drives;
@@ -116,7 +116,7 @@ class Prediction:
         predictors: Sequence[int],
         limits: QualityThresholds,
     ) -> "Prediction":
-        """Fit on drives that are in order; every drive counts the same."""
+        """Fit on drives without faults; every drive counts the same."""
         total = reference.mean
         at = np.array(targets, dtype=np.intp)
         weights = np.zeros((len(at), len(total)))

@@ -32,7 +32,7 @@ from fleet_slip.warehouse.tables import Warehouse
 
 @dataclass(frozen=True)
 class SensorFault(Record):
-    """A drive whose sensors are not in order."""
+    """A drive with faulty sensors."""
 
     DOCUMENT = "drive_id vehicle_id day kind=fault.kind signals=fault.signals figure=fault.figure"
 
@@ -52,7 +52,7 @@ class QualityReport(Answer):
     Attributes:
         drives: Gram rows long enough to be examined.
         compared: those among them that had enough peers to be compared with.
-        findings: one for each that is not in order, by day and drive.
+        findings: one for each faulty drive, by day and drive.
     """
 
     drives: int
@@ -150,7 +150,7 @@ def examine(cohort: Cohort, known: Mapping[str, Fault] | None = None) -> Quality
     """Examine each drive of a cohort, beside other drives of its car and of its vehicle model.
 
     First for what no car does (`find_implausible`), then by comparison with its peers, if it has
-    `min_drives` of them; see `_peer_groups`. `known` are drives that are not in order.
+    `min_drives` of them; see `_peer_groups`. `known` are faulty drives.
     """
     limits = thresholds().quality
     drives = compared = 0
