@@ -36,19 +36,18 @@ def connect(
     *,
     threads: int | None = None,
     query: str | None = None,
-    scenarios: bool = False,
 ) -> duckdb.DuckDBPyConnection:
     """Return a DuckDB connection with the views of the warehouse at `root`, a path or a URL.
 
     `log` (SI units), `log_counts`, `drives`, `grams`, `models`, `quarantine`, `runs` and
     `dictionary`, which documents every column, all of one snapshot. With a `query`, only those that
-    it names, which is faster. Drives that models are tested on are there with `scenarios`, or if
-    the query names the column `source`.
+    it names, which is faster. Drives that models are tested on are there if it names the column
+    `source`.
 
     It opens the files of the snapshot and no others, and its settings cannot be changed. DuckDB
     knows no right to read without the right to write: ask SQL of others through `Fleet.sql`.
     """
-    return open_views(data_root(root), query, threads, scenarios=scenarios)
+    return open_views(data_root(root), query, threads)
 
 
 def open_views(
@@ -56,7 +55,6 @@ def open_views(
     query: str | None,
     threads: int | None = None,
     *,
-    scenarios: bool,
     unlocked: bool = False,
 ) -> duckdb.DuckDBPyConnection:
     """Return a connection as `connect` does; `unlocked`, it opens any file and takes settings."""
@@ -64,8 +62,7 @@ def open_views(
     warehouse.require()
     wanted = VIEWS if query is None else needed_views(query)
     snapshots = table_snapshots(warehouse, wanted)
-    scenarios = scenarios or _SOURCE.search(query or "") is not None
-    of = ALL_DRIVES if scenarios else TRAINING_DRIVES
+    of = ALL_DRIVES if _SOURCE.search(query or "") else TRAINING_DRIVES
     database = open_tables(warehouse, wanted, snapshots, threads=threads, of=of)
     if "runs" in wanted:
         add_runs(database, warehouse.root)

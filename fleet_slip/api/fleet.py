@@ -61,29 +61,26 @@ class Fleet(HealthAndUpkeep):
     the view `runs`. Every call raises `StorageError` where the root cannot be read or written.
     """
 
-    def sql(
-        self, query: str, *, threads: int | None = None, scenarios: bool = False
-    ) -> "duckdb.DuckDBPyRelation":
+    def sql(self, query: str, *, threads: int | None = None) -> "duckdb.DuckDBPyRelation":
         """Return the answer to an SQL query on the views as a DuckDB relation.
 
         It is computed when asked for rows: `.df()`, `.pl()`, `.to_arrow_table()`, `.fetchall()`;
-        what is made of it keeps the connection open. Evaluation scenarios are there with
-        `scenarios`, or if the query names the column `source`. Raises `QuestionError` for a query
+        what is made of it keeps the connection open. Evaluation scenarios are there if the query
+        names the column `source`. Raises `QuestionError` for a query
         that is not valid or would write, and `StorageError` without a data root.
         """
-        return self.session(query, threads=threads, scenarios=scenarios).sql(query)
+        return self.session(query, threads=threads).sql(query)
 
     def session(
         self,
         query: str | None = None,
         *,
         threads: int | None = None,
-        scenarios: bool = False,
         unlocked: bool = False,
     ) -> "Session":
         """Open the views of this moment for many queries, which all see the same commits.
 
-        With a `query`, only those that it names, which is faster. For `scenarios` see `sql`. If it
+        With a `query`, only those that it names, which is faster. For scenarios see `sql`. If it
         is `unlocked`, it allows any statement, and any file that you may read or write: only for
         SQL that you trust, since it can overwrite the warehouse. Raises `StorageError` without a
         data root.
@@ -91,7 +88,7 @@ class Fleet(HealthAndUpkeep):
         from fleet_slip.api.session import Session
         from fleet_slip.views import open_views
 
-        opened = open_views(self.root, query, threads, scenarios=scenarios, unlocked=unlocked)
+        opened = open_views(self.root, query, threads, unlocked=unlocked)
         return Session(opened, unlocked)
 
     def cohort(

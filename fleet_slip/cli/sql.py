@@ -57,9 +57,6 @@ def sql(
     everything: Annotated[
         bool, typer.Option("--all", help="Print all rows and columns of a table, however wide.")
     ] = False,
-    scenarios: Annotated[
-        bool, typer.Option("--scenarios", help="Show the drives that models are tested on as well.")
-    ] = False,
     unsafe: Annotated[
         bool,
         typer.Option(
@@ -71,8 +68,8 @@ def sql(
 ) -> None:
     """Query the warehouse: log (SI), log_counts, drives, grams, models, quarantine, dictionary.
 
-    Every column is described in the view dictionary. Test drives are there with --scenarios, or
-    if the query names the column source. A query can read the warehouse, and nothing else. A table
+    Every column is described in the view dictionary. Test drives are there if the query
+    names the column source. A query can read the warehouse, and nothing else. A table
     shows what fits of columns and rows; --all shows all. --csv, --json and --output give numbers to
     the last digit. Several statements on stdin are answered one after the other.
 
@@ -88,7 +85,7 @@ def sql(
         raise UsageError(f"{output}: the suffix says the format: .parquet, .csv or .json.")
     if not unsafe:
         limit_memory()
-    opened = fleet.session(text, scenarios=scenarios, unlocked=unsafe)
+    opened = fleet.session(text, unlocked=unsafe)
     with opened as session, _representation_errors():
         if output is not None:
             _write(session.table(text), output, exact)

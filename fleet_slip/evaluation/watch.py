@@ -102,9 +102,10 @@ def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> 
     """Return the frames of a drive of the logs. Raises `QuestionError`."""
     names = [one.column for one in catalogue().signals.values()]
     query = (
-        f"SELECT time_s, campaign, day, track, vehicle_model, mass_kg, {', '.join(names)} FROM log"
+        "SELECT time_s, source, campaign, day, track, vehicle_model, mass_kg, "
+        f"{', '.join(names)} FROM log"
     )
-    with connect(warehouse.root, query=query, scenarios=True) as database:
+    with connect(warehouse.root, query=query) as database:
         statement = f"{query} WHERE drive_id = $drive ORDER BY time_s"
         rows = database.sql(statement, params={"drive": drive_id}).to_arrow_table()
     if not rows.num_rows:
